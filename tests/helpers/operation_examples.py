@@ -99,7 +99,7 @@ EXAMPLES = {
     ),
     "contact_patch": Example(
         lambda dtype: contact_patches.arguments("four slots", dtype),
-        lambda found, _: [found.force, found.polygon, torch.stack(found.pos), torch.stack(found.normal)],
+        lambda found, _: [found.force, found.area, torch.stack(found.pos), torch.stack(found.normal)],
         (2e-5, 2e-8, 2e-5, 2e-5),
     ),
 }

@@ -4,6 +4,7 @@ import contact_patches
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import tgdsl
@@ -18,11 +19,13 @@ SCENE = """<mujoco><worldbody>
 OWN, FIXED = {"per_env": 40.0}, 30.0
 
 
-def area_of(points: np.ndarray, normal: np.ndarray) -> float:
-    """The shoelace rule in the order of the angles across the normal."""
+def area_of(points: np.ndarray, normal: np.ndarray, is_star: bool = False) -> float:
+    """Qhull's area of the points across the normal, or by the shoelace rule in the order of their angles."""
     across = np.linalg.svd(normal[None])[2][1:]
     across[1] *= np.sign(np.cross(*across) @ normal)
     x, y = across @ points.T
+    if not is_star:
+        return ConvexHull(np.stack([x, y], axis=1)).volume if len(np.unique(points, axis=0)) > 2 else 0.0
     order = np.argsort(np.arctan2(y, x), kind="stable")
     x, y = x[order], y[order]
     return max(0.0, 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)))
@@ -49,14 +52,16 @@ def brute_force(contacts: Contacts, sides: Sides) -> np.ndarray:
         mean = mean if np.linalg.norm(mean) > 1e-3 else out[pressed > 0][0]
         mean /= np.linalg.norm(mean)
         back = Rotation.from_quat(quat[env, body], scalar_first=True).inv()
-        area = area_of(place[pressed > 0] - centre, mean)
+        area = area_of(place[pressed > 0] - centre, mean, sides.is_star)
         found[env, b, o] = pressed.sum(), area, *back.apply(centre - body_pos[env, body]), *back.apply(mean)
     return found
 
 
+@pytest.mark.parametrize("is_star", [False, True], ids=["hull", "star"])
 @pytest.mark.parametrize("case", contact_patches.CASES)
-def test_random_contacts_make_the_patches_that_brute_force_finds(case):
+def test_random_contacts_make_the_patches_that_brute_force_finds(case, is_star):
     contacts, sides, dtype = contact_patches.arguments(case, torch.float64)
+    sides = sides._replace(is_star=is_star)
     quat = contacts.body_quat / contacts.body_quat.norm(dim=-1, keepdim=True)
     contacts = contacts._replace(body_quat=quat)
     force, area, pos, normal = patch(contacts, sides, dtype)
@@ -71,6 +76,31 @@ def of_one_pair(force, normal, pos, whole):
     none, quat = 0 * whole, torch.tensor([[[1.0, 0.0, 0.0, 0.0]]], dtype=torch.float64)
     contacts = Contacts(force, 0 * force, normal, pos, whole, none, quat)
     return patch(contacts, Sides(torch.tensor([0]), torch.tensor([[0]]), True), torch.float64)
+
+
+MM = 1e-3
+RECTANGLE = [[0, 0], [20, 0], [20, 10], [0, 10]]
+SHAPES = {
+    "rectangle with a point inside": ([*RECTANGLE, [15, 4]], 200.0),
+    "rectangle with points on its sides": ([*RECTANGLE, [10, 0], [20, 5]], 200.0),
+    "L": ([[0, 0], [20, 0], [20, 5], [5, 5], [5, 20], [0, 20]], 287.5),
+    "two points on one ray": ([[0, 0], [10, 0], [5, 8], [5, 2]], 40.0),
+    "line": ([[0, 0], [1, 1], [2, 2], [5, 5]], 0.0),
+    "ten points": ([*RECTANGLE, [1, 1], [19, 1], [10, 9], [10, 5], [3, 7], [18, 8]], 200.0),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_patch_has_the_area_of_its_points_hull(shape):
+    """Whatever the order, and wherever the load pulls the centre to."""
+    points, area = SHAPES[shape]
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        flat = rng.permutation(MM * np.array(points, dtype=float))
+        force = rng.uniform(0.1, 2.0, (len(flat), 1)) * np.array([0.0, 0.0, 1.0])
+        pos = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+        found = of_one_pair(force, np.tile([0.0, 0.0, 1.0], (len(flat), 1)), pos, force.sum(axis=0))
+        assert found.area.item() == pytest.approx(1e-6 * area, rel=1e-12, abs=1e-18)
 
 
 def test_contacts_without_forces_share_the_whole_one_alike():

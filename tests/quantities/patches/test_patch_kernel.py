@@ -6,7 +6,7 @@ from kernels import interpreted, needs_triton, use_kernels
 
 from tgdsl.quantities.patches.patch import CONTACT_PATCH, patch
 
-TOLERANCES = {"force": 2e-5, "polygon": 2e-8, "pos": 2e-5, "normal": 2e-5}
+TOLERANCES = {"force": 2e-5, "area": 2e-8, "pos": 2e-5, "normal": 2e-5}
 """Some roundings of float32 of forces of 10 N, places some metres away, and points of 1 cm about them [N, m², m]."""
 
 
@@ -21,7 +21,7 @@ def check(case):
         )
         assert (part.double() - other).abs().max() <= tolerance, (case, name, (part.double() - other).abs().max())
     assert (found.force > 0).any() and (found.force == 0).any(), case
-    assert (found.polygon > 0).any() == (contact_patches.CASES[case].slots > 2), case
+    assert (found.area > 0).any() == (contact_patches.CASES[case].slots > 2), case
 
 
 def check_strange_numbers():

@@ -33,7 +33,7 @@ def _patches(use: PatchesUse[Tensor], scene: Scene) -> ContactPatch:
         none = use.start.new_zeros((1, use.topology.num_bodies, use.topology.num_objects)).to(scene.dtype)
         nowhere = (none, none, none)
         return ContactPatch(none, none, nowhere, nowhere, None, None, objects, use.topology, use.sides, cells, boxes)
-    tensors, sides = scene.tensors, Sides(use.bodies, use.pairs, len(use.topology.met) == use.pairs.numel())
+    tensors, sides = scene.tensors, Sides(use.bodies, use.pairs, len(use.topology.met) == use.pairs.numel(), use.is_star)
     force, area, centre, normal = CONTACT_PATCH(Contacts(*(tensors[name] for name in FIELDS)), sides, scene.dtype)
     seen: tuple[Vec | None, Vec | None] = None, None
     if use.topology.interfaces:

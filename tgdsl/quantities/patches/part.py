@@ -21,6 +21,7 @@ class PatchesUse(Generic[Array]):
 
     Attributes:
         topology: Which patch joins what.
+        is_star: See `ContactPatches`.
         bodies: Indices of the sensor's bodies in the state, (body,); empty without objects.
         pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
         relations: The same pair among those of the Plan, or their number, (body, object).
@@ -39,6 +40,7 @@ class PatchesUse(Generic[Array]):
     """
 
     topology: Topology
+    is_star: bool
     bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
     pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
     relations: Array = field(metadata=indices(lambda use, part, plan: len(plan.pairs.link) + 1))

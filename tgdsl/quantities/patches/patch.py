@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.patches.polygon import polygon_area
+from tgdsl.quantities.patches.polygon import patch_area
 from tgdsl.quantities.patches.request import cancelled
 from tgdsl.quantities.patches.slots import Contacts, Sides, slots_of
 from tgdsl.tensors.operations import Operation
@@ -24,10 +24,10 @@ MOST_SLOTS = 8
 
 
 class Patch(NamedTuple):
-    """Planes (env, body, object) as `ContactPatch` has them: force [N], polygon [m²], pos [m], normal in the link's frame."""
+    """Planes (env, body, object) as `ContactPatch` has them: force [N], area [m²], pos [m], normal in the link's frame."""
 
     force: Tensor
-    polygon: Tensor
+    area: Tensor
     pos: Vec
     normal: Vec
 
@@ -47,7 +47,7 @@ def patch(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> Patch:
     share = [part * inverse for part in force]
     centre = _mean(share, [slot.pos for slot in slots])
     normal = _direction(force, share, [slot.normal for slot in slots])
-    area = polygon_area([planes.sub(slot.pos, centre) for slot in slots], normal, [part > 0 for part in force])
+    area = patch_area([planes.sub(slot.pos, centre) for slot in slots], normal, [part > 0 for part in force], sides.is_star)
     turn = planes.rotation(contacts.body_quat[:, sides.bodies])
     turn = planes.rot(part.to(dtype)[..., None] for part in turn)
     return Patch(total, area, planes.rotate_back(turn, centre), planes.rotate_back(turn, normal))
@@ -88,8 +88,8 @@ def _inputs(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Tensor
 
 
 def is_small(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> bool:
-    """Return whether there are few enough contacts per pair, and what is returned is float32."""
-    return contacts.force.shape[2] <= MOST_SLOTS and dtype == torch.float32
+    """Return whether the kernel does this: few contacts per pair, float32, and the area of the hull."""
+    return contacts.force.shape[2] <= MOST_SLOTS and dtype == torch.float32 and not sides.is_star
 
 
 CONTACT_PATCH = Operation("contact_patch", patch, _by_kernel, _inputs, is_small)

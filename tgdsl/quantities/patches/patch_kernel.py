@@ -1,7 +1,7 @@
 """`patch` as one Triton kernel, for a GPU in float32 without derivatives.
 
-A program takes a block of pairs of a body and an object, with all contacts of each. Those that make a polygon are not sorted:
-each is compared with each, so that it knows how many come before it, and with that its successor.
+A program takes a block of pairs of a body and an object, with all contacts of each. Their hull needs no sorting: each is
+compared with each.
 
 Shapes of blocks: `P` pairs of a body and an object, environment by environment; `S` slots, a power of two.
 """
@@ -31,7 +31,7 @@ WARPS = 1
 
 @triton_op("tgdsl::contact_patch", mutates_args={})
 def contact_patch(contacts: list[Tensor], pairs: Tensor, bodies: Tensor) -> Tensor:
-    """Return force, area of the polygon, centre and normal in the link's frame, (8, env, body, object).
+    """Return force, area, centre and normal in the link's frame, (8, env, body, object).
 
     Args:
         contacts: The fields of `Contacts`.
@@ -105,7 +105,7 @@ def patch_kernel(
     # What is no number stays none.
     inverse = tl.where(squared == squared, inverse, squared)
     axis = (mean[0] * inverse, mean[1] * inverse, mean[2] * inverse)
-    area = _polygon(away, centre, axis, counts, slot)
+    area = _hull(away, centre, axis, counts, slot, SLOTS)
     # In the link's frame.
     w, x = tl.load(body_quat + 4 * body, is_at, 1.0), _at(body_quat, 4 * body + 1, is_at)
     y, z = _at(body_quat, 4 * body + 2, is_at), _at(body_quat, 4 * body + 3, is_at)
@@ -166,8 +166,8 @@ def _normal_force(push, out, whole, is_used):
 
 
 @triton.jit
-def _polygon(away, centre, axis, counts, slot):
-    """Return the area of the polygon of the slots that count, by their angles about the centre (P) [m²]: see `polygon_area`."""
+def _hull(away, centre, axis, counts, slot, SLOTS: tl.constexpr):
+    """Return the area of the hull of the slots that count (P) [m²]: see `patch_area`."""
     nx, ny, nz = axis
     sign = tl.where(nz >= 0, 1.0, -1.0)
     a = -1.0 / (sign + nz)
@@ -176,19 +176,29 @@ def _polygon(away, centre, axis, counts, slot):
     other = (b[:, None], (sign + ny * ny * a)[:, None], (-ny)[:, None])
     flat = (away[0] - centre[0][:, None], away[1] - centre[1][:, None], away[2] - centre[2][:, None])
     x, y = tl.where(counts, dot(flat, one), 0.0), tl.where(counts, dot(flat, other), 0.0)
+    far = tl.max(tl.where(counts, x, float("-inf")), axis=1)[:, None]
+    number = slot[None, :]
+    first = tl.min(tl.where(counts & (x == far), number, SLOTS), axis=1)[:, None]
+    is_first = number == first
+    x0, y0 = tl.sum(tl.where(is_first, x, 0.0), axis=1)[:, None], tl.sum(tl.where(is_first, y, 0.0), axis=1)[:, None]
+    angle = _angle(x, y) - _angle(x0, y0)
+    angle = tl.where(is_first, -1.0, tl.where(angle < 0, angle + 4.0, angle))
+    is_after = (angle[:, None, :] > angle[:, :, None]) & counts[:, None, :] & counts[:, :, None]
+    crossed = tl.where(is_after, x[:, :, None] * y[:, None, :] - y[:, :, None] * x[:, None, :], float("-inf"))
+    # Twice the area swept on the way to each slot: each round allows for one more corner.
+    swept = tl.where(is_first, 0.0, float("-inf"))
+    for _ in tl.static_range(SLOTS - 1):
+        swept = tl.maximum(swept, tl.max(swept[:, :, None] + crossed, axis=1))
+    area = 0.5 * tl.max(tl.where(counts, swept + x * y0 - y * x0, 0.0), axis=1)
+    return tl.where(area < 0, 0.0, area)
+
+
+@triton.jit
+def _angle(x, y):
+    """Return a number from 0 to 4 that grows with a point's angle."""
     size = tl.abs(x) + tl.abs(y)
     along = x / tl.where(size > 0, size, 1.0)
-    around = tl.where(counts, tl.where(y >= 0, 1.0 - along, 3.0 + along), 8.0)
-    number = slot[None, :]
-    is_before = around[:, None, :] < around[:, :, None]
-    is_alike = (around[:, None, :] == around[:, :, None]) & (number[:, None, :] < number[:, :, None])
-    rank = tl.sum((is_before | is_alike).to(tl.int32), axis=2)
-    count = tl.sum(counts.to(tl.int32), axis=1)[:, None]
-    wanted = tl.where(rank + 1 < count, rank + 1, 0)
-    is_next = (rank[:, None, :] == wanted[:, :, None]).to(tl.float32)
-    next_x, next_y = tl.sum(is_next * x[:, None, :], axis=2), tl.sum(is_next * y[:, None, :], axis=2)
-    area = 0.5 * tl.sum(tl.where(counts, x * next_y - y * next_x, 0.0), axis=1)
-    return tl.where(area < 0, 0.0, area)
+    return tl.where(y >= 0, 1.0 - along, 3.0 + along)
 
 
 @triton.jit

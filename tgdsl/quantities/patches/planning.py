@@ -83,6 +83,7 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
     choices, variants = (max([len(own) for own in part] + [1]) for part in _parts(heats))
     return PatchesUse(
         topology=topology,
+        is_star=use.request.is_star,
         bodies=np.array([planning.bodies.index(b) for b in bodies if names], dtype=np.int64),
         pairs=table(gate),
         relations=table(order),

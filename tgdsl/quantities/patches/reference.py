@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
 
 from tgdsl.quantities.contacts.part import SLOT_FIELDS
 from tgdsl.quantities.contacts.reference import completed
@@ -19,10 +20,10 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Patch:
-    """One patch: normal force [N], polygon's area [m²], centre [m] and normal, in the link's frame and in the object's."""
+    """One patch: normal force [N], area [m²], centre [m] and normal, in the link's frame and in the object's."""
 
     force: float
-    polygon: float
+    area: float
     pos: Float[Array, " 3"]
     normal: Float[Array, " 3"]
     object_pos: Float[Array, " 3"]
@@ -59,14 +60,14 @@ def reference(part: PatchesPart[np.ndarray], use: int, scene: ReferenceScene) ->
     """Return the patches of a sensor's bodies with the objects of a use."""
     own, found = part.uses[use], {}
     for b, o in own.topology.met:
-        patch = _patch(scene, b, scene.contact_pairs[own.pairs[b, o]].object, int(own.pairs[b, o]))
+        patch = _patch(scene, b, scene.contact_pairs[own.pairs[b, o]].object, int(own.pairs[b, o]), own.is_star)
         if patch is not None:
             found[b, o] = patch
     objects = tuple(_object(own, i, scene) for i in range(own.topology.num_objects))
     return ReferencePatches(found, objects, own.topology, own.boxes)
 
 
-def _patch(scene: ReferenceScene, b: int, name: str, pair: int) -> Patch | None:
+def _patch(scene: ReferenceScene, b: int, name: str, pair: int, is_star: bool) -> Patch | None:
     link = scene.body(scene.layout.bodies[b])
     target = scene.object_body(next(own for own in scene.objects if own.name == name))
     slots = zip(*(scene.fields[field][pair] for field in SLOT_FIELDS), strict=True)
@@ -80,16 +81,21 @@ def _patch(scene: ReferenceScene, b: int, name: str, pair: int) -> Patch | None:
     if np.linalg.norm(normal) < cancelled():
         normal = pressing[0][2]
     normal = normal / np.linalg.norm(normal)
-    area = polygon([point - pos for point, _, _ in pressing], normal)
+    area = _area([point - pos for point, _, _ in pressing], normal, is_star)
     frames = [(body.rotation.T @ (pos - body.pos), body.rotation.T @ normal) for body in (link, target)]
     return Patch(float(weights.sum()), area, *frames[0], *frames[1])
 
 
-def polygon(points: list[np.ndarray], normal: np.ndarray) -> float:
-    """Return the area of the polygon of points about the origin, by their angles across the normal [m²] (the shoelace rule)."""
+def _area(points: list[np.ndarray], normal: np.ndarray, is_star: bool) -> float:
+    """Return the area of points about the origin across the normal [m²]: of their hull, or in the order of their angles."""
     one = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     one /= np.linalg.norm(one)
     flat = np.array([[point @ one, point @ np.cross(normal, one)] for point in points])
+    if not is_star:
+        try:
+            return ConvexHull(flat).volume
+        except QhullError:  # fewer than three points, or all on a line
+            return 0.0
     flat = flat[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]), kind="stable")]
     after = np.roll(flat, -1, axis=0)
     return max(0.0, 0.5 * float(np.sum(flat[:, 0] * after[:, 1] - flat[:, 1] * after[:, 0])))

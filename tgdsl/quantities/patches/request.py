@@ -64,8 +64,7 @@ class ContactPatch(NamedTuple):
 
     Attributes:
         force: Sum of the contacts' normal forces [N].
-        polygon: Area of the polygon of the contact points in the plane across the normal, by their angles about the centre
-            [m²]; 0 for fewer than three.
+        area: Area of the contact points' convex hull in the plane across the normal [m²]; 0 for fewer than three.
         pos: Centre in the link's frame [m].
         normal: Unit normal out of the object, in the link's frame.
         object_pos: Centre in the object's frame [m]; None if no object there is divided into cells.
@@ -78,7 +77,7 @@ class ContactPatch(NamedTuple):
     """
 
     force: Tensor
-    polygon: Tensor
+    area: Tensor
     pos: Vec
     normal: Vec
     object_pos: Vec | None
@@ -97,11 +96,14 @@ class ContactPatches(Request[ContactPatch]):
     Attributes:
         slots: Contacts per body and object that make a patch.
         boxes: Lowest and highest corner of each body's box in its frame, handed on (body, 2, 3) [m].
+        is_star: Whether the area is that of the paper's polygon, through all points in the order of their angles about the
+            centre, in place of their convex hull.
         needs_stiffness: Whether each object has to be of a material whose Young's modulus is known.
     """
 
     slots: int
     boxes: Float[np.ndarray, "body 2 3"]
+    is_star: bool
     needs_stiffness: bool
 
     @property
@@ -116,4 +118,4 @@ class ContactPatches(Request[ContactPatch]):
 
     def key(self) -> tuple[Any, ...]:
         """Return what two requests have in common if they are one: each sensor has its own."""
-        return (type(self), self.objects, self.slots, self.boxes.tobytes())
+        return (type(self), self.objects, self.slots, self.is_star, self.boxes.tobytes())

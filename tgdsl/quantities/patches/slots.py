@@ -44,11 +44,13 @@ class Sides(NamedTuple):
         bodies: Indices of the sensor's bodies (body,).
         pairs: Of which pair each body's contacts with each object are (body, object); the number of pairs for none.
         are_all: Whether each body may meet each object.
+        is_star: Whether a patch's area is that of the paper's polygon: see `patch_area`.
     """
 
     bodies: Tensor
     pairs: Tensor
     are_all: bool
+    is_star: bool = False
 
 
 class Slot(NamedTuple):

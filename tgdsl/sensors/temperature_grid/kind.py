@@ -15,8 +15,8 @@ of Δt does, one after the other:
 is what a sensing element of time constant τ reads of it, exact where T is linear between calls. C_i = ρcV_i is the heat
 capacity of a cell [J/K]. Steps 2 and 3 without a source leave no temperature beyond those of links and surroundings before,
 however long Δt is; nor does 1 where cells that touch differ little from those around. The splitting between them is of first
-order in Δt. Objects with cells have their losses in 2, all of them. The patch of a contact has the area of the polygon of
-contact points, or that of a Hertzian contact under their normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
+order in Δt. Objects with cells have their losses in 2, all of them. The patch of a contact has the area of the convex
+hull of contact points, or that of a Hertzian contact under their normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
 
 What the objects hold is part of the sensor's state: one temperature each, of a body that conducts from the patch to its middle
 as a cube of its volume would, or a grid of their own with `cells`. A new episode begins at the temperatures that the document
@@ -119,7 +119,15 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
         channels=(Channel("temperature", "degC"),),
         constants=constants,
         state=state,
-        requests=(ContactPatches(spec.feels, slots=spec.slots, boxes=boxes, needs_stiffness=_needs_stiffness(spec, made_of)),),
+        requests=(
+            ContactPatches(
+                spec.feels,
+                slots=spec.slots,
+                boxes=boxes,
+                is_star=spec.model == "paper",
+                needs_stiffness=_needs_stiffness(spec, made_of),
+            ),
+        ),
         rows=rows,
         reports=reports,
         report_rows=report_rows,

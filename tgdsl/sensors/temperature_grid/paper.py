@@ -80,7 +80,7 @@ def area(patches: ContactPatch, constants: Constants) -> Tensor:
     curvature = constants["curvature"][:, None] + patches.objects.curvature[:, None, :]
     cubed = 0.75 * patches.force * compliance / curvature
     depth = planes.power(cubed, 2.0 / 3.0) * curvature
-    return torch.maximum(patches.polygon, planes.pi() * depth)
+    return torch.maximum(patches.area, planes.pi() * depth)
 
 
 def _touched(now: Tensor, objects: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
     compliance = constants["compliance"][:, None] + patches.objects.compliance[:, None, :]
     curvature = constants["curvature"][:, None] + patches.objects.curvature[:, None, :]
     cubed = 0.75 * patches.force * compliance / curvature
-    return torch.maximum(patches.polygon, planes.pi() * planes.power(cubed, 2.0 / 3.0))
+    return torch.maximum(patches.area, planes.pi() * planes.power(cubed, 2.0 / 3.0))
 
 
 def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants, x: Tensor) -> tuple[Tensor, Response]:

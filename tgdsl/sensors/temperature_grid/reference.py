@@ -363,8 +363,8 @@ def _area(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block]
     radius = spec.curvature_radius or 0.5 * float(links[b].size.min())
     compliance, curvature = own + found.objects[o].compliance, 1 / radius + found.objects[o].curvature
     if spec.model == "paper":
-        return max(patch.polygon, np.pi * curvature * (0.75 * patch.force * compliance / curvature) ** (2 / 3))
-    return max(patch.polygon, np.pi * (0.75 * patch.force * compliance / curvature) ** (2 / 3))
+        return max(patch.area, np.pi * curvature * (0.75 * patch.force * compliance / curvature) ** (2 / 3))
+    return max(patch.area, np.pi * (0.75 * patch.force * compliance / curvature) ** (2 / 3))
 
 
 def _inside(block: Block, own: ReferenceObject, area: float) -> float:

@@ -74,7 +74,7 @@ class TemperatureGridSpec(LinkSpec):
     exposed: Annotated[tuple[Face, ...], Field(min_length=1)] = FACES
     """Faces that radiate and that air cools."""
     contact_area: Literal["manifold"] | Area = "manifold"
-    """Area of a patch: `manifold`, the polygon of the contact points, or by Hertz from the force, whichever is larger; or this,
+    """Area of a patch: `manifold`, the contact points' convex hull, or by Hertz from the force, whichever is larger; or this,
     whenever they touch [m²]. A side whose material has no Young's modulus, as skin, counts as rigid."""
     contact_conductance: HeatTransfer | None = None
     """Conductance of the interface itself, of roughness or a film [W/(m²·K)]; default: it is no resistance."""
