@@ -54,7 +54,7 @@ def urdf_of(folder: Path, *meshes: str) -> Path:
         for i, mesh in enumerate(meshes)
     )
     joints = "".join(
-        f"<joint name='j{i}' type='continuous'><parent link='link0'/><child link='link{i}'/></joint>"
+        f"<joint name='j{i}' type='continuous'><origin xyz='0 0 {i}'/><parent link='link0'/><child link='link{i}'/></joint>"
         for i in range(1, len(meshes))
     )
     path = folder / "my hand.urdf"

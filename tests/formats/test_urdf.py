@@ -28,7 +28,11 @@ def link_of(name: str, geometry: str, inertial: str = BALL, origin: str = "") ->
 
 
 def joint_of(name: str, parent: str, child: str, kind: str = "fixed") -> str:
-    limit = "<limit lower='-1' upper='1' effort='1' velocity='1'/><axis xyz='0 0 1'/>" if kind != "fixed" else ""
+    limit = (
+        "<origin xyz='.1 0 0'/><limit lower='-1' upper='1' effort='1' velocity='1'/><axis xyz='0 0 1'/>"
+        if kind != "fixed"
+        else ""
+    )
     return f"<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>{limit}</joint>"
 
 
@@ -71,6 +75,31 @@ def test_urdf_primitives_and_joints(tmp_path):
     np.testing.assert_allclose(trimesh_of(model, "base").extents, [0.02, 0.04, 0.06])
     np.testing.assert_allclose(trimesh_of(model, "a").extents, [0.02, 0.02, 0.04], rtol=2e-3)
     assert model.compiled.njnt == 1
+
+
+def test_a_fixed_base_does_not_push_its_first_links_away(tmp_path):
+    """A thumb that reaches into the palm; the index, a joint further, collides with it."""
+    ball = "<sphere radius='.06'/>"
+    links = (
+        link_of("palm", ball) + link_of("mount", "<sphere radius='.001'/>") + link_of("thumb", ball) + link_of("index", ball)
+    )
+    joints = (
+        joint_of("m", "palm", "mount")
+        + joint_of("t", "mount", "thumb", "revolute")
+        + joint_of("i", "thumb", "index", "revolute")
+    )
+    path = urdf_of(tmp_path, links + joints.replace(".1 0 0", ".11 0 0"))
+    with pytest.warns(UserWarning, match="overlap where a joint connects them do not collide: palm and thumb$"):
+        model = load_model(path)
+    data = mujoco.MjData(model.compiled)
+    mujoco.mj_forward(model.compiled, data)
+    assert data.ncon == 0
+    data.joint("t").qpos = 0.9 * np.pi  # the index comes onto the palm
+    mujoco.mj_forward(model.compiled, data)
+    assert {"palm", "index"} in [
+        {model.compiled.body(model.compiled.geom_bodyid[g]).name for g in c.geom} for c in data.contact
+    ]
+    assert mujoco.MjModel.from_xml_string(model.mjcf).nexclude == 1
 
 
 def test_urdf_inertias_are_mended_with_one_warning(tmp_path):

@@ -2,6 +2,7 @@
 
 import warnings
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -114,3 +115,18 @@ def test_bodies_without_a_name_are_called_by_their_way(tmp_path):
     robot = load_model(tmp_path / "r.xml")
     found = [robot.body_path(i) for i in range(robot.compiled.nbody)]
     assert found == ["world", "a", "world/[2]", "b", "world/[2]/[2]", "c", "c/[1]", "d", "c/[1]/[2]"]
+
+
+def test_links_tells_what_presses_in_the_initial_pose(tmp_path, here):
+    """MuJoCo's own contact force: two balls on hinges that overlap by 1 mm."""
+    model = tmp_path / "hand.xml"
+    finger = '<body name="{}" pos="{} 0 0"><joint type="slide" axis="1 0 0"/><geom size=".01" mass="1"/></body>'
+    model.write_text(
+        f"<mujoco><option cone='elliptic'/><worldbody>{finger.format('one', 0)}{finger.format('two', 0.019)}</worldbody></mujoco>"
+    )
+    compiled = mujoco.MjModel.from_xml_path(str(model))
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    code, out, _ = here(tmp_path, "links", str(model))
+    assert code == 0
+    assert out.splitlines()[-1] == f"in the initial pose one and two press on each other with {data.efc_force[0]:.3g} N"

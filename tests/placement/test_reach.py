@@ -190,7 +190,8 @@ def test_the_same_hand_from_other_formats(tmp_path, format):
       <joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz=".015 0 0"/><axis xyz="0 1 0"/>
       <limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
     (tmp_path / "r.urdf").write_text(urdf)
-    robot = load_model(tmp_path / "r.urdf")
+    with pytest.warns(UserWarning, match="do not collide: a and b"):
+        robot = load_model(tmp_path / "r.urdf")
     if format == "usd":
         text = """<mujoco><worldbody><body name="a"><geom name="ga" type="box" size=".01 .01 .01"/>
           <body name="b" pos=".015 0 0"><joint name="j" axis="0 1 0" range="0 1"/><geom name="gb" type="box" size=".01 .005 .005"/>

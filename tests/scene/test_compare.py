@@ -195,7 +195,7 @@ URDF = """
   <link name="pad"><inertial><mass value=".123456789"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
     <collision><origin xyz=".0123456789 .1 .2" rpy=".123456789 .2 .3"/><geometry><box size=".0123456789 .02 .03"/></geometry></collision></link>
   <link name="tip"><inertial><mass value=".2"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><geometry><sphere radius=".0123456789"/></geometry></collision></link>
+    <collision><origin xyz=".1 0 0"/><geometry><sphere radius=".0123456789"/></geometry></collision></link>
   <joint name="j" type="revolute"><origin xyz=".0123456789 .1 .2" rpy=".123456789 .2 .3"/><parent link="pad"/><child link="tip"/>
     <axis xyz=".1 .2 .3"/><limit lower="-1" upper="1.23456789" effort="1.23456789" velocity="1"/></joint>
 </robot>

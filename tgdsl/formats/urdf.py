@@ -41,7 +41,29 @@ def read_urdf(path: Path) -> Model:
     _fill_meshes(path, spec, files)
     rewritten = rewrite_meshes(spec)
     compiled = spec.compile()
+    if overlaps := _overlaps_with_base(compiled):
+        for pair in overlaps:
+            spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
+        compiled = spec.compile()
+        pairs = listed([f"{base} and {link}" for base, link in overlaps])
+        warnings.warn(f"{path}: links that overlap where a joint connects them do not collide: {pairs}", stacklevel=4)
     return Model(path, spec, compiled, is_urdf=True, mjcf=mjcf_of(spec), rewritten=rewritten)
+
+
+def _overlaps_with_base(model: mujoco.MjModel) -> list[tuple[str, str]]:
+    """Return the links of the base, and links that a joint connects to it, that overlap in the initial pose.
+
+    MuJoCo lets no parent collide with its child, unless the parent is fixed to the world.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    weld, parent = model.body_weldid, model.body_parentid
+    pairs = set[tuple[int, int]]()
+    for contact in data.contact:
+        base, link = sorted(model.geom_bodyid[contact.geom].tolist(), key=lambda body: weld[body])
+        if contact.dist < 0 and base > 0 and weld[base] == 0 and weld[parent[weld[link]]] == 0:
+            pairs.add((base, link))
+    return [(model.body(base).name, model.body(link).name) for base, link in sorted(pairs)]
 
 
 def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -76,7 +77,24 @@ def links_table(robot: Model, layout: Path | None = None) -> list[str]:
             (", ".join(groups.get(model.body(body).name, ())),),
         )
         blocks.append(list(cells))
-    return _aligned(blocks)
+    return _aligned(blocks) + _self_contacts(robot)
+
+
+def _self_contacts(robot: Model) -> list[str]:
+    """Return a line for each pair of links that press on each other in the initial pose, the strongest first."""
+    model, data = robot.compiled, mujoco.MjData(robot.compiled)
+    mujoco.mj_forward(model, data)
+    loads: dict[tuple[int, int], float] = defaultdict(float)
+    force = np.zeros(6)
+    for i, contact in enumerate(data.contact):
+        mujoco.mj_contactForce(model, data, i, force)
+        one, two = sorted(model.geom_bodyid[contact.geom].tolist())
+        loads[one, two] += float(force[0])
+    return [
+        f"in the initial pose {robot.body_path(one)} and {robot.body_path(two)} press on each other with {load:.3g} N"
+        for (one, two), load in sorted(loads.items(), key=lambda item: -item[1])
+        if one and load
+    ]
 
 
 def _aligned(blocks: Sequence[Sequence[tuple[str, ...]]]) -> list[str]:
