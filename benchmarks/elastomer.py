@@ -30,7 +30,7 @@ import tyro
 from module import median_ms
 from torch import Tensor
 
-from tgdsl.quantities.contact_depth.reference import ReferencePenetration
+from tgdsl.quantities.contact_depth import ReferencePenetration
 from tgdsl.sensors.elastomer import blocks, operators
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance_reference
 from tgdsl.sensors.elastomer.kernels import LinkTaxels

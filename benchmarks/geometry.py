@@ -46,7 +46,7 @@ class Prepare:
         """Prepare all shapes."""
         import igl
 
-        from tgdsl.quantities.geoms.bake import bake
+        from tgdsl.quantities.bake import bake
         from tgdsl.surfaces.surface import Surface
 
         arrays: dict[str, np.ndarray] = {}

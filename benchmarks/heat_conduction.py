@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.quantities.patches.cells import modes
+from tgdsl.quantities.patches import modes
 from tgdsl.sensors.temperature_grid import diffusion
 
 LINKS, BLOCK = 5, 5

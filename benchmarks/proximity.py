@@ -25,7 +25,7 @@ from torch import Tensor
 import tgdsl
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.quantities.moments.fields import moment_sums
+from tgdsl.quantities.moment_fields import moment_sums
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.quadrature import outer_surface
 

@@ -62,23 +62,12 @@ class FieldPart(Generic[Array]):
     uses: tuple[FieldUse[Array], ...]
 
 
-def plan(planning: Planning, uses: Sequence[Use]) -> FieldPart[np.ndarray]:
-    """Number the pairs of each use."""
-    asked = [(use, use.request) for use in uses if isinstance(use.request, MagneticField)]
-    return FieldPart(tuple(_planned(planning, use, request) for use, request in asked))
-
-
 def _planned(planning: Planning, use: Use, request: MagneticField) -> FieldUse[np.ndarray]:
     bodies, active = planning.bodies_of(use.taxels), planning.layout.radius[use.taxels] > 0
     names = [target.name for target in planning.objects if target.name in request.objects]
     is_met = np.array([[Pair(body, name) in planning.pairs for body in bodies] for name in names]) & active
     ids, pair = tuple(planning.object_id(name) or 0 for name in names), planning.pair_table(names, use.taxels)
     return FieldUse(ids, use.pos, pair, is_met.astype(np.float64), request.moment, request.size, request.range)
-
-
-def gather(part: FieldPart[Tensor], scene: Scene) -> tuple[Vec, ...]:
-    """Return B of each use, planes (env, taxel)."""
-    return tuple(_field(use, scene) for use in part.uses)
 
 
 def _field(use: FieldUse[Tensor], scene: Scene) -> Vec:
@@ -99,23 +88,37 @@ def _field(use: FieldUse[Tensor], scene: Scene) -> Vec:
     return total
 
 
-def field_reference(part: FieldPart[np.ndarray], use: int, scene: ReferenceScene) -> np.ndarray:
-    """Return B (taxel, 3) [T], magnet by magnet in the world."""
-    own, layout = part.uses[use], scene.layout
-    found = np.zeros_like(layout.pos)
-    for t, link_id in enumerate(layout.link_id):
-        link = scene.body(layout.links[link_id].body)
-        for target in (scene.objects[i] for i in own.objects):
-            magnet = scene.object_body(target)
-            q = link.pos + link.rotation @ layout.pos[t] - magnet.pos
-            m, away = magnet.rotation @ np.array(own.moment), np.linalg.norm(q)
-            if layout.radius[t] > 0 and target.body != layout.links[link_id].body and away <= own.range:
-                b = 3 * (m @ q) * q / away**5 - m / away**3 if away > own.size else 2 * m / own.size**3
-                found[t] += MU * link.rotation.T @ b
-    return found
+class MagneticFieldQuantity(Quantity):
+    """Fields of dipoles, planned by pair, summed in the frame of each link."""
+
+    name, request, part = "magnetic_field", MagneticField, FieldPart
+
+    def plan(self, planning: Planning, uses: Sequence[Use]) -> FieldPart[np.ndarray]:
+        """Number the pairs of each use."""
+        asked = [(use, use.request) for use in uses if isinstance(use.request, MagneticField)]
+        return FieldPart(tuple(_planned(planning, use, request) for use, request in asked))
+
+    def gather(self, part: FieldPart[Tensor], scene: Scene) -> tuple[Vec, ...]:
+        """Return B of each use, planes (env, taxel)."""
+        return tuple(_field(use, scene) for use in part.uses)
+
+    def reference(self, part: FieldPart[np.ndarray], use: int, scene: ReferenceScene) -> np.ndarray:
+        """Return B (taxel, 3) [T], magnet by magnet in the world."""
+        own, layout = part.uses[use], scene.layout
+        found = np.zeros_like(layout.pos)
+        for t, link_id in enumerate(layout.link_id):
+            link = scene.body(layout.links[link_id].body)
+            for target in (scene.objects[i] for i in own.objects):
+                magnet = scene.object_body(target)
+                q = link.pos + link.rotation @ layout.pos[t] - magnet.pos
+                m, away = magnet.rotation @ np.array(own.moment), np.linalg.norm(q)
+                if layout.radius[t] > 0 and target.body != layout.links[link_id].body and away <= own.range:
+                    b = 3 * (m @ q) * q / away**5 - m / away**3 if away > own.size else 2 * m / own.size**3
+                    found[t] += MU * link.rotation.T @ b
+        return found
 
 
-MAGNETIC_FIELD = Quantity("magnetic_field", MagneticField, FieldPart, plan, gather, field_reference)
+MAGNETIC_FIELD = MagneticFieldQuantity()
 
 
 class HallSpec(ProbeSpec):

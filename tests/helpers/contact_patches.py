@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.quantities.patches.slots import Contacts, Sides
+from tgdsl.quantities.patch import Contacts, Sides
 
 NUM_ENVS = 37
 

@@ -6,9 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.quantities.patches.cells import is_cell, tables
-from tgdsl.quantities.patches.request import ContactPatch, HeatOfObjects
-from tgdsl.quantities.patches.topology import Topology
+from tgdsl.quantities.patches import ContactPatch, HeatOfObjects, Topology, is_cell, tables
 from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
 from tgdsl.sensors.temperature_grid.rows import rows_of
 

@@ -7,9 +7,9 @@ import torch
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.geoms import Geoms
 from tgdsl.quantities.pairs import Pairs
-from tgdsl.quantities.points.points import ObjectPoints, PointSource, point_tiles
+from tgdsl.quantities.points import ObjectPoints, PointSource, point_tiles
 
 NUM_ENVS, CELL = 4, 0.002
 CASES = {

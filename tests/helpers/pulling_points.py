@@ -3,7 +3,7 @@
 import torch
 
 from tgdsl.geometry.planes import Vec, vec
-from tgdsl.quantities.points.points import point_tiles
+from tgdsl.quantities.points import point_tiles
 from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad
 
 FALLOFF = 2000.0

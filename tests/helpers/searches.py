@@ -6,8 +6,8 @@ import torch
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.contact_depth.query import Probes, Target
-from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.depth_search import Probes, Target
+from tgdsl.quantities.geoms import Geoms
 from tgdsl.quantities.pairs import Motion, PairedObject, Pairs
 
 SHAPES = ("plane", "sphere", "capsule", "cylinder", "box")

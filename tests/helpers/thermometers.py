@@ -45,48 +45,48 @@ class HeatPart(Generic[Array]):
     uses: tuple[HeatUse[Array], ...]
 
 
-def plan(planning, uses) -> HeatPart[np.ndarray]:
-    """Look the objects up."""
-    found = []
-    for use in uses:
-        (name,) = use.request.objects
-        heat = planning.sensed[name].heat
-        if heat is None:
-            planning.report(("objects", name), "expected `material`, what it is made of", "")
-            continue
-        fixed = None if heat.is_per_env else 22.0 if heat.temperature is None else heat.temperature
-        found.append(HeatUse(planning.heated.index(name), fixed, np.array([m.conductivity for m in heat.materials])))
-    return HeatPart(tuple(found))
+class _Heat(Quantity):
+    name, request, part = "object_heat", ObjectHeatOf, HeatPart
+
+    def plan(self, planning, uses) -> HeatPart[np.ndarray]:
+        """Look the objects up."""
+        found = []
+        for use in uses:
+            (name,) = use.request.objects
+            heat = planning.sensed[name].heat
+            if heat is None:
+                planning.report(("objects", name), "expected `material`, what it is made of", "")
+                continue
+            fixed = None if heat.is_per_env else 22.0 if heat.temperature is None else heat.temperature
+            found.append(HeatUse(planning.heated.index(name), fixed, np.array([m.conductivity for m in heat.materials])))
+        return HeatPart(tuple(found))
+
+    def gather(self, part: HeatPart[Tensor], scene) -> tuple[Heat, ...]:
+        """Return the heat of each use's object."""
+        found = []
+        for use in part.uses:
+            same = torch.ones_like(scene.tensors["body_pos"][:, 0, 0], dtype=scene.dtype)
+            fixed = use.temperature
+            warm = fixed * same if fixed is not None else scene.tensors["object_temperature"][:, use.place].to(scene.dtype)
+            is_one = len(use.conductivity) == 1
+            conductivity = use.conductivity[0 if is_one else scene.tensors["object_material"][:, use.place].long()]
+            found.append(Heat(warm, conductivity * same))
+        return tuple(found)
+
+    def reference(self, part: HeatPart[np.ndarray], use: int, scene) -> tuple[float, float]:
+        """Return temperature [°C] and conductivity [W/(m·K)]."""
+        own = part.uses[use]
+        material = int(scene.fields["object_material"][own.place]) if len(own.conductivity) > 1 else 0
+        warm = scene.fields["object_temperature"][own.place] if own.temperature is None else own.temperature
+        return float(warm), float(own.conductivity[material])
+
+    def fields(self, part: HeatPart) -> set[str]:
+        """Temperatures are read if one is part of the state, materials if there is a choice."""
+        temperature = {"object_temperature"} if any(use.temperature is None for use in part.uses) else set()
+        return temperature | ({"object_material"} if any(len(use.conductivity) > 1 for use in part.uses) else set())
 
 
-def fields(part: HeatPart) -> set[str]:
-    """Temperatures are read if one is part of the state, materials if there is a choice."""
-    temperature = {"object_temperature"} if any(use.temperature is None for use in part.uses) else set()
-    return temperature | ({"object_material"} if any(len(use.conductivity) > 1 for use in part.uses) else set())
-
-
-def gather(part: HeatPart[Tensor], scene) -> tuple[Heat, ...]:
-    """Return the heat of each use's object."""
-    found = []
-    for use in part.uses:
-        same = torch.ones_like(scene.tensors["body_pos"][:, 0, 0], dtype=scene.dtype)
-        fixed = use.temperature
-        warm = fixed * same if fixed is not None else scene.tensors["object_temperature"][:, use.place].to(scene.dtype)
-        is_one = len(use.conductivity) == 1
-        conductivity = use.conductivity[0 if is_one else scene.tensors["object_material"][:, use.place].long()]
-        found.append(Heat(warm, conductivity * same))
-    return tuple(found)
-
-
-def heat_reference(part: HeatPart[np.ndarray], use: int, scene) -> tuple[float, float]:
-    """Return temperature [°C] and conductivity [W/(m·K)]."""
-    own = part.uses[use]
-    material = int(scene.fields["object_material"][own.place]) if len(own.conductivity) > 1 else 0
-    warm = scene.fields["object_temperature"][own.place] if own.temperature is None else own.temperature
-    return float(warm), float(own.conductivity[material])
-
-
-HEAT = Quantity("object_heat", ObjectHeatOf, HeatPart, plan, gather, heat_reference, fields)
+HEAT = _Heat()
 
 
 class ThermometerSpec(ProbeSpec):

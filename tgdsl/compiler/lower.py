@@ -329,7 +329,6 @@ def _state(
         rows = own.shape if isinstance(own.shape, tuple) else (sensor.rows.size,)
         if isinstance(own.shape, type):
             quantity = next(quantity for quantity in asked if quantity.request is own.shape)
-            assert quantity.num_rows is not None
             rows = (quantity.num_rows(parts[quantity.name], shared.of_sensor[sensor.name][quantity.name]),)
         memory[name] = PlannedMemory(own.rest, rows, overwritten=own.overwritten)
     if sensor.noise is not None:

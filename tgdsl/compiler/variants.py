@@ -15,7 +15,7 @@ from tgdsl.errors import RobotError
 from tgdsl.files.find import is_file
 from tgdsl.formats.model import Model
 from tgdsl.plan.scene import Asset, SceneGeom, SceneObject
-from tgdsl.quantities.geoms.baking import aligned
+from tgdsl.quantities.bake import aligned
 from tgdsl.scene.mujoco_warnings import muted_mujoco, told_of
 from tgdsl.scene.scene import Choice, geom_name, placeholder_name, portable, readable, with_choices
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom

@@ -1,19 +1,15 @@
 """What a quantity is: something that kinds of sensors ask of a scene, found once for all that ask alike.
 
-A quantity is one folder. It holds, in this order of use:
-
-    request.py     the typed request, which a kind puts into `Lowered.requests`, and what the kind gets for it
-    planning.py    from requests to its part of the Plan: what is computed beforehand, as typed arrays (`bake.py`, …)
-    gathering.py   from the state of a scene to what was asked for, in torch (and `*_kernel.py`)
-    reference.py   the definition in float64, environment by environment
-
-and ends in a `Quantity` that ties them together and is registered in `quantities/known.py`, or by an entry point.
+A quantity is one file: the typed request that a kind puts into `Lowered.requests` and what the kind gets for it, its part of
+the Plan, and a `Quantity` that plans (in NumPy), gathers (in torch) and has a float64 reference. It is registered in
+`quantities/known.py`, or by an entry point.
 
 Shapes: `env` environments, `taxel` taxels, `pair` (link, object) pairs, `row` rows of a sensor.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
@@ -27,6 +23,7 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import TgdslError
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.quantities.pairs import Pair, PairedObject, Pairs
+from tgdsl.quantities.reference import ReferenceScene
 from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.sensed import SensedObject
 
@@ -199,60 +196,59 @@ def variant_of(scene: Scene, target: PairedObject) -> Int[Tensor, " env"] | None
     return scene.tensors["variant"][:, target.varied].long() if target.num_variants > 1 else None
 
 
-def _no_fields(part: Any) -> set[str]:
-    return set()
-
-
-def _no_bodies(use: Use) -> tuple[str, ...]:
-    return ()
-
-
-def _nothing_to_explain(part: Any, use: int, objects: Sequence[PairedObject]) -> list[str]:
-    return []
-
-
-def _not_light(part: Any) -> bool:
-    return False
-
-
-def _nothing_measured(part: Any, objects: Sequence[PairedObject]) -> dict[str, list[str]]:
-    return {}
-
-
-@dataclass(frozen=True, eq=False)
-class Quantity:
-    """A quantity. A module holds it, and can be pickled where its functions can: a lambda cannot.
+class Quantity(ABC):
+    """A quantity: how it is planned, gathered and explained. One instance of each is registered.
 
     Attributes:
-        name: Its name: that of its folder, and of its part of the Plan.
+        name: Its name: that of its part of the Plan.
         request: The type of its requests.
         part: The type of its part of the Plan: a frozen dataclass, generic in its arrays (NumPy's in the Plan, torch's at run
             time).
-        plan: `(planning, uses) → part`. Mistakes go to `planning.report`; what is returned then does not matter.
-        gather: `(part, scene) → values`, one for each use: pure, traceable.
-        reference: `(part, use, scene) → value` in float64 for one environment, see `testing.scene.ReferenceScene`.
-        fields: `(part) → names of the fields of SceneState` that are read.
-        bodies: `(use) → bodies` whose poses are read besides those of pairs.
-        num_rows: `(part, use) → rows` of memory with one per row of the value, for `Memory(rows=…)`.
-        explain: `(part, use, objects of the Plan) → what an account of a sensor says of it`.
-        is_light: `(part) → whether` little is found per taxel, so that kernels may be tiled over environments and taxels.
+        has_rows: Whether memory may have a row for each row of its value, as `Memory(rows=…)` asks: see `num_rows`.
         is_fused: Whether kernels on a CPU are to be as large as can be: all that is computed is alike, and would be read again.
-        account: `(part, objects of the Plan) → lines by headline`: what was measured of what is computed beforehand.
     """
 
-    name: str
-    request: type[Request]
-    part: type
-    plan: Callable[[Planning, Sequence[Use]], Any]
-    gather: Callable[[Any, Scene], tuple[Any, ...]]
-    reference: Callable[[Any, int, Any], Any]
-    fields: Callable[[Any], set[str]] = _no_fields
-    bodies: Callable[[Use], tuple[str, ...]] = _no_bodies
-    num_rows: Callable[[Any, int], int] | None = None
-    explain: Callable[[Any, int, Sequence[PairedObject]], list[str]] = _nothing_to_explain
-    is_light: Callable[[Any], bool] = _not_light
-    is_fused: bool = False
-    account: Callable[[Any, Sequence[PairedObject]], dict[str, list[str]]] = _nothing_measured
+    name: ClassVar[str]
+    request: ClassVar[type[Request]]
+    part: ClassVar[type]
+    has_rows: ClassVar[bool] = False
+    is_fused: ClassVar[bool] = False
+
+    @abstractmethod
+    def plan(self, planning: Planning, uses: Sequence[Use]) -> Any:
+        """Return the part of the Plan for all uses; mistakes go to `planning.report`, and then the part does not matter."""
+
+    @abstractmethod
+    def gather(self, part: Any, scene: Scene) -> tuple[Any, ...]:
+        """Return the value of each use: pure, traceable."""
+
+    @abstractmethod
+    def reference(self, part: Any, use: int, scene: ReferenceScene) -> Any:
+        """Return the value of one use in float64 for one environment: the definition."""
+
+    def fields(self, part: Any) -> set[str]:
+        """Return the names of the fields of `SceneState` that are read."""
+        return set()
+
+    def bodies(self, use: Use) -> tuple[str, ...]:
+        """Return the bodies whose poses are read besides those of pairs."""
+        return ()
+
+    def num_rows(self, part: Any, use: int) -> int:
+        """Return the number of rows of a use's value."""
+        raise NotImplementedError
+
+    def is_light(self, part: Any) -> bool:
+        """Return whether little is computed per taxel, so that kernels may be tiled over environments and taxels."""
+        return False
+
+    def explain(self, part: Any, use: int, objects: Sequence[PairedObject]) -> list[str]:
+        """Return what an account of a sensor says of a use."""
+        return []
+
+    def account(self, part: Any, objects: Sequence[PairedObject]) -> dict[str, list[str]]:
+        """Return by headline what was measured of what is computed beforehand."""
+        return {}
 
 
 class Gathered(dict[type[Request], Any]):

@@ -15,12 +15,10 @@ from tgdsl.files.plugins import known
 from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.contact_depth import CONTACT_DEPTH
 from tgdsl.quantities.contacts import CONTACTS
-from tgdsl.quantities.joints import JOINTS
+from tgdsl.quantities.kinematics import JOINTS, MOTION, PLACES
 from tgdsl.quantities.loads import LOADS
 from tgdsl.quantities.moments import MOMENTS
-from tgdsl.quantities.motion import MOTION
 from tgdsl.quantities.patches import PATCHES
-from tgdsl.quantities.places import PLACES
 from tgdsl.quantities.points import POINTS
 
 QUANTITIES: tuple[Quantity, ...] = (

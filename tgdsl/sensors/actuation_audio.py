@@ -40,7 +40,7 @@ from tgdsl.fields.models import Frequency, NonNegative, Usual
 from tgdsl.geometry.planes import pi
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
-from tgdsl.quantities.joints import Joints
+from tgdsl.quantities.kinematics import Joints
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Axis,

@@ -52,8 +52,7 @@ from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.quantities.contacts import ContactPoints, Contacts
-from tgdsl.quantities.contacts.reference import ReferenceContacts
+from tgdsl.quantities.contacts import ContactPoints, Contacts, ReferenceContacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Channel,

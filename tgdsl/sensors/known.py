@@ -142,7 +142,7 @@ def _check_parts(kind: Kind, lowered: Any) -> None:
             quantity = brought.get(memory.shape)
             if not any(type(request) is memory.shape for request in lowered.requests):
                 refuse(f'shape of the state "{name}"', memory.shape, "the type of a request that the kind makes")
-            if quantity is not None and quantity.num_rows is None:
+            if quantity is not None and not quantity.has_rows:
                 refuse(f'shape of the state "{name}"', memory.shape, "a request whose quantity has `num_rows`")
     if lowered.rows is None:
         return

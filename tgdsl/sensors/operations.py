@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from tgdsl.quantities.contact_depth.search import DEEPEST
-from tgdsl.quantities.moments.nearby import FELT_MOMENTS
-from tgdsl.quantities.patches.patch import CONTACT_PATCH
-from tgdsl.quantities.points.points import LINK_POINTS
+from tgdsl.quantities.depth_search import DEEPEST
+from tgdsl.quantities.nearby import FELT_MOMENTS
+from tgdsl.quantities.patch import CONTACT_PATCH
+from tgdsl.quantities.points import LINK_POINTS
 from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, SHEAR_LOADS
 from tgdsl.sensors.force_taxel.footprint import SHARED_FORCES
 from tgdsl.sensors.temperature_grid.step import HEAT_STEP

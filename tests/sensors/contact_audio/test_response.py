@@ -10,8 +10,8 @@ from held import assert_holds
 from struck_plate import energy
 
 from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads, PairLoads
-from tgdsl.quantities.places import Places
 from tgdsl.report.oracles import sound as oracles
 from tgdsl.report.oracles.setups.sounds import STEP, plate, pressed, sound
 from tgdsl.sensors.base import Context

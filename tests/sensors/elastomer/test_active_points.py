@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tgdsl.geometry.planes import vec
-from tgdsl.quantities.points.points import point_tiles
+from tgdsl.quantities.points import point_tiles
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted, block_size
 from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad

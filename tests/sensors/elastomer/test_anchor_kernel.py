@@ -11,7 +11,7 @@ from meetings import NUM_ENVS, made
 import tgdsl
 from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.points.points import link_points
+from tgdsl.quantities.points import link_points
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.anchors import StickSlip
 from tgdsl.sensors.elastomer.point_anchors import PLANES, SHEAR_LOADS, advance, shear_loads
@@ -55,7 +55,7 @@ def nothing_held(meeting):
 
 def by_kernel(meeting, stick_slip, state):
     """Return the active points, and change the state in place, as `shear_loads` has the kernel do on a GPU."""
-    from tgdsl.quantities.points.depth_kernel import grid_tables
+    from tgdsl.quantities.points_kernel import grid_tables
     from tgdsl.sensors.elastomer.anchor_kernel import anchor_kernel, launch
 
     (rotation, offset, _, gate), source = meeting

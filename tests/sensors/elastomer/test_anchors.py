@@ -7,9 +7,8 @@ from held import assert_holds
 from scipy.spatial.transform import Rotation
 
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.contact_depth import Distance, Penetration
-from tgdsl.quantities.contact_depth.reference import ReferencePenetration
-from tgdsl.quantities.geoms.distance import Frame
+from tgdsl.quantities.contact_depth import Distance, Penetration, ReferencePenetration
+from tgdsl.quantities.geoms import Frame
 from tgdsl.report.oracles.contact_mechanics import friction
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance, advance_reference
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from tgdsl.geometry.planes import vec
-from tgdsl.quantities.points.points import LinkPoints, point_tiles
-from tgdsl.quantities.points.reference import ReferencePoints
+from tgdsl.quantities.points import LinkPoints, ReferencePoints, point_tiles
 from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.elastomer.anchors import StickSlip
 from tgdsl.sensors.elastomer.point_anchors import PLANES, Markers, advance, drag, reference_drag

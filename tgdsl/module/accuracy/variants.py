@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tgdsl.plan.plan import Plan
-from tgdsl.quantities.geoms.tables import GeomTable
+from tgdsl.quantities.geoms import GeomTable
 from tgdsl.sensors.base import Alternative, AnySensorSpec, Kind
 
 BARE: Mapping[str, Any] = {"readout": "clean", "rate": None, "history": None, "accuracy": None}

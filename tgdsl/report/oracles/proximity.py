@@ -14,9 +14,8 @@ import torch
 from scipy.integrate import quad
 
 from tgdsl.geometry.planes import split
-from tgdsl.quantities.moments.clouds import sample_cloud
-from tgdsl.quantities.moments.fields import bake_field, moment_sums, surface_area
-from tgdsl.quantities.moments.moments import MomentField, PointCloud, cloud_moments, field_moments, plane_moments
+from tgdsl.quantities.moment_fields import bake_field, moment_sums, sample_cloud, surface_area
+from tgdsl.quantities.moment_sums import MomentField, PointCloud, cloud_moments, field_moments, plane_moments
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
 from tgdsl.report.oracles.setups.scenes import probed, state
 from tgdsl.surfaces.geom import Geom, SurfaceGeom

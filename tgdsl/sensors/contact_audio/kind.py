@@ -56,8 +56,8 @@ from tgdsl.errors import LowerError
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads
-from tgdsl.quantities.places import Places
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.contact_audio.bands import membership, middle
 from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses

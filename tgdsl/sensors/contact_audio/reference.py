@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.loads import Loads
-from tgdsl.quantities.loads.reference import ReferenceLoads
-from tgdsl.quantities.places import Places
+from tgdsl.quantities.kinematics import Places
+from tgdsl.quantities.loads import Loads, ReferenceLoads
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
 from tgdsl.sensors.contact_audio.bands import middle

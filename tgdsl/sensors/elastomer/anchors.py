@@ -24,8 +24,7 @@ from torch import Tensor
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.reference import TIE
-from tgdsl.quantities.contact_depth import Penetration
-from tgdsl.quantities.contact_depth.reference import ReferencePenetration
+from tgdsl.quantities.contact_depth import Penetration, ReferencePenetration
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")
 """What is carried from call to call: e_i [m], and the number of its object from 1, 0 for none."""

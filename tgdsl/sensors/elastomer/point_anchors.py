@@ -25,8 +25,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.points.points import LINK_POINTS, LinkPoints, ObjectPoints, are_grids, tile_size
-from tgdsl.quantities.points.reference import ReferencePoints
+from tgdsl.quantities.points import LINK_POINTS, LinkPoints, ObjectPoints, ReferencePoints, are_grids, tile_size
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted
 from tgdsl.sensors.elastomer.anchors import StickSlip, capped
 from tgdsl.tensors.fusion import materialised
@@ -86,7 +85,7 @@ def shear_loads(
 def _shear_loads_by_kernel(
     objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
 ) -> tuple[list[ShearLoad], dict[str, Tensor]]:
-    from tgdsl.quantities.points.depth_kernel import grid_tables
+    from tgdsl.quantities.points_kernel import grid_tables
     from tgdsl.sensors.elastomer.anchor_kernel import advance_anchors
 
     loads, first = [], 0

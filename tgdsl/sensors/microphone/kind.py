@@ -38,7 +38,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
-from tgdsl.quantities.places import Places
+from tgdsl.quantities.kinematics import Places
 from tgdsl.sensors.base import (
     Axis,
     Channel,

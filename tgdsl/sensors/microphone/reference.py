@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.places import Places
+from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceContext, ReferenceState
 from tgdsl.sensors.microphone.interpolation import LEAST_DELAY, TAPS, coefficients

@@ -29,7 +29,7 @@ class Sides(NamedTuple):
     """Which side of a patch is at which node.
 
     Attributes:
-        tables: Those of `quantities.patches.topology`.
+        tables: Those of `quantities.patches`.
         is_plain: Whether side n of each row is at node n, and these are all bodies.
     """
 

@@ -3,7 +3,7 @@
     θ̇ = −(M_x + M_y + M_z) θ + s,   M_a = α/Δ_a² (−D² + diag(b)),   b = u Δ_a/k at exposed faces                [K/s]
 
 with D² the second difference between insulated walls and u [W/(m²·K)] the heat transfer coefficient between a cell at the face
-and the surroundings (`losses`). Eigenvectors of M_a and eigenvalues αμ/Δ² are known beforehand (`quantities.patches.cells`). A
+and the surroundings (`losses`). Eigenvectors of M_a and eigenvalues αμ/Δ² are known beforehand (`quantities.patches`). A
 step of Δt is exact in time:
 
     θ ← (I + G_x) ⊗ (I + G_y) ⊗ (I + G_z) θ + Δt φ₁(−x) s,   G = Vᵀ diag(e^(−aμ) − 1) V,   φ₁(−x) = (1 − e^(−x))/x

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from tgdsl.errors import LowerError
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.patches.cells import is_cell
+from tgdsl.quantities.patches import is_cell
 from tgdsl.sensors.base import SurfaceOf
 from tgdsl.sensors.temperature_grid.spec import TemperatureGridSpec
 

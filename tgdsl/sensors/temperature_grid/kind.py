@@ -48,8 +48,7 @@ from tgdsl.errors import LowerError
 from tgdsl.fields.materials import Material
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
-from tgdsl.quantities.patches import ContactPatches
-from tgdsl.quantities.patches.cells import is_cell, outer_areas, tables
+from tgdsl.quantities.patches import ContactPatches, is_cell, outer_areas, tables
 from tgdsl.sensors.base import Axis, Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.noise import BASE
 from tgdsl.sensors.temperature_grid import grids

@@ -8,8 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tgdsl.quantities.patches import ContactPatch
-from tgdsl.quantities.patches.topology import Topology
+from tgdsl.quantities.patches import ContactPatch, Topology
 from tgdsl.sensors.temperature_grid.rows import padded
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.patches import ContactPatches
-from tgdsl.quantities.patches.reference import Patch, ReferenceObject, ReferencePatches
+from tgdsl.quantities.patches import ContactPatches, ReferenceObject, ReferencePatch, ReferencePatches
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceContext, ReferenceState
 from tgdsl.sensors.temperature_grid.grids import counts
@@ -355,7 +354,9 @@ def _shares(block: Block, area: float, pos: np.ndarray, normal: np.ndarray) -> n
     return np.einsum("i,j,k->ijk", *axes).ravel()
 
 
-def _area(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], b: int, o: int, patch: Patch) -> float:
+def _area(
+    spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], b: int, o: int, patch: ReferencePatch
+) -> float:
     if spec.contact_area != "manifold":
         return spec.contact_area
     made_of = spec.material_of(links[b].name)

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.contact_depth import Distance, Penetration
-from tgdsl.quantities.geoms.distance import Frame
+from tgdsl.quantities.depth_search import Distance, Penetration
+from tgdsl.quantities.geoms import Frame
 from tgdsl.report.oracles.contact_mechanics.half_space import KINDS
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance

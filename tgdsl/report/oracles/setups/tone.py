@@ -12,7 +12,7 @@ from torch import Tensor
 from tgdsl.fields.models import Frequency, Number
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
-from tgdsl.quantities.places import Places
+from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Channel,

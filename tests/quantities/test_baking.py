@@ -1,0 +1,43 @@
+"""What is said of meshes that are felt otherwise than they look."""
+
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+from surfaces import box, surface_of
+
+from tgdsl.quantities.bake import geom_distance
+from tgdsl.surfaces.geom import Geom, SurfaceGeom
+from tgdsl.surfaces.sensed import DistanceOptions
+
+GEOM = Geom(0, "", "cup", "item", "mesh", np.ones(3), np.zeros(3), np.eye(3), True)
+RAYCAST = DistanceOptions(query="raycast")
+
+
+def test_a_mesh_that_is_not_closed_is_baked_with_a_warning(monkeypatch, tmp_path):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
+    cup, coarse = box((0.02, 0.02, 0.02)), DistanceOptions(tolerance=2e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        geom_distance(SurfaceGeom(GEOM, surface_of(cup)), coarse, 0.004, "object item")
+    cup.update_faces(cup.face_normals[:, 2] < 0.5)
+    with pytest.warns(
+        UserWarning, match='^object item: geom "cup" is not closed; what is inside is decided by its winding number$'
+    ):
+        geom_distance(SurfaceGeom(GEOM, surface_of(cup)), coarse, 0.004, "object item")
+
+
+def test_a_hull_is_told_of_where_it_stands_off_by_more_than_probes_reach():
+    """Two cubes of 1 cm, 2 cm apart: in the middle their hull is 1 cm from both."""
+    cubes = [box((0.01, 0.01, 0.01), (x, 0, 0)) for x in (-0.015, 0.015)]
+    hull = trimesh.util.concatenate(cubes).convex_hull
+    felt = SurfaceGeom(GEOM, surface_of(hull), surface_of(*cubes))
+    with pytest.warns(
+        UserWarning, match=r'^object item: MuJoCo collides the convex hull of geom "cup", up to (9\.9|10\.0) mm off'
+    ):
+        found = geom_distance(felt, RAYCAST, 0.0095, "object item")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        geom_distance(felt, RAYCAST, 0.0101, "object item")
+    assert found.shape == "raycast" and found.arrays["max_distance"] == 2 * 0.0095

@@ -1,0 +1,34 @@
+"""That what a kernel finds of one geom of the links after the other is put together as the definition has it."""
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from meetings import CASES, made
+
+from tgdsl.geometry import planes
+from tgdsl.quantities.geoms import body_distance
+from tgdsl.quantities.points import LINK_POINTS, link_points
+
+
+def meet(pairs, pair, points, links, g):
+    """Do what the kernel does of one geom, by distances: places in the links' frames, distances and gradients."""
+    rotation, offset = ([part[:, pair, None] for part in parts] for parts in (pairs.rotation, pairs.offset))
+    pos = planes.rotate_back(planes.rot(rotation), planes.sub(points, planes.vec(offset)))
+    parts = {name: getattr(links, name)[:, g : g + 1] for name in ("size", "pos", "rotation")}
+    alone = {name: getattr(links, name)[g : g + 1] for name in ("shapes", "is_centred", "surfaces")}
+    distance, gradient = body_distance(pos, links._replace(**parts, **alone, is_absent=None))
+    is_closed = False if pairs.gate is None else pairs.gate[:, pair, None] < 0
+    return pos, torch.where(torch.as_tensor(is_closed), torch.inf, distance), gradient
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_kernels_way_is_the_definition(monkeypatch, case):
+    monkeypatch.setitem(sys.modules, "tgdsl.quantities.points_kernel", SimpleNamespace(meet=meet))
+    own = made(case, torch.float64)
+    found, expected = LINK_POINTS.kernel(own), link_points(own)
+    for name in ("pos", "distance", "gradient", "area"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=1e-12)
+    assert found.taxels == own.source.taxels and torch.equal(found.tiles, own.source.tiles)
+    assert (found.distance == torch.inf).any() == (own.pairs.gate is not None)

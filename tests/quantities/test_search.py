@@ -1,0 +1,162 @@
+"""That `search` makes of a kernel's answer what `penetration` makes of distances; the kernel itself is tested beside it."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from pressed_pads import compiled
+from searches import paired
+
+from tgdsl.module.example import example_state
+from tgdsl.quantities import depth_search
+from tgdsl.quantities.depth_search import DEEPEST, Probes, Target, deepest, is_searchable, measure, penetration, search
+from tgdsl.quantities.geoms import Geoms
+from tgdsl.quantities.pairs import relate
+from tgdsl.quantities.search_tables import BOUND, EVERYWHERE, MARGIN, POS, ROTATION, Deepest, geom_tables
+from tgdsl.tensors import operations
+
+NUM_LINKS, NUM_OBJECTS, NUM_ENVS, NUM_TAXELS = 2, 6, 5, 40
+WHICH = (0, 1, 2, 4, 5)
+"""The objects that are felt."""
+
+
+def brute_force(pairs, probes, targets, known, reach):
+    """Return what the kernel does of centred boxes, from the tables and the distances."""
+    own = [target.geoms for target in targets]
+    spheres, geoms = (known["spheres"], known["geoms"]) if "geoms" in known else geom_tables(own)
+    ends = spheres[0, :, 1].cumsum(0).long()
+    boxes = [box(geoms[:, end - 1 : end, :3], 0, pairs.offset[0].shape[1]) for end in ends]
+    every = Probes(probes.pos, known["pair"])
+    near = measure(pairs, every, boxes)
+    felt = penetration(pairs, every, near, reach, ("normal",))
+    depths = torch.stack([r + pairs.gate[:, own.pair] - own.distance for r, own in zip(reach, near, strict=True)])
+    deepest = depths.max(dim=0)
+    pair = known["pair"].gather(0, deepest.indices)
+    return Deepest(felt.depth, felt.normal, torch.where(deepest.values > 0, pair, -1))
+
+
+@pytest.fixture
+def kernel(monkeypatch):
+    """A kernel that runs everywhere, in float64."""
+    monkeypatch.setattr(depth_search, "DEEPEST", replace(DEEPEST, kernel=brute_force))
+    monkeypatch.setattr(operations, "are_kernel_inputs", lambda *_: True)
+
+
+def box(size, first_pair, num_pairs, name="box"):
+    identity = torch.eye(3, dtype=torch.float64).reshape(1, 1, 9)
+    geoms = Geoms(("box",), (True,), size, 0 * size, identity, None, None, (None,))
+    return Target(paired(name, first_pair, num_pairs), geoms)
+
+
+@pytest.fixture
+def scene():
+    """Two links and six boxes, some of which each probe reaches; which pairs are felt, and how far."""
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    num_bodies = NUM_LINKS + NUM_OBJECTS
+    link, target = (
+        torch.arange(NUM_LINKS).repeat(NUM_OBJECTS),
+        NUM_LINKS + torch.arange(NUM_OBJECTS).repeat_interleave(NUM_LINKS),
+    )
+    state = (0.05 * random(NUM_ENVS, num_bodies, 3), random(NUM_ENVS, num_bodies, 4))
+    motion = (random(NUM_ENVS, num_bodies, 3), random(NUM_ENVS, num_bodies, 3))
+    gate = torch.where(random(NUM_ENVS, len(link)) > -1, 0.0, -torch.inf)
+    pairs = relate(*state, link, target, torch.float64, *motion, gate)
+    owner = torch.arange(NUM_TAXELS) % NUM_LINKS
+    probes = Probes((0.03 * random(3, NUM_TAXELS)).unbind(), owner.expand(NUM_OBJECTS, -1))
+    boxes = [box(0.01 + 0.02 * random(1, 1, 3).abs(), NUM_LINKS * i, NUM_LINKS, f"{i}") for i in range(NUM_OBJECTS)]
+    reach = torch.full((len(WHICH), NUM_TAXELS), 0.03, dtype=torch.float64)
+    return pairs, probes, boxes, owner + NUM_LINKS * torch.tensor(WHICH)[:, None], reach
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_motion_is_that_of_the_object_found(scene, kernel, is_known):
+    pairs, probes, boxes, pair, reach = scene
+    wants, felt = ("motion", "normal"), [boxes[i] for i in WHICH]
+    known = {"pair": pair} | (
+        dict(zip(("spheres", "geoms"), geom_tables([own.geoms for own in felt]), strict=True)) if is_known else {}
+    )
+    found = search(pairs, probes, felt, known, reach, wants)
+    near = measure(pairs, probes, boxes)
+    expected = penetration(pairs, probes, [near[i] for i in WHICH], reach, wants)
+    assert 0.2 < (expected.depth > 0).double().mean() < 0.9
+    torch.testing.assert_close(found.depth, expected.depth)
+    for part, other in zip(
+        (*found.normal, *found.velocity, *found.angular), (*expected.normal, *expected.velocity, *expected.angular), strict=True
+    ):
+        torch.testing.assert_close(part, other)
+
+
+def test_the_definition_is_the_deepest_of_all_distances(scene):
+    pairs, probes, boxes, pair, reach = scene
+    arguments = pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach
+    found, expected = deepest(*arguments), brute_force(*arguments)
+    assert torch.equal(found.pair, expected.pair) and (found.pair >= 0).any() and (found.pair < 0).any()
+    for part, other in zip((found.depth, *found.normal), (expected.depth, *expected.normal), strict=True):
+        torch.testing.assert_close(part, other)
+
+
+@pytest.mark.parametrize("num_geoms", [(2, 4), (3, 3)], ids=["unlike", "alike"])
+def test_the_spheres_that_hold_geoms_are_mujocos(num_geoms):
+    """Of an object whose geoms are there in some environments, and of one that is alike in all."""
+    shapes, generator = ("box", "capsule", "cylinder", "sphere", "plane", "box"), np.random.default_rng(0)
+    size, pos = generator.uniform(0.01, 0.03, (6, 3)), generator.normal(size=(6, 3))
+    model = mujoco.MjSpec()
+    for shape, own, at in zip(shapes, size, pos, strict=True):
+        model.worldbody.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"), size=own, pos=at)
+    radius = np.where(np.array(shapes) == "plane", EVERYWHERE, model.compile().geom_rbound)
+    first, is_absent = num_geoms[0], np.zeros((3, 6), bool)
+    is_absent[1, 0] = is_absent[2, :first] = True
+    objects = []
+    for own, absent in ((slice(first), torch.from_numpy(is_absent[:, :first])), (slice(first, 6), None)):
+        rotation = np.tile(np.eye(3).ravel(), (6, 1))
+        parts = (torch.from_numpy(part[own])[None] for part in (size, pos, rotation))
+        num = len(shapes[own])
+        objects.append(Geoms(shapes[own], (False,) * num, *parts, absent, None, (None,) * num))
+    spheres, geoms = (table.numpy() for table in geom_tables(objects))
+    of_geoms, about_bodies = (np.where(is_absent, -np.inf, reach) for reach in (radius, radius + np.linalg.norm(pos, axis=1)))
+    of_objects = np.stack([own.max(axis=1) for own in np.split(about_bodies, [first], axis=1)], axis=1)
+    for found, exact in ((geoms[..., BOUND], of_geoms), (spheres[..., 0], of_objects)):
+        np.testing.assert_allclose(found, exact, rtol=1e-12, atol=2 * MARGIN)
+        assert (found >= exact).all()
+    assert (spheres[..., 1] == num_geoms).all() and (geoms[..., POS:ROTATION] == pos).all()
+
+
+def test_a_cpu_has_no_kernel_for_it(scene):
+    pairs, probes, boxes, pair, reach = scene
+    assert search(pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach, ("normal",)) is None
+
+
+def test_what_the_kernel_cannot_answer_is_left_to_torch():
+    many = ["box"] * depth_search.THRESHOLD
+    assert is_searchable(many, {"normal", "motion"}) and is_searchable(many, ())
+    assert not is_searchable(many, {"normal", "distance"})
+    assert not is_searchable(many[1:], {"normal"})
+    assert not is_searchable([*many, "ellipsoid"], {"normal"})
+
+
+def test_a_module_asks_the_kernel_of_the_tables_that_its_plan_holds(tmp_path, kernel, monkeypatch):
+    """Six boxes about a pad: the kernel reads what distances do, of tables that were made beforehand."""
+    bodies = "".join(f'<body name="b{i}"><freejoint/><geom type="box" size=".02 .01 .0{i + 1}"/></body>' for i in range(6))
+    names = [f"b{i}" for i in range(6)]
+    sensors = {"depth": {"kind": "contact_depth", "feels": names}}
+    touch = compiled(tmp_path, bodies, {name: {"body": name} for name in names}, sensors)
+    state = example_state(touch.inputs, 3, 0, torch.float64, 0.02)
+    asked = []
+
+    def spied(pairs, probes, targets, known, reach):
+        asked.append(set(known))
+        return brute_force(pairs, probes, targets, known, reach)
+
+    monkeypatch.setattr(depth_search, "DEEPEST", replace(DEEPEST, kernel=spied))
+    found = touch(state)["depth"]
+    assert asked == [{"pair", "spheres", "geoms"}]
+    monkeypatch.undo()
+    expected = touch(state)["depth"]
+    assert len(asked) == 1 and (expected > 0).any() and (expected == 0).any()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)

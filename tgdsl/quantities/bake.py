@@ -1,0 +1,364 @@
+"""Geoms for the Plan: meshes cleaned, their signed distance baked into grids or kept as triangles, in a cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+
+from tgdsl.errors import BakeError
+from tgdsl.files import cache
+from tgdsl.geometry.grid import METHODS, one_grid
+from tgdsl.quantities.geoms import GeomTable, GridTable, TriangleTable
+from tgdsl.surfaces.geom import SurfaceGeom
+from tgdsl.surfaces.outer import Outer, outer
+from tgdsl.surfaces.sensed import DistanceOptions
+from tgdsl.surfaces.solid import Lattice, Solid
+from tgdsl.surfaces.surface import Surface
+
+FORMAT = b"tgdsl grid 4"
+CHOICE_POINTS, REPORT_POINTS = 4096, 16384
+HEADROOM, CHOICE_PERCENTILE = 0.95, 99.3
+"""The choice holds the tolerance with something to spare, nearly two standard deviations of a percentile of so few points, so
+that as a rule the 99th percentile of the held-back points holds it too."""
+EDGE_FACTOR = 5.0
+"""How many times the tolerance the 99th percentile of the error near sharp edges may be."""
+COARSEST = 16
+"""Cells along the longest side of the first grid that is tried."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors at random points of the band, none of which took part in the choice of the grid.
+
+    Points nearer to a sharp edge than one cell are counted apart: there no grid does better than O(cell).
+
+    Attributes:
+        count: Points away from sharp edges; the tolerance holds for their `p99`.
+        p99: 99th percentile of the distance error [m].
+        max: Largest distance error [m].
+        rms: Root mean square of the distance error [m].
+        angle_p99: 99th percentile of the angle between the gradient and the true one [rad].
+        edge_count: Points near sharp edges.
+        edge_p99: 99th percentile of their distance error [m]; 0 if there are none, as the next.
+        edge_max: Largest distance error among them [m].
+    """
+
+    count: int
+    p99: float
+    max: float
+    rms: float
+    angle_p99: float
+    edge_count: int
+    edge_p99: float
+    edge_max: float
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """A grid of signed distances in the surface's frame.
+
+    Attributes:
+        values: Signed distance at the nodes [m], negative inside.
+        origin: Place of node (0, 0, 0) [m].
+        cell: Spacing of the nodes [m].
+        method: Name of the function of `tgdsl.geometry.grid` that interpolates: trilinear or tricubic.
+        errors: What the grid costs in accuracy.
+        flaws: What of the surface its user should know: see `Outer`.
+    """
+
+    values: Float[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, " 3"]
+    cell: float
+    method: str
+    errors: Errors
+    flaws: tuple[str, ...]
+
+
+def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int = 64 * 2**20) -> Baked:
+    """Return the coarsest grid found that holds a surface's signed distance to a tolerance.
+
+    The tolerance bounds the 99th percentile of the error at random points of the band |distance| ≤ margin, denser near the
+    surface. An edge is sharp where its faces' normals differ by more than 30°, or where it does not join two faces: points
+    nearer to one than a cell are reported apart and held to five times the tolerance (their error is a fraction of a cell).
+    At each cell size the cheaper trilinear lookup is tried first. Results are kept in the user's cache folder.
+
+    Args:
+        surface: The surface, in the frame that the grid is to have.
+        margin: Width of the band and of the grid's rim around the surface [m]: the radius of the largest probe.
+        tolerance: Largest distance error [m], in the sense above.
+        budget: Largest size of the values [bytes].
+
+    Raises:
+        BakeError: Nothing to bake, or the tolerance needs more than the budget.
+    """
+    if not (np.isfinite(surface.vertices).all() and len(surface.faces) and 0 < margin < np.inf and 0 < tolerance < np.inf):
+        raise BakeError("a surface to bake needs faces, finite vertices, and a margin and a tolerance above 0")
+    limits = np.array([margin, tolerance, budget], float)
+    arrays = [limits, np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)]
+
+    def make() -> Baked:
+        return _bake(Solid(surface), margin, tolerance, budget)
+
+    return cache.cached(cache.digest(FORMAT, arrays), make, _packed, _unpacked)
+
+
+def _packed(baked: Baked) -> dict[str, np.ndarray]:
+    fields = {
+        field.name: np.asarray(getattr(baked, field.name)) for field in dataclasses.fields(baked) if field.name != "errors"
+    }
+    return fields | {"errors": np.array(dataclasses.astuple(baked.errors), float)}
+
+
+def _unpacked(found: Mapping[str, np.ndarray]) -> Baked:
+    count, *errors = found["errors"].tolist()
+    errors[4] = int(errors[4])
+    values, method = found["values"], str(found["method"])
+    if values.dtype != np.float32 or not np.isfinite(values).all() or method not in METHODS:
+        raise ValueError("a damaged grid")
+    report, cell = Errors(int(count), *errors), float(found["cell"])
+    return Baked(values, found["origin"], cell, method, report, tuple(found["flaws"].tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Random points of the band with their true distance [m], its gradient, and their distance to a sharp edge [m]."""
+
+    pos: Float[np.ndarray, "n 3"]
+    distance: Float[np.ndarray, " n"]
+    gradient: Float[np.ndarray, "n 3"]
+    to_edge: Float[np.ndarray, " n"]
+
+    @staticmethod
+    def around(solid: Solid, margin: float, count: int, seed: int) -> _Points:
+        """Return points of balls of radius `margin` around uniformly random points of the surface."""
+        rng = np.random.default_rng(seed)
+        corners = solid.corners
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        face = rng.choice(len(corners), count, p=area / area.sum())
+        weight = rng.dirichlet((1.0, 1.0, 1.0), count)
+        way = rng.normal(size=(count, 3))
+        way *= margin * np.cbrt(rng.uniform(size=(count, 1))) / np.linalg.norm(way, axis=1, keepdims=True)
+        pos = (weight[:, :, None] * corners[face]).sum(axis=1) + way
+        return _Points(pos, *solid.distance(pos), solid.edge_distance(pos))
+
+
+def _bake(solid: Solid, margin: float, tolerance: float, budget: int) -> Baked:
+    points = _Points.around(solid, margin, CHOICE_POINTS, seed=1)
+    lattice, method = _choose(solid, points, margin, tolerance, budget)
+    values = solid.node_distance(lattice)
+    held_back = _Points.around(solid, margin, REPORT_POINTS, seed=2)
+    errors = _errors(held_back, values, lattice, method)
+    return Baked(values, lattice.origin, lattice.cell, method, errors, solid.flaws)
+
+
+def _choose(solid: Solid, points: _Points, margin: float, tolerance: float, budget: int) -> tuple[Lattice, str]:
+    """Return the first grid, from coarse to fine, and the first method that hold the tolerance."""
+    longest = float(np.ptp(solid.corners.reshape(-1, 3), axis=0).max()) + 2 * margin
+    lattice = Lattice.around(solid, margin, longest / COARSEST)
+    needed = lattice.num_bytes
+    while lattice.num_bytes <= budget:
+        nodes = lattice.nodes_around(points.pos)
+        values = np.zeros(lattice.shape, np.float32)
+        values.reshape(-1)[nodes] = solid.distance(lattice.pos(nodes))[0]
+        worst = np.inf
+        for method in METHODS:
+            errors = _errors(points, values, lattice, method, CHOICE_PERCENTILE)
+            error = max(errors.p99, errors.edge_p99 / EDGE_FACTOR) / (HEADROOM * tolerance)
+            error = error if errors.count >= CHOICE_POINTS // 10 else np.inf
+            if error <= 1:
+                return lattice, method
+            worst = min(worst, error)
+        # Creases of the distance decide fine grids: there the error falls like the cell.
+        needed = Lattice.around(solid, margin, lattice.cell / min(worst, COARSEST)).num_bytes
+        lattice = Lattice.around(solid, margin, lattice.cell / float(np.clip(np.cbrt(worst), 1.2, 1.6)))
+    needed = max(needed, lattice.num_bytes)
+    raise BakeError(
+        f"a grid of a tolerance of {tolerance * 1e3:g} mm needs about {needed / 2**20:.3g} MiB ({needed} bytes), and the"
+        f" budget is {budget / 2**20:.3g} MiB ({budget} bytes); raise the tolerance or the budget"
+    )
+
+
+def _errors(points: _Points, values: np.ndarray, lattice: Lattice, method: str, percentile: float = 99.0) -> Errors:
+    """Return the errors of a grid, in float64, at points all of whose nodes are there."""
+    grid = one_grid(torch.from_numpy(values), torch.from_numpy(lattice.origin), torch.tensor(lattice.cell, dtype=torch.float64))
+    x, y, z = (torch.from_numpy(np.ascontiguousarray(part)) for part in points.pos.T)
+    distance, gradient = METHODS[method]((x, y, z), grid)
+    error = np.abs(distance.numpy() - points.distance)
+    cosine = (torch.stack(gradient, dim=1).numpy() * points.gradient).sum(axis=1)
+    is_edge = points.to_edge < lattice.cell
+    away, near = error[~is_edge], error[is_edge]
+    # On the surface itself the true gradient is not known: a cosine of 0 exactly.
+    angle = np.arccos(np.clip(cosine[~is_edge & points.gradient.any(axis=1)], -1, 1))
+    return Errors(
+        count=len(away),
+        p99=_percentile(away, percentile),
+        max=float(away.max(initial=0)),
+        rms=float(np.sqrt(np.mean(away**2))) if len(away) else 0.0,
+        angle_p99=_percentile(angle, percentile),
+        edge_count=len(near),
+        edge_p99=_percentile(near, percentile),
+        edge_max=float(near.max(initial=0)),
+    )
+
+
+def _percentile(values: np.ndarray, percentile: float) -> float:
+    return float(np.percentile(values, percentile)) if len(values) else 0.0
+
+
+OUTER_FORMAT = b"tgdsl outer surface 1"
+HULL_POINTS = 2000
+"""Points of a convex hull whose distance to the mesh is looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class GeomDistance:
+    """How the distance to a geom is found.
+
+    Attributes:
+        geom: The geom.
+        shape: What computes it: a primitive's type, an interpolation of a grid, or `raycast`.
+        arrays: What that needs besides the geom's size and pose, by name.
+        accuracy: What a grid costs, by name; empty for what is exact.
+    """
+
+    geom: SurfaceGeom
+    shape: str
+    arrays: Mapping[str, np.ndarray]
+    accuracy: Mapping[str, float]
+
+
+def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, name: str) -> GeomDistance:
+    """Bake a mesh, or keep its triangles, as its options say; a primitive needs neither.
+
+    Args:
+        felt: The geom.
+        options: How the distance to triangles is found.
+        margin: Largest distance from the surface that any sensor asks for [m].
+        name: What warnings call the object or link: "object cube".
+
+    Raises:
+        BakeError: If no face has an area, or no grid within the budget holds the tolerance.
+    """
+    if felt.surface is None:
+        return GeomDistance(felt, felt.shape, {}, {})
+    _warn_of_hull(felt, margin, name)
+    if options.query == "raycast":
+        triangles = _outer(felt.surface)
+        _warn_of_flaws(triangles.flaws, felt, name)
+        arrays = {"vertices": triangles.vertices, "faces": triangles.faces, "max_distance": np.asarray(2.0 * margin)}
+        return GeomDistance(felt, "raycast", arrays, {})
+    baked = bake(felt.surface, margin, options.tolerance, options.max_bytes)
+    _warn_of_flaws(baked.flaws, felt, name)
+    arrays = {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell)}
+    accuracy = {key: float(value) for key, value in dataclasses.asdict(baked.errors).items()}
+    return GeomDistance(felt, baked.method, arrays, {**accuracy, "tolerance": options.tolerance, "cell": baked.cell})
+
+
+def geom_table(cases: Sequence[Sequence[GeomDistance]]) -> GeomTable[np.ndarray]:
+    """Return the table of an object's variants, or of links: geoms of one shape share a column, in their order."""
+    shapes, places = aligned([[part.shape for part in case] for case in cases])
+    rows = [[None if i is None else own[i] for i in table] for own, table in zip(cases, places, strict=True)]
+    columns = list(zip(*rows, strict=True))
+    of_geom = {}
+    for key, absent in (("size", np.ones(3)), ("pos", np.zeros(3)), ("rotation", np.eye(3))):
+        found = [[absent if part is None else getattr(part.geom.geom, key) for part in row] for row in rows]
+        of_geom[key] = np.array(found).reshape(len(rows), len(rows[0]), -1)
+    is_absent = np.array([[part is None for part in row] for row in rows]) if len(rows) > 1 else None
+    return GeomTable(
+        shapes=shapes,
+        is_centred=tuple(all(part is None or part.geom.geom.is_centred for part in column) for column in columns),
+        **of_geom,
+        is_absent=is_absent,
+        surfaces=tuple(_surface(column) for column in columns),
+        accuracy=tuple(tuple({} if part is None else dict(part.accuracy) for part in row) for row in rows),
+    )
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], list[list[int | None]]]:
+    """Give the members of several rows common columns, each for one kind, the order within each row kept.
+
+    Args:
+        rows: The kinds of each row's members.
+
+    Returns:
+        The kind of each column; and for each row the index of its member in each column, None where it has none.
+    """
+    columns: list[str] = []
+    tables: list[list[int | None]] = []
+    for row in rows:
+        table: list[int | None] = [None] * len(columns)
+        after = 0
+        for member, kind in enumerate(row):
+            place = next((i for i in range(after, len(columns)) if columns[i] == kind), None)
+            if place is None:
+                place = len(columns)
+                columns.append(kind)
+                for other in (*tables, table):
+                    other.append(None)
+            table[place], after = member, place + 1
+        tables.append(table)
+    return tuple(columns), tables
+
+
+def _surface(column: Sequence[GeomDistance | None]) -> GridTable[np.ndarray] | TriangleTable | None:
+    """Return the grids or triangles of a column, case after case; a case that lacks it has another's."""
+    like = next(part.arrays for part in column if part is not None)
+    owned = [like if part is None else part.arrays for part in column]
+    if "vertices" in like:
+        vertices, faces = (tuple(own[key] for own in owned) for key in ("vertices", "faces"))
+        return TriangleTable(vertices, faces, float(like["max_distance"]))
+    if "values" not in like:
+        return None
+    distinct = list({id(own): own for own in owned}.values())
+    place = [next(i for i, own in enumerate(distinct) if own is found) for found in owned]
+    starts = np.cumsum([0, *(own["values"].size for own in distinct)])
+    x, y, z = owned[0]["values"].shape
+    return GridTable(
+        values=np.concatenate([own["values"].reshape(-1) for own in distinct]),
+        first=starts[place],
+        num=np.array([own["values"].shape for own in owned]),
+        origin=np.array([own["origin"] for own in owned]),
+        cell=np.array([own["cell"] for own in owned]),
+        counts=(x, y, z),
+    )
+
+
+def _outer(surface: Surface) -> Outer:
+    """Return the outer surface of a mesh; it is kept in the user's cache folder."""
+
+    def unpacked(found: Mapping[str, np.ndarray]) -> Outer:
+        return Outer(found["vertices"], found["faces"], found["uncut"], tuple(found["flaws"].tolist()))
+
+    arrays = [np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)]
+    key = cache.digest(OUTER_FORMAT, arrays)
+    return cache.cached(key, lambda: outer(surface), lambda made: {k: np.asarray(v) for k, v in vars(made).items()}, unpacked)
+
+
+def _warn_of_flaws(flaws: Sequence[str], felt: SurfaceGeom, name: str) -> None:
+    for flaw in flaws:
+        warnings.warn(f"{name}: {felt.geom.shown} {flaw}", stacklevel=3)
+
+
+def _warn_of_hull(felt: SurfaceGeom, margin: float, name: str) -> None:
+    """MuJoCo collides convex hulls: say so where a hull stands further off the mesh than any probe reaches."""
+    hull = felt.surface
+    if hull is None or felt.mesh is None:
+        return
+    whole = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
+    sampled = trimesh.sample.sample_surface(whole, HULL_POINTS, seed=0)[0]
+    squared, *_ = igl.point_mesh_squared_distance(np.asarray(sampled), felt.mesh.vertices, felt.mesh.faces)
+    depth = float(np.sqrt(np.max(squared)))
+    if depth > margin:
+        warnings.warn(
+            f"{name}: MuJoCo collides the convex hull of {felt.geom.shown}, up to {1e3 * depth:.1f} mm off the mesh, "
+            "and that hull is felt; `surface` names what to feel instead",
+            stacklevel=2,
+        )

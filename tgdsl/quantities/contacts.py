@@ -1,0 +1,302 @@
+"""The solver's contacts on the bodies that carry a sensor, each in its body's frame.
+
+Shapes: `env` environments, `body` bodies that carry the sensor, `contact` contacts of one body: slot after slot of one object
+after the other, `all_bodies` bodies of the state, `pair` pairs of the state, `slot` contacts per pair, `object` felt objects.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.fields.indices import indices
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Plane, Vec
+from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
+from tgdsl.quantities.pairs import Pair, PairedObject
+from tgdsl.quantities.reference import ReferenceScene
+from tgdsl.tensors.on_host import on_host
+
+
+class ContactPoints(NamedTuple):
+    """Contacts on each body, in its frame; planes (env, body, contact), but `net` (env, body). Unused slots are all zero.
+
+    Contacts beyond the slots have no place of their own. What a pair's slots lack of its whole force, r = f_net − Σ_c f_c, acts
+    at the centre of the contacts shown, weighted by their forces: each takes r |f_c| / Σ_c |f_c| on itself, or equal shares
+    where none has a force. The forces then sum to the whole; the moment of r about that centre is not known, nor are torques
+    beyond the slots. Where no contact is shown there is nowhere to act, and `net` alone has r.
+
+    Attributes:
+        pos: Contact points [m].
+        force: Force on the body at each [N].
+        torque: Torque on the body at each [N·m].
+        normal: Unit normal out of the object at each; not-a-number where the state has none beside a force.
+        net: Whole force on the body from the objects felt [N], contacts beyond the slots included.
+    """
+
+    pos: Vec
+    force: Vec
+    torque: Vec
+    normal: Vec
+    net: Vec
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts(Request[ContactPoints]):
+    """Asks for the solver's contacts.
+
+    Attributes:
+        slots: Contacts per body and object that are wanted; 0: the net force alone.
+    """
+
+    slots: int = 0
+    wants_contacts: ClassVar[bool] = True
+
+    @property
+    def num_slots(self) -> int:
+        """Contacts per body and object that are read."""
+        return self.slots
+
+    def key(self) -> tuple[Any, ...]:
+        """Return what two requests at the same taxels have in common if they are one: the objects."""
+        return type(self), self.objects
+
+    def merged(self, other: Request) -> Contacts:
+        """Return a request for as many slots as both want."""
+        assert isinstance(other, Contacts)
+        return dataclasses.replace(self, slots=max(self.slots, other.slots))
+
+
+Array = TypeVar("Array")
+
+SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
+"""Fields of the state that are read contact by contact."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactsUse(Generic[Array]):
+    """One request.
+
+    Attributes:
+        bodies: Indices of the sensors' bodies in the state, (body,).
+        pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
+    """
+
+    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
+    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
+
+
+@dataclass(frozen=True, eq=False)
+class ContactsPart(Generic[Array]):
+    """All of it.
+
+    Attributes:
+        slots: Contacts per pair that are read; 0: the net force alone.
+        uses: The uses.
+    """
+
+    slots: int
+    uses: tuple[ContactsUse[Array], ...]
+
+
+def _use(planning: Planning, use: Use) -> ContactsUse[np.ndarray]:
+    objects = [name for name in use.request.objects if planning.object_id(name) is not None]
+    counted = [name for name in objects if not is_counted(planning, name, use.request.objects)]
+    bodies = tuple(dict.fromkeys(link.body for link in use.links))
+    pairs = {pair: i for i, pair in enumerate(planning.contact_pairs)}
+    table = [[pairs.get(Pair(body, name), len(pairs)) for name in counted] for body in bodies]
+    # One that touches nothing has no pose in the state, and no contacts.
+    places = [planning.bodies.index(body) if body in planning.bodies else 0 for body in bodies]
+    return ContactsUse(np.array(places, dtype=np.int64), np.array(table, dtype=np.int64).reshape(len(bodies), len(counted)))
+
+
+def is_counted(planning: Planning, name: str, felt: Sequence[str]) -> bool:
+    """Return whether the contacts with an object are among those with another one that is felt too.
+
+    Objects may be made of the same body, whose force is one. Of two that share all contacts the first one counts.
+    """
+    own, before = planning.sensed[name].touched, list(felt).index(name)
+    others = [planning.sensed[other].touched for other in felt]
+    return any(own < other or (own == other and i < before) for i, other in enumerate(others) if own)
+
+
+def contacts_of(
+    state: Mapping[str, Tensor],
+    bodies: Int[Tensor, " body"],
+    index: Int[Tensor, "body object"],
+    dtype: torch.dtype,
+) -> ContactPoints:
+    """Bring the contacts of a state into the frames of the bodies, in the state's dtype, and then cast them.
+
+    Args:
+        state: Fields of `SceneState`: body_pos, body_quat, contact_netforce and, unless the slots are not wanted, contact_pos,
+            contact_force, contact_torque and contact_normal.
+        bodies: The bodies, among those of the state.
+        index: Pair of each body and object; their number where there is none.
+        dtype: Dtype of the result.
+    """
+    quat = state["body_quat"].index_select(1, bodies)
+    whole = _of_pairs(state["contact_netforce"], index)
+    *rotation, x, y, z = on_host(_in_frame, quat, whole.sum(dim=2))
+    net = x, y, z
+    if not all(name in state for name in SLOT_FIELDS):  # some of them may be there for another quantity
+        none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
+        own = [(none, none, none)] * 4
+    else:
+        each = planes.rot(part[..., None] for part in rotation)
+        names = ("contact_force", "contact_torque", "contact_normal", "contact_pos")
+        force, torque, normal, pos = (planes.split(_of_pairs(state[name], index)) for name in names)
+        is_used = _is_any((*force, *torque, *normal))
+        force, normal = _completed(planes.split(whole), force, is_used), _told(normal, is_used)
+        force, torque, normal, pos = (planes.vec(part.flatten(2) for part in vector) for vector in (force, torque, normal, pos))
+        origin = planes.split(state["body_pos"][:, bodies, None])
+        away = planes.vec(torch.where(is_used.flatten(2), part, 0.0) for part in planes.sub(pos, origin))
+        own = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
+    pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*own, net))
+    return ContactPoints(pos, force, torque, normal, net)
+
+
+def _in_frame(quat: Plane, vector: Plane) -> list[Plane]:
+    """Return the planes of the rotations of bodies, (env, body), and of vectors of the world in their frames."""
+    rotation = planes.rotation(quat)
+    return [*rotation, *planes.rotate_back(rotation, planes.split(vector))]
+
+
+class PairContacts(NamedTuple):
+    """The contacts of each body and object, in world axes; planes (env, body, object, slot).
+
+    Attributes:
+        pos: Contact points [m].
+        force: Force on the body at each [N], what the slots lack of each pair's whole force shared out.
+        normal: Unit normal out of the object; not-a-number where the state has none beside a force.
+        is_used: Which slots are contacts.
+    """
+
+    pos: Vec
+    force: Vec
+    normal: Vec
+    is_used: Bool[Tensor, "env body object slot"]
+
+
+def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]) -> PairContacts:
+    """Return the contacts of bodies and objects where they are, without torques.
+
+    Args:
+        state: Fields of `SceneState`: contact_netforce, contact_pos, contact_force and contact_normal.
+        index: Pair of each body and object; their number where there is none.
+    """
+    names = ("contact_pos", "contact_force", "contact_normal")
+    pos, force, normal = (planes.split(_of_pairs(state[name], index)) for name in names)
+    is_used = _is_any((*force, *normal))
+    whole = planes.split(_of_pairs(state["contact_netforce"], index))
+    return PairContacts(pos, _completed(whole, force, is_used), _told(normal, is_used), is_used)
+
+
+def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
+    """Return where any of some numbers is not zero; not-a-number is none."""
+    found = parts[0] != 0
+    for part in parts[1:]:
+        found = found | (part != 0)
+    return found
+
+
+def _told(normal: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
+    """Return normals, not-a-number where a contact has none."""
+    is_missing = is_used & (planes.dot(normal, normal) == 0)
+    return planes.vec(torch.where(is_missing, torch.nan, part) for part in normal)
+
+
+def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
+    """Return the contacts' forces with what they lack of each pair's whole force, (env, body, object) [N], shared out."""
+    lacking = planes.vec(total - part.sum(dim=-1) for total, part in zip(whole, force, strict=True))
+    size = planes.safe_sqrt(planes.dot(force, force))
+    total = size.sum(dim=-1, keepdim=True)
+    is_loaded, used = total > 0, is_used.to(size.dtype)
+    weight = torch.where(is_loaded, size, used) / torch.where(is_loaded, total, used.sum(dim=-1, keepdim=True).clamp(min=1.0))
+    return planes.vec(part + weight * rest[..., None] for part, rest in zip(force, lacking, strict=True))
+
+
+def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
+    """Return a field (env, pair, *rest) as (env, body, object, *rest), zero where there is no pair."""
+    padding = field.new_zeros((field.shape[0], 1, *field.shape[2:]))
+    return torch.cat([field, padding], dim=1).index_select(1, index.flatten()).unflatten(1, index.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceContacts:
+    """The solver's contacts, each in the frame of its body: `request.ContactPoints` as a list.
+
+    Attributes:
+        body: Which body each is on.
+        pos: Contact points [m].
+        force: Force on the body [N].
+        torque: Torque on the body [N·m].
+        normal: Unit normal out of the object.
+        net: Whole force on each body [N].
+    """
+
+    body: Int[np.ndarray, " contact"]
+    pos: Float[np.ndarray, "contact 3"]
+    force: Float[np.ndarray, "contact 3"]
+    torque: Float[np.ndarray, "contact 3"]
+    normal: Float[np.ndarray, "contact 3"]
+    net: Float[np.ndarray, "body 3"]
+
+
+def completed(contacts: list[list[np.ndarray]], whole: np.ndarray) -> list[list[np.ndarray]]:
+    """Return a pair's contacts (place, force, torque, normal), what they lack of its whole force added by shares of force."""
+    sizes = [float(np.linalg.norm(force)) for _, force, _, _ in contacts]
+    sizes = sizes if sum(sizes) > 0 else [1.0] * len(contacts)
+    lacking = whole - sum((force for _, force, _, _ in contacts), np.zeros(3))
+    return [
+        [pos, force + size / sum(sizes) * lacking, torque, normal]
+        for size, (pos, force, torque, normal) in zip(sizes, contacts, strict=True)
+    ]
+
+
+class _Contacts(Quantity):
+    name, request, part = "contacts", Contacts, ContactsPart
+
+    def plan(self, planning: Planning, uses: Sequence[Use]) -> ContactsPart[np.ndarray]:
+        slots = max((use.request.slots for use in uses if isinstance(use.request, Contacts)), default=0)
+        return ContactsPart(slots, tuple(_use(planning, use) for use in uses))
+
+    def gather(self, part: ContactsPart[Tensor], scene: Scene) -> tuple[ContactPoints, ...]:
+        return tuple(contacts_of(scene.tensors, use.bodies, use.pairs, scene.dtype) for use in part.uses)
+
+    def reference(self, part: ContactsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceContacts:
+        table, num_pairs = part.uses[use].pairs, len(scene.contact_pairs)
+        rows: list[tuple[int, list[np.ndarray]]] = []
+        net = np.zeros((len(scene.layout.bodies), 3))
+        for b, name in enumerate(scene.layout.bodies):
+            body = scene.body(name)
+            for p in (p for p in table[b].tolist() if p < num_pairs):
+                whole = scene.fields["contact_netforce"][p]
+                net[b] += body.rotation.T @ whole
+                slots = (
+                    zip(*(scene.fields[name][p] for name in SLOT_FIELDS), strict=True) if SLOT_FIELDS[0] in scene.fields else ()
+                )
+                used = [list(row) for row in slots if np.any(row[1:])]
+                for pos, *vectors in completed(used, whole):
+                    rows.append((b, [body.rotation.T @ vector for vector in (pos - body.pos, *vectors)]))
+        pos, force, torque, normal = np.array([row for _, row in rows]).reshape(len(rows), 4, 3).transpose(1, 0, 2)
+        return ReferenceContacts(np.array([b for b, _ in rows], dtype=np.int64), pos, force, torque, normal, net)
+
+    def fields(self, part: ContactsPart) -> set[str]:
+        return {"contact_netforce", *(["contact_found", *SLOT_FIELDS] if part.slots else [])}
+
+    def is_light(self, part: ContactsPart) -> bool:
+        return True
+
+    def explain(self, part: ContactsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
+        return ["the solver's contacts"]
+
+
+CONTACTS = _Contacts()

@@ -1,0 +1,331 @@
+"""Signed distance to the union of geoms, of an object or of links: as the Plan holds it, at run time, and in float64.
+
+Shapes: `case` 1, or `env` if the object differs between environments, or variants, or the links of a table of links; `geom` its
+geoms, columns of a table; `node` nodes of all grids of a column.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.fields.indices import indices
+from tgdsl.geometry import planes
+from tgdsl.geometry.bvh import TriangleMesh, nearest
+from tgdsl.geometry.grid import METHODS, Grid
+from tgdsl.geometry.planes import Rot, Vec, split
+from tgdsl.geometry.reference import TIE, signed_distance
+from tgdsl.geometry.shapes import SHAPES
+from tgdsl.quantities.base import Scene, variant_of
+from tgdsl.quantities.pairs import PairedObject
+from tgdsl.tensors.env_ids import may_look
+
+
+class RaycastSurface(NamedTuple):
+    """Triangles that are queried at run time, one mesh per variant, and the distance [m] up to which they are told apart."""
+
+    meshes: tuple[TriangleMesh, ...]
+    max_distance: float
+
+
+class Frame(NamedTuple):
+    """How an object sees points: a point, rotated and shifted, is in the object's frame; planes that broadcast with points.
+
+    Attributes:
+        rotation: Rotates the points' vectors into the object's frame.
+        offset: The points' origin in the object's frame [m].
+    """
+
+    rotation: Rot
+    offset: Vec
+
+
+class Geoms(NamedTuple):
+    """An object's geoms in its body's frame, as each environment has it.
+
+    Attributes:
+        shapes: How the distance to each geom is found: see `tables.GeomTable`.
+        is_centred: Whether each geom's frame is the body's.
+        size: Size of each geom as MuJoCo defines it [m].
+        pos: Origin of each geom in the body frame [m].
+        rotation: Rotates geom vectors into the body frame, row by row.
+        is_absent: Which geoms a case lacks; None if none does.
+        variant: Which variant each environment has; None if all are alike.
+        surfaces: Grid or triangles of each geom that is no primitive.
+    """
+
+    shapes: tuple[str, ...]
+    is_centred: tuple[bool, ...]
+    size: Float[Tensor, "case geom 3"]
+    pos: Float[Tensor, "case geom 3"]
+    rotation: Float[Tensor, "case geom 9"]
+    is_absent: Bool[Tensor, "case geom"] | None
+    variant: Int[Tensor, " env"] | None
+    surfaces: tuple[Grid | RaycastSurface | None, ...]
+
+
+def body_distance(point: Vec, geoms: Geoms) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] of points in a body's own frame to the union of its geoms, and its gradient there."""
+    frames = []
+    for g, is_centred in enumerate(geoms.is_centred):
+        turn = planes.rot(geoms.rotation[:, g, None].unbind(-1))
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = turn
+        offset = planes.vec(-part for part in planes.rotate_back(turn, planes.split(geoms.pos[:, g, None])))
+        frames.append(None if is_centred else Frame((xx, yx, zx, xy, yy, zy, xz, yz, zz), offset))
+    return union_distance(point, frames, geoms)
+
+
+def union_distance(point: Vec, frames: Sequence[Frame | None], geoms: Geoms) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] to the nearest geom, the first among equals, and its gradient in the points' frame.
+
+    `frames` say how each geom sees the points; None: they are in its frame already.
+    """
+    return united((_in_frame(point, frame, geoms, g) for g, frame in enumerate(frames)), geoms.is_absent)
+
+
+def united(geoms: Iterable[tuple[Tensor, Vec]], is_absent: Bool[Tensor, "case geom"] | None) -> tuple[Tensor, Vec]:
+    """Return the least of the distances to an object's geoms [m], the first among equals, and its gradient.
+
+    Args:
+        geoms: Signed distance to each geom [m] and its gradient, planes (case, …, point).
+        is_absent: Which geoms a case lacks; None if none does.
+    """
+    least, outward = None, None
+    for g, (distance, gradient) in enumerate(geoms):
+        if is_absent is not None:
+            distance = torch.where(is_absent[:, g, None], torch.inf, distance)
+        if least is None or outward is None:
+            least, outward = distance, gradient
+        else:
+            outward = planes.where(distance < least - planes.tie(), gradient, outward)
+            least = torch.minimum(least, distance)
+    assert least is not None and outward is not None
+    return least, outward
+
+
+def _in_frame(point: Vec, frame: Frame | None, geoms: Geoms, g: int) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] of points to a geom that sees them as a frame says, and its gradient in the points' frame."""
+    if frame is None:
+        return _to_geom(point, geoms, g)
+    distance, gradient = _to_geom(planes.add(planes.rotate(frame.rotation, point), frame.offset), geoms, g)
+    return distance, planes.rotate_back(frame.rotation, gradient)
+
+
+def _to_geom(point: Vec, geoms: Geoms, g: int) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] of points in a geom's frame to it, and its gradient there."""
+    shape, surface = geoms.shapes[g], geoms.surfaces[g]
+    if isinstance(surface, Grid):
+        return METHODS[shape](point, surface)
+    if isinstance(surface, RaycastSurface):
+        which = geoms.variant[:, None] if geoms.variant is not None and len(surface.meshes) > 1 else None
+        return nearest(point, surface.meshes, surface.max_distance, which)
+    return SHAPES[shape](point, planes.split(geoms.size[:, g, None]))
+
+
+Array = TypeVar("Array")
+
+
+@dataclass(frozen=True, eq=False)
+class GridTable(Generic[Array]):
+    """The grids of one column, one after the other.
+
+    Attributes:
+        values: Signed distance at the nodes [m], float32, (node,).
+        first: Index of each case's node (0, 0, 0), (case,).
+        num: Number of its nodes along each axis, (case, 3).
+        origin: Place of its node (0, 0, 0) in the geom's frame [m], (case, 3).
+        cell: Spacing of its nodes [m], (case,).
+        counts: Nodes of the first case's grid: numbers that become part of compiled code.
+    """
+
+    values: Array
+    first: Array = field(
+        metadata=indices(lambda grids, part, plan: len(grids.values) + 1 - np.prod(grids.num, axis=1, dtype=float))
+    )
+    num: Array = field(metadata=indices(None, least=2))
+    origin: Array
+    cell: Array
+    counts: tuple[int, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleTable:
+    """The triangles of one column, which are queried at run time; they stay on the host.
+
+    Attributes:
+        vertices: Of each case [m], (vertex, 3).
+        faces: Of each case, (face, 3).
+        max_distance: How far a query looks [m].
+    """
+
+    stays_on_host: ClassVar[bool] = True
+    vertices: tuple[np.ndarray, ...]
+    faces: tuple[np.ndarray, ...] = field(metadata=indices(lambda table, part, plan: tuple(map(len, table.vertices))))
+    max_distance: float
+
+    @cached_property
+    def prepared(self) -> RaycastSurface:
+        """What is queried; cases with the same triangles share a mesh."""
+        meshes: dict[tuple[bytes, bytes], TriangleMesh] = {}
+        found = []
+        for vertices, faces in zip(self.vertices, self.faces, strict=True):
+            key = vertices.tobytes(), faces.tobytes()
+            if key not in meshes:
+                meshes[key] = TriangleMesh(vertices, faces)
+            found.append(meshes[key])
+        return RaycastSurface(tuple(found), self.max_distance)
+
+
+@dataclass(frozen=True, eq=False)
+class GeomTable(Generic[Array]):
+    """The geoms of an object.
+
+    A column stands for the geoms of one type that the cases have in its place; a case may lack it.
+
+    Attributes:
+        shapes: How the distance to each column is found: a primitive's type, an interpolation of a grid, or `raycast`.
+        is_centred: Which of them share the body's frame in all cases.
+        size: Size of each as MuJoCo defines it [m], (case, geom, 3).
+        pos: Its origin in the body's frame [m], (case, geom, 3).
+        rotation: Rotates its vectors into the body's frame, row by row, (case, geom, 9).
+        is_absent: 1 where a case lacks it, (case, geom); None if there is one case.
+        surfaces: Grids or triangles of each that is no primitive.
+        accuracy: What was measured of each case's geoms: see `bake.Errors`; empty where distances are exact.
+    """
+
+    shapes: tuple[str, ...]
+    is_centred: tuple[bool, ...]
+    size: Array
+    pos: Array
+    rotation: Array
+    is_absent: Array | None = field(metadata=indices(lambda table, part, plan: 2))
+    surfaces: tuple[GridTable[Array] | TriangleTable | None, ...]
+    accuracy: tuple[tuple[Mapping[str, float], ...], ...]
+
+
+def account_of_geoms(table: GeomTable[np.ndarray], names: Sequence[str]) -> list[str]:
+    """Return what was measured of a table's grids, for users.
+
+    Args:
+        table: The table.
+        names: What to call each case.
+    """
+    lines = []
+    for case, (name, row) in enumerate(zip(names, table.accuracy, strict=True)):
+        for i, accuracy in enumerate(row):
+            surface = table.surfaces[i]
+            if not accuracy or not isinstance(surface, GridTable):
+                continue
+            num = surface.num[case]
+            lines += [
+                f"{name}, geom {i}: {table.shapes[i]} grid of {' × '.join(map(str, num))} nodes every "
+                f"{1e3 * accuracy['cell']:.3g} mm, {4 * int(num.prod())} bytes",
+                f"  distance: 99 % within {1e3 * accuracy['p99']:.3g} mm (asked: {1e3 * accuracy['tolerance']:.3g} "
+                f"mm), largest error {1e3 * accuracy['max']:.3g} mm; near sharp edges "
+                f"{1e3 * accuracy['edge_max']:.3g} mm",
+            ]
+    return lines
+
+
+def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -> Geoms:
+    """Return an object's geoms as each environment has them: its variant, its size. What none of them has may be left out."""
+    variant = variant_of(scene, target)
+    size, is_absent = _chosen(table.size, variant), None
+    if variant is not None and table.is_absent is not None:
+        is_absent = _chosen(table.is_absent, variant) > 0
+    if target.is_sized:
+        own = scene.tensors["object_size"][:, target.varied, None].to(size.dtype).expand(-1, size.shape[1], -1)
+        size = own if is_absent is None else torch.where(is_absent[..., None], size, own)
+    geoms = Geoms(
+        shapes=table.shapes,
+        is_centred=table.is_centred,
+        size=size,
+        pos=_chosen(table.pos, variant),
+        rotation=_chosen(table.rotation, variant),
+        is_absent=is_absent,
+        variant=variant,
+        surfaces=tuple(_surface(own, variant) for own in table.surfaces),
+    )
+    return geoms if is_absent is None or not may_look(is_absent) else _had_by_some(geoms, is_absent)
+
+
+def _had_by_some(geoms: Geoms, is_absent: Bool[Tensor, "env geom"]) -> Geoms:
+    """Return those geoms that some environment has."""
+    own = [g for g, is_missing in enumerate(is_absent.all(dim=0).tolist()) if not is_missing]
+    if len(own) == len(geoms.shapes) or not own:
+        return geoms
+    ids = torch.tensor(own, device=is_absent.device)
+    return geoms._replace(
+        **{name: tuple(getattr(geoms, name)[g] for g in own) for name in ("shapes", "is_centred", "surfaces")},
+        **{name: getattr(geoms, name).index_select(1, ids) for name in ("size", "pos", "rotation", "is_absent")},
+    )
+
+
+def link_geoms(table: GeomTable[Tensor], links: Tensor) -> Geoms:
+    """Return the own geoms of some links: each is a case."""
+    return Geoms(
+        shapes=table.shapes,
+        is_centred=table.is_centred,
+        size=table.size[links],
+        pos=table.pos[links],
+        rotation=table.rotation[links],
+        is_absent=None if table.is_absent is None else table.is_absent[links] > 0,
+        variant=links,
+        surfaces=tuple(_surface(own, links) for own in table.surfaces),
+    )
+
+
+def _surface(
+    table: GridTable[Tensor] | TriangleTable | RaycastSurface | None, variant: Tensor | None
+) -> Grid | RaycastSurface | None:
+    if isinstance(table, TriangleTable):
+        return table.prepared
+    if not isinstance(table, GridTable):
+        return table
+    if variant is None:
+        return Grid(table.values, 0, table.counts, split(table.origin[:, None]), table.cell[:, None])
+    origin, cell, num = table.origin[variant], table.cell[variant], table.num[variant]
+    return Grid(table.values, table.first[variant][:, None], split(num[:, None]), split(origin[:, None]), cell[:, None])
+
+
+def _chosen(array: Tensor, variant: Tensor | None) -> Tensor:
+    """Return an array with one row per environment, or a single one if it is the same in all."""
+    return array if variant is None else array[variant]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceGeom:
+    """A geom in its body's frame: MuJoCo's type name and size [m], position [m], rotation matrix."""
+
+    shape: str
+    size: Float[np.ndarray, " 3"]
+    pos: Float[np.ndarray, " 3"]
+    rotation: Float[np.ndarray, "3 3"]
+
+
+def geoms_of(table: GeomTable[np.ndarray], case: int, size: Float[np.ndarray, " 3"] | None = None) -> list[ReferenceGeom]:
+    """Return the geoms of a case of a table; with a size, that of its only geom [m]."""
+    found = []
+    for g, shape in enumerate(table.shapes):
+        if table.is_absent is None or not table.is_absent[case, g]:
+            own = np.asarray(table.size[case, g]) if size is None else size
+            found.append(ReferenceGeom(shape, own, table.pos[case, g], table.rotation[case, g].reshape(3, 3)))
+    return found
+
+
+def distance_to(geoms: Sequence[ReferenceGeom], point: Float[np.ndarray, " 3"]) -> tuple[float, Float[np.ndarray, " 3"]]:
+    """Return the signed distance [m] of a point in a body's frame to its geoms, and its gradient; the first of equals wins."""
+    least, outward = np.inf, np.zeros(3)
+    for geom in geoms:
+        phi, gradient = signed_distance(geom.shape, geom.size, geom.rotation.T @ (point - geom.pos))
+        if phi < least - TIE:
+            outward = geom.rotation @ gradient
+        least = min(phi, least)
+    return least, outward

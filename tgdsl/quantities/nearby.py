@@ -1,0 +1,167 @@
+"""What is near each probe: the moments of every object's surface, in the link's frame.
+
+Shapes: `env` environments, `taxel` probes, `case` 1, or `env` if the object differs between environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Rot, Vec
+from tgdsl.quantities.base import Request
+from tgdsl.quantities.moment_sums import MomentField, Moments, PointCloud, cloud_moments, field_moments, plane_moments
+from tgdsl.quantities.pairs import Motion, PairedObject, Pairs, gathered
+from tgdsl.tensors.operations import Operation
+
+
+class SurfaceMoments(NamedTuple):
+    """What is near each probe, in its link's frame; planes (env, taxel).
+
+    Attributes:
+        pos: Where the probes are [m], planes (taxel,).
+        none: Zero at each probe.
+        moments: Moments of each object's surface about each probe, by the object's name.
+        motions: Motion of each object relative to the link; empty if not asked for.
+        area: Area of each object's outer surface, planes left out [m²], (case, 1).
+    """
+
+    pos: Vec
+    none: Tensor
+    moments: dict[str, Moments]
+    motions: dict[str, Motion]
+    area: dict[str, Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class MomentsRequest(Request[SurfaceMoments]):
+    """Asks for moments of objects' surfaces, within the probes' own radii. They are never gated.
+
+    Attributes:
+        backend: "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
+        num_points: Points of each object.
+        tolerance: Root mean square error of a field as a fraction of full scale.
+        gradient_tolerance: Error that 99.9 % of S0's gradients by place may have, as a fraction of the largest; None: any.
+        max_bytes: Largest size of all fields of an object, or of its lists of points [bytes].
+        with_area: Whether the area of the felt objects is wanted, so that there must be one.
+        motion: Whether the objects' motions are asked for.
+    """
+
+    backend: Literal["field", "points"] = "field"
+    num_points: int = 5000
+    tolerance: float = 0.005
+    gradient_tolerance: float | None = None
+    max_bytes: int = 64 * 2**20
+    with_area: bool = False
+    motion: bool = False
+    is_within_radii: ClassVar[bool] = True
+
+    def merged(self, other: Request) -> MomentsRequest:
+        """Return a request for what both ask for: they are alike."""
+        return self
+
+
+class Plane(NamedTuple):
+    """A plane in its object's frame: rotates plane vectors, whose z is its normal, into it; its origin [m]."""
+
+    rotation: Rot
+    pos: Vec
+
+
+class MomentSource(NamedTuple):
+    """One object, and how its moments are found.
+
+    Attributes:
+        target: The object.
+        pair: Index of each probe's pair among its own.
+        radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on
+            the object itself.
+        shift: By how much that is more than the radius that a field is of [m], (env, taxel); None: nothing.
+        surface: Its outer surface but for planes; None if there is no more to it.
+        planes: Its planes.
+        area: Area of its outer surface, planes left out [m²].
+    """
+
+    target: PairedObject
+    pair: Int[Tensor, " taxel"]
+    radius: Float[Tensor, "*env taxel"]
+    shift: Float[Tensor, "env taxel"] | None
+    surface: MomentField | PointCloud | None
+    planes: tuple[Plane, ...]
+    area: Float[Tensor, "case 1"]
+
+
+def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> SurfaceMoments:
+    """Return the moments of objects about probes, their motions if pairs have them, and their areas.
+
+    Args:
+        pairs: Relative poses of all pairs of the plan.
+        pos: Where the probes are in their links' frames [m], planes (taxel,).
+        sources: The objects.
+    """
+    found: dict[str, Moments] = {}
+    motions: dict[str, Motion] = {}
+    for source in sources:
+        name, own = source.target.name, source.target.pairs
+        found[name] = FELT_MOMENTS(pairs, own, pos, source)
+        if pairs.motion is not None:
+            linear, angular, turn = (gathered(part, own, source.pair) for part in pairs.motion)
+            motions[name] = Motion(linear, angular, turn)
+    none = pairs.offset[0].new_zeros((pairs.offset[0].shape[0], pos[0].shape[0]))
+    return SurfaceMoments(pos, none, found, motions, {source.target.name: source.area for source in sources})
+
+
+def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
+    """Return the moments of an object at the probes, in their links' frames."""
+    rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
+    point = planes.add(planes.rotate(rotation, pos), gathered(pairs.offset, own, source.pair))
+    moments = _moments(point, source)
+    return Moments(moments.mass, planes.rotate_back(rotation, moments.first))
+
+
+def _moments(point: Vec, source: MomentSource) -> Moments:
+    """Return the moments of an object at points in its frame."""
+    parts = []
+    if isinstance(source.surface, MomentField):
+        near = field_moments(point, source.surface, source.shift)
+        if source.shift is not None:  # to first order S0 becomes negative near the edge of the sensing ball
+            near = near._replace(mass=torch.clamp(near.mass, min=0))
+        # The field knows no radius: an inactive probe asks one that is not its own.
+        is_active = source.radius > 0
+        none = torch.zeros_like(near.mass)
+        parts.append(Moments(torch.where(is_active, near.mass, 0.0), planes.where(is_active, near.first, (none, none, none))))
+    elif source.surface is not None:
+        parts.append(cloud_moments(point, source.surface, source.radius))
+    for plane in source.planes:
+        local = planes.rotate_back(plane.rotation, planes.sub(point, plane.pos))
+        near = plane_moments(local, source.radius)
+        parts.append(Moments(near.mass, planes.rotate(plane.rotation, near.first)))
+    mass, first = parts[0]
+    for part in parts[1:]:
+        mass, first = mass + part.mass, planes.add(first, part.first)
+    return Moments(mass, first)
+
+
+def _by_kernel(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
+    from tgdsl.quantities import nearby_kernel
+
+    assert isinstance(source.surface, MomentField)
+    return nearby_kernel.felt_moments(pairs, own, pos, source.pair, source.radius, source.shift, source.surface)
+
+
+def _inputs(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> list[Tensor]:
+    shift = [] if source.shift is None else [source.shift]
+    return [source.radius, *pos, *pairs.rotation, *pairs.offset, *shift]
+
+
+def _is_one_field(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> bool:
+    return isinstance(source.surface, MomentField) and not source.surface.is_smooth and not source.planes
+
+
+FELT_MOMENTS = Operation("felt_moments", felt_moments, _by_kernel, _inputs, _is_one_field)

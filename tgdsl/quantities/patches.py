@@ -1,0 +1,695 @@
+"""Contact patches: where and how widely links touch objects, and the heat that the objects hold.
+
+Shapes: `env` environments, or 1 where all are alike, `body` bodies that carry the sensor, `object` objects, in the order of the
+request, `choice` materials that one may have, `variant` its variants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
+from torch.nn.functional import pad
+
+from tgdsl.fields.indices import indices
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
+from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
+from tgdsl.quantities.contacts import SLOT_FIELDS, completed, is_counted
+from tgdsl.quantities.pairs import Pair, PairedObject
+from tgdsl.quantities.patch import CONTACT_PATCH, Contacts, Sides, cancelled
+from tgdsl.quantities.reference import ReferenceScene
+from tgdsl.surfaces.sensed import ObjectHeat
+
+
+@dataclass(frozen=True)
+class Topology:
+    """What is joined.
+
+    Attributes:
+        num_bodies: Number of bodies.
+        cells: How many cells each object has along each axis; all 1 if it has one temperature.
+        grids: The objects that are rows of their own.
+        lumped: The objects that are nodes.
+        links: For each object the body that it is, if it is a link of the sensor; else −1.
+        met: The (body, object) pairs that may meet.
+    """
+
+    num_bodies: int
+    cells: tuple[tuple[int, int, int], ...]
+    grids: tuple[int, ...]
+    lumped: tuple[int, ...]
+    links: tuple[int, ...]
+    met: tuple[tuple[int, int], ...]
+
+    @property
+    def num_objects(self) -> int:
+        """Number of objects."""
+        return len(self.cells)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether every object is a node: then a link's sides are its patches with the objects, in their order."""
+        return len(self.lumped) == self.num_objects
+
+    @property
+    def num_rows(self) -> int:
+        """Number of rows of cells."""
+        return self.num_bodies + len(self.grids)
+
+    @property
+    def interfaces(self) -> tuple[tuple[int, int], ...]:
+        """The pairs whose patch is a node of its own."""
+        return tuple(pair for pair in self.met if pair[1] not in self.lumped)
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes."""
+        return len(self.lumped) + len(self.interfaces)
+
+    def node_of(self, body: int, target: int) -> int:
+        """Return the node of a pair's patch."""
+        if target in self.lumped:
+            return self.lumped.index(target)
+        return len(self.lumped) + self.interfaces.index((body, target))
+
+    def sides(self) -> list[list[tuple[int, bool, int]]]:
+        """Return of each row its sides: the pair, counted body by body, whether it is the object's side, and the node."""
+        rows: list[list[tuple[int, bool, int]]] = [[] for _ in range(self.num_rows)]
+        for body, target in self.met:
+            pair, node = body * self.num_objects + target, self.node_of(body, target)
+            rows[body].append((pair, False, node))
+            if self.links[target] >= 0:
+                rows[self.links[target]].append((pair, True, node))
+            elif target in self.grids:
+                rows[self.num_bodies + self.grids.index(target)].append((pair, True, node))
+        return rows
+
+    def tables(self) -> dict[str, np.ndarray]:
+        """Return the sides as arrays of indices.
+
+        pair (row, slot), with the number of pairs where there is no side; is_object (row, slot); node (row, slot), 0 where
+        there is none; at_node (node, share), sides counted row by row, with their number where there is none; coupled (node,
+        node, share), pairs of slots counted row by row, with their number where there is none.
+        """
+        rows = self.sides()
+        count = max([len(row) for row in rows] + [1])
+        no_pair = self.num_bodies * self.num_objects
+        pair = np.full((self.num_rows, count), no_pair, dtype=np.int64)
+        is_object, node = np.zeros(pair.shape, dtype=np.int64), np.zeros(pair.shape, dtype=np.int64)
+        at: list[list[int]] = [[] for _ in range(self.num_nodes)]
+        coupled: dict[tuple[int, int], list[int]] = {}
+        for r, row in enumerate(rows):
+            for s, (own, is_objects, n) in enumerate(row):
+                pair[r, s], is_object[r, s], node[r, s] = own, is_objects, n
+                at[n].append(r * count + s)
+                for t, (_, _, m) in enumerate(row):
+                    if m != n:
+                        coupled.setdefault((n, m), []).append((r * count + s) * count + t)
+        shares = max([len(own) for own in at] + [1])
+        at_node = np.full((self.num_nodes, shares), pair.size, dtype=np.int64)
+        for n, own in enumerate(at):
+            at_node[n, : len(own)] = own
+        shares = max([len(own) for own in coupled.values()] + [0])
+        between = np.full((self.num_nodes, self.num_nodes, shares), pair.size * count, dtype=np.int64)
+        for (n, m), own in coupled.items():
+            between[n, m, : len(own)] = own
+        return {"pair": pair, "is_object": is_object, "node": node, "at_node": at_node, "coupled": between}
+
+
+class HeatOfObjects(NamedTuple):
+    """What objects are made of, planes (env, object).
+
+    Attributes:
+        start: Temperature at which an episode begins [°C]; without meaning where the object has none of its own.
+        has_start: 1 where it has.
+        conductivity: k [W/(m·K)].
+        volumetric_heat: ρc [J/(m³·K)].
+        emissivity: ε [1].
+        compliance: (1 − ν²)/E [1/Pa].
+        volume: [m³]; infinite for what keeps its temperature, such as a plane.
+        area: Outer surface [m²].
+        curvature: 1/R of the surface where it is touched [1/m]; 0 for what is flat.
+        size: Sides of the box of one that is divided into cells, planes (object,) each [m].
+        corner: Lowest corner of that box in the object's frame [m].
+    """
+
+    start: Tensor
+    has_start: Tensor
+    conductivity: Tensor
+    volumetric_heat: Tensor
+    emissivity: Tensor
+    compliance: Tensor
+    volume: Tensor
+    area: Tensor
+    curvature: Tensor
+    size: Vec
+    corner: Vec
+
+
+class ContactPatch(NamedTuple):
+    """Patches between each body and each object, planes (env, body, object); all zero where they do not touch.
+
+    Contacts count where their normal force is positive. The centre is that of these contacts, and the normal the direction of
+    the sum of their normals, both weighted by normal force; where the normals cancel, as of a link that is pinched from two
+    sides, that of the first of them.
+
+    Attributes:
+        force: Sum of the contacts' normal forces [N].
+        area: Area of the contact points' convex hull in the plane across the normal [m²]; 0 for fewer than three.
+        pos: Centre in the link's frame [m].
+        normal: Unit normal out of the object, in the link's frame.
+        object_pos: Centre in the object's frame [m]; None if no object there is divided into cells.
+        object_normal: Normal in the object's frame.
+        objects: What the objects are made of.
+        topology: Which patch joins what.
+        sides: `topology`'s tables.
+        cells: What a step needs of the boxes of objects with cells, see `cells.tables`.
+        boxes: Lowest and highest corner of each body's box, (body, 2, 3) in its frame [m].
+    """
+
+    force: Tensor
+    area: Tensor
+    pos: Vec
+    normal: Vec
+    object_pos: Vec | None
+    object_normal: Vec | None
+    objects: HeatOfObjects
+    topology: Topology
+    sides: Mapping[str, Tensor]
+    cells: Mapping[str, Tensor]
+    boxes: Float[Tensor, "body 2 3"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactPatches(Request[ContactPatch]):
+    """Asks for the patches.
+
+    Attributes:
+        slots: Contacts per body and object that make a patch.
+        boxes: Lowest and highest corner of each body's box in its frame, handed on (body, 2, 3) [m].
+        is_star: Whether the area is that of the paper's polygon, through all points in the order of their angles about the
+            centre, in place of their convex hull.
+        needs_stiffness: Whether each object has to be of a material whose Young's modulus is known.
+    """
+
+    slots: int
+    boxes: Float[np.ndarray, "body 2 3"]
+    is_star: bool
+    needs_stiffness: bool
+
+    @property
+    def wants_contacts(self) -> bool:  # type: ignore[override]
+        """Whether contacts are read: where there are objects."""
+        return bool(self.objects)
+
+    @property
+    def num_slots(self) -> int:
+        """Contacts per body and object that are read."""
+        return self.slots if self.objects else 0
+
+    def key(self) -> tuple[Any, ...]:
+        """Return what two requests have in common if they are one: each sensor has its own."""
+        return (type(self), self.objects, self.slots, self.is_star, self.boxes.tobytes())
+
+
+Array = TypeVar("Array")
+
+
+@dataclass(frozen=True, eq=False)
+class PatchesUse(Generic[Array]):
+    """One request.
+
+    Attributes:
+        topology: Which patch joins what.
+        is_star: See `ContactPatches`.
+        bodies: Indices of the sensor's bodies in the state, (body,); empty without objects.
+        pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
+        relations: The same pair among those of the Plan, or their number, (body, object).
+        boxes: Lowest and highest corner of each body's box (body, 2, 3) [m].
+        start: Temperature at which each object begins (object,) [°C], and `has_start` 1 where it has one.
+        has_start: See `start`.
+        materials: Conductivity [W/(m·K)], ρc [J/(m³·K)], emissivity [1] and compliance [1/Pa], (object, choice, 4).
+        shapes: Volume [m³], area [m²] and curvature [1/m], (object, variant, 3).
+        grids: Lowest corner of each object's box and its sides (object, 2, 3) [m].
+        variants: Where each object's variant is in the state's field; −1: all alike.
+        heated: Where each object is in the state's fields of heat; −1: it is not there.
+        has_own_start: Whether the state says at which temperature it begins.
+        num_materials: How many materials it may have.
+        sides: The tables of `topology`.
+        cells: What a step needs of the boxes of objects with cells, see `cells.tables`; empty if there are none.
+    """
+
+    topology: Topology
+    is_star: bool
+    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
+    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
+    relations: Array = field(metadata=indices(lambda use, part, plan: len(plan.pairs.link) + 1))
+    boxes: Array
+    start: Array
+    has_start: Array
+    materials: Array
+    shapes: Array
+    grids: Array
+    variants: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(plan.inputs.objects), least=-1))
+    heated: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(plan.inputs.heated), least=-1))
+    has_own_start: tuple[bool, ...]
+    num_materials: tuple[int, ...]
+    sides: Mapping[str, Array]
+    cells: Mapping[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class PatchesPart(Generic[Array]):
+    """All of it."""
+
+    uses: tuple[PatchesUse[Array], ...]
+
+
+FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
+"""Faces of a box, by the axis that they are across, and on which side."""
+
+
+def tables(
+    count: Int[np.ndarray, "row 3"],
+    size: Float[np.ndarray, "row 3"],
+    faces: Sequence[str] = FACES,
+    loss: Float[np.ndarray, "row 3"] | None = None,
+) -> dict[str, np.ndarray]:
+    """Return what a step needs of boxes.
+
+    `count`, `number` and `volume` of cells; by axis `ends`, how many exposed faces across it a cell has, `mode`, the modes,
+    their eigenvalues `square`, `smooth` with (kπ/n)² in place of 4 sin²(kπ/2n) in them, and the modes' sums over the cells
+    `total`.
+
+    Args:
+        count: Cells of each box along each axis.
+        size: Its sides [m].
+        faces: Its exposed faces.
+        loss: b of the exposed faces across each axis [1]; default: they are insulated.
+    """
+    loss = np.zeros(count.shape) if loss is None else loss
+    found = {"count": count.astype(np.float64)}
+    found |= {"number": found["count"].prod(axis=1), "volume": (size / count).prod(axis=1)}
+    for axis, name in enumerate("xyz"):
+        own = exposed_ends(count[:, axis], [face[0] for face in faces if face[1] == name])
+        vectors, values = modes(count[:, axis], own * loss[:, axis, None])
+        k = np.arange(values.shape[1])[None, :] / count[:, axis, None]
+        smooth = np.where(k < 1, values + (np.pi * k) ** 2 - 4.0 * np.sin(0.5 * np.pi * k) ** 2, 0.0)
+        sums = vectors.sum(axis=2)
+        if not (own * loss[:, axis, None]).any():
+            sums[:, 1:] = 0.0  # exactly: what insulated cells hold stays
+        found |= {f"ends_{name}": own, f"mode_{name}": vectors}
+        found |= {f"square_{name}": values, f"smooth_{name}": smooth, f"total_{name}": sums}
+    return found
+
+
+def is_cell(count: Int[np.ndarray, "row 3"]) -> Bool[np.ndarray, "row x y z"]:
+    """Return which cells there are, where rows are padded to as many as the one with most."""
+    along = [np.arange(count[:, axis].max(initial=1))[None, :] < count[:, axis, None] for axis in range(3)]
+    return along[0][:, :, None, None] & along[1][:, None, :, None] & along[2][:, None, None, :]
+
+
+def exposed_ends(count: Int[np.ndarray, " row"], sides: Sequence[str]) -> Float[np.ndarray, "row cell"]:
+    """Return how many exposed faces cells along an axis have across it, on the sides `-` and `+`."""
+    place = np.arange(count.max(initial=1))[None, :]
+    first, last = np.broadcast_to(place == 0, (len(count), place.size)), place == count[:, None] - 1
+    return np.sum([first if side == "-" else last for side in sides], axis=0, dtype=np.float64) + np.zeros(last.shape)
+
+
+def outer_areas(
+    count: Int[np.ndarray, "row 3"], size: Float[np.ndarray, "row 3"], faces: Sequence[str]
+) -> Float[np.ndarray, "row x y z"]:
+    """Return the area of each cell that lies on some faces of its box [m²]."""
+    there, step = is_cell(count), size / count
+    area = np.zeros(there.shape)
+    for axis, name in enumerate("xyz"):
+        ends = exposed_ends(count[:, axis], [face[0] for face in faces if face[1] == name])
+        shape = [len(count), 1, 1, 1]
+        shape[1 + axis] = -1
+        across = step[:, [a for a in range(3) if a != axis]].prod(axis=1)
+        area += ends.reshape(shape) * across[:, None, None, None] * there
+    return area
+
+
+def modes(
+    count: Int[np.ndarray, " row"], loss: Float[np.ndarray, "row cell"]
+) -> tuple[Float[np.ndarray, "row mode cell"], Float[np.ndarray, "row mode"]]:
+    """Return the modes along an axis, orthonormal, the slowest first and positive, and their eigenvalues μ [1].
+
+    Both are 0 where a row has fewer cells than another.
+
+    Args:
+        count: Cells of each row.
+        loss: What each cell loses at its exposed faces, b of each [1].
+    """
+    most = int(count.max(initial=1))
+    vectors, values = np.zeros((len(count), most, most)), np.zeros((len(count), most))
+    for row, n in enumerate(count.tolist()):
+        if loss[row, :n].any():
+            coupled = np.diff(np.eye(n), axis=0)
+            found = np.linalg.eigh(coupled.T @ coupled + np.diag(loss[row, :n]))[1].T
+            found *= np.where(found.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+            # By Rayleigh's quotient, a sum of positive numbers: a small loss keeps its digits.
+            values[row, :n] = (np.diff(found, axis=1) ** 2).sum(axis=1) + (loss[row, :n] * found**2).sum(axis=1)
+        else:
+            m, i = np.arange(n)[:, None], np.arange(n)[None, :] + 0.5
+            found = np.sqrt(np.where(m == 0, 1.0, 2.0) / n) * np.cos(np.pi * m * i / n)
+            values[row, :n] = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2
+        vectors[row, :n, :n] = found
+    return vectors, values
+
+
+HINT = "give it `material`, and `temperature` if it does not begin at the sensor's ambient"
+
+
+def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
+    """Return whether the objects of a use have heat that is this use's alone; note what is wrong."""
+    assert isinstance(use.request, ContactPatches)
+    is_well = True
+    for name in use.request.objects:
+        heat, others = planning.sensed[name].heat, [*([held[name]] if name in held else []), *use.sensors]
+        if heat is None:
+            planning.report(("objects", name), "it has no `material`, and a sensor of temperature feels it", HINT)
+        elif heat.cells and not np.isfinite(heat.volume).all():
+            planning.report(
+                ("objects", name, "cells"), "a plane is without bounds, and has one temperature", "leave `cells` out"
+            )
+        elif planning.sensed[name].body in {link.body for link in use.links} and (heat.cells or heat.temperature is not None):
+            which = "cells" if heat.cells else "temperature"
+            what = f"it is a link of the sensor, whose own {which} counts; its `material` says how stiff it is to touch"
+            planning.report(("objects", name, which), what, f"leave `{which}` out")
+        elif use.request.needs_stiffness and any(own.youngs_modulus is None for own in heat.materials):
+            what = "neither it nor a link that feels it has a `youngs_modulus`, from which the area of a contact follows"
+            planning.report(("objects", name, "material"), what, "give one, or the sensor's `contact_area`")
+        elif heat.cells and len(heat.volume) > 1:
+            planning.report(("objects", name, "cells"), "an object with variants has one temperature", "leave `cells` out")
+        elif is_counted(planning, name, use.request.objects):
+            planning.report(("objects", name), "it shares its geoms with another object that is felt", "one body has one heat")
+        elif len(others) > 1:
+            hint = "put their links into one sensor, with `materials` by link"
+            what = f'the sensors "{others[0]}" and "{others[1]}" both hold the heat of object "{name}"'
+            planning.report(("sensors", others[1], "feels"), what, hint)
+        else:
+            held[name] = use.sensors[0]
+            continue
+        is_well = False
+    return is_well
+
+
+def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
+    assert isinstance(use.request, ContactPatches)
+    names = use.request.objects
+    bodies = tuple(dict.fromkeys(link.body for link in use.links))
+    heats = [heat for name in names if (heat := planning.sensed[name].heat) is not None]
+    objects = [next((own for own in planning.objects if own.name == name), None) for name in names]
+    gate = {pair: i for i, pair in enumerate(planning.contact_pairs)}
+    order = {pair: i for i, pair in enumerate(planning.pairs)}
+    topology = _topology(planning, bodies, names, heats)
+    met = set(topology.met)
+
+    def table(index: dict[Pair, int]) -> np.ndarray:
+        rows = [
+            [index.get(Pair(body, name), len(index)) if (b, o) in met else len(index) for o, name in enumerate(names)]
+            for b, body in enumerate(bodies)
+        ]
+        return np.array(rows, dtype=np.int64).reshape(len(bodies), len(names))
+
+    choices, variants = (max([len(own) for own in part] + [1]) for part in _parts(heats))
+    return PatchesUse(
+        topology=topology,
+        is_star=use.request.is_star,
+        bodies=np.array([planning.bodies.index(b) for b in bodies if names], dtype=np.int64),
+        pairs=table(gate),
+        relations=table(order),
+        boxes=use.request.boxes,
+        start=np.array([heat.temperature or 0.0 for heat in heats]),
+        has_start=np.array([float(heat.temperature is not None) for heat in heats]),
+        materials=np.array([_padded([_thermal(m) for m in heat.materials], choices) for heat in heats]).reshape(-1, choices, 4),
+        shapes=np.array([_padded(_shapes(heat), variants) for heat in heats]).reshape(-1, variants, 3),
+        grids=np.array([_grid(heat) for heat in heats]).reshape(-1, 2, 3),
+        variants=tuple(-1 if own is None or own.num_variants == 1 else own.varied for own in objects),
+        heated=tuple(_place(planning, name, heat) for name, heat in zip(names, heats, strict=True)),
+        has_own_start=tuple(heat.is_per_env for heat in heats),
+        num_materials=tuple(len(heat.materials) for heat in heats),
+        sides=topology.tables(),
+        cells=_cells(topology, heats),
+    )
+
+
+def _topology(planning: Planning, bodies: Sequence[str], names: Sequence[str], heats: Sequence[ObjectHeat]) -> Topology:
+    links = [bodies.index(planning.sensed[name].body) if planning.sensed[name].body in bodies else -1 for name in names]
+    contact = set(planning.contact_pairs)
+    met: list[tuple[int, int]] = []
+    for b, body in enumerate(bodies):
+        for o, name in enumerate(names):
+            is_seen_already = links[o] >= 0 and any(
+                b == links[other] and links[o] == of for of, other in met if links[other] >= 0
+            )
+            if Pair(body, name) in contact and not is_seen_already:
+                met.append((b, o))
+    cells = tuple((1, 1, 1) if heat.cells is None else heat.cells for heat in heats)
+    grids = tuple(i for i, heat in enumerate(heats) if heat.cells is not None and links[i] < 0)
+    lumped = tuple(i for i in range(len(names)) if i not in grids and links[i] < 0)
+    return Topology(len(bodies), cells, grids, lumped, tuple(links), tuple(met))
+
+
+def _place(planning: Planning, name: str, heat: ObjectHeat) -> int:
+    """Return where an object is in the state's fields of heat, if they say anything of it; else −1."""
+    is_told = heat.is_per_env or len(heat.materials) > 1
+    return planning.heated.index(name) if is_told and name in planning.heated else -1
+
+
+def _parts(heats: Sequence[ObjectHeat]) -> tuple[list, list]:
+    return [heat.materials for heat in heats], [heat.volume for heat in heats]
+
+
+def _thermal(material) -> list[float]:  # type: ignore[no-untyped-def]
+    modulus, ratio = material.youngs_modulus, material.poissons_ratio
+    compliance = 0.0 if modulus is None else (1.0 - (ratio or 0.0) ** 2) / modulus
+    return [material.conductivity, material.density * material.specific_heat, material.emissivity, compliance]
+
+
+def _shapes(heat: ObjectHeat) -> list[list[float]]:
+    return [[float(v) for v in row] for row in zip(heat.volume, heat.area, heat.curvature, strict=True)]
+
+
+def _grid(heat: ObjectHeat) -> list[np.ndarray]:
+    size = np.asarray(heat.box_size[0], dtype=np.float64)
+    if not np.isfinite(size).all():
+        return [np.zeros(3), np.ones(3)]
+    return [np.asarray(heat.box_center[0]) - 0.5 * size, size]
+
+
+def _cells(topology: Topology, heats: Sequence[ObjectHeat]) -> dict[str, np.ndarray]:
+    count = np.array([topology.cells[i] for i in topology.grids], dtype=np.int64).reshape(-1, 3)
+    size = np.array([heats[i].box_size[0] for i in topology.grids], dtype=np.float64).reshape(-1, 3)
+    return tables(count, size) if len(count) else {}
+
+
+def _padded(rows: list[list[float]], count: int) -> list[list[float]]:
+    return [*rows, *[rows[0]] * (count - len(rows))]
+
+
+FIELDS = (*(f"contact_{name}" for name in ("force", "torque", "normal", "pos", "netforce")), "body_pos", "body_quat")
+"""Fields of the state that patches follow from."""
+
+
+def _patches(use: PatchesUse[Tensor], scene: Scene) -> ContactPatch:
+    objects, boxes = _objects(use, scene), use.boxes.to(scene.dtype)
+    cells = {name: table.to(scene.dtype) for name, table in use.cells.items()}
+    if not use.topology.met:
+        none = use.start.new_zeros((1, use.topology.num_bodies, use.topology.num_objects)).to(scene.dtype)
+        nowhere = (none, none, none)
+        return ContactPatch(none, none, nowhere, nowhere, None, None, objects, use.topology, use.sides, cells, boxes)
+    tensors, sides = scene.tensors, Sides(use.bodies, use.pairs, len(use.topology.met) == use.pairs.numel(), use.is_star)
+    force, area, centre, normal = CONTACT_PATCH(Contacts(*(tensors[name] for name in FIELDS)), sides, scene.dtype)
+    seen: tuple[Vec | None, Vec | None] = None, None
+    if use.topology.interfaces:
+        seen = _as_objects_see(use, scene, centre, normal)
+    return ContactPatch(force, area, centre, normal, *seen, objects, use.topology, use.sides, cells, boxes)
+
+
+def _as_objects_see(use: PatchesUse[Tensor], scene: Scene, centre: Vec, normal: Vec) -> tuple[Vec, Vec]:
+    """Return centres and normals in the frames of the objects."""
+    assert scene.pairs is not None
+
+    rotation = planes.rot(_pairs_of(use.relations, part) for part in scene.pairs.rotation)
+    offset = planes.vec(_pairs_of(use.relations, part) for part in scene.pairs.offset)
+    return planes.add(planes.rotate(rotation, centre), offset), planes.rotate(rotation, normal)
+
+
+def _pairs_of(relations: Tensor, plane: Tensor) -> Tensor:
+    """Return a plane (env, pair) as (env, body, object); 0 where they never meet."""
+    return pad(plane, (0, 1))[:, relations]
+
+
+def _objects(use: PatchesUse[Tensor], scene: Scene) -> HeatOfObjects:
+    """Return what the objects are made of, where they differ between environments."""
+    materials, shapes = use.materials.to(scene.dtype)[None], use.shapes.to(scene.dtype)[None]
+    start = use.start.to(scene.dtype)[None]
+    if any(use.has_own_start):
+        given = scene.tensors["object_temperature"].to(scene.dtype)
+        columns = [given[:, place] if own else None for place, own in zip(use.heated, use.has_own_start, strict=True)]
+        start = torch.stack([start[:, i].expand(len(given)) if c is None else c for i, c in enumerate(columns)], dim=1)
+    chosen = _chosen(materials, scene.tensors.get("object_material"), use.heated, use.num_materials)
+    counts = tuple(2 if place >= 0 else 1 for place in use.variants)
+    shaped = _chosen(shapes, scene.tensors.get("variant"), use.variants, counts)
+    grids = use.grids.to(scene.dtype)
+    corner, size = (planes.vec(grids[:, i, axis] for axis in range(3)) for i in range(2))
+    conductivity, volumetric_heat, emissivity, compliance = chosen.unbind(-1)
+    volume, area, curvature = shaped.unbind(-1)
+    made_of = (conductivity, volumetric_heat, emissivity, compliance, volume, area, curvature)
+    return HeatOfObjects(start, use.has_start.to(scene.dtype)[None], *made_of, size, corner)
+
+
+def _chosen(values: Tensor, which: Tensor | None, places: tuple[int, ...], counts: tuple[int, ...]) -> Tensor:
+    """Return values (1, object, choice, n) as (env, object, n), of the choice that each environment has."""
+    if which is None or not any(count > 1 and place >= 0 for place, count in zip(places, counts, strict=True)):
+        return values[:, :, 0]
+    columns = []
+    for i, (place, count) in enumerate(zip(places, counts, strict=True)):
+        is_chosen = count > 1 and place >= 0
+        columns.append(values[0, i][which[:, place].long()] if is_chosen else values[:, i, 0].expand(len(which), -1))
+    return torch.stack(columns, dim=1)
+
+
+@dataclass(frozen=True)
+class ReferencePatch:
+    """One patch: normal force [N], area [m²], centre [m] and normal, in the link's frame and in the object's."""
+
+    force: float
+    area: float
+    pos: Float[np.ndarray, " 3"]
+    normal: Float[np.ndarray, " 3"]
+    object_pos: Float[np.ndarray, " 3"]
+    object_normal: Float[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceObject:
+    """What an object is made of, see `HeatOfObjects`; `start` is None where it has no temperature of its own."""
+
+    start: float | None
+    conductivity: float
+    volumetric_heat: float
+    emissivity: float
+    compliance: float
+    volume: float
+    area: float
+    curvature: float
+    corner: Float[np.ndarray, " 3"]
+    size: Float[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePatches:
+    """All patches that there are, by (body, object), and what they are between."""
+
+    patches: dict[tuple[int, int], ReferencePatch]
+    objects: tuple[ReferenceObject, ...]
+    topology: Topology
+    boxes: Float[np.ndarray, "body 2 3"]
+
+
+def _reference_patch(scene: ReferenceScene, b: int, name: str, pair: int, is_star: bool) -> ReferencePatch | None:
+    link = scene.body(scene.layout.bodies[b])
+    target = scene.object_body(next(own for own in scene.objects if own.name == name))
+    slots = zip(*(scene.fields[field][pair] for field in SLOT_FIELDS), strict=True)
+    used = completed([list(row) for row in slots if np.any(row[1:])], scene.fields["contact_netforce"][pair])
+    pressing = [(pos, float(force @ normal), normal) for pos, force, _, normal in used if not force @ normal <= 0]
+    if not pressing:
+        return None
+    weights = np.array([force for _, force, _ in pressing])
+    pos = np.average([pos for pos, _, _ in pressing], axis=0, weights=weights)
+    normal = np.average([normal for _, _, normal in pressing], axis=0, weights=weights)
+    if np.linalg.norm(normal) < cancelled():
+        normal = pressing[0][2]
+    normal = normal / np.linalg.norm(normal)
+    area = _area([point - pos for point, _, _ in pressing], normal, is_star)
+    frames = [(body.rotation.T @ (pos - body.pos), body.rotation.T @ normal) for body in (link, target)]
+    return ReferencePatch(float(weights.sum()), area, *frames[0], *frames[1])
+
+
+def _area(points: list[np.ndarray], normal: np.ndarray, is_star: bool) -> float:
+    """Return the area of points about the origin across the normal [m²]: of their hull, or in the order of their angles."""
+    one = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    one /= np.linalg.norm(one)
+    flat = np.array([[point @ one, point @ np.cross(normal, one)] for point in points])
+    if not is_star:
+        try:
+            return ConvexHull(flat).volume
+        except QhullError:  # fewer than three points, or all on a line
+            return 0.0
+    flat = flat[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]), kind="stable")]
+    after = np.roll(flat, -1, axis=0)
+    return max(0.0, 0.5 * float(np.sum(flat[:, 0] * after[:, 1] - flat[:, 1] * after[:, 0])))
+
+
+def _reference_object(use, i: int, scene: ReferenceScene) -> ReferenceObject:  # type: ignore[no-untyped-def]
+    start = float(use.start[i]) if use.has_start[i] else None
+    if use.has_own_start[i]:
+        start = float(scene.fields["object_temperature"][use.heated[i]])
+    material = int(scene.fields["object_material"][use.heated[i]]) if use.num_materials[i] > 1 else 0
+    variant = int(scene.fields["variant"][use.variants[i]]) if use.variants[i] >= 0 else 0
+    corner, size = use.grids[i]
+    k, heat, emissivity, compliance = use.materials[i, material].tolist()
+    volume, area, curvature = use.shapes[i, variant].tolist()
+    return ReferenceObject(start, k, heat, emissivity, compliance, volume, area, curvature, corner, size)
+
+
+class _Patches(Quantity):
+    name, request, part = "patches", ContactPatches, PatchesPart
+    has_rows = True
+    is_fused = True
+
+    def plan(self, planning: Planning, uses: Sequence[Use]) -> PatchesPart[np.ndarray]:
+        held: dict[str, str] = {}
+        found = []
+        for use in uses:
+            if _check(planning, use, held):
+                found.append(_use(planning, use))
+        return PatchesPart(tuple(found))
+
+    def gather(self, part: PatchesPart[Tensor], scene: Scene) -> tuple[ContactPatch, ...]:
+        return tuple(_patches(use, scene) for use in part.uses)
+
+    def reference(self, part: PatchesPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferencePatches:
+        own, found = part.uses[use], {}
+        for b, o in own.topology.met:
+            patch = _reference_patch(scene, b, scene.contact_pairs[own.pairs[b, o]].object, int(own.pairs[b, o]), own.is_star)
+            if patch is not None:
+                found[b, o] = patch
+        objects = tuple(_reference_object(own, i, scene) for i in range(own.topology.num_objects))
+        return ReferencePatches(found, objects, own.topology, own.boxes)
+
+    def fields(self, part: PatchesPart) -> set[str]:
+        wanted = (
+            {"contact_found", "contact_netforce", *SLOT_FIELDS} if any(use.topology.num_objects for use in part.uses) else set()
+        )
+        if any(any(use.has_own_start) for use in part.uses):
+            wanted.add("object_temperature")
+        if any(count > 1 for use in part.uses for count in use.num_materials):
+            wanted.add("object_material")
+        return wanted
+
+    def bodies(self, use: Use) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(link.body for link in use.links)) if use.request.objects else ()
+
+    def num_rows(self, part: PatchesPart, use: int) -> int:
+        cells = part.uses[use].topology.cells
+        most = [max(own[axis] for own in cells) if cells else 1 for axis in range(3)]
+        return len(cells) * most[0] * most[1] * most[2]
+
+    def explain(self, part: PatchesPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
+        own = part.uses[use].topology
+        return [f"contact patches with {own.num_objects} objects"] if own.num_objects else []
+
+
+PATCHES = _Patches()

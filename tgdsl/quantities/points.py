@@ -1,0 +1,425 @@
+"""Points that are sampled on objects, where links see them, and how deep they are in the links' own surfaces.
+
+Shapes: `env` environments, `link` links that may meet one object, `point` points of it, `case` 1, or `env` if the object
+differs between environments, `tile` groups of taxels that a GPU's kernel takes at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.errors import BakeError, LowerError
+from tgdsl.fields.indices import indices
+from tgdsl.geometry import planes
+from tgdsl.geometry.grid import Grid
+from tgdsl.geometry.planes import Vec, vec
+from tgdsl.layout.layout import Link
+from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use, pairs_for, variant_of
+from tgdsl.quantities.geoms import Geoms, GeomTable, account_of_geoms, body_distance, distance_to, geoms_of, link_geoms, united
+from tgdsl.quantities.pairs import Pair, PairedObject, Pairs
+from tgdsl.quantities.reference import ReferenceScene
+from tgdsl.surfaces.sensed import DistanceOptions, SensedObject
+from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.operations import Operation
+
+LINKS = DistanceOptions()
+"""How the distance to links' own surfaces is found."""
+
+
+SMALLEST_TILE, LARGEST_TILE = 32, 128
+"""Numbers of taxels of a tile."""
+
+
+class PointSource(NamedTuple):
+    """The points of one object, and the links that they may meet.
+
+    Attributes:
+        object: The object's name.
+        pair: Index of the pair of each link and the object.
+        taxels: First of each link's taxels, and one beyond the last.
+        tiles: What `point_tiles` returns of them.
+        points: Places in the object's frame [m].
+        area: Surface that each stands for [m²].
+        links: The links' own surfaces, each in the frame of its body: an object whose cases are links.
+    """
+
+    object: str
+    pair: Int[Tensor, " link"]
+    taxels: tuple[tuple[int, int], ...]
+    tiles: Int[Tensor, "tile 3"]
+    points: tuple[Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"]]
+    area: Float[Tensor, "case 1"]
+    links: Geoms
+
+
+class LinkPoints(NamedTuple):
+    """Points sampled on one object, as the links that they may meet see them; planes (env, link, point), in each link's frame.
+
+    Attributes:
+        taxels: First of each link's taxels, and one beyond the last.
+        tiles: What `points.point_tiles` returns of them.
+        pos: Where they are now [m]; a compiler stores them.
+        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed, and maybe where it is beyond what
+            the sensors asked for.
+        gradient: Its unit gradient.
+        area: Surface of the object that each stands for [m²], (case, 1).
+    """
+
+    taxels: tuple[tuple[int, int], ...]
+    tiles: Int[Tensor, "tile 3"]
+    pos: Vec
+    distance: Tensor
+    gradient: Vec
+    area: Tensor
+
+
+class ObjectPoints(NamedTuple):
+    """The points of one object, and the pairs by which links see them, gated as these are."""
+
+    pairs: Pairs
+    source: PointSource
+
+
+def link_points(own: ObjectPoints) -> LinkPoints:
+    """Return where the points are, and how deep in the links' surfaces."""
+    pairs, source = own
+    rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
+    offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
+    pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
+    distance, gradient = body_distance(pos, source.links)
+    if pairs.gate is not None:
+        distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
+    return LinkPoints(source.taxels, source.tiles, planes.vec(map(materialised, pos)), distance, gradient, source.area)
+
+
+def point_tiles(taxels: Sequence[tuple[int, int]], num_taxels: int) -> list[tuple[int, int, int]]:
+    """Return tiles that cover all taxels of a query: the number of a link, −1 for none, its first taxel, one beyond the last.
+
+    Args:
+        taxels: First of each link's taxels, and one beyond the last.
+        num_taxels: Number of the query's taxels.
+    """
+    size, found, end = tile_size(taxels), [], 0
+    owners = sorted((first, last, link) for link, (first, last) in enumerate(taxels))
+    for first, last, link in [*owners, (num_taxels, num_taxels, -1)]:
+        found += [(-1, start, min(start + size, first)) for start in range(end, first, size)]
+        found += [(link, start, min(start + size, last)) for start in range(first, last, size)]
+        end = last
+    return found
+
+
+def tile_size(taxels: Sequence[tuple[int, int]]) -> int:
+    """Return the largest number of taxels of a tile, a power of two."""
+    most = max([1, *[last - first for first, last in taxels]])
+    return min(max(1 << (most - 1).bit_length(), SMALLEST_TILE), LARGEST_TILE)
+
+
+def _by_kernel(own: ObjectPoints) -> LinkPoints:
+    """One geom of the links after the other."""
+    from tgdsl.quantities.points_kernel import meet
+
+    pairs, source = own
+    found = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]
+    distance, gradient = united([geom[1:] for geom in found], source.links.is_absent)
+    return LinkPoints(source.taxels, source.tiles, found[0][0], distance, gradient, source.area)
+
+
+def _inputs(own: ObjectPoints) -> list[Tensor]:
+    (rotation, offset, _, _), source = own
+    return [*rotation, *offset, *source.points, source.links.pos, source.links.rotation]
+
+
+def are_grids(own: ObjectPoints) -> bool:
+    """Return whether all geoms of the links are grids."""
+    return all(isinstance(surface, Grid) for surface in own.source.links.surfaces)
+
+
+LINK_POINTS = Operation("meet", link_points, _by_kernel, _inputs, are_grids)
+
+
+@dataclass(frozen=True, eq=False)
+class Points(Request[dict[str, ObjectPoints]]):
+    """Asks for points of objects. Where a gate is closed they are nowhere: their distance is +∞.
+
+    Attributes:
+        num_points: Points of each object.
+        range: Distance from a link's surface up to which it is needed [m].
+    """
+
+    num_points: int = 5000
+    range: float = 0.0
+
+
+Array = TypeVar("Array")
+
+
+@dataclass(frozen=True, eq=False)
+class CloudPart(Generic[Array]):
+    """The points of one object.
+
+    Attributes:
+        object: The object: its place in the Plan.
+        points: Places in its body's frame [m], (3, variant, point).
+        area: Surface that each stands for [m²], (variant,).
+    """
+
+    object: int = field(metadata=indices(lambda cloud, part, plan: len(plan.objects)))
+    points: Array
+    area: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MetObject(Generic[Array]):
+    """An object of a use, and the links that may meet it.
+
+    Attributes:
+        cloud: Number of its cloud.
+        links: The links: indices into `PointsPart.links`.
+        taxels: First of each link's taxels among the use's, and one beyond the last.
+        pair: Index of the pair of each link and the object among all pairs, (link,).
+        link: `links` as an array, (link,).
+        tiles: What `points.point_tiles` returns of the taxels, (tile, 3).
+    """
+
+    cloud: int = field(metadata=indices(lambda met, part, plan: len(part.clouds)))
+    links: tuple[int, ...] = field(metadata=indices(lambda met, part, plan: len(part.links)))
+    taxels: tuple[tuple[int, int], ...] = field(metadata=indices(lambda met, part, plan: plan.layout.num_taxels + 1))
+    pair: Array = field(metadata=indices(lambda met, part, plan: len(plan.pairs.link)))
+    link: Array = field(metadata=indices(lambda met, part, plan: len(part.links)))
+    tiles: Array = field(
+        metadata=indices(lambda met, part, plan: [len(met.links), *[plan.layout.num_taxels + 1] * 2], least=-1)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PointsUse(Generic[Array]):
+    """One request: its objects, and whether they are felt only in contact."""
+
+    is_gated: bool
+    objects: tuple[MetObject[Array], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PointsPart(Generic[Array]):
+    """All of it.
+
+    Attributes:
+        links: Names of the links whose own surfaces points are measured against.
+        surfaces: Their geoms: a case for each link; None if there is none.
+        clouds: The objects' points.
+        uses: The uses.
+    """
+
+    links: tuple[str, ...]
+    surfaces: GeomTable[Array] | None
+    clouds: tuple[CloudPart[Array], ...]
+    uses: tuple[PointsUse[Array], ...]
+
+
+def _source(part: PointsPart[Tensor], met: MetObject[Tensor], scene: Scene) -> PointSource:
+    """Return the points of an object, and the links that they may meet."""
+    cloud = part.clouds[met.cloud]
+    target = scene.objects[cloud.object]
+    points, area, variant = cloud.points, cloud.area, variant_of(scene, target)
+    if variant is not None:
+        points, area = points[:, variant], area[variant]
+    assert part.surfaces is not None
+    places = vec(points[:, :, None].unbind())
+    links = link_geoms(part.surfaces, met.link)
+    return PointSource(target.name, met.pair, met.taxels, met.tiles, places, area[:, None], links)
+
+
+def _with_lost(pairs: Pairs) -> Pairs:
+    """Return pairs that are nowhere, their offset not-a-number, where their gate is not-a-number."""
+    if pairs.gate is None:
+        return pairs
+    lost = pairs.gate.clamp(min=0.0)  # zero where it is a number
+    return pairs._replace(offset=planes.vec(part + lost for part in pairs.offset))
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePoints:
+    """Points sampled on one object, in the frame of one link that they may meet: a row of `points.LinkPoints` as arrays.
+
+    Attributes:
+        taxels: The link's taxels.
+        pos: Where they are [m].
+        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed.
+        gradient: Its unit gradient.
+        area: Surface that each stands for [m²].
+    """
+
+    taxels: Int[np.ndarray, " own"]
+    pos: Float[np.ndarray, "point 3"]
+    distance: Float[np.ndarray, " point"]
+    gradient: Float[np.ndarray, "point 3"]
+    area: float
+
+
+class _Points(Quantity):
+    name, request, part = "points", Points, PointsPart
+    has_rows = True
+
+    def plan(self, planning: Planning, uses: Sequence[Use]) -> PointsPart[np.ndarray]:
+        """Return the part of the Plan; an object or a link without a surface is a mistake."""
+        from tgdsl.quantities.bake import geom_table  # compilers alone bake meshes
+
+        clouds = _clouds(planning, uses)
+        links = _links(planning, uses)
+        numbers = {key: i for i, key in enumerate(clouds)}
+        return PointsPart(
+            links=tuple(links),
+            surfaces=geom_table(list(links.values())) if links else None,
+            clouds=tuple(clouds.values()),
+            uses=tuple(_use(planning, use, numbers, list(links)) for use in uses),
+        )
+
+    def gather(self, part: PointsPart[Tensor], scene: Scene) -> tuple[dict[str, ObjectPoints], ...]:
+        found = []
+        for use in part.uses:
+            pairs = _with_lost(pairs_for(scene, use.is_gated))
+            sources = [_source(part, met, scene) for met in use.objects]
+            found.append({source.object: ObjectPoints(pairs, source) for source in sources})
+        return tuple(found)
+
+    def reference(self, part: PointsPart[np.ndarray], use: int, scene: ReferenceScene) -> tuple[ReferencePoints, ...]:
+        own, layout = part.uses[use], scene.layout
+        numbers = {link.name: (i, link.body) for i, link in enumerate(layout.links)}
+        found = []
+        for met in own.objects:
+            cloud = part.clouds[met.cloud]
+            target = scene.objects[cloud.object]
+            body, variant = scene.object_body(target), scene.variant(target)
+            world = cloud.points[:, variant].T @ body.rotation.T + body.pos
+            area = float(cloud.area[variant])
+            for row in met.links:
+                assert part.surfaces is not None
+                i, name = numbers[part.links[row]]
+                link, geoms = scene.body(name), geoms_of(part.surfaces, row)
+                pos = (world - link.pos) @ link.rotation
+                phi, gradient = (np.array(one) for one in zip(*(distance_to(geoms, z) for z in pos), strict=True))
+                if own.is_gated and not scene.is_touching(name, target.name):
+                    phi = np.full(len(pos), np.inf)
+                found.append(ReferencePoints(np.flatnonzero(layout.link_id == i), pos, phi, gradient, area))
+        return tuple(found)
+
+    def fields(self, part: PointsPart) -> set[str]:
+        return {"contact_found"} if any(use.is_gated for use in part.uses) else set()
+
+    def num_rows(self, part: PointsPart, use: int) -> int:
+        return sum(part.clouds[met.cloud].points.shape[2] * len(met.links) for met in part.uses[use].objects)
+
+    def explain(self, part: PointsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
+        lines = []
+        for met in part.uses[use].objects:
+            cloud, links = part.clouds[met.cloud], ", ".join(part.links[i] for i in met.links)
+            lines.append(f"{cloud.points.shape[2]} points of {objects[cloud.object].name} against {links}")
+        return lines
+
+    def account(self, part: PointsPart, objects: Sequence[PairedObject]) -> dict[str, list[str]]:
+        lines = [] if part.surfaces is None else account_of_geoms(part.surfaces, [f"link {name}" for name in part.links])
+        return {"meshes": lines} if lines else {}
+
+
+POINTS = _Points()
+
+
+def _request(use: Use) -> Points:
+    assert isinstance(use.request, Points)
+    return use.request
+
+
+def _clouds(planning: Planning, uses: Sequence[Use]) -> dict[tuple[int, str], CloudPart[np.ndarray]]:
+    """Return the points of all objects, by their number and the object."""
+    found: dict[tuple[int, str], CloudPart[np.ndarray]] = {}
+    for use in uses:
+        num_points = _request(use).num_points
+        for i, name in enumerate(use.request.objects):
+            number = planning.object_id(name)
+            if (num_points, name) in found or number is None:
+                continue
+            planning.progress(f"object {name}: points on its surface")
+            try:
+                found[num_points, name] = cloud(planning.sensed[name], num_points, number)
+            except LowerError as error:
+                planning.report(("sensors", use.sensors[0], "feels", i), error.what, error.hint)
+    return found
+
+
+def cloud(sensed: SensedObject, num_points: int, number: int) -> CloudPart[np.ndarray]:
+    """Return the points of an object.
+
+    Raises:
+        LowerError: If it has no surface of a fixed size to sample ("feels").
+    """
+    from tgdsl.quantities.moment_fields import sample_points
+
+    if sensed.is_sized:
+        what = f'the size of body "{sensed.body}" is given per environment, and points are sampled beforehand'
+        raise LowerError(what, "feels", "use `variants` for the sizes that it has, or `anchors: taxels`")
+    if any(geom.shape == "plane" for geoms in sensed.variants for geom in geoms):
+        what = f'body "{sensed.body}" has a plane, which has no end, so no points can be sampled on it'
+        raise LowerError(what, "feels", "use `anchors: taxels`, which take hold of any surface, or a box instead of the plane")
+    try:
+        sampled = [sample_points(geoms, num_points) for geoms in sensed.variants]
+    except BakeError as error:
+        raise LowerError(f'body "{sensed.body}": {error}', "feels") from error
+    points = np.stack([pos.T for pos, _ in sampled], axis=1)
+    return CloudPart(number, points, np.array([area / num_points for _, area in sampled]))
+
+
+def _links(planning: Planning, uses: Sequence[Use]) -> dict[str, list[Any]]:
+    """Return how the distance to each link's own surface is found."""
+    from tgdsl.quantities.bake import geom_distance
+
+    found: dict[str, list[Any]] = {}
+    for use in uses:
+        for link in use.links:
+            if link.name in found:
+                continue
+            planning.progress(f"link {link.name}: distances")
+            try:
+                margin = _margin(planning, link, uses)
+                geoms = planning.geoms_of(link.name)
+                found[link.name] = [geom_distance(geom, LINKS, margin, f"link {link.name}") for geom in geoms]
+            except BakeError as error:
+                place = ("sensors", use.sensors[0], "links")
+                planning.report(place, f'link "{link.name}": {error}', "or use `anchors: taxels`")
+    return found
+
+
+def _margin(planning: Planning, link: Link, uses: Sequence[Use]) -> float:
+    """Return the largest distance from a link's own surface that any sensor on it asks for [m].
+
+    Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
+    """
+    found = []
+    for use in uses:
+        if link in use.links:
+            found += [_request(use).range, float(planning.layout.radius[use.taxels].max())]
+    return max(found)
+
+
+def _use(planning: Planning, use: Use, clouds: dict[tuple[int, str], int], links: Sequence[str]) -> PointsUse[np.ndarray]:
+    request, layout = _request(use), planning.layout.take(use.taxels)
+    active = [i for i in range(len(layout.links)) if (layout.radius[layout.link_id == i] > 0).any()]
+    allowed, found = planning.allowed(request), []
+    for name in request.objects:
+        own = [i for i in active if Pair(layout.links[i].body, name) in allowed and layout.links[i].name in links]
+        number = clouds.get((request.num_points, name))
+        if not own or number is None:
+            continue
+        pair = [planning.pairs.index(Pair(layout.links[i].body, name)) for i in own]
+        places = [np.flatnonzero(layout.link_id == i) for i in own]
+        taxels = tuple((int(part[0]), int(part[-1]) + 1) for part in places)
+        met = tuple(links.index(layout.links[i].name) for i in own)
+        tiles = np.array(point_tiles(taxels, len(use.taxels)), dtype=np.int32).reshape(-1, 3)
+        found.append(MetObject(number, met, taxels, np.array(pair), np.array(met), tiles))
+    return PointsUse(request.is_gated, tuple(found))
