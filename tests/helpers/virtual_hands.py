@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from tgdsl.runtime.xhand1 import driver, reader, step_timer
+from tgdsl.runtime.xhand1 import driver, reader, source
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
@@ -182,7 +182,7 @@ def virtual_hand(
 ) -> Iterator[tuple[XHand1, VirtualPort, VirtualTime]]:
     """Open a hand as `XHand1.open` does, its line and its clock virtual."""
     time, timing = VirtualTime(), timing or SerialTiming()
-    for module in (driver, reader, step_timer):
+    for module in (driver, reader, source):
         monkeypatch.setattr(module, "time", time)
     port = VirtualPort(EmulatedWire(hand or EmulatedHand(), Faults(), BAUD, turnaround_s, seed), time)
 

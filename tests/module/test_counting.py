@@ -5,7 +5,7 @@ import math
 import torch
 
 from tgdsl.geometry.bvh import TriangleMesh, nearest
-from tgdsl.module.counting import OperationCounter
+from tgdsl.module.explain import OperationCounter
 
 
 def counted(compute) -> int:

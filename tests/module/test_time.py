@@ -10,7 +10,7 @@ import torch
 from pressed_probes import pad, pressed, ramp
 
 from tgdsl.errors import StateError
-from tgdsl.module.reading import _phase
+from tgdsl.module.sensing import _phase
 
 LATE = {"read_delay": "25 ms"}
 

@@ -10,7 +10,7 @@ import mujoco_warp
 import pytest
 
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.warp.private import TRIED, constraint_contact_bit, contact_force_function
+from tgdsl.runtime.warp.contacts import TRIED, constraint_contact_bit, contact_force_function
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -51,7 +51,7 @@ def test_the_reader_of_private_names(tmp_path, text, is_private):
 
 
 def test_nothing_else_touches_private_parts():
-    beside = {"tgdsl/runtime/warp/private.py", Path(__file__).relative_to(REPOSITORY).as_posix()}
+    beside = {"tgdsl/runtime/warp/contacts.py", Path(__file__).relative_to(REPOSITORY).as_posix()}
     folders = ("tgdsl", "tests", "benchmarks", "examples", "robots")
     files = {
         file.relative_to(REPOSITORY).as_posix(): file for folder in folders for file in (REPOSITORY / folder).rglob("*.py")

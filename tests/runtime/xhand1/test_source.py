@@ -9,15 +9,14 @@ from xhand1_hands import PATIENT, wait_until
 
 from tgdsl.errors import StateError
 from tgdsl.runtime.source import Source
-from tgdsl.runtime.xhand1 import step_timer
+from tgdsl.runtime.xhand1 import source as step_timer
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.body import TipForces
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.source import XHand1Source
-from tgdsl.runtime.xhand1.step_timer import RealTime
+from tgdsl.runtime.xhand1.source import RealTime, XHand1Source
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogError
 

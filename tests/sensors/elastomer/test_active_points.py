@@ -7,8 +7,7 @@ import torch
 from tgdsl.geometry.planes import vec
 from tgdsl.quantities.points import point_tiles
 from tgdsl.sensors.elastomer import point_anchors
-from tgdsl.sensors.elastomer.active_points import active_points, are_compacted, block_size
-from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad
+from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad, active_points, are_compacted, block_size
 
 FALLOFF, NUM_MARKERS, TAXELS = 2000.0, 11, ((6, 10), (0, 6), (10, 10))
 """Markers of three links, of which one has none; the last marker is of no link."""

@@ -5,6 +5,7 @@ Shapes: `env` environments, `nq`, `nv` and `nu` as in MuJoCo's model.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
@@ -12,12 +13,14 @@ from typing import Any, TypeVar, Unpack
 
 import mujoco
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.errors import SimulationError
+from tgdsl.errors import SimulationError, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.controls import write_controls
 from tgdsl.runtime.simulators.claims import release
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
@@ -25,12 +28,130 @@ from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.objects.choices import ObjectChoices, Values
 from tgdsl.runtime.simulators.objects.heat import EnvHeat
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
-from tgdsl.runtime.simulators.saving import load_state, saved_state
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
-from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
-from tgdsl.runtime.simulators.substep_states import SubstepStates
+from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.watch import Watched, WatchReader
-from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
+from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, env_mask
+
+
+def saved_state(
+    arrays: Mapping[str, Tensor],
+    heat: Mapping[str, Tensor],
+    properties: ObjectProperties,
+    start: StartContacts,
+    faults: EnvFaults,
+) -> dict[str, Tensor]:
+    """Return copies of a simulation's state by name."""
+    is_placed, values = start.placed
+    found = {f"state/{name}": arrays[name] for name in INTEGRATED} | dict(heat)
+    found |= {f"properties/{name}": value for name, value in properties.fields().items()}
+    if is_placed is not None:
+        found |= {"start/is_placed": is_placed} | {f"start/{name}": value for name, value in values.items()}
+    return {name: value.clone() for name, value in (found | {"faults/counts": faults.counts}).items()}
+
+
+def load_state(
+    saved: Mapping[str, Tensor],
+    arrays: Mapping[str, Tensor],
+    heat: Mapping[str, Tensor],
+    properties: ObjectProperties,
+    start: StartContacts,
+    faults: EnvFaults,
+    forward: Callable[[], None],
+) -> None:
+    """Put a simulation into a saved state, and evaluate poses and contacts there.
+
+    Raises:
+        SimulationError: If it is that of another simulation; nothing has changed.
+    """
+    wanted = {f"state/{name}": arrays[name] for name in INTEGRATED} | {**heat, "faults/counts": faults.counts}
+    wrong = [name for name, now in wanted.items() if name not in saved or saved[name].shape != now.shape]
+    if wrong:
+        raise SimulationError(f"this is the state of another simulation: {listed(wrong)} missing or of another shape")
+    own = {part: _below(saved, part) for part in ("properties", "start")}
+    properties.set_fields(own["properties"])
+    with torch.no_grad():
+        for name, now in wanted.items():
+            now.copy_(saved[name])
+        faults.clear(torch.ones_like(faults.mask))
+    forward()
+    is_placed = own["start"].pop("is_placed", None)
+    device = faults.counts.device
+    start.placed = None if is_placed is None else (is_placed.to(device), {n: v.to(device) for n, v in own["start"].items()})
+
+
+def _below(saved: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    return {name.removeprefix(f"{part}/"): value for name, value in saved.items() if name.startswith(f"{part}/")}
+
+
+class SubstepStates:
+    """Copies of the states after each physics step of the last control step but for the last one."""
+
+    def __init__(self, inputs: Inputs):
+        """Begin: no step was made yet."""
+        self._wanted = inputs.substeps
+        self._earlier: list[SceneState] = []
+        self._restarted: Bool[Tensor, " env"] | None = None
+
+    @property
+    def are_wanted(self) -> bool:
+        """Whether the module has sensors that are advanced at each physics step."""
+        return self._wanted > 1
+
+    def begin(self, substeps: int) -> None:
+        """Forget the last control step; the next one has so many physics steps.
+
+        Raises:
+            SimulationError: If the module wants another number.
+        """
+        if substeps != self._wanted:
+            steps = f"{self._wanted} physics step{'' if self._wanted == 1 else 's'}"
+            what = f"this module has sensors that are advanced at {steps} per call"
+            raise SimulationError(
+                f"{what}, and this simulation makes {substeps} per control step; simulate with substeps={self._wanted}"
+            )
+        self._earlier, self._restarted = [], None
+
+    def note(self, state: SceneState) -> None:
+        """Keep a copy of the state after a physics step."""
+        values = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+        copies: dict[str, Any] = {name: v.clone() if isinstance(v, Tensor) else v for name, v in values.items()}
+        self._earlier.append(SceneState(**copies))
+
+    def restart(self, chosen: Bool[Tensor, " env"]) -> None:
+        """Note environments that have begun a new episode since: what was before is none of theirs."""
+        if self._earlier:
+            self._restarted = chosen.clone() if self._restarted is None else self._restarted | chosen
+
+    def stepped(self, restarted: Bool[Tensor, " env"]) -> None:
+        """Note that a captured step has written the states anew, and which environments it has started anew.
+
+        A replayed graph runs no Python: neither `begin` nor `restart`.
+        """
+        if self._earlier:
+            self._restarted = restarted.clone()
+
+    def added_to(self, state: SceneState) -> SceneState:
+        """Return a state with the earlier ones; in environments that have just begun an episode they are as it is."""
+        if not self.are_wanted:
+            return state
+        if not self._earlier:
+            return dataclasses.replace(state, substeps=(state,) * (self._wanted - 1))
+        restarted = self._restarted
+        earlier = self._earlier if restarted is None else [_mixed(restarted, state, then) for then in self._earlier]
+        return dataclasses.replace(state, substeps=tuple(earlier))
+
+
+def _mixed(chosen: Bool[Tensor, " env"], now: SceneState, then: SceneState) -> SceneState:
+    """Return the state of now in some environments, and that of then in the others."""
+    mixed: dict[str, Any] = {}
+    for field in dataclasses.fields(SceneState):
+        new, old = getattr(now, field.name), getattr(then, field.name)
+        if isinstance(new, Tensor):
+            old = torch.where(broadcast_over(chosen.to(new.device), new), new, old)
+        mixed[field.name] = old
+    return SceneState(**mixed)
+
 
 T = TypeVar("T")
 

@@ -6,12 +6,13 @@ per environment and sensor, each contact matched with each sensor, a sort.
 Shapes: `env` environments, `pair` and `slot` as the module's `inputs` list them, `sensor` sensors of a model.
 """
 
-# pyright: reportInvalidTypeForm=false
 from __future__ import annotations
 
 import functools
 import math
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from importlib.metadata import version
 from typing import Any, no_type_check
 
 import mujoco
@@ -20,12 +21,51 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tgdsl.errors import SimulationError
 from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.runtime.simulators.model_ids import part_geoms
-from tgdsl.runtime.warp.private import constraint_contact_bit, contact_force_function
 from tgdsl.runtime.warp.stream import libraries
+
+TRIED = ("3.17.0",)
+"""Versions of MuJoCo Warp that have these parts as they are used here."""
+
+
+def contact_force_function(mjw: Any) -> Any:
+    """Return the Warp function of a contact's force and torque in its frame, for use inside a kernel.
+
+    The public `mujoco_warp.contact_force` is a kernel's launch over a list of contacts: a kernel can call a function, but no
+    kernel, and to launch both would need the list, and memory for its answers, on the device.
+
+    Raises:
+        SimulationError: If this version has none.
+    """
+    return _part(mjw, "support.contact_force_fn")
+
+
+def constraint_contact_bit(mjw: Any) -> int:
+    """Return the bit of `Contact.type` of contacts that carry force, rather than those that only sensors look for.
+
+    `Contact.type` is public, the enumeration of its values is not.
+
+    Raises:
+        SimulationError: If this version has none.
+    """
+    return int(_part(mjw, "types.ContactType.CONSTRAINT"))
+
+
+def _part(mjw: Any, path: str) -> Any:
+    try:
+        return reduce(getattr, path.split("."), mjw._src)
+    except AttributeError as error:
+        tried = ", ".join(TRIED)
+        what = f"MuJoCo Warp {version('mujoco-warp')} has no `{path}`, which contacts are read with"
+        raise SimulationError(f"{what}; tried was {tried}") from error
+
+
+# pyright: reportInvalidTypeForm=false
+
 
 _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", "contact_netforce")
 """Fields of vectors, in the order of the kernel's arguments."""

@@ -11,29 +11,174 @@ from typing import Any, TypeVar
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.runtime.simulators.bodies import warn_of_mocap
+from tgdsl.plan.inputs import Inputs
+from tgdsl.runtime.simulators.bodies import BodyFields, warn_of_mocap
 from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.joint_fields import JointColumns
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects.heat import EnvHeat
-from tgdsl.runtime.simulators.objects.properties import PER_ENV
+from tgdsl.runtime.simulators.objects.properties import (
+    MASS_FIELDS,
+    PER_ENV,
+    ObjectProperties,
+    RigidObject,
+    refuse_other_fields,
+)
 from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
 from tgdsl.runtime.simulators.watch import Watch, WatchReader, merged_joints
+from tgdsl.runtime.warp.contacts import PairContacts
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
-from tgdsl.runtime.warp.properties import WorldProperties
-from tgdsl.runtime.warp.reading import StateReader
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.options import Options
-from tgdsl.tensors.env_ids import EnvIds, env_mask
+from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_mask
+
+
+class StateReader:
+    """Gathers the fields of a state by index, on the device."""
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        model: mujoco.MjModel,
+        sources: Mapping[str, Tensor],
+        kept: Mapping[str, Tensor],
+        contacts: PairContacts | None = None,
+    ):
+        """Look up where everything is.
+
+        Args:
+            inputs: What the module wants.
+            model: The scene.
+            sources: The arrays that `STATE_ARRAYS` names and those of `joint_fields.FORCES`, (env, …).
+            kept: The arrays of joints and actuators at the state's instant, (env, …).
+            contacts: The contacts that are wanted; default: none.
+
+        Raises:
+            SimulationError: If the model lacks a body, a joint or an actuator.
+        """
+        self._sources, self._contacts = sources, contacts
+        device = sources["xpos"].device
+        self._bodies = BodyFields(
+            inputs,
+            model,
+            index=lambda ids: torch.from_numpy(ids).to(device),
+            take=lambda array, ids: array[:, ids],
+            cross=torch.linalg.cross,
+        )
+        indices = JointColumns.of(inputs, model)
+        self._joints = {
+            name: ({**sources, **kept}[array], torch.from_numpy(indices.by_array[array]).to(device))
+            for name, array in indices.fields.items()
+        }
+
+    def read(self) -> dict[str, Tensor]:
+        """Return the fields of a state that are poses, velocities, contacts or joints, each a tensor of its own."""
+        values = self._bodies.read(self._sources) | ({} if self._contacts is None else self._contacts.read())
+        values |= {name: array[:, columns] for name, (array, columns) in self._joints.items()}
+        return values
+
+
+class WorldProperties(ObjectProperties):
+    """Masses and frictions of objects, changed on the device without waiting."""
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        model: mujoco.MjModel,
+        bodies_of: Mapping[str, str],
+        num_envs: int,
+        device: torch.device,
+    ):
+        """Begin: all environments are as the scene has them.
+
+        Args:
+            parameters: The fields that environments have of their own, (env, …).
+            model: The scene.
+            bodies_of: Body of each of the document's objects.
+            num_envs: Number of environments.
+            device: Where physics runs.
+        """
+        super().__init__(model, bodies_of, num_envs, device)
+        self._fields = parameters
+        self._indices: dict[tuple[str, str], Tensor] = {}
+        self._plain: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
+
+    def renew(self) -> None:
+        """Take what objects now are like as what masses are changed from: after others were chosen."""
+        for parts in self._plain.values():
+            for array, columns, value in parts:
+                value.copy_(array[:, columns])
+
+    def fields(self) -> dict[str, Tensor]:
+        """Return what environments have of their own: see `ObjectProperties.fields`."""
+        return dict(self._fields)
+
+    def set_fields(self, fields: Mapping[str, Tensor]) -> None:
+        """Give environments fields of their own: see `ObjectProperties.set_fields`."""
+        refuse_other_fields(fields, self._fields)
+        for name, value in fields.items():
+            self._fields[name].copy_(value)
+
+    def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
+        self._check("mass")
+        if not target.is_tree:
+            what = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
+            raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
+        own, inertia, subtree, body, dof = (self._fields[name] for name in MASS_FIELDS)
+        bodies, above, dofs = (self._index(target, name, own.device) for name in ("bodies", "above", "dofs"))
+        parts = [(own, bodies), (inertia, bodies), (subtree, bodies), (body, bodies), (dof, dofs)]
+        if target.name not in self._plain:  # what masses are changed from each time: rounding would add up
+            self._plain[target.name] = [(array, columns, array[:, columns].clone()) for array, columns in parts]
+        plain = [value for _, _, value in self._plain[target.name]]
+        before = own[:, bodies].sum(dim=1)
+        factor = mass.to(own.dtype) / plain[0].sum(dim=1)
+        scales = (factor, factor, factor, 1.0 / factor, 1.0 / factor)
+        for (array, columns), value, scale in zip(parts, plain, scales, strict=True):
+            new = value * scale.view(-1, *[1] * (value.ndim - 1))
+            array[:, columns] = torch.where(broadcast_over(mask, new), new, array[:, columns])
+        subtree[:, above] = subtree[:, above] + (own[:, bodies].sum(dim=1) - before)[:, None]
+
+    def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
+        self._check("friction")
+        own = self._fields["geom_friction"]
+        geoms = self._index(target, "geoms", own.device)
+        own[:, geoms, 0] = torch.where(mask[:, None], friction.to(own.dtype)[:, None], own[:, geoms, 0])
+
+    def _mass(self, target: RigidObject) -> Float[Tensor, " env"]:
+        own = self._values("body_mass")
+        return own[:, self._index(target, "bodies", own.device)].sum(dim=1)
+
+    def _friction(self, target: RigidObject) -> Float[Tensor, " env"]:
+        own = self._values("geom_friction")
+        return own[:, self._index(target, "geoms", own.device), 0].amax(dim=1)
+
+    def _values(self, field: str) -> Float[Tensor, "env ..."]:
+        """Return what each environment has of a field of the model, also where all share it."""
+        if field in self._fields:
+            return self._fields[field]
+        shared = torch.from_numpy(getattr(self._model, field)).to(self._device, torch.float32)
+        return shared.expand(self._num_envs, *shared.shape)
+
+    def _check(self, word: str) -> None:
+        if not self._fields.keys() >= set(PER_ENV[word]):
+            raise SimulationError(f'environments share each {word}; simulate(..., per_env=("{word}",)) gives them their own')
+
+    def _index(self, target: RigidObject, name: str, device: torch.device) -> Tensor:
+        key = (target.name, name)
+        if key not in self._indices:
+            self._indices[key] = torch.from_numpy(getattr(target, name)).to(device)
+        return self._indices[key]
+
 
 T = TypeVar("T")
 
