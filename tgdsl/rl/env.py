@@ -32,6 +32,7 @@ from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
 from tgdsl.rl.task import Now
+from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_hold
 from tgdsl.tensors.fused import FusedCall
 from tgdsl.tensors.threads import one_thread
@@ -361,6 +362,11 @@ class TouchEnv:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
         rates = self.task.rates(now, terminated)
+        for name, term in self.loaded.terms.items():
+            if isinstance(term, RewardTerm):
+                rates[name] = self._checked(name, term.weight * term.rate(now, self.task.setup), terminated)
+            elif isinstance(term, TerminationTerm):
+                terminated = terminated | self._checked(name, term.is_over(now, self.task.setup), terminated)
         earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self._control_step).float()
         reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
         self._episodes.add(tuple(rates), earned, reward)
@@ -374,6 +380,18 @@ class TouchEnv:
         ended = terminated | truncated
         info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults.clone())
         return Step(obs, reward, terminated, truncated, info)
+
+    def _checked(self, name: str, value: Tensor, like: Tensor, ndim: int = 1) -> Tensor:
+        """Return what a term returns, (env,) or (env, feature).
+
+        Raises:
+            SimulationError: If it is of another shape.
+        """
+        if not isinstance(value, Tensor) or value.ndim != ndim or len(value) != len(like):
+            found = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            expected = f"({len(like)},)" if ndim == 1 else f"({len(like)}, …)"
+            raise SimulationError(f'the term "{name}" returns {found}, expected a tensor {expected}')
+        return value
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
         """Return the instant that readings are of."""
@@ -403,4 +421,6 @@ class TouchEnv:
         exact = groups.proprio(now)
         proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
         own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
+        terms = {name: term for name, term in self.loaded.terms.items() if isinstance(term, ObservationTerm)}
+        own |= {name: self._checked(name, term.observe(now, self.task.setup), proprio, ndim=2) for name, term in terms.items()}
         return {name: value.to(self.device, torch.float32) for name, value in (own | self.task.told(now, own)).items()}

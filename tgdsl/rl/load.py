@@ -6,20 +6,22 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
+from tgdsl.rl.terms import TERMS, RewardTerm, Term
 from tgdsl.schema.load import read_source
 from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Path as Place
 from tgdsl.schema.yaml import Source, from_mapping
 
+C = TypeVar("C")
 REQUIRED = ("tgdsl", "task", "document", "object", "joints")
 
 
@@ -32,12 +34,19 @@ class LoadedTask:
         task: The task's class.
         source: Its text's values and places.
         folder: Folder that file names in it are relative to.
+        terms: Terms that it adds to the task, by name.
     """
 
     spec: TaskSpec
     task: type[Task[Any]]
     source: Source
     folder: Path
+    terms: Mapping[str, Term] = field(default_factory=dict)
+
+    @property
+    def senses(self) -> tuple[str, ...]:
+        """Kinds of sensors that task and terms look at."""
+        return tuple(dict.fromkeys(kind for part in (self.task, *self.terms.values()) for kind in part.senses))
 
     def error(self, place: Place, what: str, hint: str = "") -> SpecError:
         """Return the error of a mistake at a place of the document."""
@@ -71,38 +80,66 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
     task = _task_class(source, folder)
     problems: list[Problem] = list(source.problems)
     spec = validate(source, (), task.Spec, problems, REQUIRED)
+    terms = _terms(source, folder, spec, problems) if isinstance(spec, TaskSpec) else {}
     if problems or not isinstance(spec, TaskSpec):
         raise SpecError(problems)
-    return LoadedTask(spec, task, source, folder)
+    return LoadedTask(spec, task, source, folder, terms)
+
+
+def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]) -> dict[str, Term]:
+    """Return the terms that a document adds; note what is wrong with them."""
+    terms = {}
+    for name, value in spec.terms.items():
+        place = ("terms", name)
+        try:
+            class_ = _class_of(source, folder, (*place, "term"), str(value.get("term", name)), Term, TERMS, "terms")
+        except SpecError as error:
+            problems += error.problems
+            continue
+        term = validate(source, place, class_, problems, ())
+        if isinstance(term, RewardTerm) and hasattr(getattr(spec, "rewards", None), name):
+            problems.append(source.problem(place, f'the task has a term "{name}"', f"set `rewards.{name}`", on_key=True))
+        elif isinstance(term, Term):
+            terms[name] = term
+    return terms
 
 
 def _task_class(source: Source, folder: Path) -> type[Task[Any]]:
-    """Return the class that a document's `task` names.
-
-    Raises:
-        SpecError: If there is none.
-    """
     name = source.value["task"]
     if name in TASKS:
         place, class_ = TASKS[name]
         return getattr(importlib.import_module(place), class_)
+    return _class_of(source, folder, ("task",), name, Task, TASKS, "tasks")
+
+
+def _class_of(
+    source: Source, folder: Path, place: Place, name: str, base: type[C], known: Mapping[str, Any], which: str
+) -> type[C]:
+    """Return the class that a document names: of `known`, or as `package.module:Class` or `file.py:Class`.
+
+    Raises:
+        SpecError: If there is none.
+    """
     module, colon, class_ = name.partition(":")
+    if name in known:
+        return known[name]
     if not colon:
-        hint = f"{did_you_mean(name, TASKS, 'tasks')}; one of your own is package.module:Class or file.py:Class"
-        raise SpecError([source.problem(("task",), f'there is no task "{name}"', hint)])
+        hint = f"{did_you_mean(name, known, which)}; one of your own is package.module:Class or file.py:Class"
+        raise SpecError([source.problem(place, f'there is no {which[:-1]} "{name}"', hint)])
     try:
         own = _own_module(module, folder)
     except Exception as error:  # whatever a user's code raises
-        place = f"{raised_at(str((folder / module).resolve()), error)}: " if module.endswith(".py") else ""
-        what = f'cannot import "{name}": {place}{type(error).__name__}: {error}'
-        raise SpecError([source.problem(("task",), what)]) from error
+        line = f"{raised_at(str((folder / module).resolve()), error)}: " if module.endswith(".py") else ""
+        what = f'cannot import "{name}": {line}{type(error).__name__}: {error}'
+        raise SpecError([source.problem(place, what)]) from error
     found = getattr(own, class_, None)
     if found is None:
-        tasks = [key for key, value in vars(own).items() if isinstance(value, type) and issubclass(value, Task)]
-        hint = did_you_mean(class_, tasks, "tasks in it")
-        raise SpecError([source.problem(("task",), f'{module} has no class "{class_}"', hint)])
-    if not (isinstance(found, type) and issubclass(found, Task)):
-        raise SpecError([source.problem(("task",), f'"{name}" is no subclass of tgdsl.rl.task.Task')])
+        classes = [key for key, value in vars(own).items() if isinstance(value, type) and issubclass(value, base)]
+        raise SpecError(
+            [source.problem(place, f'{module} has no class "{class_}"', did_you_mean(class_, classes, f"{which} in it"))]
+        )
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise SpecError([source.problem(place, f'"{name}" is no subclass of {base.__module__}.{base.__name__}')])
     return found
 
 

@@ -138,7 +138,7 @@ def compile_sensed(
     """
     spec, file, document = loaded.spec, loaded.folder / loaded.spec.document, sensors_document(loaded)
     kinds = _kinds(document)
-    senses = loaded.task.senses if only is None else only
+    senses = loaded.senses if only is None else only
     of_policy = [] if only is not None or spec.touch == "none" else [spec.touch]
     types = of_policy if feels is None else [each.type for each in feels]
     sensor = _sensors_of(loaded, kinds, {"task": senses, "touch": [SENSED[type_][0] for type_ in types]})

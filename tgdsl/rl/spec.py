@@ -153,6 +153,8 @@ class TaskSpec(SpecModel):
     """How an action is understood."""
     randomise: RandomSpec = RandomSpec()
     """What is random at each reset."""
+    terms: dict[str, dict[str, Any]] = {}
+    """Terms of reward, reasons to end and groups of observations that are added to the task's: see `tgdsl.rl.terms`."""
     train: TrainSpec = TrainSpec()
     """How a policy is learned: `tgdsl train`."""
     distill: DistillSpec = DistillSpec()

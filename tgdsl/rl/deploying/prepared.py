@@ -5,6 +5,7 @@ Shapes: `actuator` actuators of the scene.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -162,7 +163,7 @@ def prepare(
 
 def _with(loaded: LoadedTask, values: Mapping[str, Any]) -> LoadedTask:
     """Return a document with other values."""
-    return LoadedTask(loaded.spec.model_copy(update=dict(values)), loaded.task, loaded.source, loaded.folder)
+    return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=dict(values)))
 
 
 def _default_groups(loaded: LoadedTask) -> list[str]:
@@ -201,7 +202,7 @@ def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple
         spec = loaded.task.asked_for(loaded.spec, tuple(goal))
     except LowerError as error:
         raise DeployError(f"goal: {error} (`{error.field}` of the task's document)") from error
-    return LoadedTask(spec, loaded.task, loaded.source, loaded.folder), tuple(goal)
+    return dataclasses.replace(loaded, spec=spec), tuple(goal)
 
 
 def _taxels(loaded: LoadedTask, sensed: Sensed, feels: Sequence[Felt]) -> str:

@@ -5,6 +5,7 @@ Shapes: `env` environments, `joint` joints that the policy moves.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -120,4 +121,4 @@ def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:
     """Return the task of a policy that feels one thing, in environments of its own."""
     chosen = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
     spec = loaded.spec.model_copy(update=chosen)
-    return LoadedTask(spec, loaded.task, loaded.source, loaded.folder)
+    return dataclasses.replace(loaded, spec=spec)

@@ -1,0 +1,147 @@
+"""Terms that a document adds to its task: rewards, reasons to end, groups of observations; a user's own from a file."""
+
+import numpy as np
+import pytest
+import torch
+from tiny_tasks import tiny_env, write_task
+
+from tgdsl.errors import SimulationError, SpecError
+from tgdsl.rl.load import load_task
+
+OWN = '''
+import torch
+from tgdsl.fields.models import PositiveLength
+from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.task import Start, Task
+from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
+
+class Height(RewardTerm):
+    """Height of the object over `floor` [m]."""
+    floor: PositiveLength = 0.01
+
+    def rate(self, now, setup):
+        return now.object.pos[:, 2] - self.floor
+
+class Turned(TerminationTerm):
+    """A joint is beyond `most`."""
+    most: float
+
+    def is_over(self, now, setup):
+        return (now.joint_pos > self.most).any(dim=1)
+
+class Squares(ObservationTerm):
+    def observe(self, now, setup):
+        return now.joint_pos.square()
+
+class Idle(Task):
+    Spec = TaskSpec
+    score_unit = "none"
+
+    def reset(self, chosen, episode):
+        return Start({"qpos": self.setup.qpos.expand(self.setup.num_envs, -1)})
+
+    def advance(self, now):
+        pass
+
+    def is_over(self, now):
+        return torch.zeros_like(now.friction, dtype=torch.bool)
+
+    def reward(self, now, is_over):
+        return {"nothing": torch.zeros_like(now.friction)}
+
+    def observe(self, now):
+        return {}
+
+    def score(self):
+        return torch.zeros(self.setup.num_envs)
+
+class Wrong(RewardTerm):
+    def rate(self, now, setup):
+        return now.joint_pos
+'''
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    return tmp_path
+
+
+def test_terms_add_to_reward_end_and_observations(folder):
+    more = """terms:
+  height: {term: "own.py:Height", weight: -2, floor: 2 cm}
+  hurry: {term: object_speed, weight: -0.5, free_speed: 1 mm/s, free_spin: 0.01}
+  turned: {term: "own.py:Turned", most: 0.3}
+  squares: {term: "own.py:Squares"}
+"""
+    env, plain = tiny_env(folder, more=more), tiny_env(folder)
+    rng = torch.Generator().manual_seed(1)
+    ended = torch.zeros(4, dtype=torch.bool)
+    for _ in range(20):
+        action = 2 * torch.rand((4, 2), generator=rng) - 1
+        action[0] = 1.0  # the first environment's joints go up until the episode ends
+        made, other = env.step(action), plain.step(action)
+        if (ended | made.info.ended).any():
+            ended |= made.terminated
+            break
+        pos, speed, spin = (env.now.object.pos, env.now.object.linvel.norm(dim=1), env.now.object.angvel.norm(dim=1))
+        expected = {
+            "height": -2 * (pos[:, 2] - 0.02),
+            "hurry": -0.5 * ((speed / 1e-3 - 1).clamp(min=0) + (spin / 0.01 - 1).clamp(min=0)),
+        }
+        for name, rate in expected.items():
+            np.testing.assert_allclose(made.info.terms[name], env.control_step * rate, rtol=1e-5, atol=1e-9)
+        added = sum(made.info.terms[name] for name in expected)
+        np.testing.assert_allclose(made.reward - other.reward, added, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(made.obs["squares"], env.now.joint_pos.square(), rtol=1e-6)
+    assert ended[0]
+
+
+def test_a_saved_environment_goes_on_with_its_terms(folder):
+    more = 'terms: {height: {term: "own.py:Height", weight: 1}, squares: {term: "own.py:Squares"}}\n'
+    env, again = tiny_env(folder, more=more), tiny_env(folder, more=more)
+    action = torch.full((4, 2), 0.3)
+    env.step(action)
+    again.load_state_dict(env.state_dict())
+    one, two = env.step(action), again.step(action)
+    assert torch.equal(one.reward, two.reward) and torch.equal(
+        one.info.episode_terms["height"], two.info.episode_terms["height"]
+    )
+
+
+def test_terms_bring_the_sensors_that_they_look_at(folder):
+    env = tiny_env(folder, task="own.py:Idle", more="terms: {near: {weight: 1}}\n")
+    assert env.now.distance.shape[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("terms", "line", "path", "says"),
+    [
+        ("{efort: {weight: 1}}", 8, "terms.efort.term", 'there is no term "efort"; did you mean "effort"?'),
+        ("{a: {term: efort, weight: 1}}", 8, "terms.a.term", 'did you mean "effort"?'),
+        ("{a: {term: contact_force}}", 8, "terms.a", 'missing key "weight"'),
+        ("{a: {term: contact_force, weight: 1, max_forse: 2 N}}", 8, "terms.a.max_forse", 'did you mean "max_force"?'),
+        ("{a: {term: contact_force, weight: 1, max_force: 2 mm}}", 8, "terms.a.max_force", "unit of force"),
+        ("{near: {weight: 1}}", 8, "terms.near", "set `rewards.near`"),
+        ("{a: {term: 'own.py:Hight', weight: 1}}", 8, "terms.a.term", 'did you mean "Height"?'),
+        ("{a: {term: 'nowhere.py:A', weight: 1}}", 8, "terms.a.term", "there is no such file"),
+        ("{a: {term: 'pathlib:Path'}}", 8, "terms.a.term", "no subclass of tgdsl.rl.terms.Term"),
+        ("{a: 3}", 8, "terms.a", "expected a mapping"),
+    ],
+)
+def test_what_is_wrong_with_a_term_is_told_at_its_place(folder, terms, line, path, says):
+    with pytest.raises(SpecError) as caught:
+        load_task(write_task(folder, more=f"terms: {terms}\n"))
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.path) == (line, path)
+    assert says in f"{problem.what}; {problem.hint}"
+
+
+def test_values_are_set_by_dotted_path(folder):
+    task = write_task(folder, more="terms: {effort_: {term: speed_limit, max_speed: 1 m/s}}\n")
+    assert load_task(task, {"terms.effort_.max_speed": "3 cm/s"}).terms["effort_"].max_speed == pytest.approx(0.03)
+
+
+def test_a_term_of_the_wrong_shape_is_named(folder):
+    with pytest.raises(SimulationError, match=r'the term "odd" returns shape \(4, 2\), expected a tensor \(4,\)'):
+        tiny_env(folder, more='terms: {odd: {term: "own.py:Wrong", weight: 1}}\n').step(torch.zeros(4, 2))
