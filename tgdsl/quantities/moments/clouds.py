@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from tgdsl.errors import BakeError
 from tgdsl.files import cache
@@ -128,6 +127,8 @@ def _lists(
     points: Float[np.ndarray, "n 3"], origin: np.ndarray, num: tuple[int, int, int], cell: float, reach: float, budget: int
 ) -> np.ndarray | int:
     """Return for each cube the points within reach of any place in it; or the size of that [bytes] if it is over the budget."""
+    from scipy.spatial import KDTree
+
     index = np.stack(np.unravel_index(np.arange(np.prod(num)), num), axis=1)
     middle = origin + cell * (index + 0.5)
     tree = KDTree(points)

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.ndimage import spline_filter
 
 from tgdsl.errors import BakeError
 from tgdsl.files import cache
@@ -318,6 +317,8 @@ def _fitted(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x 
 
 def _splines(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x y z channel"]:
     """Return the factors of the quadratic B-splines whose sum equals the values at the nodes; zero in the two outer layers."""
+    from scipy.ndimage import spline_filter
+
     found = np.zeros_like(values)
     within = (slice(2, -2),) * 3
     for channel in range(values.shape[3]):

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import map_coordinates
 
 from tgdsl.quantities.moments.part import CloudTable, FieldTable, MomentsPart, MomentTable
 from tgdsl.quantities.reference import ReferenceScene
@@ -63,6 +61,8 @@ def reference(part: MomentsPart[np.ndarray], use: int, scene: ReferenceScene) ->
 
 def _splines(factors: np.ndarray, place: np.ndarray) -> float:
     """Return a sum of quadratic B-splines about nodes at a place in cells, clamped to half a cell within the border."""
+    from scipy.ndimage import map_coordinates
+
     place = np.clip(place, 0.5, np.array(factors.shape) - 1.5)
     return float(map_coordinates(factors, place[:, None], order=2, prefilter=False, mode="nearest")[0])
 
@@ -99,6 +99,8 @@ class ReferenceTable:
         values = field.values[first : first + num.prod()].reshape(*num, 4).astype(np.float64)
         if field.is_smooth:
             return lambda point: np.array([_splines(part, (point - origin) / cell) for part in np.moveaxis(values, 3, 0)])[None]
+        from scipy.interpolate import RegularGridInterpolator
+
         axes = [start + cell * np.arange(count) for start, count in zip(origin, num, strict=True)]
         return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=0.0)
 
