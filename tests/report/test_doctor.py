@@ -134,7 +134,13 @@ def test_the_command(monkeypatch, capsys):
     Doctor(json=True).run()
     assert json.loads(capsys.readouterr().out)["system"]["tgdsl"] == importlib.metadata.version("tgdsl")
     broken = doctor.Installation(
-        sound.system, (Package("numpy", "1.0", ">=2.0", ""),), {"cpu": ""}, COMPILERS, {"egl": True}, {"/nowhere": None}, told_of(sound)
+        sound.system,
+        (Package("numpy", "1.0", ">=2.0", ""),),
+        {"cpu": ""},
+        COMPILERS,
+        {"egl": True},
+        {"/nowhere": None},
+        told_of(sound),
     )
     monkeypatch.setattr(doctor, "examine", lambda: broken)
     with pytest.raises(SystemExit) as stopped:

@@ -244,7 +244,7 @@ def findings(
     setting = os.environ.get("MUJOCO_GL", OPENGL[0])
     if not drawn_by.get(setting, True):
         others = [f"MUJOCO_GL={name}" for name, draws in drawn_by.items() if draws]
-        then = f"set {others[0]}" if others else "install libegl1, with a GPU's driver, or libosmesa6; pictures of `run` need none"
+        then = f"set {others[0]}" if others else "install libegl1 or libosmesa6; pictures of `tgdsl run` need none"
         found.append(Finding("missing", f"no OpenGL by MUJOCO_GL={setting}: `tgdsl play --video` is refused", then))
     order: tuple[Level, ...] = ("fault", "slower", "missing", "note")
     return tuple(sorted(found, key=lambda finding: order.index(finding.level)))

@@ -18,7 +18,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.runtime.controls import write_controls
+from tgdsl.runtime.controls import warn_of_range, write_controls
 from tgdsl.runtime.simulators.claims import release
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
@@ -62,6 +62,7 @@ class Simulation(ABC):
     _objects: ObjectChoices | None = None
     _watch: WatchReader | None = None
     _is_closed = False
+    _has_warned_of_range = False
 
     @property
     @abstractmethod
@@ -136,7 +137,7 @@ class Simulation(ABC):
 
         Args:
             control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were. Those on a GPU
-                are checked there.
+                are checked there. MuJoCo clips them to their ranges; one on the host that is far beyond is warned of.
 
         Raises:
             SimulationError: If controls do not fit, or a pool of MuJoCo Warp was too small; and with `on_fault="raise"` if
@@ -388,6 +389,7 @@ class Simulation(ABC):
         if control is None:
             return
         self._faults.note(BAD_CONTROL, write_controls(control, self.ctrl, self._faults.on_fault == "raise"))
+        self._has_warned_of_range = self._has_warned_of_range or warn_of_range(control, self.model)
 
     def _scene_state(self, values: Mapping[str, Tensor], dt: float) -> SceneState:
         """Return a state of the fields that the module wants; `dt` in s."""
