@@ -251,6 +251,18 @@ def test_held_joints_stay_and_actions_move_targets(make):
     torch.testing.assert_close(env.sim.ctrl[:, :2], expected, rtol=0, atol=1e-12)
 
 
+def test_now_says_when_its_readings_are_of(make):
+    """One physics step before the end of the control step, and at 0 in an episode that has just begun."""
+    env = make(2)
+    physics = float(env.sim.model.opt.timestep)
+    assert env.now.time.tolist() == [0.0, 0.0]
+    env.step(torch.zeros(2, 2))
+    assert env.now.time.tolist() == pytest.approx([env.control_step - physics] * 2)
+    env.steps[1] = env.max_steps
+    assert env.step(torch.zeros(2, 2)).truncated.tolist() == [False, True]
+    assert env.now.time.tolist() == pytest.approx([2 * env.control_step - physics, 0.0])
+
+
 def test_actions_in_another_unit_are_warned_of_in_the_first_step(make):
     env = make(3)
     given = torch.tensor([[0.0, 3.0], [0.5, -50.0], [0.0, 0.0]])

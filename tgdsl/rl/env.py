@@ -407,6 +407,7 @@ class TouchEnv:
             friction=self._episodes.friction,
             mass=self._episodes.mass,
             readings=readings,
+            time=self.sim.time,
         )
 
     def _observe(self, now: Now) -> Observations:

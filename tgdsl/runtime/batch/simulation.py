@@ -126,6 +126,7 @@ class BatchSimulation(Simulation):
             self._keepers.append(self._watched_joints)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
+            self._time = torch.zeros(num_envs, dtype=torch.float64)
             self._table = StateTable(self.model, self._arrays)
             self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
         self.heat = EnvHeat(touch.inputs, num_envs, torch.device("cpu"), torch.float64)
@@ -142,6 +143,11 @@ class BatchSimulation(Simulation):
     def num_envs(self) -> int:
         """Number of environments."""
         return self.batch.nsim
+
+    @property
+    def time(self) -> Float[torch.Tensor, " env"]:
+        """When the instant is that `state` is of [s]: see `Simulation.time`."""
+        return self._time.clone()
 
     @property
     def arrays(self) -> Mapping[str, torch.Tensor]:
@@ -198,6 +204,7 @@ class BatchSimulation(Simulation):
     def _evaluate(self, ids: Int[Array, " n"], stage: int = _FORWARD) -> None:
         if len(ids):
             self._run(lambda: self.batch.forward(ids, stage=stage))
+            self._time[ids] = self._arrays["time"][ids]
             for keeper in self._keepers:
                 keeper.keep(ids)
 
@@ -210,6 +217,7 @@ class BatchSimulation(Simulation):
             for keeper in keepers:
                 keeper.keep()
             self._run(lambda: self.batch.step(nstep=1))
+        self._time.copy_(self._arrays["time"]).sub_(float(self.model.opt.timestep))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.update()
         if not is_faulty.any():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeVar, Unpack
 
@@ -92,6 +93,14 @@ class Simulation(ABC):
     def ctrl(self) -> Float[Tensor, "env nu"]:
         """Controls of the actuators, as MuJoCo's `ctrl`: a live tensor, as `qpos` is."""
         return self._arrays["ctrl"]
+
+    @property
+    @abstractmethod
+    def time(self) -> Float[Tensor, " env"]:
+        """When the instant is that `state` and `read` are of, by MuJoCo's clock [s].
+
+        After `step` it is a physics step before now: see `state`. Readings of two times within a control step differ by it.
+        """
 
     @cached_property
     def joints(self) -> Joints:
@@ -187,7 +196,7 @@ class Simulation(ABC):
                 if i < self.substeps - 1:
                     self._earlier.note(state)
                 self._earlier.restart(self._faults.restarted)
-            yield state
+            yield replace(state, time=self.time.to(self._touch.device))
 
     def state(self) -> SceneState:
         """Return what the module wants on its device, all of one instant; `dt` is that of a control step.
@@ -199,7 +208,8 @@ class Simulation(ABC):
         are.
         """
         self._refuse_if_closed()
-        return self._earlier.added_to(self._start_contacts.applied_to(self._state(self.control_step)))
+        state = self._earlier.added_to(self._start_contacts.applied_to(self._state(self.control_step)))
+        return replace(state, time=self.time.to(self._touch.device))
 
     def read(self, env_ids: EnvIds | None = None) -> dict[str, Tensor]:
         """Return the module's readings of the present state: `touch(state())`, for some environments (default: all).

@@ -161,6 +161,12 @@ class WarpSimulation(Simulation):
         return int(self._worlds.data.nworld)
 
     @property
+    def time(self) -> Float[Tensor, " env"]:
+        """When the instant is that `state` is of [s]: see `Simulation.time`."""
+        self._worlds.refresh()
+        return self._worlds.kept["time"].clone()
+
+    @property
     def arrays(self) -> Mapping[str, Tensor]:
         """Live tensors (env, …) of MuJoCo's arrays: what it integrates, and what states are read from."""
         return self._worlds.arrays
