@@ -259,7 +259,7 @@ class BatchSimulation(Simulation):
         if self._objects is not None:
             values |= {"variant": self._objects.variant[rows], "object_size": self._objects.object_size[rows]}
         tensors = {name: torch.from_numpy(value) for name, value in values.items()}
-        tensors |= {name: value[rows] for name, value in self.heat.read().items()}
+        tensors |= {name: value[rows] for name, value in self.heat.read().items()} | {"time": self.time[rows]}
         return self._scene_state({name: value.to(self._touch.device) for name, value in tensors.items()}, dt)
 
     def _read_watch(self) -> SceneState:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeVar, Unpack
 
@@ -196,7 +195,7 @@ class Simulation(ABC):
                 if i < self.substeps - 1:
                     self._earlier.note(state)
                 self._earlier.restart(self._faults.restarted)
-            yield replace(state, time=self.time.to(self._touch.device))
+            yield state
 
     def state(self) -> SceneState:
         """Return what the module wants on its device, all of one instant; `dt` is that of a control step.
@@ -208,8 +207,7 @@ class Simulation(ABC):
         are.
         """
         self._refuse_if_closed()
-        state = self._earlier.added_to(self._start_contacts.applied_to(self._state(self.control_step)))
-        return replace(state, time=self.time.to(self._touch.device))
+        return self._earlier.added_to(self._start_contacts.applied_to(self._state(self.control_step)))
 
     def read(self, env_ids: EnvIds | None = None) -> dict[str, Tensor]:
         """Return the module's readings of the present state: `touch(state())`, for some environments (default: all).
@@ -404,7 +402,7 @@ class Simulation(ABC):
     def _scene_state(self, values: Mapping[str, Tensor], dt: float) -> SceneState:
         """Return a state of the fields that the module wants; `dt` in s."""
         fields: dict[str, Any] = {**values, "dt": dt}
-        return SceneState(**{name: value for name, value in fields.items() if name in self._touch.inputs.fields})
+        return SceneState(**{name: value for name, value in fields.items() if name in (*self._touch.inputs.fields, "time")})
 
     def _refuse_if_closed(self) -> None:
         if self._is_closed:

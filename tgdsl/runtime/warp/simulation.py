@@ -289,7 +289,7 @@ class WarpSimulation(Simulation):
         return self._read(dt).to(self._touch.device)
 
     def _read(self, dt: float) -> SceneState:
-        values = self._reader.read() | self.heat.read()
+        values = self._reader.read() | self.heat.read() | {"time": self._worlds.kept["time"].clone()}
         if self._objects is not None:
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
         return self._scene_state(values, dt)
