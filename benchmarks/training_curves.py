@@ -57,7 +57,7 @@ PANELS: dict[str, dict[str, str]] = {
 ROWS = 64
 """Rows of a curve that are kept, at most."""
 COLUMNS = ("iteration", "samples", "seconds", "Episode/return", "Episode/score", "Episode/dropped", "Reward/spin",
-           "Policy/mean_std", "Loss/learning_rate", "rollout", "update")  # fmt: skip
+           "Policy/mean_std", "Loss/learning_rate", "Loss/rnd", "rollout", "update")  # fmt: skip
 """What is kept of an iteration, if it is there."""
 WINDOW = 5
 """Rows of a curve that a point is the mean of."""

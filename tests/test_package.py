@@ -79,6 +79,14 @@ def test_help_waits_for_nothing_heavy():
     assert not heavy & set(said)
 
 
+def test_loading_waits_for_what_only_compiling_needs():
+    """SciPy takes 0.3 s; what bakes tables, analyses modes or reads robots is imported where it is used."""
+    heavy = {"scipy", "skfem", "trimesh", "mujoco", "ruamel", "matplotlib", "pymeshlab", "sympy", "torch._dynamo"}
+    said = in_python("import sys, tgdsl; tgdsl.load; print(*sys.modules)")
+    assert "torch" in said
+    assert not heavy & set(said)
+
+
 def test_environments_leave_triton_alone():
     """Its LLVM and that of MuJoCo's software renderer, which `MUJOCO_GL=osmesa` loads, do not go into one process."""
     assert in_python(

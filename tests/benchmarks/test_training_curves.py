@@ -18,17 +18,20 @@ def test_a_curve_is_thinned_to_means_over_equal_numbers_of_iterations(tmp_path, 
     num = 2 * training_curves.ROWS
     with (tmp_path / "curve.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["iteration", "samples", "seconds", "episodes", "Episode/score", "Reward/spin", "rollout"])
+        writer.writerow(
+            ["iteration", "samples", "seconds", "episodes", "Episode/score", "Reward/spin", "Loss/rnd", "rollout", "update"]
+        )
         for i in range(num):
             score = "nan" if i < 2 else i
-            writer.writerow([i + 1, 100 * (i + 1), 0.5 * (i + 1), 0 if i < 2 else 1 + 2 * (i % 2), score, i, i])
+            writer.writerow([i + 1, 100 * (i + 1), 0.5 * (i + 1), 0 if i < 2 else 1 + 2 * (i % 2), score, i, 3 * i, i, 2 * i])
     found = training_curves.keep(tmp_path, "task/run")
     assert found == tmp_path / "kept" / "task" / "run.csv"
     with found.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == training_curves.ROWS
     assert rows[0] == {
-        "iteration": "2", "samples": "200", "seconds": "1", "Episode/score": "", "Reward/spin": "", "rollout": "0.5",
+        "iteration": "2", "samples": "200", "seconds": "1", "Episode/score": "", "Reward/spin": "",
+        "Loss/rnd": "1.5", "rollout": "0.5", "update": "1",
     }  # fmt: skip
     assert float(rows[4]["Episode/score"]) == (8 + 3 * 9) / 4 and rows[4]["Reward/spin"] == "8.75"
     assert rows[4]["rollout"] == "8.5"

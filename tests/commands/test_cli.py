@@ -115,6 +115,12 @@ def test_bad_overrides(base, fails, argument, message):
     assert fails(base, "compile", "pad.yaml", "--set", argument).endswith(message)
 
 
+def test_a_resolution_is_set(base, fails):
+    message = "tgdsl: --resolution{}: there is no such option; write --set resolution=high\n"
+    assert fails(base, "compile", "pad.yaml", "--resolution", "high") == message.format("")
+    assert fails(base, "compile", "pad.yaml", "--resolution=3") == message.format("=3")
+
+
 def test_documents_that_cannot_be_read(base, tmp_path, fails):
     assert fails(base, "compile", "none.yaml") == "none.yaml: cannot read this file: No such file or directory\n1 mistake\n"
     (tmp_path / "scene.xml").write_text("<mujoco><worldbody><geo/></worldbody></mujoco>")

@@ -102,6 +102,7 @@ def test_readings_are_the_same_and_gated_depths_are_not_measured(modules, monkey
     ],
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.filterwarnings("ignore:poses of bodies are not finite")
 def test_one_contact_or_one_number_that_is_none_and_all_is_measured(modules, monkeypatch, field, place, value, dtype):
     touch = modules["gated"].to(dtype)
     state = closed_state(touch)

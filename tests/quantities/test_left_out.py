@@ -39,6 +39,7 @@ def bits(touch, state):
 
 @pytest.mark.parametrize("variants", [[0, 0, 0], [1, 1, 1], [2, 2, 2], [0, 2, 0], [0, 1, 2]])
 @pytest.mark.parametrize("odd", [None, math.nan, math.inf])
+@pytest.mark.filterwarnings("ignore:poses of bodies are not finite")
 def test_readings_are_the_same_without_geoms_that_no_environment_has(touch, monkeypatch, variants, odd):
     state = example_state(touch.inputs, 3, 0, torch.float64, 0.02)
     state.variant = torch.tensor(variants)[:, None]

@@ -2,6 +2,8 @@
 
 import importlib.metadata
 import json
+import os
+import sys
 
 import pytest
 import torch
@@ -44,7 +46,7 @@ def known(monkeypatch, **versions):
 
 def told(found, gpu=False):
     places = {"cpu": "", **({"cuda:0": ""} if gpu else {})}
-    return {(each.level, each.what) for each in findings(found, COMPILERS, places) if each.what != "torch sees no GPU"}
+    return {(each.level, each.what) for each in findings(found, COMPILERS, places, {}) if each.what != "torch sees no GPU"}
 
 
 def test_packages_are_those_of_this_platform_and_not_of_tgdsls_own_development(monkeypatch):
@@ -75,7 +77,7 @@ def test_a_simulator_beside_another_versions_models_is_a_fault(monkeypatch):
 
 
 def test_what_is_missing_says_what_cannot_be_done(monkeypatch):
-    (finding,) = (f for f in findings(known(monkeypatch, mujoco_warp=None), COMPILERS, {"cpu": "", "cuda:0": ""}))
+    (finding,) = (f for f in findings(known(monkeypatch, mujoco_warp=None), COMPILERS, {"cpu": "", "cuda:0": ""}, {}))
     assert (finding.level, finding.what) == ("missing", "mujoco-warp is not installed")
     assert 'pip install "tgdsl[gpu]"' in finding.then
 
@@ -87,7 +89,7 @@ def test_triton_is_missed_where_there_is_a_gpu(monkeypatch):
 
 
 def test_faults_are_told_first(monkeypatch):
-    found = findings(known(monkeypatch, numpy="1.0", mujoco_warp=None, torch="2.13.0"), {CPP: None}, {"cpu": ""})
+    found = findings(known(monkeypatch, numpy="1.0", mujoco_warp=None, torch="2.13.0"), {CPP: None}, {"cpu": ""}, {})
     assert [finding.level for finding in found] == ["fault", "slower", "missing", "note", "note"]
 
 
@@ -121,16 +123,24 @@ def test_this_installation(monkeypatch, tmp_path):
     assert folder_size(tmp_path) == 8
     assert found.devices["cpu"] == f"{torch.get_num_threads()} threads"
     assert len(found.devices) == 1 + torch.cuda.device_count()
+    assert not found.opengl["glfw"] or "DISPLAY" in os.environ or sys.platform != "linux"
 
 
 def test_the_command(monkeypatch, capsys):
     """A table, or JSON; exit code 1 at a fault alone."""
     sound = examine()
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(doctor, "examine", lambda: sound)
     Doctor(json=True).run()
     assert json.loads(capsys.readouterr().out)["system"]["tgdsl"] == importlib.metadata.version("tgdsl")
     broken = doctor.Installation(
-        sound.system, (Package("numpy", "1.0", ">=2.0", ""),), {"cpu": ""}, COMPILERS, {"/nowhere": None}, told_of(sound)
+        sound.system,
+        (Package("numpy", "1.0", ">=2.0", ""),),
+        {"cpu": ""},
+        COMPILERS,
+        {"egl": True},
+        {"/nowhere": None},
+        told_of(sound),
     )
     monkeypatch.setattr(doctor, "examine", lambda: broken)
     with pytest.raises(SystemExit) as stopped:
@@ -138,8 +148,10 @@ def test_the_command(monkeypatch, capsys):
     assert stopped.value.code == 1
     printed = capsys.readouterr().out
     assert "numpy    1.0        >=2.0" in printed and "/nowhere  none yet" in printed
-    assert 'fault: numpy is 1.0, expected >=2.0\n    pip install "numpy>=2.0"' in printed
+    assert 'fault: numpy is 1.0, expected >=2.0: pip install "numpy>=2.0"\n' in printed
+    assert "egl        draws" in printed
+    assert "missing: no OpenGL by MUJOCO_GL=glfw: `tgdsl play --video` is refused: set MUJOCO_GL=egl\n" in printed
 
 
 def told_of(sound):
-    return findings((Package("numpy", "1.0", ">=2.0", ""),), COMPILERS, sound.devices)
+    return findings((Package("numpy", "1.0", ">=2.0", ""),), COMPILERS, sound.devices, {"glfw": False, "egl": True})

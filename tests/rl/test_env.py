@@ -251,6 +251,45 @@ def test_held_joints_stay_and_actions_move_targets(make):
     torch.testing.assert_close(env.sim.ctrl[:, :2], expected, rtol=0, atol=1e-12)
 
 
+def test_now_says_when_its_readings_are_of(make):
+    """One physics step before the end of the control step, and at 0 in an episode that has just begun."""
+    env = make(2)
+    physics = float(env.sim.model.opt.timestep)
+    assert env.now.time.tolist() == [0.0, 0.0]
+    env.step(torch.zeros(2, 2))
+    assert env.now.time.tolist() == pytest.approx([env.control_step - physics] * 2)
+    env.steps[1] = env.max_steps
+    assert env.step(torch.zeros(2, 2)).truncated.tolist() == [False, True]
+    assert env.now.time.tolist() == pytest.approx([2 * env.control_step - physics, 0.0])
+
+
+def test_actions_in_another_unit_are_warned_of_in_the_first_step(make):
+    env = make(3)
+    given = torch.tensor([[0.0, 3.0], [0.5, -50.0], [0.0, 0.0]])
+    with pytest.warns(UserWarning, match=r"^action of right is -50 in environment 1, and clipped to \[-1, 1\]") as caught:
+        env.step(given)
+    assert caught[0].filename == __file__
+    env.step(given)  # warnings are errors
+    make(3).step(torch.full((3, 2), 3.0))  # as a policy's that explores
+
+
+def test_a_step_prints_names_dtypes_and_shapes(make):
+    env = make(3)
+    made = env.step(torch.zeros(3, 2))
+    lines = str(made.info).splitlines()
+    assert [line.split()[0] for line in lines[:3]] == ["StepInfo", "ended", "final_obs"]
+    assert lines[1].split(maxsplit=1)[1] == "bool (3,)"
+    assert (
+        f"proprio float32 (3, {env.groups['proprio']}), tactile_sensors float32 (3, {env.groups['tactile_sensors']})"
+        in lines[2]
+    )
+    assert [line.split(maxsplit=1)[1] for line in str(made).splitlines()[-4:]] == [
+        "float32 (3,)",
+        *["bool (3,)"] * 2,
+        "StepInfo",
+    ]
+
+
 @pytest.mark.parametrize("more", ["", RANDOM])
 def test_an_action_that_is_no_number_ends_one_episode(make, more):
     env, other = make(more=more), make(more=more)

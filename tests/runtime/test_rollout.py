@@ -7,7 +7,16 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.rollout import Recorder, Step, is_touched, missed_loads, recorded_controls, rollout, scripted_controls
+from tgdsl.runtime.rollout import (
+    Recorder,
+    Step,
+    missed_loads,
+    recorded_controls,
+    rollout,
+    scripted_controls,
+    silent_readings,
+    touching_bodies,
+)
 from tgdsl.runtime.simulate import simulate
 
 SCENE = """
@@ -197,7 +206,7 @@ def test_an_object_is_touched_where_it_is_less_than_its_size_away(document, clea
     sim = simulate(touch, 2)
     sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))  # the scene has it a millimetre deep
     sim.set_state([1], qpos=np.array([0.001 - clearance, 0.0]))
-    assert is_touched(touch, sim) == (clearance < 0)
+    assert bool(touching_bodies(touch, sim)) == (clearance < 0)
 
 
 @pytest.mark.parametrize(("clearance", "is_contact"), [(-1e-3, True), (1e-3, True), (3e-3, False), (6e-3, False)])
@@ -211,7 +220,20 @@ def test_within_a_gap_nothing_is_touched(document, tmp_path, clearance, is_conta
     data.qpos[:] = 0.001 + clearance, 0.0
     mujoco.mj_forward(sim.model, data)
     assert (data.ncon > 0) == (clearance < 5e-3)
-    assert is_touched(touch, sim) == is_contact == (data.nefc > 0)
+    assert bool(touching_bodies(touch, sim)) == is_contact == (data.nefc > 0)
+
+
+@pytest.mark.parametrize("faces_up", [True, False])
+def test_taxels_on_the_side_that_nothing_touches_are_silent(document, faces_up):
+    """A grid along −z lies on the side that faces the cube, one along +z on the other; neither misses its link."""
+    grid = {"method": "grid", "rows": 2, "columns": 2, "direction": [0, 0, -1 if faces_up else 1], "radius": 0.002}
+    layout = {"resolutions": {"o": {"pad": grid}}}
+    sensors = {"depth": document["sensors"]["depth"]}
+    touch = tgdsl.compile({**document, "robot": {**document["robot"], "layout": layout}, "sensors": sensors})
+    assert len(touch.taxels["depth"]) == 4
+    sim = simulate(touch, 1)
+    silent = silent_readings(touch, sim, touch(sim.state()), touching_bodies(touch, sim))
+    assert silent == ({} if faces_up else {"depth": ["pad"]})
 
 
 @pytest.mark.parametrize(("cube", "is_contact"), [(0.03, True), (0.1, False)])
@@ -225,7 +247,7 @@ def test_what_is_flexible_may_touch_too(document, tmp_path, cube, is_contact):
     touch = tgdsl.compile({**document, "robot": {**document["robot"], "model": str(tmp_path / "cloth.xml")}})
     sim = simulate(touch, 1)
     assert sim.model.nflex == 1 and sim.model.geom(sim.model.ngeom - 1).bodyid == sim.model.body("cube").id
-    assert is_touched(touch, sim) == is_contact
+    assert bool(touching_bodies(touch, sim)) == is_contact
 
 
 @pytest.mark.parametrize(("x", "is_told"), [(0.0, False), (0.022, True)])

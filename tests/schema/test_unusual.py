@@ -63,6 +63,20 @@ CASES = {
         ),
         '14:21: sensors.touch.youngs_modulus: found 0.2 Pa, usually at least 1000 Pa; was "0.2 MPa" or "0.2 GPa" meant?',
     ),
+    "a skin of plastic": (
+        DOCUMENT.replace(CONTACT, "kind: elastomer").replace(
+            TOUCH, TOUCH + "    kernel: half_space\n    normal_stiffness: 1e8\n    youngs_modulus: 1e9\n"
+        ),
+        "14:21: sensors.touch.youngs_modulus: found 1e+09 Pa, usually at most 5e+08 Pa",
+    ),
+    "the stiffness of a taxel": (
+        DOCUMENT.replace(CONTACT, "kind: kinematic_taxel").replace(TOUCH, TOUCH + "    normal_stiffness: 1e9\n"),
+        "12:23: sensors.touch.normal_stiffness: found 1e+09, usually at most 1e+07",
+    ),
+    "the stiffness of proximity": (
+        DOCUMENT.replace(CONTACT, "kind: proximity").replace(TOUCH, TOUCH + "    normal_stiffness: 1e9\n"),
+        "12:23: sensors.touch.normal_stiffness: found 1e+09, usually at most 1e+07",
+    ),
 }
 
 

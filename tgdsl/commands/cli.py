@@ -97,6 +97,8 @@ def _run() -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"tgdsl {version('tgdsl')}")
         return
+    if wrong := [word for word in sys.argv[1:] if word.partition("=")[0] == "--resolution"]:
+        raise TgdslError(f"{wrong[0]}: there is no such option; write --set resolution=high")
     about = "Touch for robot learning. `tgdsl --version` prints the version."
     tyro.cli(Command, prog="tgdsl", description=about).run()  # type: ignore[arg-type]
 

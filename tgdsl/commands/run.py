@@ -50,8 +50,9 @@ class Run:
 
     def run(self) -> None:
         """Step through the controls, show the table, write the files."""
+        from tgdsl.errors import listed
         from tgdsl.files.write import check_writable, with_folder
-        from tgdsl.runtime.rollout import Recorder, is_touched, missed_loads
+        from tgdsl.runtime.rollout import Recorder, missed_loads, silent_readings, touching_bodies
         from tgdsl.view.cameras import ViewError, angles_of
 
         if self.temperatures is not None and not self.temperatures[0] < self.temperatures[1]:
@@ -68,8 +69,12 @@ class Run:
             sim, controls = self.start(touch, progress)
             recorder = Recorder(touch, len(controls), self.num_envs)
         readings = self._steps(touch, sim, controls, recorder)
-        if touch.plan.objects and not is_touched(touch, sim):
+        touching = touching_bodies(touch, sim)
+        if touch.plan.objects and not touching:
             print("at the end nothing touches an object")
+        for name, bodies in silent_readings(touch, sim, readings, touching).items():
+            what = f'an object touches {listed(bodies)}, and "{name}" is 0 on all taxels'
+            print(f"at the end {what}: do they face it? A grid along [0, 0, -1] is on the side that faces +z")
         print("".join(f"at the end {what}: see {name}\n" for name, what in missed_loads(touch, readings).items()), end="")
         recorder.write(with_folder(files["readings"]), controls)
         print(f"readings: {files['readings']}")

@@ -33,6 +33,13 @@ def listing(entries: Iterable[tuple[str, str]], indent: str = "  ") -> str:
     return "\n".join(lines)
 
 
+def shapes(value: Any) -> str:
+    """Return dtype and shape of a tensor, or those of all tensors of a mapping by name; of anything else its type's name."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {shapes(own)}" for name, own in value.items())
+    return f"{value.dtype} {tuple(value.shape)}".removeprefix("torch.") if hasattr(value, "dtype") else type(value).__name__
+
+
 def with_units(channels: Sequence[str], units: Sequence[str]) -> str:
     """Return channels, each unit once after those that have it: `force_x, force_y, force_z [N]`."""
     parts = []

@@ -15,7 +15,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 
 from tgdsl.errors import RobotError, listed
@@ -40,6 +39,8 @@ def triangles(file: Path) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray
     Raises:
         RobotError: If the file cannot be read, wants an extension of glTF that changes triangles, or holds none.
     """
+    import trimesh
+
     kwargs: dict[str, Any] = {}
     if file.suffix.lower() in (".glb", ".gltf"):
         kwargs["skip_materials"] = True

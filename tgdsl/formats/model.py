@@ -10,7 +10,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -208,6 +207,8 @@ class Model:
             return surface
         count = int(model.mesh_graph[first])  # a graph starts with its number of vertices, of faces, then two tables of these
         ids = model.mesh_graph[first + 2 + count : first + 2 + 2 * count]
+        import trimesh
+
         hull = trimesh.convex.convex_hull(surface.vertices[ids])
         faces = np.asarray(hull.faces, dtype=np.int64)
         return Surface(np.asarray(hull.vertices, dtype=np.float64), faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
@@ -222,6 +223,8 @@ class Model:
         return Surface(vertices, faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
 
     def _tessellated(self, geom: Geom) -> tuple[np.ndarray, np.ndarray]:
+        import trimesh
+
         if geom.shape == "box":
             mesh = trimesh.creation.box(2 * geom.size)
         elif geom.shape == "sphere":

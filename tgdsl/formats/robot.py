@@ -12,8 +12,6 @@ from tgdsl.errors import RobotError, listed
 from tgdsl.formats.mjcf import read_mjcf
 from tgdsl.formats.model import Model
 from tgdsl.formats.urdf import read_urdf
-from tgdsl.formats.usd.export.write import write_usd
-from tgdsl.formats.usd.reader import read_usd
 from tgdsl.scene.mujoco_warnings import told_of
 
 Reader = Callable[[Path], Model]
@@ -21,9 +19,22 @@ Reader = Callable[[Path], Model]
 Writer = Callable[[Model, Path], None]
 """Writes a compiled model to a file."""
 
+
+def _read_usd(path: Path) -> Model:
+    from tgdsl.formats.usd.reader import read_usd
+
+    return read_usd(path)
+
+
+def _write_usd(model: Model, out: Path) -> None:
+    from tgdsl.formats.usd.export.write import write_usd
+
+    write_usd(model, out)
+
+
 READERS: Mapping[str, Reader] = {
     ".urdf": read_urdf,
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _read_usd),
 }
 """By a file's ending, in lower case; any other file is XML, whose root element tells."""
 
@@ -34,7 +45,7 @@ def _refuse_part(path: Path) -> Model:
 
 ROOTS: Mapping[str, Reader] = {"robot": read_urdf, "mujocoinclude": _refuse_part}
 """By the root element of XML; any other is MJCF's."""
-WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), write_usd)
+WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), _write_usd)
 """By a file's ending."""
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import brentq
 
 from tgdsl.geometry.planes import tie
 
@@ -87,6 +86,8 @@ def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
         nearest[flat] = square[flat] * y[flat] / gap[flat]
         nearest[least] = size[least] * np.sqrt(1.0 - at_pole)
     else:
+        from scipy.optimize import brentq
+
         low, high = max(1e-300, float(np.max(size * y - gap))), float(np.linalg.norm(size * y))
         u = brentq(excess, 0.5 * low, 2.0 * max(low, high), xtol=1e-300, rtol=np.float64(1e-15))
         nearest = square * y / (u + gap)

@@ -20,9 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tgdsl.modal.loudness import of_groups
-from tgdsl.modal.shapes import interpolated
-
 
 @dataclass(frozen=True, eq=False)
 class SurfaceGains:
@@ -66,6 +63,9 @@ class ModeShapes:
             pos: The points, in the body's frame [m].
             along: The direction, of unit length, in the body's frame.
         """
+        from tgdsl.modal.loudness import of_groups
+        from tgdsl.modal.shapes import interpolated
+
         found = interpolated(self.low, self.step, self.num, self.value, pos @ self.axes.T)
         return of_groups(np.einsum("xif,xi->xf", found, along @ self.axes.T), self.owner, int(self.owner.max()) + 1)
 

@@ -19,7 +19,7 @@ from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors.base import Kind
 from tgdsl.tensors.buffers import Constants
-from tgdsl.tensors.env_ids import EnvIds, env_mask
+from tgdsl.tensors.env_ids import EnvIds, env_mask, is_out_of_sight
 
 TOLERANCE = 1e-3
 """Part of a pair's force that slots may lack unnoticed: far above what single precision makes of a sum."""
@@ -149,6 +149,9 @@ class Incoming:
         if not self.slot_watch.is_done and not torch.compiler.is_compiling():
             self.slot_watch.note(tensors)
             self.slot_watch.warn()
+        # Our simulators, which say the time, notice faults themselves.
+        if state.time is None and "poses" not in self._warned and not is_out_of_sight(tensors["body_pos"]):
+            self._look_at_poses(tensors)
         if inputs.substeps > 1:
             tensors |= self._substeps(state, device, len(tensors["body_pos"]))
         return tensors
@@ -183,6 +186,16 @@ class Incoming:
                     raise StateError(f"SceneState.substeps[{i}].{name} holds {len(value)} environments, body_pos {num_envs}")
                 found[f"substep/{i}/{name}"] = value
         return found
+
+    def _look_at_poses(self, tensors: Mapping[str, Tensor]) -> None:
+        """Warn of environments with a pose that is not finite, the first time."""
+        poses = [tensors[name].detach().sum(dim=(1, 2)) for name in ("body_pos", "body_quat") if name in tensors]
+        is_bad = ~sum(poses).isfinite()  # type: ignore[union-attr]
+        if is_bad.any():
+            self._warned.add("poses")
+            envs = listed([str(env) for env in is_bad.nonzero().flatten().tolist()])
+            what = f"poses of bodies are not finite in environments {envs}: their readings mean nothing"
+            warnings.warn(f"{what}; this is said once, and not of states on a GPU", stacklevel=7)
 
     def _dt_tensor(self, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Return dt as a tensor that is written only when it changes.

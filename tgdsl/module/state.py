@@ -77,6 +77,7 @@ class SceneState:
         joint_effort: What the actuators exert on each joint at that instant [N·m; slides: N].
         last_action: Control of each actuator that acted at that instant, in its own unit; before any, that of the start.
         dt: Time since the last state [s].
+        time: When the instant is in each environment, by MuJoCo's clock [s]; our simulators say it, no module reads it.
         substeps: The states after each physics step since the last call but for the last one, which this state is; only if
             `inputs.substeps` is more than 1. Right after a reset they are all as this state.
     """
@@ -100,6 +101,7 @@ class SceneState:
     joint_effort: Float[Tensor, "env joint"] | None = None
     last_action: Float[Tensor, "env actuator"] | None = None
     dt: float | None = None
+    time: Float[Tensor, " env"] | None = None
     substeps: tuple[SceneState, ...] = ()
 
     def to(self, *args: Any, **kwargs: Any) -> SceneState:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import igl
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
 
 from tgdsl.errors import BakeError
@@ -352,6 +351,8 @@ def _warn_of_hull(felt: SurfaceGeom, margin: float, name: str) -> None:
     hull = felt.surface
     if hull is None or felt.mesh is None:
         return
+    import trimesh
+
     whole = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
     sampled = trimesh.sample.sample_surface(whole, HULL_POINTS, seed=0)[0]
     squared, *_ = igl.point_mesh_squared_distance(np.asarray(sampled), felt.mesh.vertices, felt.mesh.faces)

@@ -20,8 +20,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.ndimage import spline_filter
-from scipy.spatial import KDTree
 
 from tgdsl.errors import BakeError
 from tgdsl.files import cache
@@ -319,6 +317,8 @@ def _fitted(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x 
 
 def _splines(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x y z channel"]:
     """Return the factors of the quadratic B-splines whose sum equals the values at the nodes; zero in the two outer layers."""
+    from scipy.ndimage import spline_filter
+
     found = np.zeros_like(values)
     within = (slice(2, -2),) * 3
     for channel in range(values.shape[3]):
@@ -468,6 +468,8 @@ def _lists(
     points: Float[np.ndarray, "n 3"], origin: np.ndarray, num: tuple[int, int, int], cell: float, reach: float, budget: int
 ) -> np.ndarray | int:
     """Return for each cube the points within reach of any place in it; or the size of that [bytes] if it is over the budget."""
+    from scipy.spatial import KDTree
+
     index = np.stack(np.unravel_index(np.arange(np.prod(num)), num), axis=1)
     middle = origin + cell * (index + 0.5)
     tree = KDTree(points)

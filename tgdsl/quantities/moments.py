@@ -13,8 +13,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from tgdsl.errors import BakeError, LowerError
@@ -208,6 +206,8 @@ class ReferenceMoments:
 
 def _splines(factors: np.ndarray, place: np.ndarray) -> float:
     """Return a sum of quadratic B-splines about nodes at a place in cells, clamped to half a cell within the border."""
+    from scipy.ndimage import map_coordinates
+
     place = np.clip(place, 0.5, np.array(factors.shape) - 1.5)
     return float(map_coordinates(factors, place[:, None], order=2, prefilter=False, mode="nearest")[0])
 
@@ -244,6 +244,8 @@ class ReferenceTable:
         values = field.values[first : first + num.prod()].reshape(*num, 4).astype(np.float64)
         if field.is_smooth:
             return lambda point: np.array([_splines(part, (point - origin) / cell) for part in np.moveaxis(values, 3, 0)])[None]
+        from scipy.interpolate import RegularGridInterpolator
+
         axes = [start + cell * np.arange(count) for start, count in zip(origin, num, strict=True)]
         return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=0.0)
 

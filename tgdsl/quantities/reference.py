@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.pairs import Pair, PairedObject
@@ -36,6 +35,8 @@ class ReferenceBody:
     @cached_property
     def rotation(self) -> Float[Array, "3 3"]:
         """Rotates body vectors into the world."""
+        from scipy.spatial.transform import Rotation
+
         return Rotation.from_quat(self.quat, scalar_first=True).as_matrix()
 
     def velocity_at(self, point: Float[Array, " 3"]) -> Float[Array, " 3"]:

@@ -9,6 +9,8 @@ import importlib.metadata
 import os
 import platform
 import re
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +44,9 @@ WITHOUT: Mapping[str, tuple[Level, str]] = {
 }
 """What follows if a package is not installed that tgdsl can do without."""
 CPP = "C++, for modules on a CPU"
+OPENGL = ("glfw", "egl", "osmesa") if sys.platform == "linux" else ("glfw",)
+"""Values of `MUJOCO_GL`: the first, MuJoCo's default, needs a display; on other systems there is no other."""
+_DRAW = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,7 @@ class Installation:
         packages: The packages that tgdsl uses.
         devices: Where a module can be, and what of it torch says.
         compilers: What compiles kernels, by name: its place or version; None: there is none.
+        opengl: Which values of `MUJOCO_GL` draw.
         caches: Folders of what was compiled or computed before, and their sizes [bytes]; None: there is no such folder.
         findings: What a user should know, the worst first.
     """
@@ -98,6 +104,7 @@ class Installation:
     packages: tuple[Package, ...]
     devices: Mapping[str, str]
     compilers: Mapping[str, str | None]
+    opengl: Mapping[str, bool]
     caches: Mapping[str, int | None]
     findings: tuple[Finding, ...]
 
@@ -113,9 +120,11 @@ def examine() -> Installation:
     Raises:
         TgdslError: If tgdsl itself is not installed, so that nobody knows what it wants.
     """
-    known, places = packages(), devices()
+    known, places, drawn_by = packages(), devices(), opengl()
     compiled_by = compilers(known)
-    return Installation(system(), known, places, compiled_by, caches(), findings(known, compiled_by, places))
+    return Installation(
+        system(), known, places, compiled_by, drawn_by, caches(), findings(known, compiled_by, places, drawn_by)
+    )
 
 
 def system() -> dict[str, str]:
@@ -188,6 +197,15 @@ def compilers(known: Sequence[Package]) -> dict[str, str | None]:
     }
 
 
+def opengl() -> dict[str, bool]:
+    """Return which values of `MUJOCO_GL` draw, each tried in a process of its own: MuJoCo takes one for good."""
+    tried = {
+        name: subprocess.Popen([sys.executable, "-c", _DRAW], env=os.environ | {"MUJOCO_GL": name}, stderr=subprocess.DEVNULL)
+        for name in OPENGL
+    }
+    return {name: process.wait() == 0 for name, process in tried.items()}
+
+
 def caches() -> dict[str, int | None]:
     """Return the folders of what is kept between runs, and their sizes [bytes]."""
     from tgdsl.tensors.torch_internals import inductor_cache
@@ -211,8 +229,10 @@ def folder_size(folder: Path) -> int:
     return sum(file.lstat().st_size for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
 
 
-def findings(known: Sequence[Package], compiled_by: Mapping[str, str | None], places: Mapping[str, str]) -> tuple[Finding, ...]:
-    """Return what a user should know of some packages, compilers and devices, the worst first."""
+def findings(
+    known: Sequence[Package], compiled_by: Mapping[str, str | None], places: Mapping[str, str], drawn_by: Mapping[str, bool]
+) -> tuple[Finding, ...]:
+    """Return what a user should know of some packages, compilers, devices and ways to OpenGL, the worst first."""
     has_gpu = any(name.startswith("cuda") for name in places)
     found = [*_wrong_versions(known), *_known_faults(known), *_not_there(known, has_gpu)]
     if compiled_by[CPP] is None:
@@ -221,6 +241,11 @@ def findings(known: Sequence[Package], compiled_by: Mapping[str, str | None], pl
         found.append(
             Finding("note", "torch sees no GPU", "everything runs on the CPU; `python -m torch.utils.collect_env` says more")
         )
+    setting = os.environ.get("MUJOCO_GL", OPENGL[0])
+    if not drawn_by.get(setting, True):
+        others = [f"MUJOCO_GL={name}" for name, draws in drawn_by.items() if draws]
+        then = f"set {others[0]}" if others else "install libegl1 or libosmesa6; pictures of `tgdsl run` need none"
+        found.append(Finding("missing", f"no OpenGL by MUJOCO_GL={setting}: `tgdsl play --video` is refused", then))
     order: tuple[Level, ...] = ("fault", "slower", "missing", "note")
     return tuple(sorted(found, key=lambda finding: order.index(finding.level)))
 

@@ -10,6 +10,7 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from os import PathLike
@@ -40,6 +41,8 @@ from tgdsl.tensors.torch_internals import below_autograd
 
 MOST_OF_ONE_THREAD = 2**16
 """Up to so many taxels of all environments one thread reads on a CPU: each of two would get less than 2¹⁵ numbers."""
+FAR_BEYOND = 10.0
+"""Actions of that size are a mistake, such as angles in degrees."""
 PREPARING_STEPS = 3
 """The third step is captured on a GPU, and the second one compiled."""
 
@@ -139,7 +142,9 @@ class TouchEnv:
         is_small = is_plain and num_envs * self.touch.plan.layout.num_taxels <= MOST_OF_ONE_THREAD
         self._dispatch = below_autograd if is_plain else nullcontext
         self._step_by, self._logic_by = (one_thread if own else nullcontext for own in (is_small, is_plain and not is_small))
+        self._has_stepped = True
         self._prepare(progress or silent, is_compiled)
+        self._has_stepped = False
         self._obs = self.reset(seed)
         self.groups = {name: value.shape[1] for name, value in self._obs.items()}
 
@@ -212,8 +217,9 @@ class TouchEnv:
         """Make one control step in all environments; those whose episodes end begin the next one.
 
         Args:
-            action: What the policy asks for, from −1 to 1: what is beyond is clipped. An environment with actions that are not
-                finite ends its episode, and is named in `info.faults`. NumPy's arrays are taken too.
+            action: What the policy asks for, from −1 to 1: what is beyond is clipped, and warned of if it is far beyond in the
+                first step. An environment with actions that are not finite ends its episode, and is named in `info.faults`.
+                NumPy's arrays are taken too.
 
         Raises:
             SimulationError: If an action does not fit or is of integers, or a pool of MuJoCo Warp was too small.
@@ -223,6 +229,12 @@ class TouchEnv:
             raise SimulationError(f"action is of {action.dtype}, expected numbers from -1 to 1")
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
+        if not self._has_stepped:  # once: the host waits for a GPU to see it
+            self._has_stepped = True
+            env, joint = divmod(int(action.abs().nan_to_num(posinf=0.0).argmax()), self.num_actions)
+            if abs(value := float(action[env, joint])) > FAR_BEYOND:
+                what = f"action of {self.joint_names[joint]} is {value:g} in environment {env}, and clipped to [-1, 1]"
+                warnings.warn(f"{what}; later steps are not looked at", stacklevel=2)
         with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too
             self._action.copy_(action)
             made, self._instant = self._call()
@@ -413,6 +425,7 @@ class TouchEnv:
             friction=self._episodes.friction,
             mass=self._episodes.mass,
             readings=readings,
+            time=self.sim.time,
         )
 
     def _observe(self, now: Now) -> Observations:

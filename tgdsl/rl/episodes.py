@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.console.tables import listing, shapes
 from tgdsl.rl.actuation import ONE, ZERO, Actuation
 from tgdsl.rl.draws import Draws, within
 from tgdsl.rl.pushes import Pushes
@@ -50,6 +51,9 @@ class StepInfo(NamedTuple):
     episode_terms: dict[str, Float[Tensor, " env"]]
     faults: Bool[Tensor, " env"]
 
+    def __repr__(self) -> str:
+        return "StepInfo\n" + listing((name, shapes(value)) for name, value in self._asdict().items())
+
     def is_whole(self, max_steps: int) -> Bool[Tensor, " env"]:
         """Return which episodes have lasted as long as one may, in control steps, and were not ended by a fault."""
         return (self.episode_steps >= max_steps) & ~self.faults
@@ -71,6 +75,9 @@ class Step(NamedTuple):
     terminated: Bool[Tensor, " env"]
     truncated: Bool[Tensor, " env"]
     info: StepInfo
+
+    def __repr__(self) -> str:
+        return "Step\n" + listing((name, shapes(value)) for name, value in self._asdict().items())
 
 
 class Episodes:

@@ -107,6 +107,7 @@ class Now:
         friction: Coefficient of sliding friction of the object.
         mass: Mass of the object [kg].
         readings: All readings of the module by name.
+        time: When the instant is, in each environment, by MuJoCo's clock [s]; that of a step is its last physics step's start.
     """
 
     watched: Watched
@@ -123,6 +124,7 @@ class Now:
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
     readings: Mapping[str, Tensor]
+    time: Float[Tensor, " env"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
+
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, listed
+
+FAR_BEYOND = 10.0
+"""How many widths of its range a control must be beyond to be a mistake, such as one of units; less is clipped silently."""
 
 
 def control_tensor(control: Tensor | np.ndarray, num_envs: int, num_actuators: int) -> Float[Tensor, "*env actuator"]:
@@ -49,6 +55,23 @@ def write_controls(
     is_bad = is_unfinite(values)
     ctrl.copy_(torch.where(is_bad[..., None], ctrl, values))
     return is_bad
+
+
+def warn_of_range(control: Tensor | np.ndarray, model: mujoco.MjModel) -> bool:
+    """Warn of the first control on the host that is far beyond its actuator's range; return whether there is one."""
+    if isinstance(control, Tensor) and control.is_cuda:
+        return False
+    values = np.atleast_2d(control.detach().double().numpy() if isinstance(control, Tensor) else control)
+    low, high = model.actuator_ctrlrange.T
+    reach = np.where(model.actuator_ctrllimited, FAR_BEYOND * (high - low), np.inf)
+    found = np.argwhere(np.maximum(low - values, values - high) > reach)
+    if not len(found):
+        return False
+    env, i = found[0]
+    where = f"environment {env}" if len(values) > 1 else "all environments"
+    what = f'control of actuator "{model.actuator(int(i)).name}" is {values[env, i]:g} in {where}'
+    warnings.warn(f"{what}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; this is said once", stacklevel=4)
+    return True
 
 
 def is_unfinite(values: Float[Tensor, "*env actuator"]) -> Bool[Tensor, "*env"]:

@@ -149,10 +149,11 @@ def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterato
         yield Step(index, (index + 1) * sim.control_step, touch(sim.state()))
 
 
-def is_touched(touch: TactileModule, sim: BatchSimulation) -> bool:
-    """Return whether any of a module's objects is in contact with another body, in the first environment, where it is now.
+def touching_bodies(touch: TactileModule, sim: BatchSimulation) -> set[int]:
+    """Return the bodies that are in contact with an object, and that object, in the first environment, where it is now.
 
     A contact is one that MuJoCo makes constraints for: what is nearer than the geoms' margin, and not within their gap alone.
+    Bodies are MuJoCo's indices; of welded ones it is the first.
     """
     model = sim.env_model(0)
     data = mujoco.MjData(model)
@@ -168,7 +169,27 @@ def is_touched(touch: TactileModule, sim: BatchSimulation) -> bool:
     ends = [
         {rigid(int(model.geom_bodyid[geom])) if geom >= 0 else -1 for geom in c.geom} for c in data.contact if not c.exclude
     ]
-    return any(len(bodies) == 2 and bodies & objects for bodies in ends)
+    return set().union(*(bodies for bodies in ends if len(bodies) == 2 and bodies & objects))
+
+
+def silent_readings(
+    touch: TactileModule, sim: BatchSimulation, readings: Mapping[str, Tensor], touching: set[int]
+) -> dict[str, list[str]]:
+    """Return the readings of taxels that are 0 although bodies with these taxels touch an object, and these bodies.
+
+    Args:
+        touch: The module.
+        sim: The simulation.
+        readings: Its readings.
+        touching: What touches: see `touching_bodies`.
+    """
+    weld, body = sim.model.body_weldid, sim.model.body
+    found = {}
+    for output in touch.outputs:
+        own = [name for name in output.bodies if (int(weld[body(name).id]) or body(name).id) in touching]
+        if output.rows == "taxel" and own and not readings[output.name][0].any():
+            found[output.name] = own
+    return found
 
 
 def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[str, str]:

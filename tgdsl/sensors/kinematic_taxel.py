@@ -47,7 +47,7 @@ import torch
 from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 
-from tgdsl.fields.models import NonNegative, Positive
+from tgdsl.fields.models import NonNegative, Positive, Usual
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
@@ -77,7 +77,7 @@ class KinematicTaxelSpec(ContactProbeSpec):
     """Force [N] and torque [N·m] of each taxel from depth, normal and velocity."""
     outputs: Annotated[tuple[Literal["force", "torque"], ...], Field(min_length=1)] = ("force", "torque")
     """What a reading holds; what is not listed is not computed."""
-    normal_stiffness: NonNegative = 500.0
+    normal_stiffness: Annotated[NonNegative, Usual("number", high=1e7)] = 500.0
     """k_n, force per depth^α [N/m^α]."""
     normal_damping: NonNegative = 1.0
     """c_n, force per depth^α and normal velocity [N·s/m^(1+α)]."""

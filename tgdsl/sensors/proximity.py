@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import Field, StrictInt
 from torch import Tensor
 
-from tgdsl.fields.models import Area, NonNegative, Positive, Quantity
+from tgdsl.fields.models import Area, NonNegative, Positive, Quantity, Usual
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
@@ -72,7 +72,7 @@ class ProximitySpec(ProbeSpec):
     """Largest size of an object's fields, or of its lists of points [bytes]."""
     outputs: Annotated[tuple[Literal["force", "torque"], ...], Field(min_length=1)] = ("force", "torque")
     """What a reading holds; what is not listed is not computed."""
-    normal_stiffness: NonNegative = 300.0
+    normal_stiffness: Annotated[NonNegative, Usual("number", high=1e7)] = 300.0
     """k, force per depth [N/m]."""
     shear_damping: NonNegative = 10.0
     """k_s, force per depth and velocity [N·s/m²]."""

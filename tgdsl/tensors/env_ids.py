@@ -132,7 +132,7 @@ def put(target: Tensor, where: Bool[Tensor, "*mask"], new: Tensor | float) -> No
 
 def may_look(values: Tensor) -> bool:
     """Return whether Python may branch on values: not on a GPU, where derivatives are wanted, or operations are followed."""
-    return not (torch.is_grad_enabled() or _is_out_of_sight(values))
+    return not (torch.is_grad_enabled() or is_out_of_sight(values))
 
 
 def may_hold(mask: Bool[Tensor, "*n"]) -> bool:
@@ -140,8 +140,9 @@ def may_hold(mask: Bool[Tensor, "*n"]) -> bool:
 
     What is done only where a mask holds can be left out if this is False; the result must be the same bytes.
     """
-    return _is_out_of_sight(mask) or bool(mask.any())
+    return is_out_of_sight(mask) or bool(mask.any())
 
 
-def _is_out_of_sight(values: Tensor) -> bool:
+def is_out_of_sight(values: Tensor) -> bool:
+    """Return whether Python must not look at values: on a GPU, which it would wait for, and where operations are followed."""
     return values.is_cuda or torch.compiler.is_compiling() or is_followed()

@@ -3,7 +3,7 @@
 import numpy as np
 from resting_hands import TARE
 
-from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.wire.protocol import Command
 
 
@@ -32,3 +32,15 @@ def test_monitor_in_newton_and_what_cannot_be(emulator, plugged, here, tmp_path)
     code, _, error = here(tmp_path, *arguments, "none.yaml")
     assert (code, error) == (2, "none.yaml: cannot read this file: No such file or directory\n1 mistake\n")
     assert sum(frame.command == Command.EXCHANGE for _, frame in emulator.requests) < 200
+
+
+def test_commands_on_an_emulated_hand_by_name(here, tmp_path):
+    code, said, error = here(tmp_path, "hand", "monitor", "--port", "emulator", "--seconds", "0.3", "--hand-id", "0")
+    assert (code, error) == (0, "")
+    assert said.splitlines()[4].split()[:5] == ["thumb", "0.00", "0.00", "0.00", "0.00"]
+    code, said, error = here(tmp_path, "hand", "probe", "--port", "emulator", "--hand-id", "0")
+    assert (code, error) == (0, "")
+    assert "emulated" in said
+    code, _, error = here(tmp_path, "hand", "tare", "--port", "emulator", "--hand-id", "0", "-o", "tare.yaml")
+    assert (code, error) == (0, "")
+    assert not load_calibration(tmp_path / "tare.yaml").tare.any()

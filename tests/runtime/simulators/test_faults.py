@@ -204,6 +204,23 @@ def test_faults_wait_for_a_reset_unless_they_shall_not(tmp_path, simulator):
 
 
 @BOTH
+def test_controls_in_another_unit_are_warned_of_once(tmp_path, simulator):
+    """Controls of 90 degrees; motors without a range take any."""
+    scene = SCENE.replace("</actuator>", '<position name="turn" joint="two" ctrlrange="-1.5 1.5"/></actuator>')
+    scene = scene.replace('ctrl=".1 -.1"', 'ctrl=".1 -.1 0"')
+    sim = simulator(module(tmp_path, scene), 3)
+    control = np.zeros((3, 3))
+    control[:, 2], control[:, 0] = 3.0, 100.0
+    sim.step(control)
+    control[1, 2] = 90.0
+    message = r'^control of actuator "turn" is 90 in environment 1, and MuJoCo clips it to \[-1\.5, 1\.5\]'
+    with pytest.warns(UserWarning, match=message) as caught:
+        sim.step(control)
+    assert caught[0].filename == __file__
+    sim.step(torch.from_numpy(control))  # warnings are errors
+
+
+@BOTH
 def test_a_reset_of_faulty_environments_may_say_where_they_begin(tmp_path, simulator):
     touch = module(tmp_path)
     sim = simulator(touch, 3, keyframe="home", on_fault="reset")

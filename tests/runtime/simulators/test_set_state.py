@@ -364,3 +364,28 @@ def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypat
         one.reset(mask)
     assert not torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])
     assert torch.equal(twin.state().body_pos, sim.state().body_pos) and torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])
+
+
+@BOTH
+def test_a_state_says_when_it_is(tmp_path, simulator):
+    """By MuJoCo's own clock at the instant of its poses: one physics step before now after a step, else now."""
+    touch = module(tmp_path)
+    sim = simulator(touch, 3, substeps=4, keyframe="home")
+    data = fresh(sim.model, {}, keyframe=0)
+    assert sim.state().time.tolist() == [0.0] * 3 == sim.time.tolist()
+    sim.step(), sim.step()
+    for _ in range(7):
+        mujoco.mj_step(sim.model, data)
+    instant = data.time
+    mujoco.mj_step(sim.model, data)
+    cube = touch.inputs.bodies.index("cube")
+    state = sim.state()
+    torch.testing.assert_close(state.time.double(), torch.full((3,), instant, dtype=torch.float64), rtol=0, atol=1e-8)
+    pos = torch.from_numpy(data.body("cube").xpos.copy()).expand(3, 3)
+    torch.testing.assert_close(state.body_pos[:, cube].double(), pos, rtol=0, atol=1e-6)
+    sim.forward([1]), sim.reset([2])
+    expected = torch.tensor([instant, data.time, 0.0], dtype=torch.float64)
+    for found in (sim.time, sim.state().time):
+        torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-8)
+    assert [round(float(own.time[0]), 4) for own in sim.substates()] == [0.016, 0.018, 0.02, 0.022]
+    torch.testing.assert_close(state.time.double(), torch.full((3,), instant, dtype=torch.float64), rtol=0, atol=1e-8)

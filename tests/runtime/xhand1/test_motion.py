@@ -19,7 +19,7 @@ from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ranges
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, MotionError, WatchdogError
-from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, Mode, encode_command
+from tgdsl.runtime.xhand1.wire.payloads import JOINTS, PASSIVE, Mode, encode_command
 from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
 
 RANGES = [
@@ -56,7 +56,11 @@ def test_ranges_come_from_the_robot_file(name):
 
 def test_another_robot_has_no_such_joints():
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    with pytest.raises(MotionError, match="expected one joint thumb_bend_joint with a range; the robot has none"):
+    with pytest.raises(MotionError, match="is a whole hand: expected one joint with a range for each of thumb_bend_joint, "):
+        joint_ranges(model)
+    finger = "".join(f'<body><joint name="{name}" range="0 90"/><geom size=".1"/></body>' for name in JOINTS[1:])
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{finger}</worldbody></mujoco>")
+    with pytest.raises(MotionError, match=f"for each of {JOINTS[0]}; the robot has {JOINTS[1]}, "):
         joint_ranges(model)
 
 

@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from tgdsl.runtime.xhand1.calibration import Calibration
     from tgdsl.view.hand_table import HandView
 
-Port = Annotated[str | None, tyro.conf.arg(help="The hand's serial port; default: that of the only hand found.")]
+Port = Annotated[
+    str | None,
+    tyro.conf.arg(help="The hand's serial port; default: that of the only hand found. `emulator`: a hand at rest, emulated."),
+]
 HandId = Annotated[int | None, tyro.conf.arg(help="The hand's id, where several are on one port.")]
 
 

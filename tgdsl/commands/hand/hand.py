@@ -6,7 +6,7 @@ no current: its reply is the only reading of touch that is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import tyro
@@ -36,4 +36,10 @@ class Hand:
 
     def run(self) -> None:
         """Do it; Ctrl-C ends it with the hand's port closed."""
-        self.action.run()
+        if isinstance(self.action, Replay) or self.action.port != "emulator":
+            self.action.run()
+            return
+        from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+
+        with Emulator() as emulator:
+            replace(self.action, port=emulator.device).run()

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Show versions, devices, compilers and caches, what is at fault, and what is done instead; exit code 1 at a fault."""
+    """Show versions, devices, compilers, OpenGL, caches, what is at fault, and what is done instead; exit code 1 at a fault."""
 
     json: bool = False
     """Print JSON, for a report."""
@@ -41,10 +41,10 @@ def _text(found: Installation) -> str:
         text_table(("package", "installed", "wanted", "extra"), rows),
         text_table(("device", ""), found.devices.items()),
         text_table(("compiler", ""), [(name, place or "none") for name, place in found.compilers.items()]),
+        text_table(("MUJOCO_GL", ""), [(name, "draws" if draws else "does not draw") for name, draws in found.opengl.items()]),
         text_table(("cache", ""), [(name, _size(size)) for name, size in found.caches.items()]),
     ]
-    for finding in found.findings:
-        parts.append(f"{finding.level}: {finding.what}\n    {finding.then}")
+    parts.append("\n".join(f"{finding.level}: {finding.what}: {finding.then}" for finding in found.findings))
     return "\n\n".join(parts)
 
 

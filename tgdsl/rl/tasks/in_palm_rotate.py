@@ -8,8 +8,8 @@ and n up for `direction: counterclockwise`, down for `clockwise`, as seen from a
     θ   = swing_n(q q_0⁻¹)                                      tilt [rad]
     g   = (k + 1) π/2                                           goal; k goals were reached, k ← k + 1 where g − ψ < ε, θ < θ_max
 
-Groups: `goal` holds six numbers of the goal's orientation, rot_n(g) q_0, and the angle from there to q [rad]; `priv_obj_state`
-and `priv_obj_props` as in `groups`.
+Groups: `goal` holds six numbers of the goal's orientation, rot_n(g) q_0, and the angle from there to q [rad], by which whoever
+sees it knows the object's exact angle; `priv_obj_state` and `priv_obj_props` as in `groups`.
 
 The reward is the sum of these terms times Δt; weights are the paper's.
 

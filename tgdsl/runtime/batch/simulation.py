@@ -317,6 +317,7 @@ class BatchSimulation(Simulation):
             self._keepers.append(self._watched_joints)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
+            self._time = torch.zeros(num_envs, dtype=torch.float64)
             self._table = StateTable(self.model, self._arrays)
             self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
         self.heat = EnvHeat(touch.inputs, num_envs, torch.device("cpu"), torch.float64)
@@ -333,6 +334,11 @@ class BatchSimulation(Simulation):
     def num_envs(self) -> int:
         """Number of environments."""
         return self.batch.nsim
+
+    @property
+    def time(self) -> Float[torch.Tensor, " env"]:
+        """When the instant is that `state` is of [s]: see `Simulation.time`."""
+        return self._time.clone()
 
     @property
     def arrays(self) -> Mapping[str, torch.Tensor]:
@@ -389,6 +395,7 @@ class BatchSimulation(Simulation):
     def _evaluate(self, ids: Int[Array, " n"], stage: int = _FORWARD) -> None:
         if len(ids):
             self._run(lambda: self.batch.forward(ids, stage=stage))
+            self._time[ids] = self._arrays["time"][ids]
             for keeper in self._keepers:
                 keeper.keep(ids)
 
@@ -401,6 +408,7 @@ class BatchSimulation(Simulation):
             for keeper in keepers:
                 keeper.keep()
             self._run(lambda: self.batch.step(nstep=1))
+        self._time.copy_(self._arrays["time"]).sub_(float(self.model.opt.timestep))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.update()
         if not is_faulty.any():
@@ -442,7 +450,7 @@ class BatchSimulation(Simulation):
         if self._objects is not None:
             values |= {"variant": self._objects.variant[rows], "object_size": self._objects.object_size[rows]}
         tensors = {name: torch.from_numpy(value) for name, value in values.items()}
-        tensors |= {name: value[rows] for name, value in self.heat.read().items()}
+        tensors |= {name: value[rows] for name, value in self.heat.read().items()} | {"time": self.time[rows]}
         return self._scene_state({name: value.to(self._touch.device) for name, value in tensors.items()}, dt)
 
     def _read_watch(self) -> SceneState:

@@ -21,7 +21,7 @@ from tgdsl.errors import SimulationError, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.controls import write_controls
+from tgdsl.runtime.controls import warn_of_range, write_controls
 from tgdsl.runtime.simulators.claims import release
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
@@ -183,6 +183,7 @@ class Simulation(ABC):
     _objects: ObjectChoices | None = None
     _watch: WatchReader | None = None
     _is_closed = False
+    _has_warned_of_range = False
 
     @property
     @abstractmethod
@@ -212,6 +213,14 @@ class Simulation(ABC):
     def ctrl(self) -> Float[Tensor, "env nu"]:
         """Controls of the actuators, as MuJoCo's `ctrl`: a live tensor, as `qpos` is."""
         return self._arrays["ctrl"]
+
+    @property
+    @abstractmethod
+    def time(self) -> Float[Tensor, " env"]:
+        """When the instant is that `state` and `read` are of, by MuJoCo's clock [s].
+
+        After `step` it is a physics step before now: see `state`. Readings of two times within a control step differ by it.
+        """
 
     @cached_property
     def joints(self) -> Joints:
@@ -257,7 +266,7 @@ class Simulation(ABC):
 
         Args:
             control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were. Those on a GPU
-                are checked there.
+                are checked there. MuJoCo clips them to their ranges; one on the host that is far beyond is warned of.
 
         Raises:
             SimulationError: If controls do not fit, or a pool of MuJoCo Warp was too small; and with `on_fault="raise"` if
@@ -509,11 +518,12 @@ class Simulation(ABC):
         if control is None:
             return
         self._faults.note(BAD_CONTROL, write_controls(control, self.ctrl, self._faults.on_fault == "raise"))
+        self._has_warned_of_range = self._has_warned_of_range or warn_of_range(control, self.model)
 
     def _scene_state(self, values: Mapping[str, Tensor], dt: float) -> SceneState:
         """Return a state of the fields that the module wants; `dt` in s."""
         fields: dict[str, Any] = {**values, "dt": dt}
-        return SceneState(**{name: value for name, value in fields.items() if name in self._touch.inputs.fields})
+        return SceneState(**{name: value for name, value in fields.items() if name in (*self._touch.inputs.fields, "time")})
 
     def _refuse_if_closed(self) -> None:
         if self._is_closed:

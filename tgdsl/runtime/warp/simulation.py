@@ -306,6 +306,12 @@ class WarpSimulation(Simulation):
         return int(self._worlds.data.nworld)
 
     @property
+    def time(self) -> Float[Tensor, " env"]:
+        """When the instant is that `state` is of [s]: see `Simulation.time`."""
+        self._worlds.refresh()
+        return self._worlds.kept["time"].clone()
+
+    @property
     def arrays(self) -> Mapping[str, Tensor]:
         """Live tensors (env, …) of MuJoCo's arrays: what it integrates, and what states are read from."""
         return self._worlds.arrays
@@ -428,7 +434,7 @@ class WarpSimulation(Simulation):
         return self._read(dt).to(self._touch.device)
 
     def _read(self, dt: float) -> SceneState:
-        values = self._reader.read() | self.heat.read()
+        values = self._reader.read() | self.heat.read() | {"time": self._worlds.kept["time"].clone()}
         if self._objects is not None:
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
         return self._scene_state(values, dt)

@@ -191,7 +191,7 @@ class Worlds:
             names = (*INTEGRATED, *_DERIVED, *_WATCHED)
             self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), stream) for name in names}
             self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), stream) for name in per_env}
-            self.kept = {array: self.arrays[array].clone() for array in joints.moved.values()}
+            self.kept = {array: self.arrays[array].clone() for array in (*joints.moved.values(), "time")}
             self.contacts = PairContacts(inputs, model, num_envs, stream.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=stream.device)

@@ -104,13 +104,11 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
         MotionError: If the robot lacks a joint, or one has no range.
     """
     names = [model.joint(i).name for i in range(model.njnt)]
-    ids = []
-    for wanted in JOINTS:
-        found = [i for i, name in enumerate(names) if name == wanted or name.endswith(f"_hand_{wanted}")]
-        if len(found) != 1 or not model.jnt_limited[found[0]]:
-            raise MotionError(f"expected one joint {wanted} with a range; the robot has {listed(names) or 'none'}")
-        ids.append(found[0])
-    return np.array(ids)
+    found = [[i for i, name in enumerate(names) if name == own or name.endswith(f"_hand_{own}")] for own in JOINTS]
+    if lacking := [own for own, ids in zip(JOINTS, found, strict=True) if len(ids) != 1 or not model.jnt_limited[ids[0]]]:
+        what = f"an XHand1, real or emulated, is a whole hand: expected one joint with a range for each of {listed(lacking)}"
+        raise MotionError(f"{what}; the robot has {listed(names) or 'none'}")
+    return np.array(found)[:, 0]
 
 
 def joint_ranges(model: mujoco.MjModel) -> Float[np.ndarray, "joint 2"]:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from tgdsl.console.progress import Progress, silent
-from tgdsl.modal.analysis import analysed
 from tgdsl.modal.modes import Modes
 from tgdsl.modal.spec import ShapeModes
 from tgdsl.sensors.contact_audio.spec import ModesField
@@ -28,6 +27,8 @@ def modes_of(given: ModesField, name: str, surface: Callable[[], Surface], below
         LowerError: If its shape gives none.
     """
     if isinstance(given, ShapeModes):
+        from tgdsl.modal.analysis import analysed
+
         return analysed(name, surface(), given, below, progress)
     ordered = sorted(given, key=lambda mode: mode.frequency)
     return Modes(

@@ -20,8 +20,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.special import j0, j1
 
 from tgdsl.sensors.elastomer.half_space import QUADRATIC, Profiles, patch_transform
 
@@ -104,6 +102,8 @@ def profiles(r: np.ndarray, layer: Layer, patch: float) -> Profiles:
 
 def tabulated(r: np.ndarray, layer: Layer, patch: float) -> Profiles:
     """Return `profiles` by cubic splines through a table up to the largest r."""
+    from scipy.interpolate import CubicSpline
+
     b = (1.0 + QUADRATIC) * patch
     last = float(np.max(r, initial=0.0)) + b
     knots = np.linspace(0.0, last, max(8, int(np.ceil(STEPS_PER_PATCH * last / b))) + 1)
@@ -123,6 +123,8 @@ def _quadrature(largest_distance: float, layer: Layer, patch: float) -> tuple[np
 
 def _hankel(r: np.ndarray, k: np.ndarray, factors: np.ndarray) -> np.ndarray:
     """Return the integrals with J0 (two), J1 (two) and J2 (one) at each r."""
+    from scipy.special import j0, j1
+
     x = r[:, None] * k
     zero, one = j0(x), j1(x)
     is_small = x < 1e-3

@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.fft import next_fast_len
 from torch import Tensor
 
 from tgdsl.errors import LowerError
@@ -189,6 +188,8 @@ def _joined(planes: list[Tensor]) -> Tensor:
 
 def _padded(num: int) -> int:
     """Return an even length that FFTs like and that holds all offsets of a row of cells."""
+    from scipy.fft import next_fast_len
+
     return 2 * (next_fast_len(num, real=True) or num)
 
 

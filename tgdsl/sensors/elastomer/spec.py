@@ -74,7 +74,7 @@ class ElastomerSpec(ContactProbeSpec):
     """Thickness of the elastomer [m] (gaussian: length ε, default the taxel spacing; bonded_layer)."""
     poissons_ratio: Annotated[NonNegative, AfterValidator(_at_most_half)] = 0.5
     """ν [1]; for the Gaussian it only sets the tangential against the normal stiffness under friction."""
-    youngs_modulus: Annotated[Pressure | None, Usual("pressure", low=1e3, high=1e11)] = None
+    youngs_modulus: Annotated[Pressure | None, Usual("pressure", low=1e3, high=5e8)] = None
     """E [Pa], also as `0.2 MPa` (half_space, bonded_layer)."""
     normal_stiffness: Positive | None = None
     """K_n, pressure per depth [Pa/m] (half_space, bonded_layer)."""

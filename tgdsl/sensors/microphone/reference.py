@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import brentq
 
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.kinematics import Places
@@ -51,6 +50,7 @@ def reference(
 
 def age_of_sound(listener: Float[np.ndarray, " 3"], track: Float[np.ndarray, "node 3"], dt: float, speed: float) -> float:
     """Return how long ago a source emitted what is heard now [s], its places at the last steps being given, now first."""
+    from scipy.optimize import brentq
 
     def early(age: float) -> float:
         where = [np.interp(age, dt * np.arange(len(track)), track[:, i]) for i in range(3)]

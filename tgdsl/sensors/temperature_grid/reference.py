@@ -6,7 +6,6 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import expm
 
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.patches import ContactPatches, ReferenceObject, ReferencePatch, ReferencePatches
@@ -241,6 +240,8 @@ def _diffused(
     axes, size = block.operators(film), block.above.size
     made = source * np.ones(block.count)  # type: ignore[arg-type]
     if spec.scheme == "exact":
+        from scipy.linalg import expm
+
         x, y, z = axes
         one = [np.eye(n) for n in block.count or ()]
         whole = np.kron(np.kron(x, one[1]), one[2]) + np.kron(np.kron(one[0], y), one[2]) + np.kron(np.kron(one[0], one[1]), z)
