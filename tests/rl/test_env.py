@@ -1,5 +1,6 @@
 """A whole step: order, instants, episodes, random numbers, what is told of them."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -8,6 +9,9 @@ import torch
 from tiny_tasks import NOISY, RADIUS, RANDOM, actions, same, taxel_world, tiny_envs
 
 from tgdsl.errors import SimulationError
+from tgdsl.runtime import simulate
+from tgdsl.runtime.batch.connect import SIMULATION
+from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 
 STEPS = 12
@@ -356,3 +360,32 @@ def test_an_action_of_another_shape_is_refused(make):
     env = make(2)
     with pytest.raises(SimulationError, match=r"action has shape \(2, 3\), expected \(2, 2\)"):
         env.step(torch.zeros(2, 3))
+
+
+def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
+    """One of MuJoCo's threads under another name, whose options are fewer: it steps as MuJoCo's own does."""
+
+    class Mine(BatchSimulation):
+        def __init__(self, touch, num_envs, *, substeps, keyframe, options, watch, on_fault):
+            super().__init__(
+                touch,
+                num_envs,
+                substeps=substeps,
+                keyframe=keyframe,
+                options=options,
+                watch=watch,
+                on_fault=on_fault,
+                threads=1,
+            )
+
+    mine = dataclasses.replace(SIMULATION, name="mine", simulate=Mine, recognise=None)
+    monkeypatch.setattr(simulate, "known_sources", lambda: (SIMULATION, mine))
+    env, other = make(3, simulator="mine"), make(3, simulator="mujoco")
+    assert isinstance(env.sim, Mine)
+    for _ in range(3):
+        one, two = (own.step(torch.full((3, 2), 0.3)) for own in (env, other))
+    assert torch.equal(one.reward, two.reward) and torch.equal(one.obs["proprio"], two.obs["proprio"])
+    with pytest.raises(SimulationError, match='simulator is "min"; did you mean "mine"'):
+        make(3, simulator="min")
+    with pytest.raises(SimulationError, match='MuJoCo steps on the CPU, and the device is "cuda"'):
+        simulate.simulator_for("cuda", "mujoco")

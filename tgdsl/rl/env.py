@@ -31,7 +31,7 @@ from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
-from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
+from tgdsl.rl.start import make_setup, make_simulation, moved_joints
 from tgdsl.rl.task import Now
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_hold
@@ -91,7 +91,8 @@ class TouchEnv:
             device: "cpu" (MuJoCo on its threads) or "cuda", "cuda:1" (MuJoCo Warp).
             seed: What all that is random follows from.
             overrides: Values of the document to set first by dotted path, such as `{"rewards.spin": 3}`.
-            simulator: "mujoco" or "warp"; default: by the device. MuJoCo Warp on a CPU is slow, and meant for tests.
+            simulator: "mujoco", "warp" or one that a package brings; default: by the device. MuJoCo Warp on a CPU is slow, and
+                meant for tests.
             threads: CPU threads of physics; 0: one per CPU.
             compiled: Whether the module, and all of a step but for physics, is compiled by torch; default: on a GPU.
             first_env: Number of the first environment among those of all processes: of it, random numbers and variants.
@@ -104,7 +105,6 @@ class TouchEnv:
             SpecError: All mistakes of the document, at their places.
             SimulationError: If the scene cannot be simulated as the document says.
         """
-        chosen = simulator_of(device, simulator)
         loaded = self.loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
         self.spec, sensed = loaded.spec, sensed or compile_sensed(loaded, device, progress, feels=feels)
         self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
@@ -114,7 +114,7 @@ class TouchEnv:
         if is_compiled:
             self.touch.compile(dynamic=not is_cuda)  # a GPU reads all environments each time, a CPU any number of them
         self._joints = moved_joints(loaded, sensed)
-        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads, first_env)
+        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, simulator, threads, first_env)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws, first_env)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)

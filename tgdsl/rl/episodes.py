@@ -17,8 +17,8 @@ from tgdsl.rl.actuation import ONE, ZERO, Actuation
 from tgdsl.rl.draws import Draws, within
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.spec import RandomSpec
-from tgdsl.rl.start import EnvSimulation
 from tgdsl.rl.task import Start, Task
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.tensors.env_ids import put_rows
 from tgdsl.tensors.fused import FusedCall
 
@@ -103,7 +103,7 @@ class Episodes:
 
     def __init__(
         self,
-        sim: EnvSimulation,
+        sim: Simulation,
         random: RandomSpec,
         task: Task,
         actuation: Actuation,

@@ -17,16 +17,13 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed
 from tgdsl.rl.task import Setup
-from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.simulate import simulator_for
 from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.watch import Watch
-from tgdsl.runtime.warp import WarpSimulation
+from tgdsl.runtime.source_kind import keyword_options
 from tgdsl.scene.scene import SceneModels, is_absent
 from tgdsl.schema.select import is_plain, matching
-
-SIMULATORS = ("mujoco", "warp")
-"""What steps physics: MuJoCo's threads, or MuJoCo Warp."""
-EnvSimulation = BatchSimulation | WarpSimulation
 
 
 def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
@@ -58,10 +55,10 @@ def make_simulation(
     joints: tuple[str, ...],
     num_envs: int,
     device: str,
-    simulator: str,
+    simulator: str | None,
     threads: int = 0,
     first_env: int = 0,
-) -> EnvSimulation:
+) -> Simulation:
     """Simulate the task's scene; environments with faults wait for a reset.
 
     Args:
@@ -70,7 +67,7 @@ def make_simulation(
         joints: The joints that the policy moves.
         num_envs: Number of environments.
         device: As for `tgdsl.simulate`.
-        simulator: "mujoco" or "warp".
+        simulator: As for `simulator_for`.
         threads: CPU threads; 0: one per CPU.
         first_env: Number of the first environment among those of all processes.
 
@@ -91,35 +88,19 @@ def make_simulation(
     random = spec.randomise
     per_env = [name for name, value, rest in (("mass", random.mass, ZERO), ("friction", random.friction, ONE)) if value != rest]
     given: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
-    given |= {"watch": watch, "on_fault": "note"}
-    if simulator == "warp":
-        capacities: dict[str, Any] = dict(spec.physics.capacities)
-        sim = WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **(given | capacities))
-    else:
-        sim = BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
+    given |= {"watch": watch, "on_fault": "note", "device": device, "per_env": per_env, "threads": threads}
+    given |= spec.physics.capacities
+    kind = simulator_for(device, simulator)
+    known = keyword_options(kind.simulate)
+    sim = kind.simulate(sensed.touch, num_envs, **{name: value for name, value in given.items() if name in known})
     num_variants = _num_variants(sensed, spec.object)
     if first_env % num_variants:
         sim.set_objects({spec.object: (np.arange(num_envs) + first_env) % num_variants})
     return sim
 
 
-def simulator_of(device: str, simulator: str | None) -> str:
-    """Return the simulator that is taken: on a GPU MuJoCo Warp, else MuJoCo unless another is asked for.
-
-    Raises:
-        SimulationError: If there is no such simulator, or it is not for this device.
-    """
-    is_cpu = device.partition(":")[0] == "cpu"
-    chosen = simulator or ("mujoco" if is_cpu else "warp")
-    if chosen not in SIMULATORS:
-        raise SimulationError(f'simulator is "{chosen}"; {did_you_mean(chosen, SIMULATORS, "simulators")}')
-    if chosen == "mujoco" and not is_cpu:
-        raise SimulationError(f'MuJoCo steps on the CPU, and the device is "{device}"; leave `simulator` out')
-    return chosen
-
-
 def make_setup(
-    loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
+    loaded: LoadedTask, sensed: Sensed, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
 ) -> Setup:
     """Return what the task is told of its simulation.
 
@@ -160,7 +141,7 @@ def _num_variants(sensed: Sensed, name: str) -> int:
     return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 
 
-def _half_heights(sim: EnvSimulation, sensed: Sensed, name: str) -> Float[Tensor, " env"]:
+def _half_heights(sim: Simulation, sensed: Sensed, name: str) -> Float[Tensor, " env"]:
     """Return how far each environment's object reaches below its body's origin as the keyframe has it [m]."""
     num = _num_variants(sensed, name)
     qpos = sim.qpos[0].double().cpu().numpy()
@@ -169,7 +150,7 @@ def _half_heights(sim: EnvSimulation, sensed: Sensed, name: str) -> Float[Tensor
     return torch.tensor(each, dtype=sim.qpos.dtype)[variants].to(sim.qpos.device)
 
 
-def _first_half_height(sim: EnvSimulation, sensed: Sensed) -> float:
+def _first_half_height(sim: Simulation, sensed: Sensed) -> float:
     """Return how far the object's first variant reaches below its body's origin [m], whatever the environments here have."""
     first = SceneModels(sensed.touch.plan.scene).model({})
     return half_height(first, sensed.object, sim.qpos[0].double().cpu().numpy())

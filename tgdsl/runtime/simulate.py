@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from os import PathLike
 from typing import Any, Literal, overload
 
-from tgdsl.errors import SimulationError, listed
+from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.known import known_sources
@@ -17,6 +17,8 @@ from tgdsl.runtime.source_kind import SimulatorKind, keyword_options
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene.options import Options
 
+MUJOCO = "mujoco"
+"""What users call the kind "simulation" where they name a simulator."""
 _DEFAULTS = {
     "substeps": 1,
     "threads": 0,
@@ -108,7 +110,7 @@ def simulate(
         raise SimulationError(f"found a {type(touch).__name__}, expected a module: {made}")
     given: dict[str, Any] = {"substeps": substeps, "threads": threads, "keyframe": keyframe, "on_fault": on_fault}
     given |= {"options": options, "watch": watch, "per_env": tuple(per_env), "nconmax": nconmax, "njmax": njmax}
-    kind = _simulator_on(device)
+    kind = simulator_for(device)
     known = keyword_options(kind.simulate)
     if unknown := [name for name, value in given.items() if name not in known and value != _DEFAULTS[name]]:
         what = f'"{kind.name}", which simulates on "{device}", has no option {listed(unknown)}'
@@ -117,14 +119,25 @@ def simulate(
     return kind.simulate(touch, num_envs, **options)
 
 
-def _simulator_on(device: str) -> SimulatorKind:
-    """Return the simulator that is taken for a device.
+def simulator_for(device: str, name: str | None = None) -> SimulatorKind:
+    """Return a simulator: by its name, or the one that is taken for a device.
+
+    Args:
+        device: Where physics runs.
+        name: "mujoco", "warp" or one that a package brings: see `tgdsl.runtime.known`.
 
     Raises:
-        SimulationError: If there is no such device, or no simulator for it.
+        SimulationError: If there is no such device or simulator, or MuJoCo is asked for on a GPU.
     """
     simulators = [kind for kind in known_sources() if isinstance(kind, SimulatorKind)]
     type_ = device.partition(":")[0]
+    if name is not None:
+        by_name = {MUJOCO if kind.name == "simulation" else kind.name: kind for kind in simulators}
+        if name not in by_name:
+            raise SimulationError(f'simulator is "{name}"; {did_you_mean(name, by_name, "simulators")}')
+        if name == MUJOCO and type_ != "cpu":
+            raise SimulationError(f'MuJoCo steps on the CPU, and the device is "{device}"; leave `simulator` out')
+        return by_name[name]
     found = [kind for kind in simulators if type_ in kind.devices]
     if not found:
         checked_device(device, sorted({type_ for kind in simulators for type_ in kind.devices}, reverse=True))

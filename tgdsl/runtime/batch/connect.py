@@ -28,18 +28,14 @@ def simulate_on_cpu(
     watch: Watch | None = None,
     per_env: Sequence[str] = (),
     on_fault: OnFault = "raise",
-    nconmax: int | None = None,
-    njmax: int | None = None,
 ) -> BatchSimulation:
     """Simulate the module's scene, as `tgdsl.simulate` says it.
 
     Raises:
-        SimulationError: As from `BatchSimulation`, or if an argument is for a GPU.
+        SimulationError: As from `BatchSimulation`.
     """
     if unknown := [word for word in per_env if word not in PER_ENV]:
         raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {did_you_mean(unknown[0], PER_ENV, "words")}')
-    if nconmax is not None or njmax is not None:
-        raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
     return BatchSimulation(
         touch,
         num_envs,

@@ -222,6 +222,15 @@ class Simulation(ABC):
         After `step` it is a physics step before now: see `state`. Readings of two times within a control step differ by it.
         """
 
+    @property
+    @abstractmethod
+    def arrays(self) -> Mapping[str, Tensor]:
+        """Live tensors (env, …) of the arrays that MuJoCo integrates, by their names in `mjData`."""
+
+    @abstractmethod
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return the model of one environment, its objects as they are there."""
+
     @cached_property
     def joints(self) -> Joints:
         """Where each joint stands: `sim.qpos[:, sim.joints["thumb"].qpos]`, `sim.qvel[:, sim.joints["thumb"].qvel]`.
