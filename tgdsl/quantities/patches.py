@@ -13,7 +13,6 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -623,6 +622,8 @@ def _area(points: list[np.ndarray], normal: np.ndarray, is_star: bool) -> float:
     one /= np.linalg.norm(one)
     flat = np.array([[point @ one, point @ np.cross(normal, one)] for point in points])
     if not is_star:
+        from scipy.spatial import ConvexHull, QhullError
+
         try:
             return ConvexHull(flat).volume
         except QhullError:  # fewer than three points, or all on a line
