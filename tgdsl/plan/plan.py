@@ -29,7 +29,7 @@ from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.known import QUANTITIES
 from tgdsl.quantities.pairs import PairedObject, PairTable
 
-FORMAT = 16
+FORMAT = 17
 """Version of the Plan; a reader refuses any other."""
 
 
