@@ -96,6 +96,22 @@ class TestSubsteps(TestSamples):
     num_steps = 2
 
 
+class TestForce(TestSamples):
+    test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
+    parameters = {**COMMON, "model": "force"}
+
+
+class TestForceOfObjects(TestSamples):
+    parameters = {**COMMON, "model": "force", "of": "object", "scrape": 0.0, "substeps": 2}
+    float64_tolerance = KindConformance.float64_tolerance
+    test_something_is_felt = None
+
+
+class TestForceBands(TestSamples):
+    parameters = {**COMMON, "model": "force", "outputs": "bands"}
+    test_something_is_felt = TestBands.test_something_is_felt
+
+
 class TestPaper(TestSamples):
     parameters = {**COMMON, "model": "paper"}
 
@@ -139,6 +155,11 @@ class TestAtContacts(TestSamples):
         monkeypatch.setattr(given_modes, "analysed", shaped)
         monkeypatch.setattr(definition, "_no_surface", lambda name: NOTHING)
         monkeypatch.setattr(Surfaces, "of_object", lambda own, name: NOTHING)  # the suite's floor has none
+
+
+class TestForceAtContacts(TestAtContacts):
+    parameters = {**TestAtContacts.parameters, "model": "force"}
+    test_compiled_equals_eager = None
 
 
 class TestOfObjectsAtContacts(TestAtContacts):

@@ -72,6 +72,17 @@ def test_a_blow_strikes_each_mode_by_its_shape_there(tmp_path, dtype, tolerance)
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max() + 1e-12)
 
 
+def test_a_force_drives_each_mode_by_its_shape_there(tmp_path):
+    """`model: force`: of the force of one step z is s F (e^(λΔt) − 1)²/(λ²Δt)."""
+    touch = plate(tmp_path, **GIVEN, scrape=0, model="force")
+    constants = touch.plan.sensors[0].constants
+    rate = -constants["decay"][:1] + 2j * np.pi * constants["frequency"][:1]
+    blow = wanted(touch, PLACES)[:, 0, 0] + 1j * wanted(touch, PLACES)[:, 0, 1]
+    blow = blow * np.expm1(rate * STEP) ** 2 / (rate * STEP) ** 2 / np.exp(rate * STEP)
+    found = struck(touch, PLACES)[:, 0]
+    np.testing.assert_allclose(found[:, 0] + 1j * found[:, 1], blow, rtol=0, atol=1e-12 * np.abs(blow).max() + 2e-12)
+
+
 def test_the_centre_of_a_square_plate_rings_in_x2_plus_y2_alone(tmp_path):
     """xy, x² − y² and the pair have a node there; at the corner the first is louder than anywhere else of these places."""
     touch = plate(tmp_path, **GIVEN, scrape=0)

@@ -12,6 +12,8 @@ than τ to rise by ΔF, at the rate R, with R τ² alone; a steady one not at al
 With mode shapes each mode i has an A_i of its own, which grows by s_i (F − F̄)₊ Δt with the mode's share s_i of what strikes
 where the load acts, and is kept and passed on when A is: so it is weighted by where the load was when it grew.
 
+`model: force` collects nothing: its drive is the rise of the force in each step.
+
 Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects, `mode` modes.
 """
 
@@ -22,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.sensors.base import Constants, State
+from tgdsl.sensors.base import Constants, Context, State
 
 Load = Float[Tensor, "env body object"]
 UNKNOWN = 1e30
@@ -54,6 +56,33 @@ def impulses(
     own, each = grown[..., None] * share, state["weighted"].clone()
     new["weighted"] = torch.where(is_over[..., None], 0.0, torch.addcmul(own, each, kept))
     return torch.where(is_over[..., None], each, 0.0 * own), new
+
+
+def rises(
+    force: Load,
+    context: Context,
+    constants: Constants,
+    state: State,
+    share: Float[Tensor, "env body object mode"] | None = None,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return by how much the force on each row rises in this step (env, row, *mode) [N], and what is remembered.
+
+    Args:
+        force: F [N].
+        context: When.
+        constants: The sensor's.
+        state: What was remembered.
+        share: Of each mode, s.
+    """
+    load = of_rows(force if share is None else force[..., None] * share, constants)
+    is_first = context.is_first.view(-1, *[1] * (load.ndim - 1))
+    return load - torch.where(is_first, load, state["load"]), {"load": load}
+
+
+def of_rows(pairs: Tensor, constants: Constants) -> Tensor:
+    """Return the sum over what touches each body (or object) that rings, (env, row, *mode), of (env, body, object, *mode)."""
+    dim = 1 if "is_of_object" in constants else 2
+    return pairs.squeeze(dim) if pairs.shape[dim] == 1 else pairs.sum(dim=dim)
 
 
 def reference_impulses(

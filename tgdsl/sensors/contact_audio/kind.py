@@ -34,14 +34,35 @@ zero are flushed to it.
 A microphone hears it at the frames of the bodies that ring, as ρc √(A/4π) s at 1 m [Pa]: what a surface of A = 0.01 m² radiates
 that moves with s, at all frequencies alike (Kinsler et al., *Fundamentals of Acoustics*, 7.5).
 
+`model: force`: no impulse is collected; the force F on a body drives each of its modes, a damped oscillator of unit modal mass
+whose surface moves with q_i, at every step:
+
+    q̈ + 2d q̇ + (d² + ω²) q = F,   ω = 2πf,   s(t) = Σ_i g_i q̇_i(t)                           [m/s]
+
+q is per g [N·s²], q̇ an impulse [N·s]. The phasor z is the vibration about the deflection that F alone would hold:
+
+    z(t) = ∫ e^(λ(t−t′)) F(t′) dt′ + F(t)/λ,   ż = λz + Ḟ/λ,   λ = −d + iω,   q̇ = Re z − (d/ω) Im z
+
+F is linear within a step, from F₀ at its start, the normal forces of the step before [N], to F₁ at its end, so the integral is
+closed for any Δt:
+
+    z(t) = e^(λt) z(0) + (F₁ − F₀)/Δt · (e^(λt) − 1)/λ²,   0 ≤ t ≤ Δt                          [N·s]
+
+A collision short to the mode's period leaves |z| = Σ F Δt, its impulse, whatever Δt and its duration; any other the spectrum of
+its force, |∫ F e^(−λt) dt|. A steady force adds nothing, and the first one of an episode counts as steady. F is summed over
+what touches the body, with `gains: contact` as s_i F. Noise of sliding is as above. Bands read z, which rings on if the force
+stays as it is.
+
 `model: paper`: y[k] = a₁ y[k−1] − a₂ y[k−2] + u[k], a₁ = 2r cos(2πfΔt/K), a₂ = r², r = e^(−dΔt/K), and s = Σ g y, with
 u[1] = Δt (F − F_before)₊ and noise at each sample; how loud an impact is then depends on K and Δt.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio"; noise by the power of friction as in van den
-Doel, Kry and Pai, *FoleyAutomatic* (SIGGRAPH 2001). Departures: the response and the impulses above, see `model: paper`.
+Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio"; Duhamel's integral of a force that is linear
+between samples, Nigam and Jennings, *Bull. Seism. Soc. Am.* 59 (1969); noise by the power of friction as in van den Doel, Kry
+and Pai, *FoleyAutomatic* (SIGGRAPH 2001). Departures: the response and the impulses above, see `model: paper`.
 
 Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it. A load that is
-spread over a body's surface strikes at its centre alone; friction strikes along the normal, as pressing does.
+spread over a body's surface strikes at its centre alone; friction strikes along the normal, as pressing does. The
+noise drives alike modes whose frequencies differ by a multiple of 4/Δt.
 """
 
 from __future__ import annotations
@@ -60,7 +81,7 @@ from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.contact_audio.bands import membership, middle
-from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses
+from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses, of_rows, rises
 from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
 from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
@@ -91,18 +112,23 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
     }
     constants |= tables(modes.shapes, modes.frequency.shape[1]) if modes.shapes else {}
     constants |= {"is_of_object": scalar(1.0)} if spec.of == "object" else {}
-    constants |= {"is_paper": scalar(1.0)} if spec.model == "paper" else {}
+    constants |= {f"is_{spec.model}": scalar(1.0)} if spec.model != "physical" else {}
     channels = (Channel("sound", "m/s"),)
     if spec.outputs == "bands":
         constants["band"] = membership(modes.frequency, modes.bands)
         constants |= {"is_decibel": scalar(1.0)} if spec.scale == "decibel" else {}
         unit = "dB" if spec.scale == "decibel" else "m²/s²"
         channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in modes.bands)
-    pairs = (len(layout.bodies), len(spec.feels))
-    state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(UNKNOWN, pairs)}
-    if spec.model != "paper":
+    num_modes, pairs = modes.frequency.shape[1], (len(layout.bodies), len(spec.feels))
+    own = (num_modes,) if modes.shapes else ()
+    state = {"phasors": Memory(shape=(rows.size, 2 * num_modes))}
+    if spec.model == "force":
+        state["load"] = Memory(shape=(rows.size, *own))
+    else:
+        state["steady"] = Memory(UNKNOWN, pairs)
+    if spec.model == "physical":
         state["pending"] = Memory(shape=pairs)
-        state |= {"weighted": Memory(shape=(*pairs, modes.frequency.shape[1]))} if modes.shapes else {}
+        state |= {"weighted": Memory(shape=(*pairs, *own))} if own else {}
     is_heard, loads = spec.outputs == "samples", Loads(spec.feels, slots=spec.slots, of=spec.of, has_center=bool(modes.shapes))
     return Lowered(
         channels=channels,
@@ -132,53 +158,51 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     if loads.center is not None and loads.along is not None and "shape_value" in constants:
         share = shares(loads.center, loads.along, constants)
         sliding = sliding[..., None] * (share * share)
-    impulse, new = impulses(loads.force, constants, state, share)
-    struck = _of_rows(impulse, constants).unsqueeze(2)
+    if "is_force" in constants:
+        drive, new = rises(loads.force, context, constants, state, share)
+    else:
+        impulse, new = impulses(loads.force, constants, state, share)
+        drive = of_rows(impulse, constants)
+    driven = drive.unsqueeze(2)
     if "noise" in constants:
-        strikes = _noise(_of_rows(sliding, constants), context, constants)
-        struck = torch.cat([strikes[:, :, :1] + struck, strikes[:, :, 1:]], dim=2)
+        driven = torch.cat([driven, _noise(of_rows(sliding, constants), context, constants)], dim=2)
     phasors, turn = state["phasors"], turn_of(constants, context.step[0] + context.substep)
-    new["phasors"] = after = _turned(phasors, struck, turn, constants)
+    new["phasors"] = after = _turned(phasors, driven, turn, constants)
     if "heard" in constants:  # environments last: libraries multiply few rows by many columns faster
-        parts = torch.cat([phasors, struck.flatten(2)], dim=-1).permute(1, 2, 0)
+        parts = torch.cat([phasors, driven.flatten(2)], dim=-1).permute(1, 2, 0)
         made = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 1, 0)
         return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
 
 
-def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants) -> Tensor:
+def _turned(phasors: Tensor, driven: Tensor, turn: Tensor, constants: Constants) -> Tensor:
     """Return the phasors at the end of a step, (env, row, part · mode) [N·s].
 
     By products alone, not of a matrix: matrices may be multiplied in TF32, and phasors would then grow or decay by it.
 
     Args:
         phasors: Those at its start, real parts first [N·s].
-        struck: Impulses (env, row, grain) [N·s], or of each mode, (env, row, grain, mode).
+        driven: Impulse [N·s] or rise of the force [N], then noise [N·s], (env, row, drive); or of each mode, (env, row, drive,
+            mode).
         turn: What is left of each part, and what it has of the other, (2, row, part · mode).
         constants: The sensor's.
     """
     along, across = turn.unbind()
     crossed = phasors.roll(phasors.shape[-1] // 2, dims=-1)
     after = torch.addcmul(phasors * along, crossed, across)
-    for grain, own in enumerate(constants["struck"].unbind()):
-        one = struck[:, :, grain]
+    for i, own in enumerate(constants["driven"].unbind()):
+        one = driven[:, :, i]
         # Eager, tensors that are alike are multiplied faster than those that broadcast.
         spread = torch.cat([one, one], dim=-1) if one.ndim == 3 else one[..., None].expand_as(after).contiguous()
         after = torch.addcmul(after, spread, own)
     return torch.nn.functional.hardshrink(after, least())
 
 
-def _of_rows(pairs: Tensor, constants: Constants) -> Tensor:
-    """Return the sum over what touches each body (or object) that rings, (env, row, *mode), of (env, body, object, *mode)."""
-    dim = 1 if "is_of_object" in constants else 2
-    return pairs.squeeze(dim) if pairs.shape[dim] == 1 else pairs.sum(dim=dim)
-
-
 def _noise(sliding: Tensor, context: Context, constants: Constants) -> Tensor:
     """Return the impulses of sliding (env, row, grain, *mode) [N·s], of its power (env, row, *mode) [W]."""
     assert context.stream is not None
-    rows, grains = sliding.shape[1], constants["struck"].shape[0]
+    rows, grains = sliding.shape[1], constants["driven"].shape[0] - 1
     count = (grains + 1) // 2
     index = torch.arange(rows * count, dtype=torch.int32, device=sliding.device)
     pair = random.normal_pair(random.words(context.stream, index), sliding.dtype)

@@ -2,14 +2,15 @@
 
     heard = Hᵀ (Re z, Im z, u),   z′ = p z + Bᵀ u
 
-with the phasors z of the modes at the start of a step [N·s] and impulses u at `GRAINS` times within it [N·s]; H holds the
-samples' sines, p and B what is left of phasors and impulses at the end. All are exact, whatever the step. A phasor that is
-turned by the same rounded factor at every step drifts by 3e-8 a step. So in float32 p is rounded down at some steps and up at
-others, such that its mean is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the
-last place by which it is above the lower number. What is left are roundings that do not add up.
+with the phasors z of the modes at the start of a step [N·s] and what drives them in it, u: an impulse at its start [N·s], or
+with `model: force` the rise of the force [N], and impulses of noise at `GRAINS` times [N·s]; H holds the samples' sines, p and
+B what is left of phasors and drives at the end. All are exact, whatever the step. A phasor that is turned by the same rounded
+factor at every step drifts by 3e-8 a step. So in float32 p is rounded down at some steps and up at others, such that its mean
+is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the last place by which it is
+above the lower number. What is left are roundings that do not add up.
 
 Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `both` the real parts of all
-modes, then their imaginary ones, `sample` samples of a block, `band` bands, `grain` times of impulses.
+modes, then their imaginary ones, `sample` samples of a block, `band` bands, `grain` times of noise, `drive` what drives a mode.
 """
 
 from __future__ import annotations
@@ -53,13 +54,6 @@ def highest(samples: int, step: float) -> float:
     return HIGHEST * samples / step
 
 
-def strike_times(samples: int, step: float, is_paper: bool, has_noise: bool) -> Float[np.ndarray, " grain"]:
-    """Return when impulses act [s], impacts first: from the start of the step on, of the paper's response at each sample."""
-    if is_paper:
-        return np.arange(1, samples + 1 if has_noise else 2) * step / samples
-    return np.arange(GRAINS if has_noise else 1) * step / GRAINS
-
-
 def strike_phasors(frequency: np.ndarray, samples: int, step: float, is_paper: bool) -> Complex[np.ndarray, "row mode"]:
     """Return the phasor that a unit impulse adds to each mode: 1, or e^(iθ)/sin θ of the two-pole response."""
     if not is_paper:
@@ -78,42 +72,57 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
 
     Args:
         constants: `frequency` [Hz], `decay` [1/s], `gain` [1/kg], each (row, mode), 0 where a row has fewer; `samples`;
-            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `band` (row, mode, band) of bands; `shape_value`
-            where each mode has impulses of its own.
+            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `is_force` where the force drives; `band` (row,
+            mode, band) of bands; `shape_value` where each mode has a drive of its own.
         step: The time step.
     """
-    samples, is_paper, scrape = int(constants["samples"]), "is_paper" in constants, float(constants["scrape"])
+    samples, scrape = int(constants["samples"]), float(constants["scrape"])
+    is_paper, is_force = "is_paper" in constants, "is_force" in constants
     frequency = constants["frequency"]
     is_heard = (frequency > 0) & (frequency <= highest(samples, step) * (1 + 1e-12))
     rate, gain = -constants["decay"] + 2j * math.pi * frequency, np.where(is_heard, constants["gain"], 0.0)
-    times, strikes = np.arange(1, samples + 1) * step / samples, strike_times(samples, step, is_paper, scrape > 0)
+    times = np.arange(1, samples + 1) * step / samples
+    grains = np.zeros(0) if scrape == 0 else times if is_paper else np.arange(GRAINS) * step / GRAINS
     begun = strike_phasors(frequency, samples, step, is_paper)
+    over = rate.real / np.where(is_heard, rate.imag, 1.0)
+    seen = gain * (1.0 - 1j * over) if is_force else -1j * gain  # heard is Re(seen z)
 
     def factors(time: np.ndarray) -> np.ndarray:
         """Return e^((−d + 2πif) t), (row, mode, *time); 0 of modes that are not heard, and before an impulse."""
         shape = (..., *[None] * time.ndim)
         return np.where(is_heard[shape] & (time >= -1e-12 * step), np.exp(rate[shape] * np.maximum(time, 0.0)), 0.0)
 
-    kept, turn, left = math.exp(-step / float(constants["settling"])), factors(np.array(step)), factors(step - strikes)
-    added = (begun[..., None] * left).transpose(2, 0, 1)
+    def struck(time: np.ndarray) -> np.ndarray:
+        """Return the phasors (row, mode, time) of a unit impulse, or of a force that rises evenly by 1 N in the step."""
+        if not is_force:
+            return begun[..., None] * factors(time - (step / samples if is_paper else 0.0))
+        square = np.where(is_heard, rate, 1.0)[..., None] ** 2
+        return np.where(is_heard[..., None], np.expm1(rate[..., None] * time) / (square * step), 0.0)
+
+    kept = math.exp(-step / float(constants["settling"]))
+    turn = factors(np.array(step))
+    added = np.concatenate([struck(np.array([step])), begun[..., None] * factors(step - grains)], axis=2).transpose(2, 0, 1)
     found = {
         "kept": np.asarray(kept),
         "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
-        "struck": np.concatenate([np.real(added), np.imag(added)], axis=2),
+        "driven": np.concatenate([np.real(added), np.imag(added)], axis=2),
         **{name: _by_parts(name, part) for name, part in _rounded("turn", np.stack([np.real(turn), np.imag(turn)])).items()},
     }
     if scrape > 0:
-        found["noise"] = np.asarray(math.sqrt(scrape * step / len(strikes)))
+        found["noise"] = np.asarray(math.sqrt(scrape * step / len(grains)))
     if "band" in constants:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
         return found | {"energy": np.concatenate([energy, energy], axis=1)}
-    free, of_impulses = factors(times), begun[..., None, None] * factors(times - strikes[:, None])
-    own = gain[..., None, None] * np.imag(of_impulses)
-    by_mode = own.swapaxes(1, 2).reshape(len(own), -1, own.shape[-1])  # grain by grain
-    strikes = by_mode if "shape_value" in constants else own.sum(axis=1)
-    parts = [gain[..., None] * np.imag(free), gain[..., None] * np.real(free), strikes]
-    return found | {"heard": np.concatenate(parts, axis=1)}
+    of_grains = begun[..., None, None] * factors(times - grains[:, None])
+    free, drives = seen[..., None] * factors(times), np.concatenate([struck(times)[:, :, None], of_grains], axis=2)
+    heard = np.real(seen[..., None, None] * drives)
+    by_mode = heard.swapaxes(1, 2).reshape(len(heard), -1, samples)  # drive by drive
+    return found | {
+        "heard": np.concatenate(
+            [np.real(free), -np.imag(free), by_mode if "shape_value" in constants else heard.sum(axis=1)], axis=1
+        )
+    }
 
 
 def _rounded(name: str, exact: np.ndarray) -> dict[str, np.ndarray]:

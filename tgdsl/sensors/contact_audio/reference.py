@@ -38,13 +38,21 @@ def reference(
     loads, step = gathered[Loads], context.dt
     modes = ringing(spec, layout, spec.timestep or step, _no_surface)
     is_paper, below = spec.model == "paper", highest(spec.samples, step)
-    before, share = loads.force if context.is_first else state["steady"], _shares(spec, modes, loads)
-    pending = state.get("pending", np.zeros_like(before))
-    weighted = state.get("weighted", np.zeros_like(share) if is_paper or spec.gains == "contact" else pending[..., None])
-    own = (before, pending, weighted)
-    impulse, steady, pending, weighted = reference_impulses(loads.force, own, share, step, spec.settling, is_paper)
-    axis = 1 if spec.of == "link" else 0
-    struck, rubbed = impulse.sum(axis=axis), (loads.sliding[..., None] * share**2).sum(axis=axis)
+    is_force, axis, share = spec.model == "force", 1 if spec.of == "link" else 0, _shares(spec, modes, loads)
+    if is_force:
+        load = (loads.force[..., None] * share).sum(axis=axis)
+        struck = load - (load if context.is_first else state["load"].reshape(load.shape))
+        after = {"load": load if spec.gains == "contact" else load[:, 0]}
+    else:
+        before = loads.force if context.is_first else state["steady"]
+        pending = state.get("pending", np.zeros_like(before))
+        weighted = state.get("weighted", np.zeros_like(share) if is_paper or spec.gains == "contact" else pending[..., None])
+        own = (before, pending, weighted)
+        impulse, steady, pending, weighted = reference_impulses(loads.force, own, share, step, spec.settling, is_paper)
+        struck = impulse.sum(axis=axis)
+        after = {"steady": steady} | ({} if is_paper else {"pending": pending})
+        after |= {"weighted": weighted} if spec.gains == "contact" and not is_paper else {}
+    rubbed = (loads.sliding[..., None] * share**2).sum(axis=axis)
     num = len(struck)
     phasors, heard = state["phasors"].copy(), np.zeros((spec.samples, num))
     half = modes.frequency.shape[1]
@@ -52,18 +60,21 @@ def reference(
     for row in range(num):
         for m in range(half):
             of = m if spec.gains == "contact" else 0
-            strikes = _strikes(spec, context, row, num, float(struck[row, of]), float(rubbed[row, of]))
+            drive, strikes = float(struck[row, of]), _noise(spec, context, row, float(rubbed[row, of]))
             frequency, decay, gain = (float(table[row, m]) for table in (modes.frequency, modes.decay, modes.gain))
             if not 0 < frequency <= below * (1 + 1e-12):
                 phasors[row, [m, half + m]] = 0.0
                 continue
             rate, before = complex(-decay, 2 * math.pi * frequency), complex(phasors[row, m], phasors[row, half + m])
-            samples, after = _ring(rate, before, strikes, spec.samples, step, is_paper)
+            if is_force:
+                samples, last = _driven(rate, before, drive, strikes, spec.samples, step)
+            else:
+                strikes = [(step / spec.samples if is_paper else 0.0, drive), *strikes]
+                samples, last = _ring(rate, before, strikes, spec.samples, step, is_paper)
             heard[:, row] += gain * samples
-            phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (after.real, after.imag)]
+            phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (last.real, last.imag)]
             amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
-    after = {"phasors": phasors, "steady": steady} | ({} if is_paper else {"pending": pending})
-    after |= {"weighted": weighted} if spec.gains == "contact" and not is_paper else {}
+    after["phasors"] = phasors
     if spec.outputs == "bands":
         return _bands(spec, modes, amplitude), after
     return heard[..., None], after, {SAMPLES: radiated() * heard, PLACE: gathered[Places].T}
@@ -85,20 +96,29 @@ def _no_surface(name: str) -> Surface:
     raise NotImplementedError(f"the reference of contact audio knows listed modes alone, not those of the shape of {name}")
 
 
-def _strikes(
-    spec: ContactAudioSpec, context: ReferenceContext, row: int, num_rows: int, impulse: float, rubbed: float
-) -> Strikes:
-    """Return the impulses on a row: the impact at the start of the step, and noise of variance m_s W Δt/G each."""
-    is_paper = spec.model == "paper"
-    grains = 1 if spec.scrape == 0 else spec.samples if is_paper else GRAINS
-    times = [(g + 1) * context.dt / spec.samples if is_paper else g * context.dt / GRAINS for g in range(grains)]
+def _noise(spec: ContactAudioSpec, context: ReferenceContext, row: int, rubbed: float) -> Strikes:
+    """Return the noise on a row: impulses of variance m_s W Δt/G each."""
     if spec.scrape == 0:
-        return [(times[0], impulse)]
+        return []
+    is_paper = spec.model == "paper"
+    grains = spec.samples if is_paper else GRAINS
     words = (grains + 1) // 2
     index = np.arange(row * words, (row + 1) * words, dtype=np.uint64)
     normals = np.stack(normal_pair(context.words(index)), axis=-1).ravel()
     size = math.sqrt(spec.scrape * rubbed * context.dt / grains)
-    return [(time, size * normals[g] + (impulse if g == 0 else 0.0)) for g, time in enumerate(times)]
+    return [((g + is_paper) * context.dt / grains, size * normals[g]) for g in range(grains)]
+
+
+def _driven(
+    rate: complex, phasor: complex, rise: float, strikes: Strikes, samples: int, step: float
+) -> tuple[Float[np.ndarray, " sample"], complex]:
+    """Return the velocity of a mode of gain 1 in a step whose force rises evenly [N], and its phasor at the end."""
+    found = []
+    for k in range(1, samples + 1):
+        time = k * step / samples
+        noise = sum(u * np.exp(rate * (time - s)) for s, u in strikes if s <= time + 1e-12 * step)
+        found.append(np.exp(rate * time) * phasor + rise / step * np.expm1(rate * time) / rate**2 + noise)
+    return np.array([z.real + rate.real / rate.imag * z.imag for z in found]), complex(found[-1])
 
 
 def _ring(

@@ -62,7 +62,7 @@ class ContactAudioSpec(ProbeSpec):
     timestep: Annotated[Time | None, Usual("time", low=1e-5, high=0.1)] = None
     """Time that a physics step takes [s]; default: that of the scene."""
     settling: Annotated[Time, Usual("time", low=1e-4, high=1.0)] = 0.02
-    """Time in which a load counts as steady, τ [s]: what presses more slowly makes no sound."""
+    """Time in which a load counts as steady, τ [s]: what presses more slowly makes no sound. Of `physical`."""
     loudest: Annotated[StrictInt, Field(ge=1)] | None = None
     """Most modes of each body that are computed, those that ring with most energy, g²/4d; default: all that are heard."""
     scrape: NonNegative = 1e-5
@@ -71,8 +71,9 @@ class ContactAudioSpec(ProbeSpec):
     """`samples` to hear, one after the other; or `bands`: energy in third octaves, once per physics step."""
     scale: Literal["linear", "decibel"] | None = None
     """Of `bands`: `linear` [m²/s²], the default, or `decibel`, 10 lg(1 + E/E₀) with E₀ = (1 µm/s)²."""
-    model: Literal["physical", "paper"] = "physical"
-    """`paper`: the two-pole response as printed, and impulses of each rise of the force, however many steps it takes."""
+    model: Literal["physical", "force", "paper"] = "physical"
+    """`physical`: impulses of collisions; `force`: the force drives the modes, so that a contact excites what is slower than it
+    lasts; `paper`: the two-pole response as printed, and impulses of each rise of the force, however many steps it takes."""
     slots: Annotated[StrictInt, Field(ge=1)] = 4
     """Contacts per pair of body and object that are read one by one."""
     needs_taxels: ClassVar[bool] = False
