@@ -205,7 +205,7 @@ def test_table_and_picture_sum_alike(tmp_path):
     expected = force[0].sum(dim=0).norm().item()
     assert markers.summary() == f"|Σ| {expected:.3g} N · max {force[0].norm(dim=-1).max().item():.2g} N"
     sizes = force[0].norm(dim=-1).sum().item()
-    assert markers.headline.startswith(f"Σ |force| {sizes:.3g} N · |Σ force| {expected:.3g} N · max ")
+    assert markers.headline.startswith(f"Σ |force| {sizes:.3g} · |Σ force| {expected:.3g} · max ")
     assert table(touch, {"touch": force})[2].split()[1] == f"{expected:.3f}"
     small = markers_of(touch, sim, touch.outputs[0], 0.01 * force, 0)
     assert small.summary().startswith(f"|Σ| {10 * expected:.3g} mN")
@@ -229,7 +229,7 @@ def test_opposed_forces_do_not_hide_the_load(tmp_path):
     force[0, :, 0] = torch.tensor([0.5, -0.5] * 18)
     force[0, 0, 0] += 1e-7
     markers = markers_of(touch, sim, touch.outputs[0], force, 0)
-    assert markers.headline == "Σ |force| 18 N · |Σ force| 0 N · max 0.5 N"
+    assert markers.headline == "Σ |force| 18 · |Σ force| 0 · max 0.5 N"
 
 
 GRIPPER = """

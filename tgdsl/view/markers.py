@@ -79,32 +79,35 @@ class Markers(Taxels):
 
         Vectors of a link are summed as vectors, `|Σ|`, as the table of `tgdsl run` does; magnitudes alone as they are, `Σ`.
         """
-        value = self.value[chosen]
+        value, unit = self.value[chosen], f" {self.unit}" if self.unit else ""
         if not value.any():
-            return self._number(0.0)
-        if self.unit in ("m", "mm", "µm"):
-            return self._most(value)
-        total = f"Σ {self._number(value.sum())}" if self.vector is None else f"|Σ| {self._net(chosen)}"
-        return f"{total} · {self._most(value)}" if self.unit else total
+            return f"0{unit}"
+        most = f"max {value.max():.2g}{unit}"
+        if self._is_length:
+            return most
+        total = f"Σ {_number(value.sum())}" if self.vector is None else f"|Σ| {self._net(chosen)}"
+        return f"{total}{unit} · {most}" if unit else total
 
     @property
     def headline(self) -> str:
-        """All taxels: `Σ |force| 22.5 N · |Σ force| 2.45 N · max 0.3 N`. The forces of opposed fingers cancel in the second."""
-        if self.vector is None or not self.value.any() or self.unit in ("m", "mm", "µm"):
+        """All taxels: `Σ |force| 22.5 · |Σ force| 2.45 · max 0.3 N`. The forces of opposed fingers cancel in the second."""
+        if self.vector is None or not self.value.any() or self._is_length:
             return f"{self.quantity} {self.summary()}"
-        net = f"|Σ {self.quantity.strip('|')}| {self._net()}"
-        return f"Σ {self.quantity} {self._number(self.value.sum())} · {net} · {self._most(self.value)}"
+        net = f"|Σ {self.quantity.strip('|')}| {self._net(slice(None))}"
+        return f"Σ {self.quantity} {_number(self.value.sum())} · {net} · max {self.value.max():.2g} {self.unit}"
 
-    def _net(self, chosen: Int[Array, " chosen"] | slice = slice(None)) -> str:
+    @property
+    def _is_length(self) -> bool:
+        return self.unit in ("m", "mm", "µm")
+
+    def _net(self, chosen: Int[Array, " chosen"] | slice) -> str:
         assert self.vector is not None
         size = float(np.linalg.norm(self.vector[chosen].sum(axis=0)))
-        return self._number(self.scale * size if size > self.threshold else 0.0)
+        return _number(self.scale * size if size > self.threshold else 0.0)
 
-    def _most(self, value: Float[Array, " chosen"]) -> str:
-        return f"max {value.max():.2g} {self.unit}"
 
-    def _number(self, number: float) -> str:
-        return f"{number:.{3 if number >= 0.1 else 2}g} {self.unit}".rstrip()
+def _number(number: float) -> str:
+    return f"{number:.{3 if number >= 0.1 else 2}g}"
 
 
 def markers_of(touch: TactileModule, sim: Simulator, output: Output, values: Tensor, env: int) -> Markers:

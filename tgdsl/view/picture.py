@@ -136,7 +136,7 @@ def chosen_output(touch: TactileModule, readings: Mapping[str, Tensor], name: st
 
 def _draw_names(axes: Axes, viewport: Viewport, places: Mapping[str, Float[Array, " 3"]]) -> None:
     """Write the names of links at the left and right edge of the 3-D view, each with a line to its taxels."""
-    at = {name: viewport.project(place)[:2] for name, place in places.items()}
+    at = {name: (float(x), float(y)) for name, (x, y, _) in ((name, viewport.project(pos)) for name, pos in places.items())}
     for is_left in (True, False):
         side = sorted((name for name in at if (at[name][0] < viewport.width / 2) == is_left), key=lambda name: at[name][1])
         row = -np.inf
@@ -172,7 +172,7 @@ def _draw_maps(
     size = _TITLE[min(columns, 4)]
     for i, (link, chosen) in enumerate(maps.items()):
         axes = figure.add_subplot(grid[i], anchor="N", label=link)
-        along, is_tip = distal(model, table["body"][chosen[0]], table["pos"][chosen])
+        along, is_tip = distal(model, str(table["body"][chosen[0]]), table["pos"][chosen])
         _draw_map(axes, markers.value[chosen], table[chosen], along, norm)
         mark = "▲ tip" if is_tip else "▲ distal"
         axes.set_title(f"{names[link]}\n{markers.summary(chosen)}", fontsize=size, color=INK, linespacing=1.35, pad=17)
