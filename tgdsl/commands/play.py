@@ -111,8 +111,9 @@ class Play:
         from tgdsl.view.trace import TouchTrace
 
         live, tally = LiveTable(), Tally(env)
-        is_read = any(output.rows == "taxel" for output in env.touch.outputs)
-        trace = TouchTrace(env.touch, chosen_output(env.touch, env.now.readings), steps) if is_read else None
+        on_taxels = [own for own in env.touch.outputs if own.rows == "taxel" and own.kind != "surface_distance"]
+        felt = {own.name: env.now.readings[own.name] for own in on_taxels}  # a distance is read without touch too
+        trace = TouchTrace(env.touch, chosen_output(env.touch, felt), steps) if felt else None
         with tqdm(total=steps, desc="playing", unit="step", disable=None, leave=False) as bar:
             for played in play(env, actor, steps, self.seed):
                 record.add(played)

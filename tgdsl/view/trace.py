@@ -27,6 +27,7 @@ Array = np.ndarray
 RADIUS = (0.16, 0.36)
 """Radius of the sphere of a taxel that reads nothing, and of one that reads something, as a part of its patch's width."""
 _ROW, _LABELS, _WIDTH = 18, 120, 300  # height of a bar's row, width of the names, and of all [pixel]
+_LETTERS = 18  # of a name, from its end
 
 
 class TouchTrace:
@@ -101,6 +102,7 @@ class LinkBars:
         canvas = FigureCanvasAgg(figure)
         figure.text(6 / _WIDTH, 1 - 9 / height, title, size=7.5, color=INK, va="center")
         for i, name in enumerate(names):
+            name = name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}"
             figure.text(
                 (_LABELS - 6) / _WIDTH, 1 - (_ROW * (i + 1) + 9) / height, name, size=7.5, color=INK, ha="right", va="center"
             )
