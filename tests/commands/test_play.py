@@ -59,6 +59,27 @@ def test_play(base, here, without_opengl):
     assert [path.name for path in (base / "a b").iterdir()] == ["played.npz"]
 
 
+def test_the_video_shows_what_the_policy_feels(base, here, monkeypatch):
+    """What is drawn at each step is what was observed there; a policy without touch has nothing drawn."""
+    import tgdsl.rl.playing.video as module
+
+    sensors = base / "sensors.yaml"
+    sensors.write_text(
+        sensors.read_text().replace("direction: [0, 0, -1]", "direction: [0, 0, 1]")
+    )  # the side that rests on the item
+    traces = []
+    monkeypatch.setattr(module, "video", lambda *arguments: traces.append(arguments[-1]))
+    for touch in ("bool", "none"):
+        arguments = ("task.yaml", "--envs", "2", "--seconds", "0.3", "--actions", "random", "--set", f"touch={touch}")
+        code, _, error = here(base, "play", *arguments, "--out", touch)
+        assert code == 0, error
+    with np.load(base / "bool" / "played.npz") as found:
+        bits = found["obs:tactile_sensors"][:, 0]
+    assert bits.any() and not bits.all()
+    np.testing.assert_array_equal(traces[0].values[1:], bits[1:])
+    assert traces[1] is None
+
+
 def test_an_episode_of_zeros_is_the_default(base, here):
     code, out, error = here(base, "play", "task.yaml", "--no-video", "--set", "rewards.tilt=0", "--set", "touch=none")
     assert code == 0, error

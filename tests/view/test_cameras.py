@@ -13,6 +13,7 @@ from tgdsl.runtime.rollout import held_controls, rollout
 from tgdsl.view.cameras import VIEWS, ViewError, angles_of, best_camera, camera_of, facing_camera
 from tgdsl.view.markers import Markers, markers_of, touched
 from tgdsl.view.meshes import mesh_of
+from tgdsl.view.picture import drawing as picture_of
 from tgdsl.view.picture import picture
 from tgdsl.view.raster import Camera
 from tgdsl.view.table import table
@@ -196,17 +197,78 @@ def test_without_noise_what_reads_is_touched(tmp_path):
 
 
 def test_table_and_picture_sum_alike(tmp_path):
-    """Both say the length of the summed force, here with shear that cancels in part."""
+    """Both say the length of the summed force, here with shear that cancels in part; the headline first says the sum of sizes."""
     touch, sim = pad(tmp_path)
     sim.step()
     force = torch.randn(2, 36, 3, generator=torch.Generator().manual_seed(1)).double() + torch.tensor([0, 0, -1.0])
     markers = markers_of(touch, sim, touch.outputs[0], force, 0)
     expected = force[0].sum(dim=0).norm().item()
     assert markers.summary() == f"|Σ| {expected:.3g} N · max {force[0].norm(dim=-1).max().item():.2g} N"
-    assert markers.headline.startswith(f"|Σ force| {expected:.3g} N")
+    sizes = force[0].norm(dim=-1).sum().item()
+    assert markers.headline.startswith(f"Σ |force| {sizes:.3g} · |Σ force| {expected:.3g} · max ")
     assert table(touch, {"touch": force})[2].split()[1] == f"{expected:.3f}"
-    small = markers_of(touch, sim, touch.outputs[0], 1e-4 * force, 0)
-    assert small.summary().startswith(f"|Σ| {0.1 * expected:.3g} mN")
+    small = markers_of(touch, sim, touch.outputs[0], 0.01 * force, 0)
+    assert small.summary().startswith(f"|Σ| {10 * expected:.3g} mN")
+
+
+def test_what_rounding_leaves_is_not_touched(tmp_path):
+    touch, sim = pad(tmp_path)
+    force = torch.zeros(2, 36, 3)
+    force[0, :, 2] = torch.tensor([-2.0, 0.0011, 0.0009, 1e-7] * 9)
+    markers = markers_of(touch, sim, touch.outputs[0], force, 0)
+    np.testing.assert_array_equal(markers.is_touched, [True, True, False, False] * 9)
+    assert markers.threshold_label == "1 mN"
+    figure = picture_of(touch, sim, {"touch": force})
+    assert any("18 of 36 taxels touched (above 1 mN)" in text.get_text() for text in figure.texts)
+
+
+def test_opposed_forces_do_not_hide_the_load(tmp_path):
+    """36 forces of 0.5 N whose vector sum is what float32 leaves."""
+    touch, sim = pad(tmp_path)
+    force = torch.zeros(1, 36, 3)
+    force[0, :, 0] = torch.tensor([0.5, -0.5] * 18)
+    force[0, 0, 0] += 1e-7
+    markers = markers_of(touch, sim, touch.outputs[0], force, 0)
+    assert markers.headline == "Σ |force| 18 · |Σ force| 0 · max 0.5 N"
+
+
+GRIPPER = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos="0 0 .3" quat="0 1 0 0">
+      <geom type="cylinder" size=".01 .02"/>
+      <body name="left" pos=".03 0 .05"><joint type="slide" axis="1 0 0"/><geom type="box" size=".006 .01 .03"/></body>
+      <body name="right" pos="-.03 0 .05"><joint type="slide" axis="1 0 0"/><geom type="box" size=".006 .01 .03"/></body>
+    </body>
+    <body name="ball"><freejoint/><geom type="sphere" size=".01"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_hanging_gripper_hangs_and_shows_a_pad(tmp_path):
+    (tmp_path / "gripper.xml").write_text(GRIPPER)
+    grid = {"method": "grid", "rows": 4, "columns": 3, "radius": 0.004}
+    links = {"left": {**grid, "direction": [1, 0, 0]}, "right": {**grid, "direction": [-1, 0, 0]}}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "gripper.xml"), "layout": {"resolutions": {"o": links}}},
+            "objects": {"ball": {"body": "ball"}},
+            "sensors": {"touch": {**SENSOR, "links": "*", "feels": ["ball"]}},
+        }
+    )
+    sim = tgdsl.simulate(touch, 1)
+    pose, base = Pose(*sim.body_poses(0)), sim.model.body("base").id
+    markers = markers_of(touch, sim, touch.outputs[0], torch.ones(1, 24, 3), 0)
+    hand = mesh_of(sim.model, pose, {sim.model.body(name).id for name in ("base", "left", "right")})
+    for camera in (
+        camera_of("front", sim.model, [touch.plan.layout], pose, base),
+        best_camera(markers, hand, sim.model, touch.plan.layout, pose, base),
+    ):
+        assert camera.up[2] > 0.8
+        assert 0.4 < abs(camera.toward[0]) < 0.8  # along the normals: 0 is edge-on
+        assert in_view(sim, markers, camera) == 12  # all of one pad
 
 
 @pytest.mark.slow

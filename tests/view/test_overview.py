@@ -59,6 +59,17 @@ def test_arrows_are_the_vectors_in_the_plane_of_the_picture(scene):
     np.testing.assert_allclose(drawn / np.linalg.norm(drawn), expected / np.linalg.norm(expected), atol=1e-9)
 
 
+def test_each_panel_that_reads_has_a_colour_bar(scene):
+    touch, sim = scene
+    readings = {"force": torch.full((2, 6, 3), 2e-7), "depth": torch.full((2, 6, 1), 3e-3)}
+    force, depth = drawing(touch, sim, readings).axes[:2]
+    assert not force.child_axes  # nothing is above 1 mN
+    assert not any(isinstance(part, Quiver) for part in force.collections)
+    (bar,) = depth.child_axes
+    assert bar.get_title() == "depth [mm]   (grey: up to 1 µm)"
+    np.testing.assert_allclose(bar.get_xlim(), (0, 3), rtol=1e-6)
+
+
 def test_what_cannot_be_drawn(scene, tmp_path):
     touch, sim = scene
     with pytest.raises(ViewError, match="environment 2 does not exist, expected 0 to 1"):

@@ -7,15 +7,17 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 import tgdsl
+from tgdsl.compiler.pipeline import layouts
 from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.view.cameras import facing_camera
+from tgdsl.view.cameras import facing_camera, pose_of
 from tgdsl.view.markers import Markers, markers_of
 from tgdsl.view.meshes import mesh_of
-from tgdsl.view.picture import picture, short_names
+from tgdsl.view.picture import drawing, picture, short_names
 from tgdsl.view.raster import Camera, rasterise
 from tgdsl.view.taxels import Pose, is_visible
 
@@ -199,6 +201,83 @@ def test_short_names_drop_what_all_share() -> None:
     assert list(names.values()) == ["hand_link", "mid_link2", "thumb_rota_link1"]
     assert short_names(["pad"]) == {"pad": "pad"}
     assert short_names(["pad", "side"]) == {"pad": "pad", "side": "side"}
+
+
+# The maps ------------------------------------------------------------------------------------------------------------
+
+FINGER = """
+<mujoco><worldbody>
+<body name="palm" pos="0 0 .1" euler="0 0 20">
+  <geom type="box" size=".03 .02 .01"/>
+  <body name="near" pos=".04 0 0"><joint axis="0 1 0"/><geom type="box" size=".02 .01 .01" pos=".02 0 0"/>
+    <body name="far" pos=".05 0 0"><joint axis="0 1 0"/><geom type="box" size=".02 .01 .01" pos=".02 0 0"/></body>
+  </body>
+</body>
+<body name="ball" pos="0 0 1"><freejoint/><geom size=".01"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize("along", [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+def test_maps_have_the_distal_end_up_as_seen_from_outside(tmp_path: Path, along: list[int]) -> None:
+    """The finger runs along x, its taxels look along z: up is x, and the right of the map −y, whatever the columns run along."""
+    (tmp_path / "finger.xml").write_text(FINGER)
+    grid = {"method": "grid", "rows": 3, "columns": 3, "direction": [0, 0, -1], "columns_along": along, "radius": 0.004}
+    layout = {
+        "palm": grid,
+        "near": {"method": "poisson", "count": 12, "radius": 0.004, "region": {"facing": [0, 0, 1], "within": 0.1}},
+        "far": grid,
+    }
+    module = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "finger.xml"), "layout": {"resolutions": {"o": layout}}},
+            "objects": {"ball": {"body": "ball"}},
+            "sensors": {"depth": {"kind": "contact_depth", "links": "*", "feels": ["ball"]}},
+        }
+    )
+    table = module.taxels["depth"]
+    value = 0.01 + 0.1 * table["pos"][:, 0] + 0.03 * table["pos"][:, 1]
+    sim = tgdsl.simulate(module, num_envs=1)
+    figure = drawing(module, sim, {"depth": torch.tensor(value)[None, :, None]})
+    maps = {axes.get_label(): axes for axes in figure.axes if axes.get_label() in ("palm", "near", "far")}
+    for name in ("palm", "far"):
+        own = table["link"] == name
+        order = np.lexsort((-table["pos"][own, 1].round(6), -table["pos"][own, 0].round(6)))
+        np.testing.assert_allclose(maps[name].collections[0].get_array().ravel(), 1e3 * value[own][order])
+    x, y = np.asarray(maps["near"].collections[0].get_offsets()).T
+    own = table["pos"][table["link"] == "near"]
+    np.testing.assert_allclose(x, -1e3 * own[:, 1], atol=1e-6)
+    np.testing.assert_allclose(y, 1e3 * own[:, 0], atol=1e-6)
+    marks = {name: [text.get_text() for text in axes.texts] for name, axes in maps.items()}
+    assert marks == {"palm": ["▲ distal"], "near": ["▲ distal"], "far": ["▲ tip"]}
+    named = {text.get_text() for text in figure.axes[0].texts}
+    assert {axes.get_title().splitlines()[0] for axes in maps.values()} <= named
+
+
+def test_a_link_on_a_visual_mesh_is_drawn_as_that(tmp_path: Path) -> None:
+    """An OBJ file of two objects whose box of 20 × 20 × 60 mm does not collide, round a core of 10 mm that does."""
+    boxes = [trimesh.creation.box((0.02, 0.02, 0.03)).apply_translation((0, 0, z)) for z in (-0.015, 0.015)]
+    lines, count = [], 1
+    for i, box in enumerate(boxes):
+        lines += [f"o part{i}", *(f"v {x} {y} {z}" for x, y, z in box.vertices)]
+        lines += [f"f {a} {b} {c}" for a, b, c in box.faces + count]
+        count += len(box.vertices)
+    (tmp_path / "skin.obj").write_text("\n".join(lines))
+    (tmp_path / "hand.xml").write_text(
+        """<mujoco><asset><mesh name="skin" file="skin.obj"/></asset><worldbody><body name="tip">
+        <geom type="mesh" mesh="skin" contype="0" conaffinity="0"/><geom type="box" size=".005 .005 .005"/>
+        </body></worldbody></mujoco>"""
+    )
+    grid = {"method": "grid", "rows": 6, "columns": 2, "direction": [-1, 0, 0], "radius": 0.004}
+    with pytest.warns(UserWarning, match="read whole"):
+        model, found = layouts(
+            {"tgdsl": 1, "robot": {"model": str(tmp_path / "hand.xml"), "layout": {"resolutions": {"o": {"skin": grid}}}}}
+        )
+    body, pose = {model.body("tip").id}, pose_of(model, None)
+    skin = mesh_of(model, pose, body, found["o"].links).corners.reshape(-1, 3)
+    np.testing.assert_allclose([skin.min(axis=0), skin.max(axis=0)], [[-0.01, -0.01, -0.03], [0.01, 0.01, 0.03]], atol=1e-7)
+    assert np.abs(mesh_of(model, pose, body).corners).max() == pytest.approx(0.005)
 
 
 # The file ------------------------------------------------------------------------------------------------------------

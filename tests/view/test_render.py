@@ -9,7 +9,7 @@ import pytest
 from matplotlib.axes import Axes
 
 import tgdsl
-from tgdsl.compiler.pipeline import layouts
+from tgdsl.compiler.pipeline import layouts, placed
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.view.cameras import VIEWS, camera_of, pose_of
@@ -302,6 +302,12 @@ def test_a_document_has_the_taxels_of_its_sensors_at_its_resolution(folder: Path
     assert {name: layout.num_taxels for name, layout in found.items()} == {"many": 3, "few": 6}
     _, found = layouts(folder / "hand.yaml", {"sensors.touch.links": "all", "resolution": "few"})
     assert {name: layout.num_taxels for name, layout in found.items()} == {"few": 10}
+
+
+def test_progress_names_the_links(folder: Path) -> None:
+    told: list[str] = []
+    placed(folder / "bare.yaml", resolutions=("few",), progress=told.append)
+    assert told[-2:] == ["placing taxels on palm (1 of 2 links)", "placing taxels on finger (2 of 2 links)"]
 
 
 def test_the_layout_drawn_is_the_layout_compiled(folder: Path) -> None:

@@ -61,4 +61,11 @@ def test_numbers(touch):
 
 def test_the_first_environment_is_the_default(touch):
     assert table(touch, readings()) == table(touch, readings(), env=0)
-    assert table(touch, readings())[2].split() == ["palm", "0.000", "0.00e+00", "0.00e+00", "–", "–"]
+    assert table(touch, readings())[2].split() == ["palm", "0.000", "0", "0", "–", "–"]
+
+
+def test_rounding_is_printed_as_zero(touch):
+    """Up to 1 µm and 1 µN·m, which float32 leaves of centimetres and newtons."""
+    small = {"depth": torch.full((1, 3, 1), 0.9e-6), "depth/clean": torch.full((1, 3, 1), 1.1e-6)}
+    rest = {name: value[:1] for name, value in readings().items() if name not in small}
+    assert table(touch, rest | small)[2].split() == ["palm", "0.000", "0", "1.10e-06", "–", "–"]

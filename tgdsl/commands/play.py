@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tgdsl.rl.playing.actor import Actor
     from tgdsl.rl.playing.policy import PolicyFile
     from tgdsl.rl.playing.record import Record
+    from tgdsl.view.trace import TouchTrace
 
 _FILES = {"record": "played.npz", "video": "played.mp4"}
 Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK", help="The task's YAML document.")]
@@ -24,7 +25,7 @@ Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK", help=
 
 @dataclass(frozen=True)
 class Play:
-    """Step a task's environments, show returns, score and reward terms, and write what happened and a video."""
+    """Step a task's environments, show returns, score and reward terms, and write a record and a video that shows touch."""
 
     task: Task
     policy: OptionalFile = None
@@ -71,11 +72,11 @@ class Play:
         try:
             steps = steps_of(env, self.seconds)
             record = Record(env, steps)
-            self._steps(env, self._actor(env, policy), record, steps)
+            trace = self._steps(env, self._actor(env, policy), record, steps)
             record.write(with_folder(files["record"]))
             print(f"record: {files['record']}")
             if self.video:
-                self._draw(env, record, files["video"])
+                self._draw(env, record, trace, files["video"])
         finally:
             env.close()
 
@@ -99,31 +100,39 @@ class Play:
             print(f"changed since the policy was learned: {line}")
         return policy
 
-    def _steps(self, env: TouchEnv, actor: Actor, record: Record, steps: int) -> None:
-        """Make all steps."""
+    def _steps(self, env: TouchEnv, actor: Actor, record: Record, steps: int) -> TouchTrace | None:
+        """Make all steps, and return what the first environment's taxels read; None if no taxel is read."""
         from tqdm import tqdm
 
         from tgdsl.console.live import LiveTable
         from tgdsl.rl.playing.play import play
         from tgdsl.rl.playing.tally import Tally
+        from tgdsl.view.picture import chosen_output
+        from tgdsl.view.trace import TouchTrace
 
         live, tally = LiveTable(), Tally(env)
+        on_taxels = [own for own in env.touch.outputs if own.rows == "taxel" and own.kind != "surface_distance"]
+        felt = {own.name: env.now.readings[own.name] for own in on_taxels}  # a distance is read without touch too
+        trace = TouchTrace(env.touch, chosen_output(env.touch, felt), steps) if felt else None
         with tqdm(total=steps, desc="playing", unit="step", disable=None, leave=False) as bar:
             for played in play(env, actor, steps, self.seed):
                 record.add(played)
                 tally.add(played.step.info)
+                if trace is not None:
+                    trace.add(played.index + 1, env.now.readings)
                 bar.update()
                 with bar.external_write_mode():
                     time = (played.index + 1) * env.control_step
                     live.show(tally.lines(time), is_last=played.index == steps - 1)
+        return trace
 
-    def _draw(self, env: TouchEnv, record: Record, file: Path) -> None:
+    def _draw(self, env: TouchEnv, record: Record, trace: TouchTrace | None, file: Path) -> None:
         """Draw the video, or say why there is none."""
         from tgdsl.rl.playing.video import VideoError, video
 
         try:
             with StatusLine() as progress:
-                video(env.sim.env_model(0), record.poses(0), env.control_step, file, self.camera, progress)
+                video(env.sim.env_model(0), record.poses(0), env.control_step, file, self.camera, progress, trace)
         except VideoError as error:
             print(f"no video: {error}")
         else:

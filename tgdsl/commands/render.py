@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from tgdsl.commands.arguments import OUT, OptionalFile, Overrides, in_working_folder, parsed_overrides, robot_document
+from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
@@ -41,20 +42,24 @@ class Render:
         from tgdsl.view.render import render
 
         out = self.out or in_working_folder(self.hand, ".png")
-        model, layouts, unfelt = self._placed()
-        path = render(model, layouts, out, keyframe=self.keyframe, view=self.view, size=self.size, unfelt=unfelt)
+        with StatusLine() as progress:
+            model, layouts, unfelt = self._placed(progress)
+            progress("drawing the picture")
+            path = render(model, layouts, out, keyframe=self.keyframe, view=self.view, size=self.size, unfelt=unfelt)
         print(", ".join(f"{name}: {layout.num_taxels} taxels" for name, layout in layouts.items()))
         for name, found in unfelt.items():
             if found:
                 print(f"{name}: {len(unfelt_ids(found))} taxels cannot feel: {by_reason(found)}")
         print(f"picture: {path}")
 
-    def _placed(self) -> Placed:
+    def _placed(self, progress: StatusLine) -> Placed:
         """Return the model and the layouts to draw by resolution: an artefact's own, or those that its document would have."""
         from tgdsl.compiler.pipeline import Placed, placed
 
         if not self.hand.endswith(".safetensors"):
-            return placed(robot_document(self.hand, self.layout), parsed_overrides(self.set), self.resolutions)
+            return placed(
+                robot_document(self.hand, self.layout), parsed_overrides(self.set), self.resolutions, progress=progress
+            )
         from tgdsl.module.artifact import load_plan
         from tgdsl.scene.scene import scene_model
 

@@ -140,6 +140,7 @@ def placed(
     overrides: Mapping[str, Any] | None = None,
     resolutions: Sequence[str] = (),
     kinds: Sequence[Kind] = (),
+    progress: Progress = silent,
 ) -> Placed:
     """Return where a document puts taxels, at one resolution or more, without lowering sensors or baking objects.
 
@@ -148,6 +149,7 @@ def placed(
         overrides: YAML text, or plain values, by dotted path.
         resolutions: Default: the document's own, or all of the layout's if it names none.
         kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
+        progress: Is told what is done.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
@@ -164,7 +166,7 @@ def placed(
         if name not in names:
             raise TgdslError(f'the layout has no resolution "{name}"; {did_you_mean(name, names, "resolutions")}')
     texts = {name: chosen if name == own else {**chosen, "resolution": name} for name in wanted}
-    each = {name: resolve(load(document, text, known, needs_sensors=False)) for name, text in texts.items()}
+    each = {name: resolve(load(document, text, known, needs_sensors=False), progress) for name, text in texts.items()}
     found = {name: unfelt(own.colliders, own.layout, own.reach) for name, own in each.items()}
     return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, found)
 

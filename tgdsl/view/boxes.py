@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -23,8 +22,8 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.source import Simulator
 from tgdsl.view.markers import Markers
-from tgdsl.view.scene import Paint, Seen, draw_image, draw_scale_bar, rendered
-from tgdsl.view.style import INK, WARMTH
+from tgdsl.view.scene import Paint, Seen, draw_colour_bar, draw_image, draw_scale_bar, rendered
+from tgdsl.view.style import WARMTH
 from tgdsl.view.taxels import Pose, in_world
 
 Array = np.ndarray
@@ -150,12 +149,7 @@ def draw_boxes(axes: Axes, sim: Simulator, seen: Seen, boxes: Boxes, env: int) -
     scene = rendered(seen, boxes.painter(sim.model, Pose(*sim.body_poses(env))))
     draw_image(axes, scene.image, scene.viewport)
     draw_scale_bar(axes, scene.viewport.scale, scene.viewport.width, -44.0)
-    bar = axes.inset_axes((0.46, -0.06, 0.5, 0.022))
-    colours = axes.figure.colorbar(ScalarMappable(norm, WARMTH), cax=bar, orientation="horizontal")
-    colours.outline.set_visible(False)
-    bar.set_title(boxes.label, fontsize=8.5, color=INK, pad=3)
-    bar.tick_params(labelsize=8, colors=INK, length=2, pad=1.5)
-    bar.locator_params(nbins=5)
+    draw_colour_bar(axes.inset_axes((0.46, -0.06, 0.5, 0.022)), norm, WARMTH, boxes.label)
 
 
 def span(values: Array) -> str:

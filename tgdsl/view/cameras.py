@@ -29,6 +29,9 @@ VIEWS = {
     "iso": (36.0, 32.0),
 }
 """Where the camera is, from the taxels' mean normal: degrees round the hand to the picture's right, and degrees up."""
+OPPOSED = 0.2
+"""Length of the mean unit normal below which taxels have no common side, but look at each other, as a gripper's pads do."""
+_PAST_NEAR_PAD = np.radians(35.0)  # how far a camera turns from beside opposed pads towards the face of one
 _AROUND, _RISES = range(0, 360, 45), (-30, 16, 50)
 _LOOK = 200
 """Columns and rows of the pictures by which views are compared."""
@@ -86,18 +89,23 @@ def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose:
         layouts: The taxels, which count in the model's initial state, each by the surface that it stands for.
         pose: Where the bodies are.
         root: The hand's first body: up is an axis of its frame, the one along which the taxels lie farthest from its origin of
-            those that do not point at the camera.
+            those that do not point at the camera. Where taxels are opposed, up is against gravity, and the camera stands beside
+            the gap that they close, turned so far that one side's faces show.
     """
     initial = pose_of(model, None)
     taxels = [taxels_of(model, initial, layout) for layout in layouts]
     weight = np.concatenate([each.size**2 for each in taxels])
     centre = weight @ np.concatenate([each.pos for each in taxels]) / weight.sum()
-    normal = unit(weight @ np.concatenate([each.normal for each in taxels]), np.zeros(3))
+    normals = np.concatenate([each.normal for each in taxels])
+    mean = weight @ normals / weight.sum()
+    normal = unit(mean, np.zeros(3))
     axes = Rotation.from_quat(initial.quat[root], scalar_first=True).as_matrix().T
     axes = np.concatenate([axes, -axes])
     across = axes[np.abs(axes @ normal) < 0.7]
     up = across[np.argmax(across @ (centre - initial.pos[root] + [0, 0, 1e-6]))]  # the world's z, where nothing else decides
     toward = unit(normal - (normal @ up) * up, axes[np.argmin(np.abs(axes @ up))])
+    if np.linalg.norm(mean) < OPPOSED:
+        up, toward = _beside_gap(model, normals, weight)
     around, rise = np.radians(angles_of(view))
     level = np.cos(around) * toward + np.sin(around) * np.cross(up, toward)
     toward = np.cos(rise) * level + np.sin(rise) * up
@@ -106,6 +114,17 @@ def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose:
     turn = Rotation.from_quat(pose.quat[root], scalar_first=True).as_matrix() @ axes[:3]
     right, above, toward = frame @ turn.T
     return Camera(right, above, toward, pose.pos[root])
+
+
+def _beside_gap(
+    model: mujoco.MjModel, normals: Float[Array, "taxel 3"], weight: Float[Array, " taxel"]
+) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+    """Return up and toward the camera in the world, for taxels that look at each other."""
+    up = unit(-model.opt.gravity, np.array([0.0, 0.0, 1.0]))
+    level = normals - np.outer(normals @ up, up)
+    along = np.linalg.eigh((level * weight[:, None]).T @ level)[1][:, -1]
+    along = along * np.sign(along[np.abs(along).argmax()])
+    return up, np.cos(_PAST_NEAR_PAD) * np.cross(along, up) + np.sin(_PAST_NEAR_PAD) * along
 
 
 def facing_camera(markers: Markers, origin: Float[Array, " 3"]) -> Camera:
@@ -131,6 +150,8 @@ def facing_camera(markers: Markers, origin: Float[Array, " 3"]) -> Camera:
 def best_camera(markers: Markers, hand: Mesh, model: mujoco.MjModel, layout: Layout, pose: Pose, root: int) -> Camera:
     """Return the camera that those taxels face which read most (see `facing_camera`), or the one that shows most taxels.
 
+    Where those are opposed, that camera is `front`.
+
     Taxels count that are touched, or all where none is. The first camera is kept if it shows half as many as any other or more.
 
     Args:
@@ -141,8 +162,10 @@ def best_camera(markers: Markers, hand: Mesh, model: mujoco.MjModel, layout: Lay
         pose: Where the bodies are.
         root: The hand's first body.
     """
-    first = facing_camera(markers, pose.pos[root])
     wanted = markers.is_touched if markers.is_touched.any() else markers.size > 0
+    weight = markers.value if markers.is_read.any() else np.ones(len(markers.value))
+    is_opposed = np.linalg.norm(weight @ markers.normal) < OPPOSED * weight.sum()
+    first = camera_of("front", model, [layout], pose, root) if is_opposed else facing_camera(markers, pose.pos[root])
     own, _ = _shown(markers, wanted, hand, first)
     if 2 * own >= wanted.sum():
         return first

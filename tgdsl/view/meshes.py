@@ -5,12 +5,15 @@ Shapes: `face` triangles.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tgdsl.layout.layout import Link
 from tgdsl.scene.scene import is_absent
 from tgdsl.view.raster import Mesh
 from tgdsl.view.taxels import Pose
@@ -37,12 +40,23 @@ def robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], s
     return {body for body in robot if root in above[body]}, robot
 
 
-def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int]) -> Mesh:
-    """Return the triangles of some bodies: of their geoms that collide, or else of all; planes not."""
+def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int], links: Iterable[Link] = ()) -> Mesh:
+    """Return the triangles of some bodies: of their geoms that collide, or else of all; planes not.
+
+    Args:
+        model: The model.
+        pose: Where its bodies are.
+        bodies: Which of them.
+        links: What carries taxels: bodies that have theirs on a geom or mesh that does not collide show those that do not.
+    """
     parts = [Mesh(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
+    names = {link.name for link in links}
     for body in sorted(bodies):
         own = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
-        for geom in [i for i in own if model.geom_contype[i] or model.geom_conaffinity[i]] or own:
+        colliding = [i for i in own if model.geom_contype[i] or model.geom_conaffinity[i]]
+        others = [i for i in own if i not in colliding]
+        is_on_others = any(names & _names(model, i) for i in others) and not any(names & _names(model, i) for i in colliding)
+        for geom in (others if is_on_others else colliding) or own:
             corners, normals = _triangles(model, geom)
             in_body = Rotation.from_quat(model.geom_quat[geom], scalar_first=True)
             in_world = Rotation.from_quat(pose.quat[body], scalar_first=True)
@@ -50,6 +64,12 @@ def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int]) -> Mesh:
             matrix = (in_world * in_body).as_matrix().T
             parts.append(Mesh(corners @ matrix + centre, normals @ matrix, np.full(len(corners), body)))
     return Mesh(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _names(model: mujoco.MjModel, geom: int) -> set[str]:
+    """Return the names of links that a geom's may be: see `Link`."""
+    mesh = model.mesh(model.geom_dataid[geom]).name if model.geom_dataid[geom] >= 0 else ""
+    return {model.geom(geom).name, mesh, f"{model.body(model.geom_bodyid[geom]).name}/{mesh}"} - {""}
 
 
 def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:

@@ -21,8 +21,8 @@ from tgdsl.view.boxes import Boxes, boxes_of, draw_boxes, is_boxed
 from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import Markers, markers_of, touched
 from tgdsl.view.picture import chosen_output
-from tgdsl.view.scene import RenderedScene, draw_markers, rendered, seen
-from tgdsl.view.style import DPI, FAINT, INK, SUPERSAMPLING
+from tgdsl.view.scene import RenderedScene, draw_colour_bar, draw_markers, rendered, seen
+from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING
 from tgdsl.view.table import outputs_on_taxels
 from tgdsl.view.taxels import Pose
 
@@ -111,7 +111,7 @@ def drawing(
         columns,
         left=0.01,
         right=0.99,
-        bottom=(0.5 if boxes else 0.34) / figure.get_figheight(),
+        bottom=0.5 / figure.get_figheight(),
         top=1 - 1.0 / figure.get_figheight(),
         wspace=0.06,
         hspace=0.3,
@@ -122,8 +122,11 @@ def drawing(
         if isinstance(own, Boxes):
             draw_boxes(axes, sim, view_of, own, env)
         elif scene is not None:
-            draw_markers(axes, scene, own, Normalize(0.0, float(own.value.max()) or 1.0))
+            norm = Normalize(0.0, float(own.value.max()) or 1.0)
+            draw_markers(axes, scene, own, norm)
             _draw_arrows(axes, scene, own)
+            if own.is_read.any():
+                draw_colour_bar(axes.inset_axes((0.46, -0.06, 0.5, 0.022)), norm, HEAT, own.colour_label)
         axes.set_title(f"{output.name}  ·  {output.kind}", fontsize=11, color=INK, loc="left", pad=18, weight="bold")
         axes.text(0, 1.02, own.headline, transform=axes.transAxes, fontsize=9.5, color=FAINT)
     figure.text(0.012, 1 - 0.26 / figure.get_figheight(), title, size=15, weight="bold", color=INK, va="center")

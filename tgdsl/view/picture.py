@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -21,8 +22,8 @@ from tgdsl.module.outputs import Output
 from tgdsl.runtime.source import Simulator
 from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import Markers, markers_of, touched
-from tgdsl.view.raster import unit
-from tgdsl.view.scene import draw_markers, render_scene
+from tgdsl.view.raster import Viewport, unit
+from tgdsl.view.scene import draw_colour_bar, draw_markers, render_scene
 from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING
 
 Array = np.ndarray
@@ -30,6 +31,7 @@ SIZE = (16.0, 9.0)
 """Width and height of the picture [inch]."""
 VIEW = (0.0125, 0.06, 0.55, 0.82)  # the 3-D view in the figure: left, bottom, width, height
 MAX_MAPS = 12
+_NAME_SPACING = 0.028  # least distance of the names of links, as a part of the 3-D view's height
 _TITLE = {1: 11, 2: 11, 3: 9, 4: 7.8}  # size of the maps' titles, by how many stand side by side
 
 
@@ -64,6 +66,23 @@ def picture(
         ViewError: If there is no such reading, environment or view.
         FileError: If the file cannot be written.
     """
+    figure = drawing(touch, sim, readings, env=env, reading=reading, title=title, view=view)
+    with atomic_open(with_folder(path)) as file:
+        figure.savefig(file, format="png")
+    return path
+
+
+def drawing(
+    touch: TactileModule,
+    sim: Simulator,
+    readings: Mapping[str, Tensor],
+    *,
+    env: int = 0,
+    reading: str | None = None,
+    title: str = "",
+    view: str | None = None,
+) -> Figure:
+    """Return what `picture` writes: the 3-D view, then a map for each link, whose label is its name, and the colour bar."""
     output = chosen_output(touch, readings, reading)
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
@@ -74,18 +93,26 @@ def picture(
     figure = Figure(figsize=SIZE, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     width, height = (SUPERSAMPLING * round(part * size * DPI) for part, size in zip(VIEW[2:], SIZE, strict=True))
-    draw_markers(figure.add_axes(VIEW), render_scene(touch, sim, markers, env, width, height, view), markers, norm)
-    _draw_maps(figure, markers, table, norm)
+    links = list(dict.fromkeys(table["link"].tolist()))
+    links.sort(key=lambda link: -markers.value[table["link"] == link].sum())
+    names = short_names(links)
+    if len(links) > MAX_MAPS:
+        rest = f"and {len(links) - MAX_MAPS} more links, touched less or not at all"
+        figure.text(0.985, 0.912, rest, size=10.5, color=FAINT, ha="right", va="center")
+    maps = {link: np.flatnonzero(table["link"] == link) for link in links[:MAX_MAPS]}
+    axes, scene = figure.add_axes(VIEW), render_scene(touch, sim, markers, env, width, height, view)
+    draw_markers(axes, scene, markers, norm)
+    _draw_names(axes, scene.viewport, {names[link]: markers.pos[chosen].mean(axis=0) for link, chosen in maps.items()})
+    _draw_maps(figure, sim.model, markers, table, maps, names, norm)
     resolution = touch.plan.origin.resolution
     figure.text(0.016, 0.955, title or output.name, size=19, weight="bold", color=INK, va="center")
     parts = [output.name] if title else []
     parts += [output.kind, f"resolution {resolution}"] if resolution else [output.kind]
     count = f"{markers.is_touched.sum()} of {len(table)} taxels touched"
+    count += f" (above {markers.threshold_label})" if markers.threshold else ""
     parts += [count + ("" if markers.would_read is None else " before noise"), markers.headline, f"environment {env}"]
     figure.text(0.016, 0.912, "   ·   ".join(parts), size=11.5, color=FAINT, va="center")
-    with atomic_open(with_folder(path)) as file:
-        figure.savefig(file, format="png")
-    return path
+    return figure
 
 
 def chosen_output(touch: TactileModule, readings: Mapping[str, Tensor], name: str | None = None) -> Output:
@@ -107,56 +134,118 @@ def chosen_output(touch: TactileModule, readings: Mapping[str, Tensor], name: st
 # The maps -------------------------------------------------------------------------------------------------------------
 
 
-def _draw_maps(figure: Figure, markers: Markers, table: Array, norm: Normalize) -> None:
+def _draw_names(axes: Axes, viewport: Viewport, places: Mapping[str, Float[Array, " 3"]]) -> None:
+    """Write the names of links at the left and right edge of the 3-D view, each with a line to its taxels."""
+    at = {name: (float(x), float(y)) for name, (x, y, _) in ((name, viewport.project(pos)) for name, pos in places.items())}
+    for is_left in (True, False):
+        side = sorted((name for name in at if (at[name][0] < viewport.width / 2) == is_left), key=lambda name: at[name][1])
+        row = -np.inf
+        for name in side:
+            row = max(at[name][1], row + _NAME_SPACING * viewport.height)
+            axes.annotate(
+                name,
+                at[name],
+                (0.0 if is_left else viewport.width, row),
+                fontsize=8.5,
+                color=INK,
+                ha="left" if is_left else "right",
+                va="center",
+                zorder=7,
+                arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.6, "shrinkA": 1, "shrinkB": 0},
+                bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.8},
+            )
+
+
+def _draw_maps(
+    figure: Figure,
+    model: mujoco.MjModel,
+    markers: Markers,
+    table: Array,
+    maps: Mapping[str, Int[Array, " chosen"]],
+    names: Mapping[str, str],
+    norm: Normalize,
+) -> None:
     """Draw one map per link, the most touched first, and the colour bar that all share."""
-    links = list(dict.fromkeys(table["link"].tolist()))
-    links.sort(key=lambda link: -markers.value[table["link"] == link].sum())
-    shown, names = links[:MAX_MAPS], short_names(links)
-    columns = int(np.ceil(np.sqrt(len(shown))))
-    rows = -(-len(shown) // columns)
-    grid = figure.add_gridspec(rows, columns, left=0.60, right=0.985, bottom=0.15, top=0.83, hspace=0.36, wspace=0.16)
-    for i, link in enumerate(shown):
-        axes = figure.add_subplot(grid[i], anchor="N")
-        chosen = np.flatnonzero(table["link"] == link)
-        _draw_map(axes, markers.value[chosen], table[chosen], norm)
-        axes.set_title(
-            f"{names[link]}\n{markers.summary(chosen)}", fontsize=_TITLE[min(columns, 4)], color=INK, linespacing=1.35
-        )
-    if len(links) > MAX_MAPS:
-        rest = f"and {len(links) - MAX_MAPS} more links, touched less or not at all"
-        figure.text(0.985, 0.912, rest, size=10.5, color=FAINT, ha="right", va="center")
+    columns = int(np.ceil(np.sqrt(len(maps))))
+    rows = -(-len(maps) // columns)
+    grid = figure.add_gridspec(rows, columns, left=0.60, right=0.985, bottom=0.15, top=0.82, hspace=0.44, wspace=0.16)
+    size = _TITLE[min(columns, 4)]
+    for i, (link, chosen) in enumerate(maps.items()):
+        axes = figure.add_subplot(grid[i], anchor="N", label=link)
+        along, is_tip = distal(model, str(table["body"][chosen[0]]), table["pos"][chosen])
+        _draw_map(axes, markers.value[chosen], table[chosen], along, norm)
+        mark = "▲ tip" if is_tip else "▲ distal"
+        axes.set_title(f"{names[link]}\n{markers.summary(chosen)}", fontsize=size, color=INK, linespacing=1.35, pad=17)
+        axes.annotate(mark, (0.5, 1.0), (0, 3), "axes fraction", "offset points", fontsize=size - 1, color=FAINT, ha="center")
     if markers.is_read.any():
-        _draw_colour_bar(figure, markers, norm)
+        draw_colour_bar(figure.add_axes((0.645, 0.06, 0.295, 0.016)), norm, HEAT, markers.colour_label, 10)
     else:
         figure.text(0.7925, 0.083, f"{markers.quantity}: nothing is touched", size=10.5, color=FAINT, ha="center", va="center")
 
 
-def _draw_colour_bar(figure: Figure, markers: Markers, norm: Normalize) -> None:
-    axes = figure.add_axes((0.645, 0.075, 0.295, 0.016))
-    bar = figure.colorbar(ScalarMappable(norm, HEAT), cax=axes, orientation="horizontal")
-    bar.outline.set_visible(False)
-    axes.set_xlabel(f"{markers.label}   (grey: zero)", fontsize=10.5, color=INK)
-    axes.tick_params(labelsize=9.5, colors=INK, length=3)
+def distal(model: mujoco.MjModel, body: str, pos: Float[Array, "taxel 3"]) -> tuple[Float[Array, " 3"], bool]:
+    """Return the direction in a body's frame in which the robot goes on from its joint, and whether it ends there.
+
+    It leads to the bodies that move against this one, or else to its taxels.
+
+    Args:
+        model: The robot.
+        body: The body, by name.
+        pos: Its taxels in its frame [m].
+    """
+    own = model.body(body).id
+    state = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, state)
+    base = own
+    while model.body_parentid[base] and not model.body_jntnum[base]:
+        base = model.body_parentid[base]
+    rigid = [i for i in range(model.nbody) if model.body_weldid[i] == model.body_weldid[own]]
+    ends = [i for i in range(model.nbody) if model.body_parentid[i] in rigid and model.body_jntnum[i] and i != base]
+    rotation = state.xmat[own].reshape(3, 3)
+    end = state.xpos[ends].mean(axis=0) if ends else state.xpos[own] + rotation @ pos.mean(axis=0)
+    return (end - state.xpos[base]) @ rotation, not ends
 
 
-def _draw_map(axes: Axes, value: Array, table: Array, norm: Normalize) -> None:
-    """Draw one link: a grid by row (down) and column (right), or scattered taxels in the plane of their mean tangent."""
+def turned(table: Array, along: Float[Array, " 3"]) -> tuple[Float[Array, " 3"], int]:
+    """Return the direction to the right of a link's map, and by how many quarter turns, counter-clockwise, its grid is turned.
+
+    Unturned, columns run to the right and rows down, seen from outside.
+
+    Args:
+        table: The link's taxels.
+        along: What shall be up, as nearly as it can be, in the frame of the body.
+    """
+    normal = unit(table["normal"].mean(axis=0), table["normal"][0])
+    across = table["tangent"].mean(axis=0)
+    across = unit(across - (across @ normal) * normal, table["tangent"][0])
+    if (table["row"] < 0).any():
+        up = along - (along @ normal) * normal
+        return (unit(np.cross(up, normal), across) if np.linalg.norm(up) > 0.1 * np.linalg.norm(along) else across), 0
+    up = np.cross(normal, across)
+    return across, int(np.argmax(np.array([up, across, -up, -across]) @ along))
+
+
+def _draw_map(axes: Axes, value: Array, table: Array, along: Float[Array, " 3"], norm: Normalize) -> None:
+    """Draw one link with its distal end up: a grid in quarter turns, or scattered taxels in the plane of their mean normal."""
     shown = np.where(value > 0, value, -1.0)
     active = table["radius"] > 0
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
+    across, quarters = turned(table, along)
+    normal = unit(table["normal"].mean(axis=0), table["normal"][0])
+    x, y = 1e3 * table["pos"] @ across, 1e3 * table["pos"] @ np.cross(normal, across)
     if (table["row"] >= 0).all():
         cells = np.full((table["row"].max() + 1, table["column"].max() + 1), np.nan)
         cells[table["row"][active], table["column"][active]] = shown[active]
+        pitch = np.array([np.ptp(y), np.ptp(x)]) / np.maximum(np.array(cells.shape) - 1, 1)
+        pitch = np.where(pitch > 0, pitch, pitch.max() or 1.0)  # of a single row or column there is no pitch
+        high, wide = pitch[::-1] if quarters % 2 else pitch
+        cells = np.rot90(cells, quarters)
         axes.patch.set(facecolor="#f6f7f8", hatch="////", edgecolor="#d9dce0", linewidth=0)
         edge = 9.0 / max(9, *cells.shape)
         axes.pcolormesh(np.ma.masked_invalid(cells), cmap=HEAT, norm=norm, edgecolors="white", linewidth=edge)
-        axes.set(aspect="equal", ylim=(len(cells), 0))
+        axes.set(aspect=np.clip(high / wide, 0.4, 2.5), ylim=(len(cells), 0))
         return
-    normal = unit(table["normal"].mean(axis=0), table["normal"][0])
-    across = table["tangent"].mean(axis=0)
-    across = unit(across - (across @ normal) * normal, table["tangent"][0])
-    x, y = 1e3 * table["pos"] @ across, 1e3 * table["pos"] @ np.cross(normal, across)
     size = 0.03 * axes.get_window_extent().height * 72 / DPI
     axes.scatter(x[active], y[active], c=shown[active], cmap=HEAT, norm=norm, s=size**2, linewidths=0)
     axes.patch.set_facecolor("#f6f7f8")

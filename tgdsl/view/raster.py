@@ -81,14 +81,22 @@ def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fra
         height: Number of rows.
     """
     face, row, left, right = _scanlines(corners, width, height)
-    count = np.maximum(right - left + 1, 0)
+    count = right - left + 1
     inside = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    face, row, column = np.repeat(face, count), np.repeat(row, count), np.repeat(left, count) + inside
-    edges = corners[:, 1:, :2] - corners[:, :1, :2]
-    inverse = np.linalg.pinv(edges) if len(edges) else edges
-    relative = np.stack([column, row], axis=-1) - corners[face, 0, :2]
-    second = np.einsum("pi,pij->pj", relative, inverse[face])
-    weights = np.clip(np.column_stack([1 - second.sum(axis=1), second]), 0, 1)
+    drawn, index = np.unique(face, return_inverse=True)
+    face, index, row, column = (
+        np.repeat(face, count),
+        np.repeat(index, count),
+        np.repeat(row, count),
+        np.repeat(left, count) + inside,
+    )
+    start = corners[drawn, 0, :2]
+    (x, y), (x_end, y_end) = (corners[drawn, 1, :2] - start).T, (corners[drawn, 2, :2] - start).T
+    area = x * y_end - x_end * y
+    area = np.where(area == 0, np.inf, area)  # seen edge-on: its first corner stands for it
+    u, v = (np.stack([column, row], axis=-1) - start[index]).T
+    second = (u * (y_end / area)[index] - v * (x_end / area)[index], v * (x / area)[index] - u * (y / area)[index])
+    weights = np.clip(np.stack([1 - second[0] - second[1], *second], axis=-1), 0, 1)
     nearness = (weights * corners[face, :, 2]).sum(axis=1)
     pixel = row * width + column
     nearest = np.full(height * width, -np.inf)
@@ -101,7 +109,7 @@ def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fra
 
 
 def _scanlines(corners: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:
-    """Return face, row, first and last column of each run of pixels that a triangle covers in a row."""
+    """Return face, row, first and last column of each run of pixels, at least one, that a triangle covers in a row."""
     low = np.clip(np.ceil(corners[:, :, 1].min(axis=1)), 0, height).astype(int)
     high = np.clip(np.floor(corners[:, :, 1].max(axis=1)), -1, height - 1).astype(int)
     count = np.maximum(high - low + 1, 0)
@@ -116,7 +124,9 @@ def _scanlines(corners: Array, width: int, height: int) -> tuple[Array, Array, A
         left, right = np.fmin(left, crossing), np.fmax(right, crossing)
     left, right = np.where(left > right, 1, left), np.where(left > right, 0, right)
     first = np.clip(np.ceil(left - 1e-9), 0, width).astype(int)
-    return face, row, first, np.clip(np.floor(right + 1e-9), -1, width - 1).astype(int)
+    last = np.clip(np.floor(right + 1e-9), -1, width - 1).astype(int)
+    is_run = last >= first
+    return face[is_run], row[is_run], first[is_run], last[is_run]
 
 
 def shade(image: Array, fragments: Fragments, mesh: Mesh, colour: Array, camera: Camera, opacity: float, scale: float) -> Array:

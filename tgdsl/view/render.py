@@ -102,9 +102,10 @@ def drawing(
     _check(layouts, view, size)
     pose = pose_of(model, keyframe)
     taxels = [taxels_of(model, pose, layout) for layout in layouts.values()]
-    framed, robot = robot_bodies(model, {model.body(link.body).id for layout in layouts.values() for link in layout.links})
+    links = [link for layout in layouts.values() for link in layout.links]
+    framed, robot = robot_bodies(model, {model.body(link.body).id for link in links})
     camera = camera_of(view, model, list(layouts.values()), pose, min(framed))
-    hand = mesh_of(model, pose, robot)
+    hand = mesh_of(model, pose, robot, links)
     shown = [hand.corners[np.isin(hand.body, list(framed))].reshape(-1, 3), *(each.pos for each in taxels)]
     box = _box(camera.project(np.concatenate(shown))[:, :2])
     width, height = size or _natural_size(box, len(layouts))

@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import Figure
 
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
@@ -82,7 +84,7 @@ def seen(
     carriers = {model.body(link.body).id for link in links}
     framed, robot = robot_bodies(model, carriers)
     felt = {model.body(target.body).id for target in touch.plan.objects} - carriers
-    hand, objects = (mesh_of(sim.env_model(env), pose, bodies) for bodies in (robot - felt, felt))
+    hand, objects = (mesh_of(sim.env_model(env), pose, bodies, links) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
     own = next((own for own in (touch.plan.layout, *layouts) if (own.radius > 0).any()), touch.plan.layout)
     root = min(framed)
@@ -150,6 +152,16 @@ def draw_scale_bar(axes: Axes, scale: float, width: int, row: float) -> None:
     end = 8 + length * scale / 1000
     axes.plot([8, end], [row, row], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False)
     axes.text(end + 16, row - 1, f"{length} mm", fontsize=9.5, color=INK, va="center")
+
+
+def draw_colour_bar(axes: Axes, norm: Normalize, colours: Colormap, label: str, size: float = 8.5) -> None:
+    """Fill axes with the bar of a panel's colours, its label above it in some size [pt]."""
+    assert isinstance(axes.figure, Figure)
+    bar = axes.figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal")
+    bar.outline.set_visible(False)
+    axes.set_title(label, fontsize=size, color=INK, pad=3)
+    axes.tick_params(labelsize=size - 0.5, colors=INK, length=2, pad=1.5)
+    axes.locator_params(nbins=5)
 
 
 def _bounds(hand: Array, objects: Array) -> Array:

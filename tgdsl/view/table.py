@@ -11,6 +11,7 @@ from tgdsl.console.tables import TaxelTable
 from tgdsl.module.memory.history import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
+from tgdsl.view.markers import THRESHOLDS
 
 
 def outputs_on_taxels(touch: TactileModule) -> list[Output]:
@@ -90,4 +91,5 @@ def _cell(taxels: TaxelTable, output: Output, readings: Mapping[str, Tensor], li
     if output.channels[:3] == ("force_x", "force_y", "force_z"):
         return f"{np.linalg.norm(values[:, :3].sum(axis=0)):.3f}"
     is_vector = output.channels[0].endswith("_x")
-    return f"{np.linalg.norm(values[:, : 3 if is_vector else 1], axis=1).max():.2e}"
+    largest = np.linalg.norm(values[:, : 3 if is_vector else 1], axis=1).max()
+    return f"{largest:.2e}" if largest > THRESHOLDS.get(output.units[0], 0.0) else "0"

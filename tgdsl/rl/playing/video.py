@@ -21,6 +21,7 @@ from jaxtyping import Float, UInt8
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import FileError, TgdslError, did_you_mean
 from tgdsl.files.write import atomic_path
+from tgdsl.view.trace import TouchTrace
 
 WIDTH, HEIGHT = 960, 720
 """Pixels of a frame."""
@@ -51,6 +52,7 @@ def video(
     path: Path,
     camera: str | None = None,
     progress: Progress = silent,
+    trace: TouchTrace | None = None,
 ) -> Path:
     """Draw an environment in real time; return the file.
 
@@ -61,6 +63,7 @@ def video(
         path: The file to write, `.mp4`.
         camera: A camera of the scene; default: its first one, or MuJoCo's free camera where it has none.
         progress: Is told in a line what is being done.
+        trace: What the taxels read at each control step: they are drawn, and a bar for each link.
 
     Raises:
         VideoError: If the scene has no such camera, OpenGL cannot be started, or imageio-ffmpeg is missing.
@@ -68,9 +71,9 @@ def video(
     """
     check_camera(model, camera)
     every = max(1, math.ceil(1.0 / (MAX_RATE * control_step) - 1e-9))
-    shown, encoder = {name: values[::every] for name, values in poses.items()}, _encoder()
+    steps, encoder = range(0, len(poses["qpos"]), every), _encoder()
     with closing(_renderer(model)) as renderer, atomic_path(path) as temporary:
-        frames = _told(_frames(model, shown, renderer, camera), len(shown["qpos"]), progress)
+        frames = _told(_frames(model, poses, steps, renderer, camera, trace), len(steps), progress)
         _encode(encoder, frames, 1.0 / (every * control_step), temporary, path)
     return path
 
@@ -78,17 +81,23 @@ def video(
 def _frames(
     model: mujoco.MjModel,
     poses: Mapping[str, Float[np.ndarray, "step ..."]],
+    steps: range,
     renderer: mujoco.Renderer,
     camera: str | None,
+    trace: TouchTrace | None,
 ) -> Iterator[Frame]:
-    data = mujoco.MjData(model)
+    data, bars = mujoco.MjData(model), None if trace is None else trace.bars()
     seen_from = camera if camera is not None else (0 if model.ncam else -1)
-    for i in range(len(poses["qpos"])):
+    for i in steps:
         for name, values in poses.items():
             getattr(data, name)[:] = values[i]
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, seen_from)
-        yield renderer.render()
+        if trace is None or bars is None:
+            yield renderer.render()
+        else:
+            trace.draw(renderer.scene, model, data, i)
+            yield bars.draw(renderer.render(), i)
 
 
 def _told(frames: Iterable[Frame], count: int, progress: Progress) -> Iterator[Frame]:

@@ -1,0 +1,124 @@
+"""What taxels read over a run, for a video: each as a coloured sphere in MuJoCo's scene, and a bar for each link.
+
+Shapes: `step` control steps, `link` links with a bar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from tgdsl.module.memory.history import last_step
+from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
+from tgdsl.view.markers import magnitude
+from tgdsl.view.picture import MAX_MAPS, short_names
+from tgdsl.view.style import DPI, HEAT, INK, REST
+from tgdsl.view.taxels import Pose, in_world
+
+Array = np.ndarray
+RADIUS = (0.16, 0.36)
+"""Radius of the sphere of a taxel that reads nothing, and of one that reads something, as a part of its patch's width."""
+_ROW, _LABELS, _WIDTH = 18, 120, 300  # height of a bar's row, width of the names, and of all [pixel]
+_LETTERS = 18  # of a name, from its end
+
+
+class TouchTrace:
+    """Readings of the taxels of one environment over a run.
+
+    Attributes:
+        values: Magnitude of each taxel's reading at the start of each control step [the reading's unit].
+    """
+
+    def __init__(self, touch: TactileModule, output: Output, num_steps: int):
+        """Begin; what is not added stays 0.
+
+        Args:
+            touch: The module.
+            output: Which reading: one of taxels.
+            num_steps: Number of control steps.
+        """
+        self._table, self._output = touch.taxels[output.sensor], output
+        self.values: Float[Array, "step taxel"] = np.zeros((num_steps, len(self._table)))
+
+    def add(self, step: int, readings: Mapping[str, Tensor], env: int = 0) -> None:
+        """Keep what an environment reads at the start of a control step; steps beyond the last are left out."""
+        if step < len(self.values):
+            read = last_step(readings[self._output.name])[env].detach().cpu().double().numpy()
+            self.values[step] = magnitude(read, self._output.units)
+
+    def draw(self, scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData, step: int) -> None:
+        """Add the taxels to a scene: colours run to the largest reading of the run; what reads nothing is small and grey."""
+        table, value = self._table, self.values[step]
+        pos, _ = in_world(model, Pose(data.xpos, data.xquat), table["body"], table["pos"], table["normal"])
+        colour = np.array(HEAT(np.where(value > 0, value / (self.values.max() or 1.0), -1.0)))
+        size = np.sqrt(table["area"]) * np.where(value > 0, RADIUS[1], RADIUS[0])
+        active = np.flatnonzero(table["radius"] > 0)[: scene.maxgeom - scene.ngeom]
+        for i in active:
+            sphere = scene.geoms[scene.ngeom]
+            mujoco.mjv_initGeom(
+                sphere,
+                mujoco.mjtGeom.mjGEOM_SPHERE,
+                np.full(3, size[i]),
+                pos[i],
+                np.eye(3).ravel(),
+                colour[i].astype(np.float32),
+            )
+            scene.ngeom += 1
+
+    def bars(self) -> LinkBars:
+        """Return the bars of the links: sums of magnitudes, or the largest of lengths and of contact bits."""
+        links = list(dict.fromkeys(self._table["link"].tolist()))
+        reduce = np.sum if self._output.units[0] in ("N", "N·m") else np.max
+        each = np.stack([reduce(self.values[:, self._table["link"] == link], axis=1) for link in links], axis=1)
+        shown = np.sort(np.argsort(-each.max(axis=0, initial=0.0), kind="stable")[:MAX_MAPS])
+        names, unit = short_names(links), self._output.units[0]
+        stem = self._output.channels[0].removesuffix("_x")
+        full = float(each.max(initial=0.0))
+        what = f"Σ |{stem}|" if reduce is np.sum else f"largest {stem}"
+        title = f"{what}, full: {full:.3g} {'' if unit == '1' else unit}; spheres: up to {self.values.max(initial=0.0):.2g}"
+        return LinkBars(tuple(names[links[i]] for i in shown), each[:, shown] / (full or 1.0), title.strip())
+
+
+class LinkBars:
+    """Bars at the lower left of a frame.
+
+    Attributes:
+        parts: How full each bar is at each step, from 0 to 1.
+    """
+
+    def __init__(self, names: tuple[str, ...], parts: Float[Array, "step link"], title: str):
+        """Draw what stays: names and a title."""
+        self.parts = parts
+        height = _ROW * (len(names) + 1)
+        figure = Figure(figsize=(_WIDTH / DPI, height / DPI), dpi=DPI, facecolor="white")
+        canvas = FigureCanvasAgg(figure)
+        figure.text(6 / _WIDTH, 1 - 9 / height, title, size=7.5, color=INK, va="center")
+        for i, name in enumerate(names):
+            name = name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}"
+            figure.text(
+                (_LABELS - 6) / _WIDTH, 1 - (_ROW * (i + 1) + 9) / height, name, size=7.5, color=INK, ha="right", va="center"
+            )
+        canvas.draw()
+        self._labels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    def draw(self, frame: UInt8[Array, "row column 3"], step: int) -> UInt8[Array, "row column 3"]:
+        """Return a frame with the bars of a step over it."""
+        panel = self._labels.copy()
+        for i, part in enumerate(self.parts[step]):
+            rows = slice(_ROW * (i + 1) + 4, _ROW * (i + 2) - 4)
+            room = _WIDTH - _LABELS - 8
+            panel[rows, _LABELS : _LABELS + room] = np.round(255 * np.array(to_rgb(REST)))
+            panel[rows, _LABELS : _LABELS + round(room * part)] = np.round(255 * np.array(HEAT(part)[:3]))
+        drawn = frame.copy()
+        height, width = panel.shape[:2]
+        under = drawn[-height:, :width]
+        under[:] = np.round(0.15 * under + 0.85 * panel)
+        return drawn
