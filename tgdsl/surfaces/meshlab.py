@@ -27,6 +27,9 @@ MAX_HOLE = 0.05
 """A component is solid, so that points can be inside it, if the squared length of its border is at most this share of its
 area: a sphere with a hole of an eighth of its radius is, a bowl is not."""
 
+ROUNDING = 0.05
+"""Fast winding numbers (Barill et al., SIGGRAPH 2018) that are this close to an integer are not computed exactly."""
+
 
 @dataclass(frozen=True, eq=False)
 class Shell:
@@ -60,7 +63,10 @@ class Shell:
         vertices, faces = self.solid(component)
         near = ((pos >= vertices.min(axis=0) - self.offset) & (pos <= vertices.max(axis=0) + self.offset)).all(axis=1)
         if near.any():
-            winding[near] = np.atleast_1d(igl.winding_number(vertices, faces, pos[near]))
+            winding[near] = np.atleast_1d(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(pos[near])))
+        doubtful = np.flatnonzero(np.abs(winding - np.round(winding)) > ROUNDING)
+        if len(doubtful):
+            winding[doubtful] = np.atleast_1d(igl.winding_number(vertices, faces, pos[doubtful]))
         return winding
 
 

@@ -189,15 +189,15 @@ def _groups(found: Sequence[Flexion], names: dict[int, str], links: tuple[str, .
     mounts = {names[body] for flexion in found for body in flexion.hand.mounts} - palms
     known = {name for name, members in (("tips", tips), ("palm", palms), ("fingers", fingers), ("hand", links)) if members}
 
-    def members(*groups: str, bodies: set[str]) -> tuple[str, ...]:
-        patterns = (_own(escaped(name), known) for name in sorted(bodies, key=order.__getitem__))
-        return (*(group for group in groups if group in known), *patterns)
+    def members(group: str, *others: str, bodies: set[str]) -> tuple[str, ...]:
+        patterns = (_own(escaped(name), known - {group}) for name in sorted(bodies, key=order.__getitem__))
+        return (*(other for other in others if other in known), *patterns)
 
     wanted = {
-        "tips": members(bodies=tips),
-        "palm": members(bodies=palms),
-        "fingers": members("tips", bodies=fingers - tips) if fingers else (),
-        "hand": members("fingers", "palm", bodies=mounts),
+        "tips": members("tips", bodies=tips),
+        "palm": members("palm", bodies=palms),
+        "fingers": members("fingers", "tips", bodies=fingers - tips) if fingers else (),
+        "hand": members("hand", "fingers", "palm", bodies=mounts),
     }
     return {name: group for name, group in wanted.items() if group}
 
@@ -208,7 +208,7 @@ def escaped(name: str) -> str:
 
 
 def _own(pattern: str, groups: set[str]) -> str:
-    """Return a pattern that means the link even if a group has its name."""
+    """Return a pattern that means the link even if another group has its name."""
     return f"[{pattern[0]}]{pattern[1:]}" if pattern in groups else pattern
 
 

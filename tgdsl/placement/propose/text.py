@@ -19,6 +19,7 @@ from tgdsl.placement.propose.propose import FACTORS, LinkProposal, Proposal, esc
 WIDTH = 120
 """Lists of names are broken at this column."""
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*\Z")
+_BRACKETED, _CHARACTER = re.compile(r"\[(.)\]"), r"\1"
 _KEYWORDS = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
 _HEADER = """\
 # A layout for {robot}, proposed by `tgdsl layout new`: nobody has looked at it yet.
@@ -81,7 +82,7 @@ def new_layout(
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),
-        *(f"group {name}: {listed(members)}" for name, members in proposal.groups.items()),
+        *(f"group {name}: {_BRACKETED.sub(_CHARACTER, listed(members))}" for name, members in proposal.groups.items()),
         *(f"left out: {line}" for line in _left_out(proposal)),
         *(f"weak guess of the inner side: {line}" for line in _doubts(proposal, has_side=True)),
         *(f"all around: {line}" for line in _doubts(proposal, has_side=False)),
@@ -147,7 +148,7 @@ def _groups_text(proposal: Proposal) -> str:
         if name == "tips" and "palm" not in proposal.groups:
             lines.append(_NO_PALM)
     if any(member.startswith("[") for members in proposal.groups.values() for member in members):
-        lines.append("  # A name such as [p]alm means the link palm, where the group has the same name.\n")
+        lines.append("  # A name such as [p]alm means the link palm, where another group has the same name.\n")
     return "".join(lines)
 
 
