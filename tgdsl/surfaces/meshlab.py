@@ -107,7 +107,8 @@ def _clean(surface: Surface) -> Surface:
         used, faces = np.unique(faces, return_inverse=True)
         vertices = surface.vertices[used]
         meshes.add_mesh(pymeshlab.Mesh(vertices, faces.reshape(-1, 3)))
-        weld = 1e-7 * float(np.ptp(vertices, axis=0).max())
+        # Corners that files have several times, such as STL's, are off by the rounding of float32, far from the origin by more.
+        weld = max(1e-6 * float(np.ptp(vertices, axis=0).max()), LENGTH_TOLERANCE)
         meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(weld))
         meshes.meshing_remove_duplicate_faces()
         meshes.meshing_remove_null_faces()

@@ -125,3 +125,10 @@ def test_links_that_are_called_as_groups_are_printed_plainly(tmp_path, here):
     assert "  palm: [palm]\n" in text and '  tips: [tips, "[h]and"]\n' in text
     groups = compiled(tmp_path, {"hand": "geometric"}, "low").plan.layout.groups
     assert (groups["palm"], groups["tips"]) == (("palm",), ("tips", "hand"))
+
+
+def test_a_proposal_tells_which_link_it_samples(tmp_path):
+    (tmp_path / "hand.urdf").write_text(URDF)
+    said = []
+    propose(load_model(tmp_path / "hand.urdf"), 1e4, progress=said.append)
+    assert said == [f"sampling {name} ({i} of 3 links)" for i, name in enumerate(("base", "left", "right"), 1)]

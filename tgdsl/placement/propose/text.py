@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, listed
 from tgdsl.fields import units
 from tgdsl.files.write import atomic_write, check_writable, with_folder
@@ -50,7 +51,13 @@ USUAL_DENSITY = (100.0, math.inf)
 
 
 def new_layout(
-    robot: Model, density: str, with_groups: bool, out: Path, is_forced: bool, include: Sequence[str] = ()
+    robot: Model,
+    density: str,
+    with_groups: bool,
+    out: Path,
+    is_forced: bool,
+    include: Sequence[str] = (),
+    progress: Progress = silent,
 ) -> list[str]:
     """Propose a layout for a robot and write it; return what to tell the user.
 
@@ -61,6 +68,7 @@ def new_layout(
         out: The file.
         is_forced: Whether it may be replaced.
         include: Names or shell wildcards of links outside the hands that are to have taxels too.
+        progress: Called with what is done next.
 
     Raises:
         TgdslError: If the density is none, the file is there already or cannot be written, the robot has no link that can carry
@@ -77,7 +85,7 @@ def new_layout(
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
     check_writable(out)
-    proposal = propose(robot, per_area, with_groups, include)
+    proposal = propose(robot, per_area, with_groups, include, progress)
     atomic_write(with_folder(out), layout_text(proposal, robot.file.name).encode())
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
