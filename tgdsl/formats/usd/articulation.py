@@ -197,6 +197,6 @@ def filtered_pairs(tree: SpanningTree) -> tuple[set[frozenset[str | None]], dict
         group[body] = group[node.parent] if is_welded else body
         if node.joint is not None and not is_welded:
             above[body] = group[node.parent]
-    welded = {frozenset((a, b)) for a, b in combinations(tree.nodes, 2) if group[a] == group[b]}
+    welded: set[frozenset[str | None]] = {frozenset((a, b)) for a, b in combinations(tree.nodes, 2) if group[a] == group[b]}
     children = [(body, own) for body in tree.nodes if (own := group[body]) is not None and above.get(own) is not None]
     return welded, {frozenset((a, b)): own for a, own in children for b in tree.nodes if group[b] == above[own]}
