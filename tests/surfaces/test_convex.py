@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tgdsl.geometry.reference import signed_distance
-from tgdsl.surfaces.convex import ConvexSolid, hull_planes
+from tgdsl.surfaces.convex import CHUNK, ConvexSolid, hull_planes
 from tgdsl.surfaces.surface import Surface
 
 ATOL = 1e-10  # [m] centimetres in float64, through a rotation and normals to twelve digits
@@ -79,3 +79,14 @@ def test_no_points_and_far_points():
     ball = solid("sphere", [0.02, 0, 0], [0.02, 0.02, 0.02])
     assert ball.depth(np.zeros((0, 3))).shape == (0,)
     assert ball.depth(np.full((2, 3), 9.0)).tolist() == [-np.inf, -np.inf]
+
+
+def test_depth_of_many_points_in_a_hull_of_many_faces_is_that_of_all_its_planes():
+    half = np.array([0.01, 0.02, 0.03])
+    hull = hull_of(trimesh.creation.icosphere(subdivisions=4).vertices * half)
+    planes = hull_planes(hull)
+    own = np.random.default_rng(3).uniform(-1, 1, (5000, 3)) * half
+    assert len(own) * len(planes) > 2 * CHUNK
+    found = solid("mesh", [0, 0, 0], list(half), planes).depth(own @ ROTATION.T + POS)
+    expected = np.array([(planes[:, 3] - planes[:, :3] @ point).min() for point in own])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=ATOL)

@@ -12,6 +12,8 @@ from jaxtyping import Float
 
 from tgdsl.surfaces.surface import Surface
 
+CELLS = 8
+"""Cells along each axis into which points are sorted, where they and the planes are many."""
 CHUNK = 1 << 21
 """Distances from half-spaces that are in memory at once."""
 SLACK = 1e-6
@@ -53,10 +55,24 @@ class ConvexSolid:
         return depth
 
     def _from_planes(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Return the distance from the nearest face's plane: that is the surface's for points inside."""
-        rows = max(1, CHUNK // len(self.planes))
-        parts = (pos[start : start + rows] for start in range(0, len(pos), rows))
-        return np.concatenate([(self.planes[:, 3] - part @ self.planes[:, :3].T).min(axis=1) for part in parts])
+        """Return the distance from the nearest face's plane: that is the surface's for points inside.
+
+        Normals are unit vectors: over a cell of points within r of its middle, a plane's distance changes by at most r, so that
+        planes farther from the middle than the nearest one by more than 2r are nearest to none of its points.
+        """
+        if len(pos) * len(self.planes) <= CHUNK:
+            return (self.planes[:, 3] - pos @ self.planes[:, :3].T).min(axis=1)
+        step = np.maximum(np.ptp(pos, axis=0), SLACK) / CELLS
+        cell = np.floor((pos - pos.min(axis=0)) / step).astype(np.int64) @ [4 * CELLS**2, 2 * CELLS, 1]
+        order = np.argsort(cell, kind="stable")
+        depth = np.empty(len(pos))
+        for own in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
+            middle = pos[own].mean(axis=0)
+            r = np.linalg.norm(pos[own] - middle, axis=1).max()
+            apart = self.planes[:, 3] - self.planes[:, :3] @ middle
+            near = self.planes[apart <= apart.min() + 2.0 * r + SLACK]
+            depth[own] = (near[:, 3] - pos[own] @ near[:, :3].T).min(axis=1)
+        return depth
 
     def _distance(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         import torch  # takes seconds, and hulls do not need it

@@ -27,6 +27,9 @@ MAX_HOLE = 0.05
 """A component is solid, so that points can be inside it, if the squared length of its border is at most this share of its
 area: a sphere with a hole of an eighth of its radius is, a bowl is not."""
 
+ROUNDING = 0.05
+"""Fast winding numbers (Barill et al., SIGGRAPH 2018) that are this close to an integer are not computed exactly."""
+
 
 @dataclass(frozen=True, eq=False)
 class Shell:
@@ -60,7 +63,10 @@ class Shell:
         vertices, faces = self.solid(component)
         near = ((pos >= vertices.min(axis=0) - self.offset) & (pos <= vertices.max(axis=0) + self.offset)).all(axis=1)
         if near.any():
-            winding[near] = np.atleast_1d(igl.winding_number(vertices, faces, pos[near]))
+            winding[near] = np.atleast_1d(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(pos[near])))
+        doubtful = np.flatnonzero(np.abs(winding - np.round(winding)) > ROUNDING)
+        if len(doubtful):
+            winding[doubtful] = np.atleast_1d(igl.winding_number(vertices, faces, pos[doubtful]))
         return winding
 
 
@@ -101,7 +107,8 @@ def _clean(surface: Surface) -> Surface:
         used, faces = np.unique(faces, return_inverse=True)
         vertices = surface.vertices[used]
         meshes.add_mesh(pymeshlab.Mesh(vertices, faces.reshape(-1, 3)))
-        weld = 1e-7 * float(np.ptp(vertices, axis=0).max())
+        # Corners that files have several times, such as STL's, are off by the rounding of float32, far from the origin by more.
+        weld = max(1e-6 * float(np.ptp(vertices, axis=0).max()), LENGTH_TOLERANCE)
         meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(weld))
         meshes.meshing_remove_duplicate_faces()
         meshes.meshing_remove_null_faces()

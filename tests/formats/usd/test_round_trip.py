@@ -5,9 +5,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from pxr import Usd
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.robot import export_model
+from tgdsl.formats.robot import export_model, load_model
 from tgdsl.formats.usd.reader import usd_to_mjcf
 
 XHAND1 = Path(__file__).parents[3] / "robots" / "xhand1" / "xhand1_right.xml"
@@ -147,6 +148,51 @@ def test_who_must_not_collide(pair):
         signatures = model.exclude_signature.tolist()
         both.append({frozenset((model.body(s >> 16).name, model.body(s & 0xFFFF).name)) for s in signatures})
     assert both[0] <= both[1]
+
+
+WELDED = """
+<mujoco><worldbody><body name="base"><geom size=".01"/><body name="plate"><geom size=".01"/>
+  <body name="link"><joint axis="0 1 0"/><geom size=".01"/><body name="cover"><geom size=".01"/></body>
+    <body name="tip"><joint axis="0 1 0"/><geom size=".01"/><body name="pad"><geom size=".01"/></body></body></body>
+</body></body></worldbody>{contact}</mujoco>
+"""
+
+
+@pytest.mark.parametrize("pairs", [(), (("pad", "plate"),)])
+def test_no_exclusions_are_added(tmp_path, pairs):
+    """USD's physics needs them for what MuJoCo never collides by itself; the model that comes back has only its own."""
+    contact = "".join(f'<exclude body1="{one}" body2="{two}"/>' for one, two in pairs)
+    (tmp_path / "robot.xml").write_text(WELDED.format(contact=f"<contact>{contact}</contact>"))
+    export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
+    first, second = (load_model(tmp_path / f"robot.{ending}") for ending in ("xml", "usda"))
+    assert second.compiled.nexclude == len(pairs)
+    assert second.compiled.opt.disableflags == first.compiled.opt.disableflags
+    for one in first.bodies[1:]:
+        for two in first.bodies[1:]:
+            assert first.can_collide(one, two) == second.can_collide(one, two)
+
+
+@pytest.mark.parametrize("of_joint", ["", "-10 10", "-10 4", "-300 300"])
+@pytest.mark.parametrize("of_actuator", ["", "-200 200", "-5 5"])
+def test_force_limits_of_joint_and_actuator_stay_apart(tmp_path, of_joint, of_actuator):
+    limits = [f'{key}="{text}"' if text else "" for key, text in (("actuatorfrcrange", of_joint), ("forcerange", of_actuator))]
+    body = f'<body><joint name="j" axis="0 1 0" {limits[0]}/><geom size=".01"/></body>'
+    actuator = f'<actuator><position joint="j" kp="5" gear="2" {limits[1]}/></actuator>'
+    (tmp_path / "robot.xml").write_text(f"<mujoco><worldbody>{body}</worldbody>{actuator}</mujoco>")
+    export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
+    first, second = (load_model(tmp_path / f"robot.{ending}").compiled for ending in ("xml", "usda"))
+    for field in ("jnt_actfrclimited", "jnt_actfrcrange", "actuator_forcelimited", "actuator_forcerange"):
+        np.testing.assert_allclose(getattr(second, field), getattr(first, field), rtol=1e-12, err_msg=field)
+
+
+def test_the_time_step_is_written_even_if_it_is_mujocos_default(tmp_path):
+    """A schema that another program applies to the scene has another default."""
+    (tmp_path / "robot.xml").write_text(WELDED.format(contact=""))
+    export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "robot.usda"))
+    stage.GetPrimAtPath("/physicsScene").AddAppliedSchema("NewtonSceneAPI")
+    stage.GetRootLayer().Save()
+    assert load_model(tmp_path / "robot.usda").compiled.opt.timestep == 0.002
 
 
 def test_servos(pair):

@@ -24,7 +24,7 @@ LINES = {
         "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n",
         '  tips: ["jaw a", "jaw b"]\n',
     ),
-    CAPSULES: ('  tips: ["[t]ips", "f[[]2] end", "thumb end"]\n', '  palm: ["[p]alm"]\n'),
+    CAPSULES: ('  tips: [tips, "f[[]2] end", "thumb end"]\n', "  palm: [palm]\n"),
 }
 """What the file says, by hand."""
 

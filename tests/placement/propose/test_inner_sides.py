@@ -278,3 +278,68 @@ def test_a_tip_that_rolls_about_its_middle_closes_nothing(tmp_path):
         roller = f'<body name="{name}_tip" pos="0 0 .07"><joint name="{name}_roll" axis="0 0 1" range="-90 80"/><geom type="box" size=".004 .004 .01"/></body>'
         text = text[:place] + roller + text[place:]
     assert closing_motion(loaded(tmp_path, text)).keys() == {"slide0", "slide1"}
+
+
+def hand_with_thumb(thumb: str, finger_range: str = "0 90") -> str:
+    """Two fingers that curl from a palm, and a thumb."""
+    finger = (
+        '<body name="{0}a" pos=".03 {1} .01"><joint name="{0}a" axis="0 1 0" range="{2}"/><geom type="capsule" fromto="0 0 0 0 0 .04" size=".007"/>'
+        '<body name="{0}b" pos="0 0 .05"><joint name="{0}b" axis="0 1 0" range="{2}"/><geom type="capsule" fromto="0 0 0 0 0 .03" size=".007"/>{3}'
+        "</body></body>"
+    )
+    marker = '<body name="{}" pos="0 0 .04"><geom type="sphere" size=".0003"/></body>'
+    fingers = "".join(
+        finger.format(name, y, finger_range, marker.format(f"{name}_end")) for name, y in (("f", 0.02), ("g", -0.02))
+    )
+    palm = '<body name="palm"><geom type="box" size=".04 .04 .008"/>'
+    return f"<mujoco><worldbody>{palm}{fingers}{thumb}</body></worldbody></mujoco>"
+
+
+THUMB = """<body name="t0" pos="-.03 0 .01"><joint name="t0" axis="0 1 0" range="-90 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .04" size=".007"/>
+  <body name="t1" pos="0 0 .05"><joint name="t1" axis="0 1 0" range="-90 0"/><geom type="capsule" fromto="0 0 0 0 0 .02" size=".007"/>
+    <body name="t2" pos="0 0 .03"><joint name="t2" axis="{}" range="{}"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .03" size=".007"/></body></body></body>"""
+
+
+def test_a_side_that_a_links_own_hinge_does_not_carry_it_to_is_weak(tmp_path):
+    """The last link faces along x as the joint before it carries it; its own hinge, about x, swings it along y."""
+    across = propose(loaded(tmp_path, hand_with_thumb(THUMB.format("1 0 0", "-20 20"))), DENSITY)
+    found = {link.name: (link.facing, link.doubt) for link in across.links}
+    facing, doubt = found["t2"]
+    assert np.abs(facing)[0] == 1.0
+    assert doubt == "its own hinge carries it across the side that it faces"
+    assert {found[name][1] for name in ("fa", "fb", "ga", "gb")} == {""}
+    along = propose(loaded(tmp_path, hand_with_thumb(THUMB.format("0 1 0", "-90 0")), "other.xml"), DENSITY)
+    assert {link.name: link.doubt for link in along.links}["t2"] == ""
+
+
+def test_markers_are_no_tips(tmp_path):
+    """A ball of 0.3 mm has 4 π r² = 0.0113 cm²; the links before the markers are the tips, whatever these are called."""
+    proposal = propose(loaded(tmp_path, hand_with_thumb(THUMB.format("0 1 0", "-90 0"))), DENSITY)
+    assert set(proposal.groups["tips"]) == {"fb", "gb", "t2"}
+    reasons = dict(proposal.left_out)
+    assert reasons["f_end"] == reasons["g_end"] == "a marker: its surface is 0.011 cm²"
+
+
+@pytest.mark.parametrize("limits", ["-30 90", "-40 60", "0 30"])
+def test_rounding_of_limits_decides_nothing(tmp_path, limits):
+    """Limits as people draw them: three times as far one way, one and a half times, and thirty degrees, and what float32 makes of them."""
+    low, high = map(float, limits.split())
+    found = set()
+    for i, (one, two) in enumerate([(0, 0), (1e-7, 0), (0, 1e-7), (-1e-7, 0), (0, -1e-7), (1e-7, -1e-7), (-1e-7, 1e-7)]):
+        text = hand_with_thumb(THUMB.format("0 1 0", "-90 0"), f"{low * (1 + one)!r} {high * (1 + two)!r}")
+        links = propose(loaded(tmp_path, text, f"hand{i}.xml"), DENSITY).links
+        found.add(tuple((link.name, link.facing, link.doubt) for link in links))
+    assert len(found) == 1
+
+
+def test_counts_do_not_hang_on_the_last_bits_of_an_area(tmp_path):
+    """Boxes of 2 (8 + 8 + 4) cm² hold 2.5 taxels at 0.0625/cm²: the area is known to about 1e-7 of itself only."""
+    counts = set()
+    for i, scale in enumerate((1.0, 1 + 1e-7, 1 - 1e-7, 1 + 3e-8, 1 - 3e-8)):
+        geom = f'<geom type="box" size="{0.01 * scale!r} {0.02 * scale!r} {0.01 * scale!r}"/>'
+        bodies = "".join(f'<body name="{n}" pos="{x} 0 0"><joint/>{geom}</body>' for n, x in (("a", 0.1), ("b", -0.1)))
+        links = propose(loaded(tmp_path, f"<mujoco><worldbody>{bodies}</worldbody></mujoco>", f"{i}.xml"), 625.0).links
+        counts.add(tuple(tuple(link.counts.values()) for link in links))
+    assert len(counts) == 1

@@ -111,3 +111,24 @@ def test_a_shared_name_is_told(tmp_path, here):
     here(tmp_path, "layout", "new", "hand.xml")
     line = "# Mind: geoms or meshes of other links are also called right_finger; a selection by that name takes both.\n"
     assert line in (tmp_path / "layout.yaml").read_text()
+
+
+def test_links_that_are_called_as_groups_are_printed_plainly(tmp_path, here):
+    finger = '<body name="{}" pos="{} 0 0"><joint axis="0 1 0" range="0 90"/><geom size=".01"/></body>'
+    fingers = finger.format("tips", 0.03) + finger.format("hand", -0.03)
+    (tmp_path / "hand.xml").write_text(
+        f'<mujoco><worldbody><body name="palm"><geom type="box" size=".03 .03 .01"/>{fingers}</body></worldbody></mujoco>'
+    )
+    _, said, _ = here(tmp_path, "layout", "new", "hand.xml")
+    assert "group palm: palm\n" in said and "group tips: tips, hand\n" in said
+    text = (tmp_path / "layout.yaml").read_text()
+    assert "  palm: [palm]\n" in text and '  tips: [tips, "[h]and"]\n' in text
+    groups = compiled(tmp_path, {"hand": "geometric"}, "low").plan.layout.groups
+    assert (groups["palm"], groups["tips"]) == (("palm",), ("tips", "hand"))
+
+
+def test_a_proposal_tells_which_link_it_samples(tmp_path):
+    (tmp_path / "hand.urdf").write_text(URDF)
+    said = []
+    propose(load_model(tmp_path / "hand.urdf"), 1e4, progress=said.append)
+    assert said == [f"sampling {name} ({i} of 3 links)" for i, name in enumerate(("base", "left", "right"), 1)]

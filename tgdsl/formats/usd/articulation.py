@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 from tgdsl.formats.usd.joints import Joint
 
@@ -182,22 +183,20 @@ def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots:
     return _TreeBuilder(kinematic, joints, roots).build()
 
 
-def parent_pairs(tree: SpanningTree) -> set[frozenset[str | None]]:
-    """Return the pairs of bodies that MuJoCo's filter of parents and children keeps apart.
+def filtered_pairs(tree: SpanningTree) -> tuple[set[frozenset[str | None]], dict[frozenset[str | None], str]]:
+    """Return the pairs of bodies that MuJoCo never collides by itself.
 
-    These are all pairs of two groups of welded bodies of which one is the other's parent, unless one is the world's; those
-    whose joint says itself whether they collide are left out.
+    Returns:
+        Those that are welded together; and those of two groups of welded bodies of which one is the other's parent, unless one
+        is the world's, with the body whose joint joins the groups.
     """
     group: dict[str | None, str | None] = {None: None}
-    parent: dict[str | None, str | None] = {}
+    above: dict[str, str | None] = {}
     for body, node in tree.nodes.items():
         is_welded = node.joint is not None and node.joint.kind == "fixed"
         group[body] = group[node.parent] if is_welded else body
-        if node.joint is not None and node.joint.is_filtering is None and not is_welded:
-            parent[body] = group[node.parent]
-    return {
-        frozenset((one, two))
-        for one in tree.nodes
-        for two in tree.nodes
-        if one != two and None not in (group[one], group[two]) and parent.get(group[one]) == group[two]
-    }
+        if node.joint is not None and not is_welded:
+            above[body] = group[node.parent]
+    welded: set[frozenset[str | None]] = {frozenset((a, b)) for a, b in combinations(tree.nodes, 2) if group[a] == group[b]}
+    children = [(body, own) for body in tree.nodes if (own := group[body]) is not None and above.get(own) is not None]
+    return welded, {frozenset((a, b)): own for a, own in children for b in tree.nodes if group[b] == above[own]}

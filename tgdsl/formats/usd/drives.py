@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from tgdsl.formats.usd.custom_attributes import read_custom
 from tgdsl.formats.usd.stage import Prim, Stage
 
@@ -70,6 +72,11 @@ def read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -
     rest = 0.0 if rest < ROUNDING * own else rest
     if not stiffness and not rest:
         return None, own
+    gear = float(read_custom(stage, prim, "gear") or 1.0)
+    of_joint, of_actuator = (read_custom(stage, prim, key) for key in ("actuatorfrcrange", "forcerange"))
+    if of_joint is not None and math.isclose(most, np.abs(of_joint).max(), rel_tol=ROUNDING):
+        # The drive's limit is the smaller of the joint's, which is read with the joint, and the actuator's.
+        most = math.inf if of_actuator is None else float(of_actuator[1]) * abs(gear)
     control = read_custom(stage, prim, "ctrlrange")
     order = read_custom(stage, prim, "order")
     drive = Drive(
@@ -80,7 +87,7 @@ def read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -
         velocity * unit,
         str(read_custom(stage, prim, "actuator") or ""),
         None if control is None else (float(control[0]), float(control[1])),
-        float(read_custom(stage, prim, "gear") or 1.0),
+        gear,
         math.inf if order is None else float(order),
     )
     return drive, own

@@ -41,7 +41,7 @@ import numpy as np
 
 from tgdsl.errors import RobotError
 from tgdsl.formats.model import Model
-from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, parent_pairs, spanning_tree
+from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, filtered_pairs, spanning_tree
 from tgdsl.formats.usd.audit import note_unread
 from tgdsl.formats.usd.custom_attributes import read_custom
 from tgdsl.formats.usd.elements import (
@@ -243,14 +243,18 @@ def _add_exclusions(stage: Stage, robot: _Robot, contact: ET.Element, flags: Map
     """Add the pairs of bodies that do not collide; return the flags that this needs.
 
     MuJoCo never collides a parent with its child. Where a joint says that they do, its filter is off, and all that it would
-    have kept apart is listed.
+    have kept apart is listed. What it never collides by itself is not.
     """
+    nodes, (welded, parents) = robot.tree.nodes, filtered_pairs(robot.tree)
     is_on = flags.get("filterparent") != "disable"
-    is_off = any(node.joint and node.parent and node.joint.is_filtering is False for node in robot.tree.nodes.values())
-    welded = parent_pairs(robot.tree) if is_on and is_off else ()
-    for pair in exclusions(stage, robot.bodies, robot.joints, robot.geoms, welded):
-        first, second = sorted("world" if path is None else robot.names[0][path] for path in pair)
-        ET.SubElement(contact, "exclude", body1=first, body2=second)
+    filtering = {pair: joint.is_filtering for pair, child in parents.items() if (joint := nodes[child].joint) is not None}
+    is_off = is_on and False in filtering.values()
+    silent = [pair for pair, said in filtering.items() if said is None] if is_off else ()
+    by_itself = welded | parents.keys() if is_on and not is_off else welded
+    for pair in exclusions(stage, robot.bodies, robot.joints, robot.geoms, silent):
+        if pair not in by_itself:
+            first, second = sorted("world" if path is None else robot.names[0][path] for path in pair)
+            ET.SubElement(contact, "exclude", body1=first, body2=second)
     return {"filterparent": "disable"} if is_off else {}
 
 

@@ -24,13 +24,15 @@ from jaxtyping import Float
 from tgdsl.placement.propose.hands import MAX_FINGER, Hand, KinematicTree
 from tgdsl.placement.propose.poses import Poses
 
-ONE_SIDED, LEANING = 3.0, 1.5
-"""A joint bends one way, or leans to one, if its range from the start is this many times longer on one side."""
+ONE_SIDED, LEANING = 2.99, 1.49
+"""A joint bends one way, or leans to one, if its range from the start is this many times longer on one side.
+
+No ratios that people draw, as -30 to 90 degrees is: the last bits of a range shall not decide. The same holds for the angle."""
 SYMMETRIC = 0.05
 """Limits are the same both ways if their middle is nearer to zero than half this share of the range."""
 MIN_CLOSING = 0.03
 """Least share by which the tips must draw nearer for an end of a joint's range to count as closed."""
-MIN_BEND = np.radians(30.0)
+MIN_BEND = np.radians(29.9)
 """A hinge that turns by less than this does not close a finger, but shapes a palm."""
 PARALLEL = 0.7
 """Least cosine of the angle between two axes about which a finger curls."""

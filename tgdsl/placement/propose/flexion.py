@@ -8,7 +8,7 @@ fixed jaw's the moving one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -20,14 +20,18 @@ from tgdsl.placement.propose.hands import Hand, KinematicTree, length_of
 MIN_LEVER = 0.25
 """A link whose centre is nearer to its hinge than this share of the square root of its surface turns in place, unless it is a
 single jaw."""
-LINK_SNAP, PALM_SNAP = np.radians(30.0), np.radians(40.0)
-"""A direction this close to an axis of the link's frame is taken to be that axis; a palm's that is farther is not taken."""
+LINK_SNAP, PALM_SNAP = np.radians(30.1), np.radians(40.1)
+"""A direction this close to an axis of the link's frame is taken to be that axis; a palm's that is farther is not taken.
+No angles that people draw: the last bits of a pose shall not decide."""
 STEP = 0.02
 """Share of its way by which a joint closes to see where a link goes."""
 ALIKE = 0.5
 """Least cosine of the angle between directions to which fingers curl for these to say where the palm faces."""
 PARALLEL, BESIDE = 0.99, 0.25
 """A bar beside a finger turns about an axis with at least this cosine to the finger's, nearer than this share of its length."""
+ALONG = 0.3
+"""Least cosine of the angle between where a link faces and where its own hinge carries it; else its side is weak."""
+ACROSS = "its own hinge carries it across the side that it faces"
 UNCLEAR = "which side is the inner one is not clear"
 """Why a link has no inner side, where nothing better is known."""
 
@@ -78,6 +82,10 @@ class Flexion:
         """Return where the inner side of a body faces."""
         if body in self.hand.mounts:
             return self._palm_side(body) if self.hand.jaw is None else self._fixed_side(body)
+        side = self._moving_side(body)
+        return replace(side, doubt=ACROSS) if not side.doubt and self._is_across(body, side) else side
+
+    def _moving_side(self, body: int) -> InnerSide:
         if (facing := self._meeting(body)) is not None:
             return InnerSide(facing, self._doubt(self.tree.segment[body]))
         if (carried := self._carried(body)) is not None:
@@ -85,6 +93,18 @@ class Flexion:
             turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
             return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
         return self._taken_over(body)
+
+    def _is_across(self, body: int, side: InnerSide) -> bool:
+        """Return whether hinges of a link's own have a lever on it and none carries it to its inner side or away from it."""
+        data, model, segment = self._frames(self.open), self.tree.model, self.tree.segment[body]
+        hinges = [j for j in self.tree.joints(segment) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE)]
+        if side.facing is None or not hinges:
+            return False
+        facing = data.xmat[body].reshape(3, 3) @ side.facing / np.linalg.norm(side.facing)
+        carried = np.cross(data.xaxis[hinges], self.tree.centre(body, data) - data.xanchor[hinges])
+        lever = np.linalg.norm(carried, axis=1)
+        has_lever = lever.min() >= MIN_LEVER * np.sqrt(self.tree.area[body])
+        return bool(has_lever and (np.abs(carried @ facing) < ALONG * lever).all())
 
     def _bars(self) -> set[int]:
         """Return the segments that are alone in their chain and are driven together with the longer chain beside them.
@@ -234,4 +254,6 @@ def _snapped(direction: Float[np.ndarray, " 3"], angle: float, keeps_oblique: bo
     axis = int(np.abs(direction).argmax())
     if abs(direction[axis]) >= np.cos(angle):
         return tuple(float(np.sign(direction[axis])) if i == axis else 0.0 for i in range(3))
-    return tuple(round(float(x), 2) + 0.0 for x in direction) if keeps_oblique else None
+    # Halves of a hundredth are rounded up, and what is just below them too.
+    rounded = np.sign(direction) * np.floor(100.0 * np.abs(direction) + 0.501) / 100.0
+    return tuple((rounded + 0.0).tolist()) if keeps_oblique else None

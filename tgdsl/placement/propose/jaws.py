@@ -9,8 +9,8 @@ from tgdsl.placement.propose.hands import MAX_FINGER, Hand, KinematicTree
 
 BESIDE = 0.5
 """A fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed."""
-MIN_BEND = np.radians(20.0)
-"""A jaw that turns by less does not grip."""
+MIN_BEND = np.radians(19.9)
+"""A jaw that turns by less does not grip; no angle that people draw."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
 from tgdsl.placement.propose.exposure import Options
@@ -96,7 +97,13 @@ class Proposal:
         return {"tgdsl": 1, **groups, "resolutions": resolutions}
 
 
-def propose(robot: Model, density: float, with_groups: bool = True, include: Sequence[str] = ()) -> Proposal:
+def propose(
+    robot: Model,
+    density: float,
+    with_groups: bool = True,
+    include: Sequence[str] = (),
+    progress: Progress = silent,
+) -> Proposal:
     """Return a layout for a robot; the same robot gives the same layout.
 
     Args:
@@ -104,13 +111,14 @@ def propose(robot: Model, density: float, with_groups: bool = True, include: Seq
         density: Taxels per area at `med` [1/m²].
         with_groups: Whether to propose link groups.
         include: Names or shell wildcards of links outside its hands that are to have taxels too.
+        progress: Called with what is done next.
 
     Raises:
         TgdslError: If no link can be sampled, if the density asks for more taxels than a link can have, or if a name to include
             matches no link that can have taxels.
     """
     sampler = Sampler(robot, 0.95 * COVERING / np.sqrt(density * max(FACTORS.values())))
-    found, surfaces = _sampled_hands(sampler, include)
+    found, surfaces = _sampled_hands(sampler, include, progress)
     left_out = tuple(sampler.left_out)
     if not surfaces:
         what = "; ".join(f'"{name}": {why}' for name, why in left_out)
@@ -137,7 +145,9 @@ def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
     return {name: ends for name, ends in motion.items() if name}
 
 
-def _sampled_hands(sampler: Sampler, include: Sequence[str]) -> tuple[list[Flexion], dict[str, LinkSurface]]:
+def _sampled_hands(
+    sampler: Sampler, include: Sequence[str], progress: Progress
+) -> tuple[list[Flexion], dict[str, LinkSurface]]:
     """Return the hands, and samples of their links and of those to include, in the robot's body order.
 
     Only these are sampled. A link of which nothing can be touched is left out, and the hands are looked for again without it.
@@ -149,7 +159,11 @@ def _sampled_hands(sampler: Sampler, include: Sequence[str]) -> tuple[list[Flexi
         found = chosen_hands(tree)
         outer = {sampler.robot.compiled.body(body).name: why for body, why in outside(tree, found).items()}
         wanted = [name for name in sampler.meshes if name not in outer or name in asked]
-        fresh = {name: sampler.sampled(name) for name in wanted if name not in surfaces}
+        fresh: dict[str, LinkSurface | str] = {}
+        for i, name in enumerate(wanted):
+            if name not in surfaces:
+                progress(f"sampling {name} ({i + 1} of {len(wanted)} links)")
+                fresh[name] = sampler.sampled(name)
         surfaces |= {name: own for name, own in fresh.items() if isinstance(own, LinkSurface)}
         dropped = {name: own for name, own in fresh.items() if isinstance(own, str)}
         for name, why in dropped.items():
@@ -167,12 +181,20 @@ def _link(name: str, surface: LinkSurface, side: InnerSide, density: float) -> L
         if share < MIN_SHARE:
             share, facing, doubt = 1.0, None, UNCLEAR
     area = share * surface.area
-    counts = {resolution: max(1, round(area * density * factor)) for resolution, factor in FACTORS.items()}
+    counts = {resolution: max(1, _rounded(area * density * factor)) for resolution, factor in FACTORS.items()}
     if max(counts.values()) > MAX_COUNT:
         raise TgdslError(
             f'link "{name}" would have {max(counts.values())} taxels, expected at most {MAX_COUNT}; lower the density'
         )
     return LinkProposal(name, area, facing, doubt, counts, surface.options)
+
+
+def _rounded(number: float) -> int:
+    """Return the nearest integer; of what is within a thousandth of the middle of two, the larger.
+
+    Areas that people draw often hold half a taxel more, and the last bits of an area shall not decide.
+    """
+    return int(np.floor(number + 0.501))
 
 
 def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool[np.ndarray, " n"]:
@@ -189,15 +211,15 @@ def _groups(found: Sequence[Flexion], names: dict[int, str], links: tuple[str, .
     mounts = {names[body] for flexion in found for body in flexion.hand.mounts} - palms
     known = {name for name, members in (("tips", tips), ("palm", palms), ("fingers", fingers), ("hand", links)) if members}
 
-    def members(*groups: str, bodies: set[str]) -> tuple[str, ...]:
-        patterns = (_own(escaped(name), known) for name in sorted(bodies, key=order.__getitem__))
-        return (*(group for group in groups if group in known), *patterns)
+    def members(group: str, *others: str, bodies: set[str]) -> tuple[str, ...]:
+        patterns = (_own(escaped(name), known - {group}) for name in sorted(bodies, key=order.__getitem__))
+        return (*(other for other in others if other in known), *patterns)
 
     wanted = {
-        "tips": members(bodies=tips),
-        "palm": members(bodies=palms),
-        "fingers": members("tips", bodies=fingers - tips) if fingers else (),
-        "hand": members("fingers", "palm", bodies=mounts),
+        "tips": members("tips", bodies=tips),
+        "palm": members("palm", bodies=palms),
+        "fingers": members("fingers", "tips", bodies=fingers - tips) if fingers else (),
+        "hand": members("hand", "fingers", "palm", bodies=mounts),
     }
     return {name: group for name, group in wanted.items() if group}
 
@@ -208,7 +230,7 @@ def escaped(name: str) -> str:
 
 
 def _own(pattern: str, groups: set[str]) -> str:
-    """Return a pattern that means the link even if a group has its name."""
+    """Return a pattern that means the link even if another group has its name."""
     return f"[{pattern[0]}]{pattern[1:]}" if pattern in groups else pattern
 
 

@@ -14,6 +14,8 @@ from tgdsl.surfaces.surface import Surface
 
 NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
 COVERED = "all of it is inside other links in the initial state"
+MAX_MARKER = 3e-6
+"""A link with no more surface than this only marks a place, such as a ball of half a millimetre at a fingertip [m²]."""
 _NO_AREA = "a surface without area"
 
 
@@ -52,10 +54,11 @@ def link_meshes(robot: Model) -> tuple[dict[str, Surface], list[tuple[str, str]]
         except RobotError as error:
             left_out.append((body, _reason(robot, error)))
             continue
-        if surface.face_areas.sum() > MIN_AREA:
+        area = float(surface.face_areas.sum())
+        if area > MAX_MARKER:
             meshes[body] = surface
         else:
-            left_out.append((body, _NO_AREA))
+            left_out.append((body, f"a marker: its surface is {1e4 * area:.2g} cm²" if area > MIN_AREA else _NO_AREA))
     model = robot.compiled
     unnamed = [i for i in range(model.nbody) if not model.body(i).name and model.body_geomnum[i]]
     left_out += [(robot.body_path(i), "no name, so no document can mean it") for i in unnamed]

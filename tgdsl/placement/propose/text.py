@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, listed
 from tgdsl.fields import units
 from tgdsl.files.write import atomic_write, check_writable, with_folder
@@ -19,6 +20,7 @@ from tgdsl.placement.propose.propose import FACTORS, LinkProposal, Proposal, esc
 WIDTH = 120
 """Lists of names are broken at this column."""
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*\Z")
+_BRACKETED, _CHARACTER = re.compile(r"\[(.)\]"), r"\1"
 _KEYWORDS = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
 _HEADER = """\
 # A layout for {robot}, proposed by `tgdsl layout new`: nobody has looked at it yet.
@@ -49,7 +51,13 @@ USUAL_DENSITY = (100.0, math.inf)
 
 
 def new_layout(
-    robot: Model, density: str, with_groups: bool, out: Path, is_forced: bool, include: Sequence[str] = ()
+    robot: Model,
+    density: str,
+    with_groups: bool,
+    out: Path,
+    is_forced: bool,
+    include: Sequence[str] = (),
+    progress: Progress = silent,
 ) -> list[str]:
     """Propose a layout for a robot and write it; return what to tell the user.
 
@@ -60,6 +68,7 @@ def new_layout(
         out: The file.
         is_forced: Whether it may be replaced.
         include: Names or shell wildcards of links outside the hands that are to have taxels too.
+        progress: Called with what is done next.
 
     Raises:
         TgdslError: If the density is none, the file is there already or cannot be written, the robot has no link that can carry
@@ -76,12 +85,12 @@ def new_layout(
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
     check_writable(out)
-    proposal = propose(robot, per_area, with_groups, include)
+    proposal = propose(robot, per_area, with_groups, include, progress)
     atomic_write(with_folder(out), layout_text(proposal, robot.file.name).encode())
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),
-        *(f"group {name}: {listed(members)}" for name, members in proposal.groups.items()),
+        *(f"group {name}: {_BRACKETED.sub(_CHARACTER, listed(members))}" for name, members in proposal.groups.items()),
         *(f"left out: {line}" for line in _left_out(proposal)),
         *(f"weak guess of the inner side: {line}" for line in _doubts(proposal, has_side=True)),
         *(f"all around: {line}" for line in _doubts(proposal, has_side=False)),
@@ -147,7 +156,7 @@ def _groups_text(proposal: Proposal) -> str:
         if name == "tips" and "palm" not in proposal.groups:
             lines.append(_NO_PALM)
     if any(member.startswith("[") for members in proposal.groups.values() for member in members):
-        lines.append("  # A name such as [p]alm means the link palm, where the group has the same name.\n")
+        lines.append("  # A name such as [p]alm means the link palm, where another group has the same name.\n")
     return "".join(lines)
 
 

@@ -161,7 +161,7 @@ def _on_outer_surface(
     is_geom = np.ones(len(shell.surface.geoms), bool) if region.is_geom is None else region.is_geom
     is_out = np.ones(len(pos), dtype=bool)
     for solid in np.flatnonzero(shell.is_solid).tolist():
-        is_out &= shell.winding(solid, above) < 0.5
+        is_out[is_out] = shell.winding(solid, above[is_out]) < 0.5
         if is_geom[shell.surface.face_geom[shell.component == solid]].any():
             later = np.flatnonzero(is_out & (component > solid))
             is_out[later] = shell.winding(solid, below[later]) < 0.5

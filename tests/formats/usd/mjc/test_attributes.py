@@ -113,7 +113,7 @@ SEEN = [
     ("scene", "newton:timeStepsPerSecond", 250, lambda m: m.opt.timestep, 0.004),
     ("scene", "newton:maxSolverIterations", 12, lambda m: m.opt.iterations, 12),
     ("scene", "newton:gravityEnabled", False, lambda m: m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY != 0, True),
-    ("root", "newton:selfCollisionEnabled", False, lambda m: m.nexclude, 6),
+    ("root", "newton:selfCollisionEnabled", False, lambda m: m.nexclude, 4),
     ("turn", "mjc:armature", 0.2, turn("dof_armature"), 0.2),
     ("turn", "mjc:damping", 0.3, turn("dof_damping"), 0.3),
     ("turn", "mjc:frictionloss", 0.4, turn("dof_frictionloss"), 0.4),

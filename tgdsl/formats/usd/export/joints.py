@@ -190,8 +190,10 @@ def add_drives(writer: StageWriter, joints: dict[int, Any]) -> list[int]:
         for joint, actuator in driven.items():
             set_custom(joints[joint].GetPrim(), "order", actuator)
     for joint in joints:
-        if model.jnt_actfrclimited[joint] and joint not in driven:
+        if model.jnt_actfrclimited[joint]:
             set_custom(joints[joint].GetPrim(), "actuatorfrcrange", model.jnt_actfrcrange[joint].tolist())
+            if joint in driven and model.actuator_forcelimited[driven[joint]]:
+                set_custom(joints[joint].GetPrim(), "forcerange", model.actuator_forcerange[driven[joint]].tolist())
     return left
 
 

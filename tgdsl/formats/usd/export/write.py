@@ -5,6 +5,7 @@ custom attributes named `tgdsl:`, in SI units and radians:
 
 - the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
 - a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
+  a joint's `actuatorfrcrange` and its actuator's `forcerange`, of which the drive has the smaller;
   the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
 - a joint's spring, a ball joint's range, a body's `gravcomp`, and its `inertial` if its mass or some moment is zero;
 - contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
@@ -81,7 +82,8 @@ def _add_scene(writer: StageWriter) -> None:
     set_number(scene.CreateGravityMagnitudeAttr(), strength)
     set_number(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
     settings = non_default(OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(default_model().opt, name))
-    for key, value in (settings | non_default_flags(model)).items():
+    # A scene of a stage that this one is layered into may have a schema with another default.
+    for key, value in ({"timestep": float(model.opt.timestep)} | settings | non_default_flags(model)).items():
         set_custom(scene.GetPrim(), key, value)
 
 
