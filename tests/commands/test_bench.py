@@ -41,9 +41,9 @@ def test_mistakes_end_in_their_message(here, tmp_path, arguments, message):
 
 
 def test_without_a_document_there_are_oracles_and_hard_cases(here, tmp_path, monkeypatch):
-    from tgdsl.report.hard import contacts
-    from tgdsl.report.hard import every as hard
-    from tgdsl.report.oracles import every, filters
+    from oracles import every, filters
+    from oracles.hard import contacts
+    from oracles.hard import every as hard
 
     few, cases = {"filters": (filters.maxwell_step,)}, {"contacts": (contacts.first_reading,)}
     monkeypatch.setattr(every, "run", lambda begun, run=every.run: run(few, begun))

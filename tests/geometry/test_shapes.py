@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import geometry
 
 from tgdsl.geometry.reference import signed_distance
 from tgdsl.geometry.shapes import SHAPES
-from tgdsl.report.oracles import geometry
 
 SIZES = {
     "plane": [(1.0, 1.0, 0.1)],

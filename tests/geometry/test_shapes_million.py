@@ -2,8 +2,7 @@
 
 import pytest
 from held import assert_holds
-
-from tgdsl.report.oracles import geometry
+from oracles import geometry
 
 NUM = 1_000_000
 

@@ -1,9 +1,8 @@
-"""Comparisons of `tgdsl.report.oracles` and hard cases of `tgdsl.report.hard` in tests."""
+"""Comparisons of `oracles` and hard cases of `oracles.hard` in tests."""
 
 import numpy as np
-
-from tgdsl.report.hard.results import HardCase
-from tgdsl.report.oracles.results import Comparison
+from oracles.hard.results import HardCase
+from oracles.results import Comparison
 
 
 def assert_holds(found: Comparison) -> None:

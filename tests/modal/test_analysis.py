@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 from held import assert_holds
+from oracles import modes as oracles
+from oracles.setups.solids import ball, box, surface_of
 from ringing_bodies import hollow, slabs, thin_box
 
 from tgdsl.errors import LowerError
@@ -13,8 +15,6 @@ from tgdsl.files import cache
 from tgdsl.modal import spectrum as spectra
 from tgdsl.modal.analysis import analysed
 from tgdsl.modal.spec import ShapeModes
-from tgdsl.report.oracles import modes as oracles
-from tgdsl.report.oracles.setups.solids import ball, box, surface_of
 from tgdsl.surfaces.surface import Surface
 
 

@@ -7,11 +7,11 @@ tolerances are what their meshes leave, at most the 2 % asked for.
 import numpy as np
 import pytest
 from held import assert_holds
+from oracles import modes as oracles
+from oracles.setups.solids import ball, box, breathing, lamb, surface_of, timoshenko, torsion
 from ringing_bodies import turned
 
 from tgdsl.modal.spectrum import spectrum
-from tgdsl.report.oracles import modes as oracles
-from tgdsl.report.oracles.setups.solids import ball, box, breathing, lamb, surface_of, timoshenko, torsion
 
 
 @pytest.fixture(autouse=True)

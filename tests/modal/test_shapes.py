@@ -4,6 +4,8 @@ import igl
 import numpy as np
 import pytest
 from held import assert_holds
+from oracles import modes as oracles
+from oracles.setups.solids import ball, bending, box, roots, surface_of
 
 from tgdsl.fields.materials import MATERIALS
 from tgdsl.modal import spectrum as spectra
@@ -11,8 +13,6 @@ from tgdsl.modal.analysis import analysed
 from tgdsl.modal.modes import Modes
 from tgdsl.modal.shapes import ALONG, interpolated
 from tgdsl.modal.spec import ShapeModes
-from tgdsl.report.oracles import modes as oracles
-from tgdsl.report.oracles.setups.solids import ball, bending, box, roots, surface_of
 
 LENGTH, HEIGHT, WIDTH = 0.4, 0.006, 0.01
 SIDE, THICKNESS = 0.2, 0.004

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import sound as oracles
+from oracles.setups.sounds import driven, motor
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.report.oracles import sound as oracles
-from tgdsl.report.oracles.setups.sounds import driven, motor
 from tgdsl.sensors import ACTUATION_AUDIO
 from tgdsl.testing import KindConformance
 from tgdsl.testing.conformance import SCENE

@@ -1,10 +1,10 @@
 import pytest
 import torch
 from held import assert_holds
-from scenes import module, state
+from oracles import bodies
+from oracles.setups.scenes import module, state
 
 from tgdsl.errors import SpecError
-from tgdsl.report.oracles import bodies
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.testing import KindConformance
 

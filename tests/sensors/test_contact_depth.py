@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import torch
-from hard_places import HALF, R
 from held import assert_holds, assert_stands
-from scenes import module, state
+from oracles import geometry
+from oracles.hard import probes
+from oracles.hard.places import HALF, R
+from oracles.setups.scenes import module, state
 
-from tgdsl.report.hard import probes
-from tgdsl.report.oracles import geometry
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.testing import KindConformance
 

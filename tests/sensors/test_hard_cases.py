@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from at_rest import NUM_STEPS, jittered, repeated
-from hard_places import HARD
 from held import assert_stands
-from scenes import module, state
+from oracles.hard import probes
+from oracles.hard.places import HARD
+from oracles.hard.trembling import NUM_STEPS, jittered, repeated
+from oracles.setups.scenes import module, state
 
 import tgdsl
-from tgdsl.report.hard import probes
 
 
 def test_at_rest_on_a_face_edge_corner_or_centre_the_normal_does_not_alternate():

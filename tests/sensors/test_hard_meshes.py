@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from at_rest import NUM_STEPS, jittered
 from brute import brute_force
+from oracles.hard import probes
+from oracles.hard.probes import TOLERANCE
+from oracles.hard.trembling import NUM_STEPS, jittered
 
 import tgdsl
 from tgdsl.module.state import SceneState
-from tgdsl.report.hard import probes
-from tgdsl.report.hard.probes import TOLERANCE
 
 R = 0.006
 

@@ -3,18 +3,17 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from cube_on_pad import in_link, pad, wrench
 from held import assert_holds
-from scenes import module, state
+from oracles import kinematic
+from oracles.kinematic import ABOVE, BOX, SIX, balanced, read
+from oracles.kinematic import POWER as S
+from oracles.setups.scenes import in_link, module, pad, state, wrench
 
 import tgdsl
 from tgdsl.geometry.planes import vec
 from tgdsl.quantities import ContactDepth, Contacts, Gathered
 from tgdsl.quantities.contact_depth import Penetration
 from tgdsl.quantities.contacts import ContactPoints
-from tgdsl.report.oracles import kinematic
-from tgdsl.report.oracles.kinematic import ABOVE, BOX, SIX, balanced, read
-from tgdsl.report.oracles.kinematic import POWER as S
 from tgdsl.sensors.base import UNTIMED
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.testing import KindConformance

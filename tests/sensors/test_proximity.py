@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-from scenes import module, state
+from oracles import proximity
+from oracles.proximity import AREA, COARSE, CUBE, R, read
+from oracles.proximity import DENSITY as RHO
+from oracles.setups.scenes import module, state
 
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.module.state import SceneState
-from tgdsl.report.oracles import proximity
-from tgdsl.report.oracles.proximity import AREA, COARSE, CUBE, R, read
-from tgdsl.report.oracles.proximity import DENSITY as RHO
 from tgdsl.sensors.proximity import PROXIMITY
 from tgdsl.testing import KindConformance
 

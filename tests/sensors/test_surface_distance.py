@@ -1,9 +1,9 @@
 import numpy as np
 import torch
 from held import assert_holds
-from scenes import module, state
+from oracles import geometry
+from oracles.setups.scenes import module, state
 
-from tgdsl.report.oracles import geometry
 from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
 from tgdsl.testing import KindConformance
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 import trimesh
 from held import assert_holds
+from oracles import geometry
 
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.module.state import SceneState
-from tgdsl.report.oracles import geometry
 
 R = 0.01
 HALF = 0.02

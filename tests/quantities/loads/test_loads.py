@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from oracles.setups.sounds import plate, pressed
 from scipy.spatial.transform import Rotation
 
 from tgdsl.layout.layout import Layout
@@ -14,7 +15,6 @@ from tgdsl.quantities.loads.gathering import gather
 from tgdsl.quantities.loads.part import LoadsPart
 from tgdsl.quantities.loads.reference import reference
 from tgdsl.quantities.reference import ReferenceScene
-from tgdsl.report.oracles.setups.sounds import plate, pressed
 
 
 @pytest.fixture

@@ -4,16 +4,8 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-from surfaces import box, surface_of
-
-from tgdsl.errors import BakeError
-from tgdsl.geometry.planes import split
-from tgdsl.quantities.moments import fields as moments
-from tgdsl.quantities.moments.clouds import sample_cloud, sample_points
-from tgdsl.quantities.moments.fields import bake_field, surface_area
-from tgdsl.quantities.moments.moments import MomentField, field_moments
-from tgdsl.report.oracles import proximity
-from tgdsl.report.oracles.proximity import (
+from oracles import proximity
+from oracles.proximity import (
     AREAS,
     LIMIT,
     TOLERANCE,
@@ -27,6 +19,14 @@ from tgdsl.report.oracles.proximity import (
     sphere_moments,
     sums,
 )  # fmt: skip
+from surfaces import box, surface_of
+
+from tgdsl.errors import BakeError
+from tgdsl.geometry.planes import split
+from tgdsl.quantities.moments import fields as moments
+from tgdsl.quantities.moments.clouds import sample_cloud, sample_points
+from tgdsl.quantities.moments.fields import bake_field, surface_area
+from tgdsl.quantities.moments.moments import MomentField, field_moments
 from tgdsl.surfaces.quadrature import outer_surface
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 from held import assert_holds
+from oracles import proximity
 
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moments.moments import MomentField, PointCloud, cloud_moments, field_moments, plane_moments
-from tgdsl.report.oracles import proximity
 
 
 def planes_of(points):

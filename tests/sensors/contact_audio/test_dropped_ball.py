@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles.setups import drops
+from oracles.setups.drops import GRAVITY, HEIGHTS, MASS, loudest
+from oracles.sound import impact
 
-from tgdsl.report.oracles.setups import drops
-from tgdsl.report.oracles.setups.drops import GRAVITY, HEIGHTS, MASS, loudest
-from tgdsl.report.oracles.sound import impact
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-
-from tgdsl.report.oracles import sound as oracles
-from tgdsl.report.oracles.setups.sounds import STEP, half_sine, plate, pressed, sound, struck
+from oracles import sound as oracles
+from oracles.setups.sounds import STEP, half_sine, plate, pressed, sound, struck
 
 MODE = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}]
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import sound as oracles
+from oracles.setups.sounds import STEP, plate, pressed, sound
 from struck_plate import energy
 
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.quantities.places import Places
-from tgdsl.report.oracles import sound as oracles
-from tgdsl.report.oracles.setups.sounds import STEP, plate, pressed, sound
 from tgdsl.sensors.base import Context
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.sensors.contact_audio.operators import operators

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import friction
 from scipy.spatial.transform import Rotation
 
 from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.contact_depth import Distance, Penetration
 from tgdsl.quantities.contact_depth.reference import ReferencePenetration
 from tgdsl.quantities.geoms.distance import Frame
-from tgdsl.report.oracles.contact_mechanics import friction
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance, advance_reference
 
 STICK_SLIP = StickSlip(0.0, 1e-5, 1e-4, None)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-from scenes import module, state
+from oracles import markers
+from oracles.markers import BALL, ELASTIC, PROBES, pressed
+from oracles.setups.scenes import module, state
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.report.oracles.contact_mechanics import markers
-from tgdsl.report.oracles.contact_mechanics.markers import BALL, ELASTIC, PROBES, pressed
 from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.testing import SCENE, KindConformance, assert_agrees
 

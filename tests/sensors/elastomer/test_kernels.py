@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from held import assert_holds
+from oracles import half_space, layer, markers
+from oracles.half_space import NORMAL, OBLIQUE, TANGENTIAL
 
-from tgdsl.report.oracles.contact_mechanics import half_space, layer, markers
-from tgdsl.report.oracles.contact_mechanics.half_space import NORMAL, OBLIQUE, TANGENTIAL
 from tgdsl.sensors.elastomer.bonded_layer import Layer, profiles
 from tgdsl.sensors.elastomer.half_space import half_space as profiles_of
 from tgdsl.sensors.elastomer.kernels import Gaussian

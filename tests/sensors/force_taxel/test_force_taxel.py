@@ -9,14 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from cube_on_pad import FOOTPRINT, TAXELS, pad, settled
 from held import assert_holds
+from oracles.forces import around_an_edge, made_up, shared_by_depth, torque_carried
+from oracles.setups.scenes import FOOTPRINT, TAXELS, pad, settled
 
 import tgdsl
 from tgdsl.console.progress import silent
 from tgdsl.errors import LowerError
 from tgdsl.layout.layout import Layout, Link
-from tgdsl.report.oracles.forces import around_an_edge, made_up, shared_by_depth, torque_carried
 from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL, ForceTaxelSpec, lower, reference_reports
 from tgdsl.testing import KindConformance
 from tgdsl.testing.reference import assert_agrees

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from cube_on_pad import FOOTPRINT, LINE, TAXELS, in_link, pad, settled, wrench
 from held import assert_holds
+from oracles import forces
+from oracles.setups.scenes import FOOTPRINT, LINE, TAXELS, in_link, pad, settled, wrench
 from scipy.spatial.transform import Rotation
-
-from tgdsl.report.oracles import forces
 
 ROUNDING = 1e-12
 """Sums of float64 forces of about 1 N."""

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import hearing as oracles
+from oracles.setups.listening import RATE, SCENE, heard, listening
+from oracles.setups.tone import TONE
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.report.oracles import hearing as oracles
-from tgdsl.report.oracles.setups.listening import RATE, SCENE, heard, listening
-from tgdsl.report.oracles.setups.tone import TONE
 
 
 @pytest.fixture

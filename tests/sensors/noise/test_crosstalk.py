@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-from noise_cases import Noise, line
 from noise_stages import CHANNELS
-
-from tgdsl.report.oracles import filters
-from tgdsl.report.oracles.filters import BLUR
+from oracles import filters
+from oracles.filters import BLUR
+from oracles.setups.signals import Noise, line
 
 LAYOUTS = filters.layouts()
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-
-from tgdsl.report.oracles import filters
+from oracles import filters
 
 
 @pytest.mark.parametrize("dt", [1e-6, 1e-3, 0.05, 10.0])

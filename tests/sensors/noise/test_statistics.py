@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-from noise_cases import KOLMOGOROV, MM, Noise, correlation, standard_errors, uniform_distance
+from oracles import filters
+from oracles import noise as noise_oracles
+from oracles.noise import DT, SIDE, million, reading, variance_error
+from oracles.noise import NUM as N
+from oracles.setups.signals import KOLMOGOROV, MM, Noise, correlation, standard_errors, uniform_distance
 from torch import Tensor
 
-from tgdsl.report.oracles import filters
-from tgdsl.report.oracles import noise as noise_oracles
-from tgdsl.report.oracles.noise import DT, SIDE, million, reading, variance_error
-from tgdsl.report.oracles.noise import NUM as N
 from tgdsl.sensors.noise import random, stages
 
 

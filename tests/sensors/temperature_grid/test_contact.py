@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import heat
+from oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 from scipy.linalg import expm
 
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.report.oracles import heat
-from tgdsl.report.oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 
 
 def test_aluminium_on_warm_rubber_warms_as_two_solids_do():

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import heat
+from oracles.setups.boxes import begin, cells_of, heat_module, heat_state
 
 import tgdsl
-from tgdsl.report.oracles import heat
-from tgdsl.report.oracles.setups.boxes import begin, cells_of, heat_module, heat_state
 
 
 @pytest.mark.parametrize("numbers", [(1, 0, 0), (0, 2, 0), (3, 1, 2), (4, 3, 5), (0, 0, 0)])

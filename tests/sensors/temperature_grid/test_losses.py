@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from oracles import cooling
+from oracles.cooling import SIDES
+from oracles.setups.boxes import cells_of, heat_module, heat_state
 
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.report.oracles import cooling
-from tgdsl.report.oracles.cooling import SIDES
-from tgdsl.report.oracles.setups.boxes import cells_of, heat_module, heat_state
 
 COMPARED = (
     cooling.newton, partial(cooling.newton, torch.float32), cooling.exposed_faces, cooling.radiation, cooling.both_losses,

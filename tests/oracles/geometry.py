@@ -1,0 +1,374 @@
+"""Distances of primitives, and of meshes on grids, against distances that need no code, or points built at a known one."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+
+from oracles.results import Comparison, Oracle, along, array, cases
+from oracles.setups.scenes import compiled, folder, points, probed, state
+from tgdsl.geometry.planes import split
+from tgdsl.geometry.shapes import SHAPES
+from tgdsl.module.state import SceneState
+
+KINDS = ("geometry", "contact_depth", "surface_distance")
+THIRD = 1 / np.sqrt(3)
+Row = tuple[str, tuple[float | int, ...], tuple[float | int, ...], float, tuple[float | int, ...]]
+KNOWN: tuple[Row, ...] = (
+    ("plane", (0, 0, 0), (5, -3, -2), -2.0, (0, 0, 1)),
+    ("sphere", (2, 0, 0), (0, 0, 0), -2.0, (1, 0, 0)),
+    ("sphere", (2, 0, 0), (0, 3, 4), 3.0, (0, 0.6, 0.8)),
+    ("capsule", (1, 2, 0), (0, 0, 5), 2.0, (0, 0, 1)),
+    ("capsule", (1, 2, 0), (0, 0, 1), -1.0, (1, 0, 0)),
+    ("capsule", (1, 2, 0), (3, 4, 2), 4.0, (0.6, 0.8, 0)),
+    ("box", (1, 2, 3), (2, 3, 4), float(np.sqrt(3)), (THIRD, THIRD, THIRD)),
+    ("box", (1, 2, 3), (0, 0, 0), -1.0, (1, 0, 0)),
+    ("box", (1, 2, 3), (-0.5, 1.9, 0), -0.1, (0, 1, 0)),
+    ("box", (1, 2, 3), (1, 2, 3), 0.0, (1, 0, 0)),
+    ("cylinder", (1, 2, 0), (4, 0, 6), 5.0, (0.6, 0, 0.8)),
+    ("cylinder", (1, 2, 0), (0, 0, 0), -1.0, (1, 0, 0)),
+    ("cylinder", (3, 1, 0), (0, 0, -0.5), -0.5, (0, 0, -1)),
+    ("ellipsoid", (1, 2, 3), (0, 0, 5), 2.0, (0, 0, 1)),
+    ("ellipsoid", (1, 2, 3), (-4, 0, 0), 3.0, (-1, 0, 0)),
+    ("ellipsoid", (1, 2, 3), (0, 0, 0), -1.0, (1, 0, 0)),
+    ("ellipsoid", (2, 2, 2), (0, 3, 4), 3.0, (0, 0.6, 0.8)),
+)
+"""Distances that need no code: shape, size, point, distance, gradient."""
+PRIMITIVES = (
+    ("plane", (1.0, 1.0, 0.1)),
+    ("sphere", (0.02, 0.0, 0.0)),
+    ("capsule", (0.01, 0.03, 0.0)),
+    ("box", (0.02, 0.015, 0.03)),
+    ("box", (0.05, 0.04, 1e-3)),
+    ("cylinder", (0.012, 0.03, 0.0)),
+    ("cylinder", (0.05, 0.002, 0.0)),
+    ("ellipsoid", (0.02, 0.012, 0.03)),
+    ("ellipsoid", (0.02, 0.02, 0.01)),
+    ("ellipsoid", (0.05, 0.005, 0.02)),
+)
+"""Shapes and sizes [m] whose surfaces points are built on."""
+HALF, REACH = 0.02, 0.01
+"""Half the edge of the cube of 4 cm, and the radius of its probes [m]."""
+
+
+def distances(
+    shape: str, size: tuple[float | int, ...], pos: np.ndarray, dtype: torch.dtype = torch.float64
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return this package's signed distances (point,) [m] and their gradients (point, 3) [1]."""
+    p, s = torch.tensor(pos, dtype=dtype), torch.tensor(size, dtype=dtype)
+    distance, gradient = SHAPES[shape](split(p), split(s))
+    return distance.double().numpy(), torch.stack(gradient, dim=-1).double().numpy()
+
+
+def known_distances() -> Comparison:
+    """Return distances and gradients that need no code."""
+    exact, ours = [], []
+    for shape, size, point, distance, gradient in KNOWN:
+        found, direction = distances(shape, size, np.array([point], dtype=float))
+        exact.append([distance, *gradient])
+        ours.append([found[0], *direction[0]])
+    return Comparison(
+        "Distances of primitives that need no code",
+        "geometry, by hand",
+        "φ, ∇φ",
+        KINDS,
+        "distance and gradient",
+        "1",
+        cases([f"{shape} {point}" for shape, _, point, *_ in KNOWN]),
+        np.array(exact).T,
+        np.array(ours).T,
+        atol=1e-12,
+        series=("φ", "∂x", "∂y", "∂z"),
+        defects=(7,),
+    )
+
+
+def ellipsoid_normals(num: int = 1000) -> Comparison:
+    """Return distances of points X + t n of an ellipsoid's surface, n its normal: t, near the surface."""
+    rng, size = np.random.default_rng(0), np.array([0.02, 0.012, 0.03])
+    on_sphere = rng.normal(size=(num, 3))
+    surface = size * on_sphere / np.linalg.norm(on_sphere, axis=1, keepdims=True)
+    normal = unit(surface / size**2)
+    least = size.min() ** 2 / size.max()
+    exact = np.array([0.05, 0.5 * least, 0.0, -0.5 * least])
+    ours = []
+    for t in exact:
+        found, gradient = distances("ellipsoid", tuple(size), surface + t * normal)
+        off = found[np.abs(found - t).argmax()]
+        ours.append(off if np.abs(gradient - normal).max() <= 1e-11 else np.nan)
+    return Comparison(
+        "An ellipsoid at points along its normals",
+        "X + t n is at t while t is above −(least radius of curvature)",
+        "φ(X + t n) = t",
+        KINDS,
+        "distance, the farthest off of 1,000",
+        "m",
+        along("t", "m", exact),
+        exact,
+        array(ours),
+        atol=1e-14,
+        defects=(7,),
+    )
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (vector, 3) scaled to length 1."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Points of a surface, outward normals there, and how deep a point stays the nearest one [m]."""
+
+
+def surface_points(shape: str, size: tuple[float | int, ...], rng: np.random.Generator, num: int) -> Surface:
+    """Return random points of a primitive's surface."""
+    whole = np.array(size)
+    if shape == "plane":
+        return rng.uniform(-1, 1, (num, 3)) * [1, 1, 0], np.tile([0.0, 0.0, 1.0], (num, 1)), np.full(num, 1.0)
+    if shape == "sphere":
+        normal = unit(rng.normal(size=(num, 3)))
+        return whole[0] * normal, normal, np.full(num, whole[0])
+    if shape == "capsule":
+        normal = unit(rng.normal(size=(num, 3)))
+        on_wall = rng.random(num) < 0.5
+        normal[on_wall] = unit(normal[on_wall] * [1, 1, 0])
+        height = np.where(on_wall, rng.uniform(-1, 1, num), np.sign(normal[:, 2])) * whole[1]
+        return whole[0] * normal + height[:, None] * [0, 0, 1], normal, np.full(num, whole[0])
+    if shape == "ellipsoid":
+        surface = whole * unit(rng.normal(size=(num, 3)))
+        return surface, unit(surface / whole**2), np.full(num, whole.min() ** 2 / whole.max())
+    return (_box_points if shape == "box" else _cylinder_points)(whole, rng, num)
+
+
+def _box_points(size: np.ndarray, rng: np.random.Generator, num: int) -> Surface:
+    inside = size * rng.uniform(-1, 1, (num, 3))
+    normal = unit(np.abs(rng.normal(size=(num, 3)))) * rng.choice([-1.0, 1.0], (num, 3))
+    fixed = rng.permuted(np.tile([True, False, False], (num, 1)), axis=1)  # which axes are at their end: a face,
+    fixed |= rng.random((num, 3)) < 0.3  # an edge or a corner
+    normal = unit(normal * fixed)
+    surface = np.where(fixed, np.sign(normal) * size, inside)
+    room = np.where(fixed, size, size - np.abs(inside)).min(axis=1)
+    return surface, normal, np.where(fixed.sum(axis=1) == 1, room, 0.0)
+
+
+def _cylinder_points(size: np.ndarray, rng: np.random.Generator, num: int) -> Surface:
+    radius, half = size[0], size[1]
+    angle, part = rng.uniform(0, 2 * np.pi, num), rng.integers(0, 3, num)
+    radial = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(num)])
+    side = rng.choice([-1.0, 1.0], num)
+    lean = np.where(part == 2, rng.uniform(0, np.pi / 2, num), np.where(part == 1, np.pi / 2, 0.0))
+    normal = np.cos(lean)[:, None] * radial + (np.sin(lean) * side)[:, None] * [0, 0, 1]
+    normal[part == 1] = side[part == 1, None] * [0, 0, 1]
+    rho = np.where(part == 1, radius * np.sqrt(rng.random(num)), radius)
+    height = np.where(part == 0, half * rng.uniform(-1, 1, num), half * side)
+    depth = np.select([part == 0, part == 1], [np.minimum(radius, half - np.abs(height)), np.minimum(half, radius - rho)], 0.0)
+    return rho[:, None] * radial + height[:, None] * [0, 0, 1], normal, depth
+
+
+def at_known_distances(shape: str, size: tuple[float | int, ...], num: int = 100_000) -> Comparison:
+    """Return distances and directions of points built at known ones, in float64 and float32, over the shape's size.
+
+    A point X of a surface with outward normal n, moved by t along n, is at the distance t as long as X stays the nearest
+    point: for every t > 0 outside these convex shapes, and inside down to the depth where another part comes as near.
+    """
+    rng = np.random.default_rng(0)
+    surface, normal, depth = surface_points(shape, size, rng, num)
+    t = np.where(rng.random(num) < 0.5, rng.random(num) * max(size), -rng.random(num) * depth)
+    pos, errors = surface + t[:, None] * normal, []
+    for dtype, allowed in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
+        found, gradient = distances(shape, size, pos, dtype)
+        errors += [np.abs(found - t).max() / max(size) / allowed, np.abs(np.linalg.norm(gradient, axis=1) - 1).max() / 1e-5]
+    is_clear = (t > 1e-6) | (t < -1e-6) & (-t < 0.9 * depth)
+    if shape == "ellipsoid":  # near a plane of symmetry the sign of one small component is fixed: see `planes.tie`
+        is_clear &= (np.abs(pos) > 1e-7).all(axis=1)
+    direction = distances(shape, size, pos)[1]
+    errors.append(np.abs(direction[is_clear] - normal[is_clear]).max() / 1e-8)
+    return Comparison(
+        f"{num:,} points at known distances of a {shape}, size {size}",
+        "X + t n is at t while X is the nearest point",
+        "φ(X + t n) = t, ∇φ = n",
+        KINDS,
+        "largest error over what is allowed",
+        "1",
+        cases(["φ, 1e-12 of the size", "|∇φ|, 1e-5", "φ in float32, 1e-6", "|∇φ| in float32, 1e-5", "∇φ, 1e-8"]),
+        np.zeros(5),
+        array(errors),
+        atol=1.0,
+        defects=(7,),
+    )
+
+
+def reach() -> Comparison:
+    """Return the depth of a probe of 10 mm at every clearance from a cube of 4 cm; the paper's ends at a tenth of its size."""
+    clearances = np.array([-5.0, 0.0, 1.0, 2.5, 4.0, 5.0, 7.5, 9.0, 9.9, 10.0, 10.1]) * 1e-3
+    touch = probed([(0, 0, HALF + c) for c in clearances], '<geom type="box" size=".02 .02 .02"/>', kind="contact_depth")
+    exact = np.maximum(REACH - clearances, 0)
+    return Comparison(
+        "A probe reaches its radius and no further",
+        "geometry, by hand; the paper's range as measured",
+        "d = max(0, R − φ)",
+        KINDS,
+        "depth",
+        "m",
+        along("clearance", "m", clearances),
+        exact,
+        touch(state(touch))["s"][0, :, 0].numpy(),
+        atol=1e-15,
+        paper=np.where(clearances <= 0.1 * 2 * HALF, exact, 0.0),
+        defects=(6,),
+    )
+
+
+def before_and_after_contact() -> Comparison:
+    """Return signed distances from a box, from afar to inside, up to the range."""
+    heights = np.array([0.2, 0.07, 0.0699, 0.05, 0.0201, 0.02, 0.019, 0.005])
+    box = '<geom type="box" size=".02 .02 .02"/>'
+    touch = probed([(0, 0, z) for z in heights], box, gate=None, kind="surface_distance")
+    return Comparison(
+        "Distance before, in and after contact",
+        "geometry, by hand",
+        "φ = min(z − h, range)",
+        KINDS,
+        "distance",
+        "m",
+        along("height", "m", heights),
+        np.minimum(heights - HALF, 0.05),
+        touch(state(touch))["s"][0, :, 0].numpy(),
+        atol=1e-15,
+    )
+
+
+def nearest_vector() -> Comparison:
+    """Return the vector to the nearest point, beside an edge, inside, and out of range."""
+    probes = np.array([(0.023, 0.024, 0.0), (0.0, 0.0, 0.015), (0.2, 0, 0)])
+    box = '<geom type="box" size=".02 .02 .02"/>'
+    touch = probed(probes, box, gate=None, kind="surface_distance", nearest=True)
+    return Comparison(
+        "The vector leads to the surface",
+        "geometry, by hand",
+        "v = −φ ∇φ",
+        KINDS,
+        "distance and vector",
+        "m",
+        cases([f"{'φ' if i == 0 else 'xyz'[i - 1]} at {p}" for p in range(3) for i in range(4)]),
+        array([0.005, -0.003, -0.004, 0, -0.005, 0, 0, 0.005, 0.05, 0, 0, 0]),
+        touch(state(touch))["s"][0].numpy().ravel(),
+        atol=1e-15,
+    )
+
+
+def mesh_scene(mesh: trimesh.Trimesh | None, probes: np.ndarray, *, kind: str = "contact_depth", geoms: str = "",
+               scale: float = 1.0, dtype: torch.dtype = torch.float64, **target: Any) -> tuple[Any, SceneState]:  # fmt: skip
+    """Return a module whose probes of 10 mm feel a mesh (or geoms given as MJCF), and its scene with all at the origin.
+
+    Args:
+        mesh: The mesh [m], written in units of `scale` metres; None: there is none.
+        probes: Places of the probes [m].
+        kind: The sensor's.
+        geoms: The object's geoms, if not the mesh alone.
+        scale: Unit of the mesh's file [m].
+        dtype: The module's.
+        **target: Other fields of the object.
+    """
+    with folder() as where:
+        asset = ""
+        if mesh is not None:
+            mesh.copy().apply_scale(1 / scale).export(where / "item.stl")
+            geoms = geoms or '<geom name="item" type="mesh" mesh="item"/>'
+            asset = f'<asset><mesh name="item" file="item.stl" scale="{scale} {scale} {scale}" inertia="shell"/></asset>'
+        (where / "scene.xml").write_text(
+            f'<mujoco><compiler balanceinertia="true"/>{asset}<worldbody><body name="pad"><freejoint/><geom size=".05"/></body>'
+            f'<body name="item"><freejoint/>{geoms}</body></worldbody></mujoco>',
+            encoding="utf-8",
+        )
+        gate = {} if kind == "surface_distance" else {"gate": "geometric"}
+        layout = {"resolutions": {"r": {"pad": points(probes, REACH)}}}
+        touch = compiled(
+            {
+                "tgdsl": 1,
+                "robot": {"model": str(where / "scene.xml"), "layout": layout},
+                "objects": {"item": {"body": "item", **target}},
+                "sensors": {"s": {"kind": kind, "links": "pad", "feels": ["item"], **gate}},
+            },
+            dtype,
+        )
+    num = len(touch.inputs.bodies)
+    rest = torch.zeros(1, num, 3, dtype=torch.float64)
+    quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(1, num, 4)
+    return touch, SceneState(body_pos=rest, body_quat=quat, body_linvel=rest, body_angvel=rest)
+
+
+WAYS: dict[str, tuple[dict[str, Any] | None, float]] = {
+    "exact": (None, 1e-15),
+    "sdf": ({"query": "sdf"}, 5e-5),
+    "raycast": ({"query": "raycast"}, 1e-6),
+}
+"""How a cube is queried: as a primitive, as a mesh on a grid, as a mesh triangle by triangle; and what each may err [m]."""
+
+
+def cube_of_any_making(way: str) -> Comparison:
+    """Return the depth of probes of 10 mm over a cube of 4 cm, by one of the ways to query it."""
+    target, tolerance = WAYS[way]
+    clearances = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 9.0, 9.9]) * 1e-3
+    spots = [(x, y) for x in (-0.012, 0.0, 0.007) for y in (-0.009, 0.003)]
+    probes = np.array([(x, y, HALF + c) for c in clearances for x, y in spots])
+    if target is None:
+        touch, scene = mesh_scene(None, probes, geoms='<geom name="item" type="box" size=".02 .02 .02"/>')
+    else:
+        touch, scene = mesh_scene(trimesh.creation.box((0.04, 0.04, 0.04)), probes, **target)
+    found = touch(scene)["s"][0, :, 0].numpy().reshape(len(clearances), len(spots))
+    return Comparison(
+        f"A cube of 4 cm, query {way}",
+        "geometry, by hand",
+        "d = R − c",
+        KINDS,
+        "depth",
+        "m",
+        along("clearance", "m", clearances),
+        np.repeat(REACH - clearances, len(spots)).reshape(found.shape).T,
+        found.T,
+        atol=tolerance,
+        series=tuple(f"at {spot}" for spot in spots),
+        defects=(6, 20),
+    )
+
+
+def ball_of_triangles(query: str, scale: float = 1.0) -> Comparison:
+    """Return the distance to a fine ball of triangles inside and out: the sphere's to its tessellation, 99 % of 300 points."""
+    rng = np.random.default_rng(0)
+    direction, radius = unit(rng.normal(size=(300, 3))), rng.uniform(0.012, 0.029, 300)
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=HALF)
+    touch, scene = mesh_scene(
+        ball, direction * radius[:, None], kind="surface_distance", scale=scale, query=query, surface="visual"
+    )
+    error = np.abs(touch(scene)["s"][0, :, 0].numpy() - (radius - HALF))
+    tessellation = HALF * (1 - np.cos(np.deg2rad(2.5) / 2)) + 1e-6
+    return Comparison(
+        f"A ball of triangles, query {query}, in units of {scale:g} m",
+        "geometry; R(1 − cos(θ/2)) of an arc of θ = 2.5°",
+        "φ = |x| − R",
+        KINDS,
+        "error within which 99 % are",
+        "m",
+        cases(["99 %"]),
+        array(0.0),
+        array(np.percentile(error, 99)),
+        atol=tessellation + (5e-5 if query == "sdf" else 0),
+        defects=(20,),
+    )
+
+
+ORACLES: tuple[Oracle, ...] = (
+    known_distances,
+    ellipsoid_normals,
+    *(partial(at_known_distances, shape, size, 20_000) for shape, size in PRIMITIVES),
+    reach,
+    before_and_after_contact,
+    nearest_vector,
+    *(partial(cube_of_any_making, way) for way in WAYS),
+    *(partial(ball_of_triangles, query) for query in ("sdf", "raycast")),
+)

@@ -1,0 +1,310 @@
+"""Moments of the surface within a probe's radius, and what `proximity` makes of them.
+
+S0 = ∫ (R − |p − q|)₊ dA, S1 = ∫ (R − |p − q|)₊ (p − q) dA over the points p of a surface, q the probe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.integrate import quad
+
+from oracles.results import Comparison, Oracle, along, array, cases
+from oracles.setups.scenes import probed, state
+from tgdsl.geometry.planes import split
+from tgdsl.quantities.moments.clouds import sample_cloud
+from tgdsl.quantities.moments.fields import bake_field, moment_sums, surface_area
+from tgdsl.quantities.moments.moments import MomentField, PointCloud, cloud_moments, field_moments, plane_moments
+from tgdsl.surfaces.geom import Geom, SurfaceGeom
+from tgdsl.surfaces.quadrature import outer_surface
+from tgdsl.surfaces.surface import Surface
+
+R = 0.01
+"""Radius of the probes [m]."""
+TOLERANCE, LIMIT, COARSE = 0.008, 0.01, 0.04
+"""Of a field; what it may err at points spread otherwise than the compiler's; of fields whose accuracy is not the question."""
+KINDS = ("proximity",)
+PLANE, CUBE = '<geom type="plane" size="1 1 .1"/>', '<geom type="box" size=".02 .02 .02"/>'
+AREA = 6 * 0.04**2
+DENSITY = 100 / AREA
+STIFFNESS, SLIP = 300.0, 10.0
+"""The paper's k_n and k_s."""
+SOURCE = "Chung et al., appendix, ProximityTaxel; S0 and S1 by hand"
+CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
+
+
+def felt(shape: str, size: Sequence[Any], pos: Sequence[Any] = (0, 0, 0), surface: Surface | None = None) -> SurfaceGeom:
+    """Return an object's geom of some size [m] at a place [m]."""
+    whole = np.array([*size, 0, 0][:3], float)
+    kind = "mesh" if surface is not None else shape
+    return SurfaceGeom(Geom(0, "", "", "body", kind, whole, np.array(pos, float), np.eye(3), True), surface)
+
+
+def places(count: int = 400, seed: int = 5, extent: float = 0.028) -> np.ndarray:
+    """Return points all over a ball, of another draw than the compiler's [m]."""
+    rng = np.random.default_rng(seed)
+    way = rng.normal(size=(count, 3))
+    return extent * np.cbrt(rng.uniform(size=(count, 1))) * way / np.linalg.norm(way, axis=1, keepdims=True)
+
+
+def sphere_moments(pos: np.ndarray, b: float = 0.02, radius: float = R) -> np.ndarray:
+    """Return S0 and S1 (point, 4) of a ball of radius b [m].
+
+    With D the distance of the centre: dA = 2π (b/D) r dr, and p − q has the part (D² + r² − b²)/2D towards it.
+    """
+    found = []
+    for q in pos:
+        d = float(np.linalg.norm(q))
+        low, high, mass, toward = abs(d - b), min(radius, d + b), 0.0, 0.0
+        if low < high:
+            mass = 2 * np.pi * b / d * quad(lambda r: (radius - r) * r, low, high)[0]
+            toward = 2 * np.pi * b / d * quad(lambda r: (radius - r) * r * (d**2 + r**2 - b**2) / (2 * d), low, high)[0]  # noqa: B023
+        found.append([mass, *(-toward * q / d)])
+    return np.array(found)
+
+
+def box_moments(pos: np.ndarray, half: Sequence[Any], radius: float = R, num: int = 120) -> np.ndarray:
+    """Return S0 and S1 (point, 4) of a box by midpoint sums over each face."""
+    found = np.zeros((len(pos), 4))
+    for axis in range(3):
+        u, v = ((axis + k) % 3 for k in (1, 2))
+        line = (np.arange(num) + 0.5) / num * 2 - 1
+        grid = np.zeros((num * num, 3))
+        grid[:, u], grid[:, v] = (part.ravel() for part in np.meshgrid(line * half[u], line * half[v]))
+        area = 4 * half[u] * half[v] / num**2
+        for sign in (-1, 1):
+            grid[:, axis] = sign * half[axis]
+            for i, q in enumerate(pos):
+                way = grid - q
+                weight = area * np.maximum(radius - np.sqrt((way**2).sum(axis=1)), 0)
+                found[i] += [weight.sum(), *(weight @ way)]
+    return found
+
+
+def rms(found: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
+    """Return root mean square errors of S0 and of S1, over their full scale."""
+    error = found - exact
+    full = np.abs(exact[:, 0]).max(), np.linalg.norm(exact[:, 1:4], axis=1).max()
+    return (
+        float(np.sqrt(np.mean(error[:, 0] ** 2)) / full[0]),
+        float(np.sqrt(np.mean((error[:, 1:4] ** 2).sum(axis=1))) / full[1]),
+    )
+
+
+def sums(geoms: list[SurfaceGeom], pos: np.ndarray, radius: float = R, spacing: float = R / 8, channels: int = 4) -> np.ndarray:
+    """Return this package's sums over a fine surface (point, channel)."""
+    return moment_sums(outer_surface(geoms, spacing).quadrature(spacing), pos, radius, channels, 1)
+
+
+def asked(baked: Any, pos: np.ndarray) -> np.ndarray:
+    """Return what a field reads (point, channel), with slopes if it has them."""
+    *num, channels = baked.values.shape
+    place, cell = split(torch.tensor(baked.origin)), torch.tensor(baked.cell, dtype=torch.float64)
+    flat = torch.tensor(baked.values.reshape(-1, channels), dtype=torch.float64)
+    parts: list[torch.Tensor] = []
+    for start in range(0, channels, 4):
+        field = MomentField(flat[:, start : start + 4], 0, tuple(num), place, cell)
+        mass, first = field_moments(split(torch.tensor(pos)), field)
+        parts += [mass, *first]
+    return torch.stack(parts, dim=1).numpy()
+
+
+def cloud_reads(cloud: Any, pos: np.ndarray, radius: float = R) -> np.ndarray:
+    """Return what sums over sampled points read (point, 4), as the paper takes them."""
+    grown = np.concatenate([cloud.points, [[1e6] * 3]])
+    x, y, z = (torch.tensor(part) for part in grown.T.copy())
+    place, cell = split(torch.tensor(cloud.origin)), torch.tensor(cloud.cell, dtype=torch.float64)
+    weight = torch.tensor(cloud.weight, dtype=torch.float64)
+    whole = PointCloud((x, y, z), weight, torch.tensor(cloud.lists), 0, cloud.num, place, cell)
+    mass, first = cloud_moments(split(torch.tensor(pos)), whole, torch.full((len(pos),), radius, dtype=torch.float64))
+    return torch.stack([mass, *first], dim=1).numpy()
+
+
+def over_a_plane(d: float) -> float:
+    """Return S0 [m³] of a plane at a distance [m]."""
+    return 2 * np.pi * (R**3 / 6 - R * d**2 / 2 + d**3 / 3)
+
+
+def plane_integral(heights: tuple[float, ...] = (0.0, 0.003, -0.003, 0.0099, 0.01, 0.02, -0.5)) -> Comparison:
+    """Return S0 of a plane and S1 across it, against quadrature over the disc within reach."""
+    exact, ours = [], []
+    for height in heights:
+        d = abs(height)
+        rim = np.sqrt(max(R**2 - d**2, 0.0))
+        area = quad(lambda s: 2 * np.pi * s * (R - np.hypot(s, d)), 0, rim, epsabs=1e-18)[0]  # noqa: B023
+        place = split(torch.tensor([0.3, -0.2, height], dtype=torch.float64))
+        mass, first = plane_moments(place, torch.tensor(R, dtype=torch.float64))
+        exact.append([area / R**3, -height * area / R**4])
+        ours.append([float(mass) / R**3, float(first[2]) / R**4 if float(first[0]) == float(first[1]) == 0 else np.nan])
+    return Comparison(
+        "Moments of a plane",
+        "quadrature over the disc",
+        "S0 = ∫ 2πs (R − √(s² + z²)) ds",
+        KINDS,
+        "S0/R³, S1_z/R⁴",
+        "1",
+        along("height", "m", heights),
+        np.array(exact).T,
+        np.array(ours).T,
+        rtol=1e-10,
+        atol=1e-14,
+        series=("S0", "S1_z"),
+    )
+
+
+def solid_moments(solid: str) -> Comparison:
+    """Return errors of sums and of a baked field, around a ball or a box; and of 5,000 points, as the paper samples."""
+    if solid == "ball":
+        geom, pos, closed = felt("sphere", [0.02]), places(), partial(sphere_moments, b=0.02)
+    else:
+        half = [0.02, 0.015, 0.01]
+        geom, pos, closed = felt("box", half), places(150), partial(box_moments, half=half)
+    exact = closed(pos)
+    by_sums, by_field = rms(sums([geom], pos), exact), rms(asked(bake_field([geom], R, TOLERANCE), pos), exact)
+    few = rms(cloud_reads(sample_cloud([geom], R, 5_000), pos), exact)
+    return Comparison(
+        f"Moments of a {solid}",
+        "one-dimensional quadrature over the ball; midpoint sums over the box's faces",
+        "S0, S1",
+        KINDS,
+        "RMS error over full scale, over what is allowed",
+        "1",
+        cases(["S0 of sums", "S1 of sums", "S0 of the field", "S1 of the field"]),
+        np.zeros(4),
+        array([part / 2e-3 for part in by_sums] + [part / LIMIT for part in by_field]),
+        atol=1.0,
+        paper=array([part / 2e-3 for part in few] + [part / LIMIT for part in few]),
+    )
+
+
+def sampling_noise() -> Comparison:
+    """Return how the error of sampled points falls with their number: as its root."""
+    pos = places(200)
+    exact = box_moments(pos, [0.02] * 3)
+    few, many = (rms(cloud_reads(sample_cloud([felt("box", [0.02] * 3)], R, n), pos), exact)[0] for n in (5_000, 100_000))
+    return Comparison(
+        "Sampled points err by the root of their number",
+        "variance of a sum over independent points",
+        "ε ∝ 1/√N",
+        KINDS,
+        "error of 5,000 over that of 100,000 points",
+        "1",
+        cases(["S0"]),
+        array(np.sqrt(20)),
+        array(few / many),
+        rtol=0.4,
+    )
+
+
+def _scalene(a: float, b: float, c: float) -> float:
+    """Return the area of an ellipsoid by its parameters' fundamental form, summed with weights of Gauss and Legendre."""
+    node, weight = np.polynomial.legendre.leggauss(200)
+    u, v = (node[:, None] + 1) * np.pi / 2, (node + 1) * np.pi
+    x, y, z = np.sin(u) * np.cos(v) * b * c, np.sin(u) * np.sin(v) * a * c, np.cos(u) * a * b + 0 * v
+    form = np.sin(u) * np.sqrt(x**2 + y**2 + z**2)
+    return float(weight @ form @ weight * np.pi / 2 * np.pi)
+
+
+AREAS: dict[str, tuple[list[float], float]] = {
+    "sphere": ([0.025], 4 * np.pi * 0.025**2),
+    "capsule": ([0.01, 0.02], 4 * np.pi * 0.01**2 + 2 * np.pi * 0.01 * 0.04),
+    "cylinder": ([0.012, 0.02], 2 * np.pi * 0.012**2 + 2 * np.pi * 0.012 * 0.04),
+    "box": ([0.01, 0.02, 0.03], 8 * (2 + 3 + 6) * 1e-4),
+    "ellipsoid": ([0.01, 0.02, 0.035], _scalene(0.01, 0.02, 0.035)),
+    "ellipsoid of revolution": (
+        [0.01, 0.01, 0.03],
+        2 * np.pi * 0.01**2 * (1 + 3 / np.sqrt(8 / 9) * np.arcsin(np.sqrt(8 / 9))),
+    ),
+    "ellipsoid, almost a sphere": ([0.02, 0.02 + 1e-9, 0.02], 4 * np.pi * 0.02**2),
+}
+"""Sizes [m] and areas [m²] of primitives."""
+
+
+def areas(names: Sequence[str] = tuple(AREAS)) -> Comparison:
+    """Return the surface areas of primitives."""
+    ours = [surface_area([felt(name.split()[0].rstrip(","), AREAS[name][0], pos=(0.1, -0.2, 0.3))]) for name in names]
+    exact = array([AREAS[name][1] for name in names])
+    allowed = np.array([1e-7 if "almost" in name else 1e-10 for name in names])
+    return Comparison(
+        "Areas of primitives",
+        "geometry; an ellipsoid by quadrature, one of revolution in closed form",
+        "A",
+        (*KINDS, "geometry"),
+        "area over the exact one, off 1 over what is allowed",
+        "1",
+        cases(names),
+        np.zeros(len(names)),
+        (array(ours) / exact - 1) / allowed,
+        atol=1.0,
+    )
+
+
+def read(geom: str = PLANE, probe: Any = (0, 0, 0), sensor: Any = None, **item: Any) -> np.ndarray:
+    """Return a probe's reading of force [N] and torque [N·m]."""
+    values = {"reference_area": AREA, "tolerance": COARSE, **(sensor or {})}
+    touch = probed([probe], geom, gate=None, kind="proximity", **values)
+    return touch(state(touch, **item))["s"][0, 0].numpy()
+
+
+def _reading(name: str, equation: str, exact: Any, of: Callable[[dict[str, Any]], np.ndarray], **more: Any) -> Comparison:
+    return Comparison(
+        name, SOURCE, equation, KINDS, "force [N], torque [N·m]", "", cases(CHANNELS), array(exact), of({}),
+        rtol=1e-12, atol=1e-15, paper=of({"model": "paper"}), **more,
+    )  # fmt: skip
+
+
+def plane_in_front(d: float = 0.004) -> Comparison:
+    """Return the force of a plane before a probe: it pushes back; the paper's pulls."""
+    exact = [0, 0, -STIFFNESS * DENSITY * over_a_plane(d), 0, 0, 0]
+
+    def of(sensor: dict[str, Any]) -> np.ndarray:
+        return read(sensor=sensor, pos=[0.2, 0.1, d], quat=[0, 1, 0, 0])
+
+    return _reading("A plane in front pushes the sensor back", "f = −k ρ S0 n", exact, of, defects=(3,))
+
+
+def plane_at_the_side(about: str, d: float = 0.006) -> Comparison:
+    """Return force and torque of a wall beside a probe: τ = −k ρ S1 × a, about the taxel or the link's origin."""
+    quat = [np.sqrt(0.5), 0, -np.sqrt(0.5), 0]  # its normal points to −x
+    force, arm = -STIFFNESS * DENSITY * over_a_plane(d), {"taxel": 0.0, "link": 0.02}[about]
+    exact = [0, 0, force, 0, STIFFNESS * DENSITY * d * over_a_plane(d) - arm * force, 0]
+
+    def of(sensor: dict[str, Any]) -> np.ndarray:
+        return read(probe=(0.02, 0, 0), sensor={"torque_about": about, **sensor}, pos=[0.026, 0, 0], quat=quat)
+
+    return _reading(f"A plane at the side twists the sensor, about the {about}", "τ = −k ρ S1 × a", exact, of, defects=(24,))
+
+
+def slip() -> Comparison:
+    """Return the friction of a cube that slides by: along its motion, nothing across."""
+    at: dict[str, Any] = {"pos": [0, 0, -0.026]}
+    still, moving = read(CUBE, **at), read(CUBE, **at, linvel=[0.3, -0.1, 0.7])
+    s0 = -still[2] / (STIFFNESS * DENSITY)
+    return Comparison(
+        "Slip drags the sensor along with the object",
+        SOURCE,
+        "f_t = k_s ρ S0 v_t",
+        KINDS,
+        "change of force [N], torque [N·m]",
+        "",
+        cases(CHANNELS),
+        array([SLIP * DENSITY * s0 * 0.3, -SLIP * DENSITY * s0 * 0.1, 0, 0, 0, 0]),
+        moving - still,
+        atol=1e-12,
+        defects=(3,),
+    )
+
+
+ORACLES: tuple[Oracle, ...] = (
+    plane_integral,
+    *(partial(solid_moments, solid) for solid in ("ball", "box")),
+    sampling_noise,
+    areas,
+    plane_in_front,
+    *(partial(plane_at_the_side, about) for about in ("taxel", "link")),
+    slip,
+)
