@@ -2,41 +2,34 @@
 
 from __future__ import annotations
 
-from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 import torch
 
-from oracles.noise import DT, KINDS
-from oracles.results import Comparison, Oracle, along, array, cases
+from oracles.comparison import Values, field
+from oracles.noise import DT
 from oracles.setups.signals import MM, Noise, make_layout, one
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise.lower import crosstalk_kernel
 
+oracle = field("filters", "noise")
 EXACT = 1e-12
 """Of filters in float64."""
 
 
-def delay(late: float, parts: float) -> Comparison:
-    """Return a clock that is read late, with calls at a part of 2 ms: exactly as old as the delay, never before the start."""
-    dt = DT / parts
+@oracle(
+    "A reading is as old as its delay: {late:ms}, calls every {dt:ms}", "y(t) = x(max(t − Δ, 0))",
+    "by definition, linear between calls", "reading of a clock [s]", "time [s]", atol=1e-14, series=("row 0", "row 1"),
+    defects=(19,),
+    each=[(0.5e-3, DT), (5.3e-3, DT / 0.1), (5.3e-3, DT / 10.0)],
+    also=product((0.0, 0.5e-3, 4e-3, 5.3e-3), (DT / 0.1, DT, DT / 2.0, DT / 10.0)),
+)  # fmt: skip
+def delay(late: float, dt: float):
     clock = dt * np.arange(200)
-    found = one(Noise({"read_delay": late, "bias": 1.0}, 2, dt=dt), clock.tolist(), dt) - 1
-    return Comparison(
-        f"A reading is as old as its delay: {1e3 * late:g} ms, calls every {1e3 * dt:g} ms",
-        "by definition, linear between calls",
-        "y(t) = x(max(t − Δ, 0))",
-        KINDS,
-        "reading of a clock",
-        "s",
-        along("time", "s", clock),
-        np.maximum(clock - late, 0)[None].repeat(2, 0),
-        found.T,
-        atol=1e-14,
-        series=("row 0", "row 1"),
-        defects=(19,),
-    )
+    ours = one(Noise({"read_delay": late, "bias": 1.0}, 2, dt=dt), clock.tolist(), dt) - 1
+    return Values(np.maximum(clock - late, 0), ours.T, at=clock)
 
 
 STRENGTH, TAU = 0.5, 0.05
@@ -62,65 +55,44 @@ def maxwell_of_the_paper(signal: np.ndarray, dt: float) -> np.ndarray:
     return signal + STRENGTH * lag
 
 
-def maxwell_step() -> Comparison:
-    """Return the branch after a step of the signal."""
+@oracle(
+    "Maxwell branch: after a step", "y = 1 + β e^(−t/τ)",
+    "linear viscoelasticity; a spring and a dashpot in series beside a spring", "reading [1]", "time [s]", atol=EXACT,
+)  # fmt: skip
+def maxwell_step():
     noise = Noise(BRANCH)
     rest = noise.read(0.0, DT).item()
     noise.read(1.0, 1e-15)
     t = DT * np.arange(1, 201)
-    found = one(noise, np.ones(200).tolist(), DT)[:, 0]
-    return Comparison(
-        "Maxwell branch: after a step",
-        "linear viscoelasticity; a spring and a dashpot in series beside a spring",
-        "y = 1 + β e^(−t/τ)",
-        KINDS,
-        "reading",
-        "1",
-        along("time", "s", t),
-        1 + STRENGTH * np.exp(-t / TAU),
-        found if rest == 0 else found + np.nan,
-        atol=EXACT,
-    )
+    ours = one(noise, np.ones(200).tolist(), DT)[:, 0]
+    return Values(1 + STRENGTH * np.exp(-t / TAU), ours if rest == 0 else np.nan, at=t)
 
 
-def maxwell_ramp(dt: float) -> Comparison:
-    """Return the branch on a ramp, at a step; the paper's update overshoots the more the longer the step."""
+@oracle(
+    "Maxwell branch: on a ramp, Δt = {dt:g} s", "y = vt + βvτ(1 − e^(−t/τ))", "linear viscoelasticity", "reading [1]",
+    "time [s]", rtol=EXACT, defects=(21,),
+    each=[1e-6, 1e-3, 0.05, 10.0],
+)  # fmt: skip
+def maxwell_ramp(dt: float):
     t, speed = dt * np.arange(200), 3.0 / dt
-    return Comparison(
-        f"Maxwell branch: on a ramp, Δt = {dt:g} s",
-        "linear viscoelasticity",
-        "y = vt + βvτ(1 − e^(−t/τ))",
-        KINDS,
-        "reading",
-        "1",
-        along("time", "s", t),
-        speed * t + STRENGTH * speed * TAU * (1 - np.exp(-t / TAU)),
-        one(Noise(BRANCH), (speed * t).tolist(), dt)[:, 0],
-        rtol=EXACT,
-        paper=maxwell_of_the_paper(speed * t, dt),
-        defects=(21,),
-    )
+    exact = speed * t + STRENGTH * speed * TAU * (1 - np.exp(-t / TAU))
+    ours = one(Noise(BRANCH), (speed * t).tolist(), dt)[:, 0]
+    return Values(exact, ours, maxwell_of_the_paper(speed * t, dt), at=t)
 
 
-def maxwell_cycle(parts: int, dtype: torch.dtype = torch.float64) -> Comparison:
-    """Return the branch over press, hold, release and wiggle, at 10 ms or a part of it: the same curve at any step."""
+@oracle(
+    "Maxwell branch: the same at any step, {step:g} ms",
+    "y = x + βτ Σ Δv (1 − e^(−(t−t_b)/τ)) over the signal's bends", "linear viscoelasticity", "reading [1]", "time [s]",
+    defects=(21,),
+    each=[1, 10, (1, torch.float32)], also=product((1, 2, 10), (torch.float64, torch.float32)),
+)  # fmt: skip
+def maxwell_cycle(parts: int, dtype: torch.dtype = torch.float64):
     common = np.arange(31) * 0.01
     signal = np.interp(np.arange(30 * parts + 1) * 0.01 / parts, *PRESS)
-    is_double = dtype == torch.float64
-    return Comparison(
-        f"Maxwell branch: the same at any step, {10 / parts:g} ms{'' if is_double else ', float32'}",
-        "linear viscoelasticity",
-        "y = x + βτ Σ Δv (1 − e^(−(t−t_b)/τ)) over the signal's bends",
-        KINDS,
-        "reading",
-        "1",
-        along("time", "s", common),
-        maxwell(common),
-        one(Noise(BRANCH, dtype=dtype), signal.tolist(), 0.01 / parts)[::parts, 0].astype(np.float64),
-        atol=EXACT if is_double else 1e-4,
-        paper=maxwell_of_the_paper(signal, 0.01 / parts)[::parts],
-        defects=(21,),
-    )
+    ours = one(Noise(BRANCH, dtype=dtype), signal.tolist(), 0.01 / parts)[::parts, 0]
+    paper = maxwell_of_the_paper(signal, 0.01 / parts)[::parts]
+    atol = EXACT if dtype == torch.float64 else 1e-4
+    return Values(maxwell(common), ours, paper, at=common, atol=atol, words={"step": 10 / parts})
 
 
 def grid(rows: int, columns: int, spacing: float) -> np.ndarray:
@@ -148,85 +120,47 @@ def layouts() -> dict[str, Layout]:
 
 
 BLUR: dict[str, Any] = {"crosstalk": {"strength": 0.4, "sigma": "1.5 mm"}}
+UNEVEN: dict[str, Any] = {"crosstalk": {"strength": [0.2, 0.9], "sigma": ["1 mm", "3 mm"]}}
 
 
-def crosstalk_sum(name: str, knobs: dict[str, Any] | None = None) -> Comparison:
-    """Return the sum over a pad of what each taxel's signal of 1 is spread to: 1, at centre, edge and corner."""
+@oracle(
+    "Crosstalk keeps the sum: {name}", "Σ_j K_ji = 1", "columns of the operator sum to 1", "sum [1]", "taxel", atol=1e-6,
+    defects=(10,),
+    each=["grid", "sphere cap", "irregular"], also=product(layouts(), (BLUR, UNEVEN)),
+)  # fmt: skip
+def crosstalk_sum(name: str, knobs: dict[str, Any] = BLUR):
     layout = layouts()[name]
     source = np.eye(layout.num_taxels)[:, :, None]
-    noise = Noise(knobs or BLUR, layout, num_envs=layout.num_taxels, dtype=torch.float32)
+    noise = Noise(knobs, layout, num_envs=layout.num_taxels, dtype=torch.float32)
     spread = noise.read(source)[..., 0].double().numpy()
-    return Comparison(
-        f"Crosstalk keeps the sum: {name}",
-        "columns of the operator sum to 1",
-        "Σ_j K_ji = 1",
-        KINDS,
-        "sum",
-        "1",
-        cases(range(layout.num_taxels), "taxel"),
-        np.ones(layout.num_taxels),
-        spread.sum(axis=1) if (spread >= 0).all() else np.full(layout.num_taxels, np.nan),
-        atol=1e-6,
-        defects=(10,),
-    )
+    return Values(1.0, spread.sum(axis=1) if (spread >= 0).all() else np.nan, at=range(layout.num_taxels))
 
 
-def crosstalk_edges(num: int = 15, sigma: float = 2 * MM) -> Comparison:
-    """Return what a full blur keeps at centre, edge and corner: all; a kernel that is padded with zeros loses some."""
+@oracle(
+    "A full blur keeps the force at edges", "Σ_j K_ji = 1",
+    "columns of the operator sum to 1; the paper's convolution is padded with zeros", "sum [1]",
+    at=["centre", "edge", "corner"], atol=1e-14, defects=(10,),
+)  # fmt: skip
+def crosstalk_edges(num: int = 15, sigma: float = 2 * MM):
     layout = make_layout(grid(num, num, MM))
     kernel = crosstalk_kernel(layout, np.full(num * num, sigma))
     middle = num // 2 * num + num // 2
     padded = np.exp(-np.sum((layout.pos - layout.pos[:, None]) ** 2, axis=-1) / (2 * sigma**2))
     padded /= padded[middle].sum()
     at = [middle, num // 2, 0]
-    return Comparison(
-        "A full blur keeps the force at edges",
-        "columns of the operator sum to 1; the paper's convolution is padded with zeros",
-        "Σ_j K_ji = 1",
-        KINDS,
-        "sum",
-        "1",
-        cases(["centre", "edge", "corner"]),
-        np.ones(3),
-        kernel.sum(axis=0)[at],
-        atol=1e-14,
-        paper=padded.sum(axis=1)[at],
-        defects=(10,),
-    )
+    return 1.0, kernel.sum(axis=0)[at], padded.sum(axis=1)[at]
 
 
-def crosstalk_variance(strength: float) -> Comparison:
-    """Return first and second moments of what a taxel far from edges is spread to, over σ².
-
-    Sums over a grid are integrals to 4π²σ²/h² e^(−2π²σ²/h²), 2e-7 for σ = h; the grid reaches 10 σ.
-    """
+@oracle(
+    "A blur has the variance of its Gaussian, strength {strength:g}", "Σ K x² = χ σ²", "variance of a Gaussian",
+    "moments over σ, σ² [1]", at=["x", "y", "x²", "y²"], rtol=1e-6, atol=1e-12,
+    each=[1.0], also=[0.3],
+)  # fmt: skip
+def crosstalk_variance(strength: float):
+    # Sums over a grid are integrals to 4π²σ²/h² e^(−2π²σ²/h²), 2e-7 for σ = h; the grid reaches 10 σ.
     layout, sigma = make_layout(grid(21, 21, MM)), 1.0 * MM
     source = np.zeros((441, 1))
     source[220] = 1
     spread = Noise({"crosstalk": {"strength": strength, "sigma": sigma}}, layout).read(source)[0, :, 0].numpy()
     apart = (layout.pos - layout.pos[220])[:, :2]
-    return Comparison(
-        f"A blur has the variance of its Gaussian, strength {strength:g}",
-        "variance of a Gaussian",
-        "Σ K x² = χ σ²",
-        KINDS,
-        "moments over σ, σ²",
-        "1",
-        cases(["x", "y", "x²", "y²"]),
-        array([0, 0, strength, strength]),
-        np.concatenate([spread @ apart / sigma, spread @ apart**2 / sigma**2]),
-        rtol=1e-6,
-        atol=1e-12,
-    )
-
-
-ORACLES: tuple[Oracle, ...] = (
-    *(partial(delay, late, parts) for late, parts in ((0.5e-3, 1.0), (5.3e-3, 0.1), (5.3e-3, 10.0))),
-    maxwell_step,
-    *(partial(maxwell_ramp, dt) for dt in (1e-6, 1e-3, 0.05, 10.0)),
-    *(partial(maxwell_cycle, parts) for parts in (1, 10)),
-    partial(maxwell_cycle, 1, torch.float32),
-    *(partial(crosstalk_sum, name) for name in ("grid", "sphere cap", "irregular")),
-    crosstalk_edges,
-    partial(crosstalk_variance, 1.0),
-)
+    return [0, 0, strength, strength], np.concatenate([spread @ apart / sigma, spread @ apart**2 / sigma**2])

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import torch
 
-from oracles.half_space import KINDS
-from oracles.results import Comparison, Oracle, along, array, cases
+from oracles.comparison import Values, field
 from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.contact_depth import Distance, Penetration
 from tgdsl.quantities.geoms.distance import Frame
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance
 
+oracle = field("contact mechanics: friction", "elastomer")
 RADIUS, DEPTH, SLIP = 0.02, 1e-3, 0.4
 """Of the ball, how deep it is [m], and the largest displacement per depth."""
 TURN = 0.8
@@ -44,8 +42,8 @@ class _Pad:
         frame = Frame(rot((zero + 1, zero, zero, zero, zero + 1, zero, zero, zero, zero + 1)), (zero - s, zero, zero))
         distance = Distance(-depth, (zero, zero, zero))
         felt = Penetration(self.pos, depth.clamp(min=0), None, None, None, {"o": distance}, {"o": frame})
-        found, self.memory = advance(felt, self.pos, self.normal, StickSlip(0.0, 0.0, 1e-2, SLIP), self.memory)
-        return float(found[0].sum()) / self.full
+        displacement, self.memory = advance(felt, self.pos, self.normal, StickSlip(0.0, 0.0, 1e-2, SLIP), self.memory)
+        return float(displacement[0].sum()) / self.full
 
 
 def loading(ratio: np.ndarray) -> np.ndarray:
@@ -62,89 +60,50 @@ def mindlin(ratio: np.ndarray) -> np.ndarray:
     return np.asarray(1 - (1 - np.clip(ratio, 0, 1)) ** 1.5)
 
 
-def cycle(part: str) -> Comparison:
-    """Return the pull on the way out, back or out again; back and forth by Masing's rule. Mindlin's curve for comparison."""
+@oracle(
+    "A tangential cycle is the Winkler–Coulomb loop: {part}",
+    "Q/μP = 1 − (1 − s/s*)²; Mindlin's half-space: 1 − (1 − s/s*)^1.5",
+    "Masing's rule; Johnson 1985, 7.2, for a foundation of springs", "pull over μP [1]",
+    "displacement over that of full slip [1]",
+    each=["out", "back", "again"],
+)  # fmt: skip
+def cycle(part: str):
     pad, out = _Pad(), np.linspace(0, TURN, 9)
     down = np.linspace(TURN, -TURN, 9)
     ways = {"out": out, "back": down, "again": -down}
-    found = {name: array([pad.pull(w * SLIP * DEPTH) for w in way]) for name, way in ways.items()}
+    ours = {name: [pad.pull(w * SLIP * DEPTH) for w in way] for name, way in ways.items()}
     turn = loading(np.array(TURN))
     exact = {
         "out": loading(out),
         "back": turn - 2 * loading((TURN - down) / 2),
         "again": -turn + 2 * loading((TURN - down) / 2),
     }
-    return Comparison(
-        f"A tangential cycle is the Winkler–Coulomb loop: {part}",
-        "Masing's rule; Johnson 1985, 7.2, for a foundation of springs",
-        "Q/μP = 1 − (1 − s/s*)²; Mindlin's half-space: 1 − (1 − s/s*)^1.5",
-        KINDS,
-        "pull over μP",
-        "1",
-        along("displacement over that of full slip", "1", ways[part]),
-        exact[part],
-        found[part],
-        atol=2e-3 if part == "out" else 3e-3,
-    )
+    return Values(exact[part], ours[part], at=ways[part], atol=2e-3 if part == "out" else 3e-3)
 
 
-def loop_closes() -> Comparison:
-    """Return the pull at the turning point after a whole cycle, and what all taxels slide at: μP."""
+@oracle(
+    "The loop closes", "Q(s) after a cycle = Q(s) before", "Masing's rule", "pull over μP [1]", at=[f"s = {TURN} s*"],
+    atol=1e-3,
+)  # fmt: skip
+def loop_closes():
     pad = _Pad()
-    at = SLIP * DEPTH
-    first = [pad.pull(w * at) for w in np.linspace(0, TURN, 9)][-1]
-    again = [pad.pull(w * at) for w in (*np.linspace(TURN, -TURN, 9), *np.linspace(-TURN, TURN, 9))][-1]
-    return Comparison(
-        "The loop closes",
-        "Masing's rule",
-        "Q(s) after a cycle = Q(s) before",
-        KINDS,
-        "pull over μP",
-        "1",
-        cases([f"s = {TURN} s*"]),
-        array(first),
-        array(again),
-        atol=1e-3,
-    )
+    first = [pad.pull(w * (SLIP * DEPTH)) for w in np.linspace(0, TURN, 9)][-1]
+    again = [pad.pull(w * (SLIP * DEPTH)) for w in (*np.linspace(TURN, -TURN, 9), *np.linspace(-TURN, TURN, 9))][-1]
+    return first, again
 
 
-def full_slip() -> Comparison:
-    """Return what all taxels slide at: μP."""
-    return Comparison(
-        "Beyond full slip the pull is μP",
-        "Coulomb's law",
-        "Q = μP",
-        KINDS,
-        "pull over μP",
-        "1",
-        cases(["s = 1.5 s*"]),
-        array(1.0),
-        array(_Pad().pull(1.5 * SLIP * DEPTH)),
-        atol=1e-9,
-    )
+@oracle(
+    "Beyond full slip the pull is μP", "Q = μP", "Coulomb's law", "pull over μP [1]", at=["s = 1.5 s*"], atol=1e-9,
+)  # fmt: skip
+def full_slip():
+    return 1.0, _Pad().pull(1.5 * SLIP * DEPTH)
 
 
-def off_mindlin() -> Comparison:
-    """Return how far a Winkler foundation's curve is above Mindlin's at most: 27/256, at s/s* = 7/16."""
+@oracle(
+    "A skin of springs is stiffer than Mindlin's half-space", "27/256 at s/s* = 7/16",
+    "maximum of (1 − x)^1.5 − (1 − x)² by hand", "largest difference of pulls over μP [1]", at=["s from 0 to s*"], atol=3e-3,
+)  # fmt: skip
+def off_mindlin():
     pad, way = _Pad(), np.linspace(0, 1, 129)
-    difference = array([pad.pull(w * SLIP * DEPTH) for w in way]) - mindlin(way)
-    return Comparison(
-        "A skin of springs is stiffer than Mindlin's half-space",
-        "maximum of (1 − x)^1.5 − (1 − x)² by hand",
-        "27/256 at s/s* = 7/16",
-        KINDS,
-        "largest difference of pulls over μP",
-        "1",
-        cases(["s from 0 to s*"]),
-        array(27 / 256),
-        array(difference.max()),
-        atol=3e-3,
-    )
-
-
-ORACLES: tuple[Oracle, ...] = (
-    *(partial(cycle, part) for part in ("out", "back", "again")),
-    loop_closes,
-    full_slip,
-    off_mindlin,
-)
+    difference = np.array([pad.pull(w * SLIP * DEPTH) for w in way]) - mindlin(way)
+    return 27 / 256, difference.max()

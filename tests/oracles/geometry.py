@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 
-from oracles.results import Comparison, Oracle, along, array, cases
-from oracles.setups.scenes import compiled, folder, points, probed, state
+from oracles.comparison import Values, field
+from oracles.setups.scenes import compiled, document, folder, points, probed, state
 from tgdsl.geometry.planes import split
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.module.state import SceneState
 
-KINDS = ("geometry", "contact_depth", "surface_distance")
+oracle = field("geometry", "geometry", "contact_depth", "surface_distance")
 THIRD = 1 / np.sqrt(3)
-Row = tuple[str, tuple[float | int, ...], tuple[float | int, ...], float, tuple[float | int, ...]]
+Row = tuple[str, tuple[float, ...], tuple[float, ...], float, tuple[float, ...]]
 KNOWN: tuple[Row, ...] = (
     ("plane", (0, 0, 0), (5, -3, -2), -2.0, (0, 0, 1)),
     ("sphere", (2, 0, 0), (0, 0, 0), -2.0, (1, 0, 0)),
@@ -51,12 +50,13 @@ PRIMITIVES = (
     ("ellipsoid", (0.05, 0.005, 0.02)),
 )
 """Shapes and sizes [m] whose surfaces points are built on."""
+BOX = '<geom type="box" size=".02 .02 .02"/>'
 HALF, REACH = 0.02, 0.01
 """Half the edge of the cube of 4 cm, and the radius of its probes [m]."""
 
 
 def distances(
-    shape: str, size: tuple[float | int, ...], pos: np.ndarray, dtype: torch.dtype = torch.float64
+    shape: str, size: tuple[float, ...], pos: np.ndarray, dtype: torch.dtype = torch.float64
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return this package's signed distances (point,) [m] and their gradients (point, 3) [1]."""
     p, s = torch.tensor(pos, dtype=dtype), torch.tensor(size, dtype=dtype)
@@ -64,31 +64,25 @@ def distances(
     return distance.double().numpy(), torch.stack(gradient, dim=-1).double().numpy()
 
 
-def known_distances() -> Comparison:
-    """Return distances and gradients that need no code."""
+@oracle(
+    "Distances of primitives that need no code", "φ, ∇φ", "geometry, by hand", "distance and gradient [1]",
+    at=[f"{shape} {point}" for shape, _, point, *_ in KNOWN], atol=1e-12, series=("φ", "∂x", "∂y", "∂z"), defects=(7,),
+)  # fmt: skip
+def known_distances():
     exact, ours = [], []
     for shape, size, point, distance, gradient in KNOWN:
-        found, direction = distances(shape, size, np.array([point], dtype=float))
+        computed, direction = distances(shape, size, np.array([point], dtype=float))
         exact.append([distance, *gradient])
-        ours.append([found[0], *direction[0]])
-    return Comparison(
-        "Distances of primitives that need no code",
-        "geometry, by hand",
-        "φ, ∇φ",
-        KINDS,
-        "distance and gradient",
-        "1",
-        cases([f"{shape} {point}" for shape, _, point, *_ in KNOWN]),
-        np.array(exact).T,
-        np.array(ours).T,
-        atol=1e-12,
-        series=("φ", "∂x", "∂y", "∂z"),
-        defects=(7,),
-    )
+        ours.append([computed[0], *direction[0]])
+    return np.array(exact).T, np.array(ours).T
 
 
-def ellipsoid_normals(num: int = 1000) -> Comparison:
-    """Return distances of points X + t n of an ellipsoid's surface, n its normal: t, near the surface."""
+@oracle(
+    "An ellipsoid at points along its normals", "φ(X + t n) = t",
+    "X + t n is at t while t is above −(least radius of curvature)", "distance, the farthest off of 1,000 [m]", "t [m]",
+    atol=1e-14, defects=(7,),
+)  # fmt: skip
+def ellipsoid_normals(num: int = 1000):
     rng, size = np.random.default_rng(0), np.array([0.02, 0.012, 0.03])
     on_sphere = rng.normal(size=(num, 3))
     surface = size * on_sphere / np.linalg.norm(on_sphere, axis=1, keepdims=True)
@@ -97,22 +91,10 @@ def ellipsoid_normals(num: int = 1000) -> Comparison:
     exact = np.array([0.05, 0.5 * least, 0.0, -0.5 * least])
     ours = []
     for t in exact:
-        found, gradient = distances("ellipsoid", tuple(size), surface + t * normal)
-        off = found[np.abs(found - t).argmax()]
+        distance, gradient = distances("ellipsoid", tuple(size), surface + t * normal)
+        off = distance[np.abs(distance - t).argmax()]
         ours.append(off if np.abs(gradient - normal).max() <= 1e-11 else np.nan)
-    return Comparison(
-        "An ellipsoid at points along its normals",
-        "X + t n is at t while t is above −(least radius of curvature)",
-        "φ(X + t n) = t",
-        KINDS,
-        "distance, the farthest off of 1,000",
-        "m",
-        along("t", "m", exact),
-        exact,
-        array(ours),
-        atol=1e-14,
-        defects=(7,),
-    )
+    return Values(exact, ours, at=exact)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -124,7 +106,7 @@ Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Points of a surface, outward normals there, and how deep a point stays the nearest one [m]."""
 
 
-def surface_points(shape: str, size: tuple[float | int, ...], rng: np.random.Generator, num: int) -> Surface:
+def surface_points(shape: str, size: tuple[float, ...], rng: np.random.Generator, num: int) -> Surface:
     """Return random points of a primitive's surface."""
     whole = np.array(size)
     if shape == "plane":
@@ -169,96 +151,61 @@ def _cylinder_points(size: np.ndarray, rng: np.random.Generator, num: int) -> Su
     return rho[:, None] * radial + height[:, None] * [0, 0, 1], normal, depth
 
 
-def at_known_distances(shape: str, size: tuple[float | int, ...], num: int = 100_000) -> Comparison:
-    """Return distances and directions of points built at known ones, in float64 and float32, over the shape's size.
-
-    A point X of a surface with outward normal n, moved by t along n, is at the distance t as long as X stays the nearest
-    point: for every t > 0 outside these convex shapes, and inside down to the depth where another part comes as near.
-    """
+@oracle(
+    "{num:,} points at known distances of a {shape}, size {size}", "φ(X + t n) = t, ∇φ = n",
+    "X + t n is at t while X is the nearest point", "largest error over what is allowed [1]",
+    at=["φ, 1e-12 of the size", "|∇φ|, 1e-5", "φ in float32, 1e-6", "|∇φ| in float32, 1e-5", "∇φ, 1e-8"], atol=1.0,
+    defects=(7,),
+    each=[(*row, 20_000) for row in PRIMITIVES], also=[(*row, 1_000_000) for row in PRIMITIVES],
+)  # fmt: skip
+def at_known_distances(shape: str, size: tuple[float, ...], num: int = 100_000):
+    # A point X of a surface with outward normal n, moved by t along n, is at the distance t as long as X stays the nearest
+    # point: for every t > 0 outside these convex shapes, and inside down to the depth where another part comes as near.
     rng = np.random.default_rng(0)
     surface, normal, depth = surface_points(shape, size, rng, num)
     t = np.where(rng.random(num) < 0.5, rng.random(num) * max(size), -rng.random(num) * depth)
     pos, errors = surface + t[:, None] * normal, []
     for dtype, allowed in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
-        found, gradient = distances(shape, size, pos, dtype)
-        errors += [np.abs(found - t).max() / max(size) / allowed, np.abs(np.linalg.norm(gradient, axis=1) - 1).max() / 1e-5]
+        distance, gradient = distances(shape, size, pos, dtype)
+        errors += [np.abs(distance - t).max() / max(size) / allowed, np.abs(np.linalg.norm(gradient, axis=1) - 1).max() / 1e-5]
     is_clear = (t > 1e-6) | (t < -1e-6) & (-t < 0.9 * depth)
     if shape == "ellipsoid":  # near a plane of symmetry the sign of one small component is fixed: see `planes.tie`
         is_clear &= (np.abs(pos) > 1e-7).all(axis=1)
     direction = distances(shape, size, pos)[1]
     errors.append(np.abs(direction[is_clear] - normal[is_clear]).max() / 1e-8)
-    return Comparison(
-        f"{num:,} points at known distances of a {shape}, size {size}",
-        "X + t n is at t while X is the nearest point",
-        "φ(X + t n) = t, ∇φ = n",
-        KINDS,
-        "largest error over what is allowed",
-        "1",
-        cases(["φ, 1e-12 of the size", "|∇φ|, 1e-5", "φ in float32, 1e-6", "|∇φ| in float32, 1e-5", "∇φ, 1e-8"]),
-        np.zeros(5),
-        array(errors),
-        atol=1.0,
-        defects=(7,),
-    )
+    return 0.0, errors
 
 
-def reach() -> Comparison:
-    """Return the depth of a probe of 10 mm at every clearance from a cube of 4 cm; the paper's ends at a tenth of its size."""
+@oracle(
+    "A probe reaches its radius and no further", "d = max(0, R − φ)", "geometry, by hand; the paper's range as measured",
+    "depth [m]", "clearance [m]", atol=1e-15, defects=(6,),
+)  # fmt: skip
+def reach():
     clearances = np.array([-5.0, 0.0, 1.0, 2.5, 4.0, 5.0, 7.5, 9.0, 9.9, 10.0, 10.1]) * 1e-3
-    touch = probed([(0, 0, HALF + c) for c in clearances], '<geom type="box" size=".02 .02 .02"/>', kind="contact_depth")
+    touch = probed([(0, 0, HALF + c) for c in clearances], BOX, kind="contact_depth")
     exact = np.maximum(REACH - clearances, 0)
-    return Comparison(
-        "A probe reaches its radius and no further",
-        "geometry, by hand; the paper's range as measured",
-        "d = max(0, R − φ)",
-        KINDS,
-        "depth",
-        "m",
-        along("clearance", "m", clearances),
-        exact,
-        touch(state(touch))["s"][0, :, 0].numpy(),
-        atol=1e-15,
-        paper=np.where(clearances <= 0.1 * 2 * HALF, exact, 0.0),
-        defects=(6,),
-    )
+    paper = np.where(clearances <= 0.1 * 2 * HALF, exact, 0.0)
+    return Values(exact, touch(state(touch))["s"][0, :, 0], paper, at=clearances)
 
 
-def before_and_after_contact() -> Comparison:
-    """Return signed distances from a box, from afar to inside, up to the range."""
+@oracle(
+    "Distance before, in and after contact", "φ = min(z − h, range)", "geometry, by hand", "distance [m]", "height [m]",
+    atol=1e-15,
+)  # fmt: skip
+def before_and_after_contact():
     heights = np.array([0.2, 0.07, 0.0699, 0.05, 0.0201, 0.02, 0.019, 0.005])
-    box = '<geom type="box" size=".02 .02 .02"/>'
-    touch = probed([(0, 0, z) for z in heights], box, gate=None, kind="surface_distance")
-    return Comparison(
-        "Distance before, in and after contact",
-        "geometry, by hand",
-        "φ = min(z − h, range)",
-        KINDS,
-        "distance",
-        "m",
-        along("height", "m", heights),
-        np.minimum(heights - HALF, 0.05),
-        touch(state(touch))["s"][0, :, 0].numpy(),
-        atol=1e-15,
-    )
+    touch = probed([(0, 0, z) for z in heights], BOX, gate=None, kind="surface_distance")
+    return Values(np.minimum(heights - HALF, 0.05), touch(state(touch))["s"][0, :, 0], at=heights)
 
 
-def nearest_vector() -> Comparison:
-    """Return the vector to the nearest point, beside an edge, inside, and out of range."""
+@oracle(
+    "The vector leads to the surface", "v = −φ ∇φ", "geometry, by hand", "distance and vector [m]",
+    at=[f"{'φ' if i == 0 else 'xyz'[i - 1]} at {p}" for p in range(3) for i in range(4)], atol=1e-15,
+)  # fmt: skip
+def nearest_vector():
     probes = np.array([(0.023, 0.024, 0.0), (0.0, 0.0, 0.015), (0.2, 0, 0)])
-    box = '<geom type="box" size=".02 .02 .02"/>'
-    touch = probed(probes, box, gate=None, kind="surface_distance", nearest=True)
-    return Comparison(
-        "The vector leads to the surface",
-        "geometry, by hand",
-        "v = −φ ∇φ",
-        KINDS,
-        "distance and vector",
-        "m",
-        cases([f"{'φ' if i == 0 else 'xyz'[i - 1]} at {p}" for p in range(3) for i in range(4)]),
-        array([0.005, -0.003, -0.004, 0, -0.005, 0, 0, 0.005, 0.05, 0, 0, 0]),
-        touch(state(touch))["s"][0].numpy().ravel(),
-        atol=1e-15,
-    )
+    touch = probed(probes, BOX, gate=None, kind="surface_distance", nearest=True)
+    return [0.005, -0.003, -0.004, 0, -0.005, 0, 0, 0.005, 0.05, 0, 0, 0], touch(state(touch))["s"][0].numpy().ravel()
 
 
 def mesh_scene(mesh: trimesh.Trimesh | None, probes: np.ndarray, *, kind: str = "contact_depth", geoms: str = "",
@@ -286,20 +233,9 @@ def mesh_scene(mesh: trimesh.Trimesh | None, probes: np.ndarray, *, kind: str = 
             encoding="utf-8",
         )
         gate = {} if kind == "surface_distance" else {"gate": "geometric"}
-        layout = {"resolutions": {"r": {"pad": points(probes, REACH)}}}
-        touch = compiled(
-            {
-                "tgdsl": 1,
-                "robot": {"model": str(where / "scene.xml"), "layout": layout},
-                "objects": {"item": {"body": "item", **target}},
-                "sensors": {"s": {"kind": kind, "links": "pad", "feels": ["item"], **gate}},
-            },
-            dtype,
-        )
-    num = len(touch.inputs.bodies)
-    rest = torch.zeros(1, num, 3, dtype=torch.float64)
-    quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(1, num, 4)
-    return touch, SceneState(body_pos=rest, body_quat=quat, body_linvel=rest, body_angvel=rest)
+        sensor = {"kind": kind, "links": "pad", "feels": ["item"], **gate}
+        touch = compiled(document(where / "scene.xml", "item", sensor, points(probes, REACH), **target), dtype)
+    return touch, state(touch)
 
 
 WAYS: dict[str, tuple[dict[str, Any] | None, float]] = {
@@ -308,37 +244,31 @@ WAYS: dict[str, tuple[dict[str, Any] | None, float]] = {
     "raycast": ({"query": "raycast"}, 1e-6),
 }
 """How a cube is queried: as a primitive, as a mesh on a grid, as a mesh triangle by triangle; and what each may err [m]."""
+SPOTS = [(x, y) for x in (-0.012, 0.0, 0.007) for y in (-0.009, 0.003)]
+"""Places of probes over the cube's upper face [m]."""
 
 
-def cube_of_any_making(way: str) -> Comparison:
-    """Return the depth of probes of 10 mm over a cube of 4 cm, by one of the ways to query it."""
+@oracle(
+    "A cube of 4 cm, query {way}", "d = R − c", "geometry, by hand", "depth [m]", "clearance [m]",
+    series=[f"at {spot}" for spot in SPOTS], defects=(6, 20),
+    each=list(WAYS), slow=True,
+)  # fmt: skip
+def cube_of_any_making(way: str):
     target, tolerance = WAYS[way]
     clearances = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 9.0, 9.9]) * 1e-3
-    spots = [(x, y) for x in (-0.012, 0.0, 0.007) for y in (-0.009, 0.003)]
-    probes = np.array([(x, y, HALF + c) for c in clearances for x, y in spots])
-    if target is None:
-        touch, scene = mesh_scene(None, probes, geoms='<geom name="item" type="box" size=".02 .02 .02"/>')
-    else:
-        touch, scene = mesh_scene(trimesh.creation.box((0.04, 0.04, 0.04)), probes, **target)
-    found = touch(scene)["s"][0, :, 0].numpy().reshape(len(clearances), len(spots))
-    return Comparison(
-        f"A cube of 4 cm, query {way}",
-        "geometry, by hand",
-        "d = R − c",
-        KINDS,
-        "depth",
-        "m",
-        along("clearance", "m", clearances),
-        np.repeat(REACH - clearances, len(spots)).reshape(found.shape).T,
-        found.T,
-        atol=tolerance,
-        series=tuple(f"at {spot}" for spot in spots),
-        defects=(6, 20),
-    )
+    probes = np.array([(x, y, HALF + c) for c in clearances for x, y in SPOTS])
+    mesh = None if target is None else trimesh.creation.box((0.04, 0.04, 0.04))
+    touch, scene = mesh_scene(mesh, probes, geoms=BOX if mesh is None else "", **(target or {}))
+    ours = touch(scene)["s"][0, :, 0].numpy().reshape(len(clearances), len(SPOTS))
+    return Values(REACH - clearances, ours.T, at=clearances, atol=tolerance)
 
 
-def ball_of_triangles(query: str, scale: float = 1.0) -> Comparison:
-    """Return the distance to a fine ball of triangles inside and out: the sphere's to its tessellation, 99 % of 300 points."""
+@oracle(
+    "A ball of triangles, query {query}, in units of {scale:g} m", "φ = |x| − R",
+    "geometry; R(1 − cos(θ/2)) of an arc of θ = 2.5°", "error within which 99 % are [m]", at=["99 %"], defects=(20,),
+    each=["sdf", "raycast"], also=[("sdf", 1e-3), ("raycast", 1e-3)], slow=True,
+)  # fmt: skip
+def ball_of_triangles(query: str, scale: float = 1.0):
     rng = np.random.default_rng(0)
     direction, radius = unit(rng.normal(size=(300, 3))), rng.uniform(0.012, 0.029, 300)
     ball = trimesh.creation.icosphere(subdivisions=5, radius=HALF)
@@ -347,28 +277,4 @@ def ball_of_triangles(query: str, scale: float = 1.0) -> Comparison:
     )
     error = np.abs(touch(scene)["s"][0, :, 0].numpy() - (radius - HALF))
     tessellation = HALF * (1 - np.cos(np.deg2rad(2.5) / 2)) + 1e-6
-    return Comparison(
-        f"A ball of triangles, query {query}, in units of {scale:g} m",
-        "geometry; R(1 − cos(θ/2)) of an arc of θ = 2.5°",
-        "φ = |x| − R",
-        KINDS,
-        "error within which 99 % are",
-        "m",
-        cases(["99 %"]),
-        array(0.0),
-        array(np.percentile(error, 99)),
-        atol=tessellation + (5e-5 if query == "sdf" else 0),
-        defects=(20,),
-    )
-
-
-ORACLES: tuple[Oracle, ...] = (
-    known_distances,
-    ellipsoid_normals,
-    *(partial(at_known_distances, shape, size, 20_000) for shape, size in PRIMITIVES),
-    reach,
-    before_and_after_contact,
-    nearest_vector,
-    *(partial(cube_of_any_making, way) for way in WAYS),
-    *(partial(ball_of_triangles, query) for query in ("sdf", "raycast")),
-)
+    return Values(0.0, np.percentile(error, 99), atol=tessellation + (5e-5 if query == "sdf" else 0))

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from oracles.half_space import KINDS
-from oracles.results import Comparison, Oracle, along, array, cases
+from oracles.comparison import Values, field
 from oracles.setups.scenes import probed, state
 from tgdsl.sensors.elastomer.blocks import responses
 from tgdsl.sensors.elastomer.half_space import half_space, patch_radius
@@ -33,6 +32,10 @@ STRENGTH, DILATION, SHEAR, ALPHA = 100.0, 8000.0, 2000.0, 1.2
 ELASTIC: dict[str, Any] = {"kernel": "half_space", "youngs_modulus": 2e5, "poissons_ratio": 0.48, "normal_stiffness": 1e8}
 SOURCE = "Chung et al., appendix, ElastomerTaxel"
 NAMES = tuple(f"u_{a}, {where}" for where in ("source", "5 mm off") for a in "xyz")
+PEAK = np.exp(-0.5) / np.sqrt(2 * DILATION)
+"""ḡ, the largest of r exp(−λ_d r²) [m]."""
+oracle = field("contact mechanics: markers", "elastomer")
+by_hand = partial(oracle, source=SOURCE, quantity="displacement [m]")
 
 
 def pressed(way: Any = (0.0, 0.0), probes: Any = PROBES, depth: float = DEPTH, **sensor: Any) -> np.ndarray:
@@ -42,152 +45,88 @@ def pressed(way: Any = (0.0, 0.0), probes: Any = PROBES, depth: float = DEPTH, *
     return touch(state(touch, pos=[*way, 0.01 - depth]))["s"][0].numpy()
 
 
-def _by_hand(name: str, equation: str, exact: Any, ours: np.ndarray, **more: Any) -> Comparison:
-    given = {"over": cases(NAMES), "source": SOURCE, "rtol": 1e-12, "atol": 1e-18, **more}
-    source, over = given.pop("source"), given.pop("over")
-    return Comparison(name, source, equation, KINDS, "displacement", "m", over, array(exact), ours, **given)
-
-
-def dilation() -> Comparison:
-    """Return what one pressed taxel does to itself and to another: the printed formula, without ḡ, weighted with areas."""
+@by_hand("Dilation of two taxels", "u = a s_d (r h g + n h^α g)", at=NAMES, rtol=1e-12, atol=1e-18, defects=(23,))
+def dilation():
     g = np.exp(-DILATION * 25e-6)
     bulge = np.array([0, 0, DEPTH**ALPHA])
     exact = np.concatenate([WEIGHT * STRENGTH * bulge, WEIGHT * STRENGTH * (APART * DEPTH * g + bulge * g)])
-    printed: dict[str, Any] = {"model": "paper", "normalize": "peak"}
-    return _by_hand(
-        "Dilation of two taxels",
-        "u = a s_d (r h g + n h^α g)",
-        exact,
-        pressed().ravel(),
-        paper=pressed(**printed).ravel(),
-        defects=(23,),
-    )
+    return exact, pressed().ravel(), pressed(model="paper", normalize="peak").ravel()
 
 
-def dilation_as_printed() -> Comparison:
-    """Return the same by `model: paper`, `normalize: peak`: w = h (c g/ḡ + (1 − c) ρ/ρ̄), ε the root of the mean area."""
+@by_hand(
+    "Dilation as the paper prints it, model paper", "u = s_d (r h (c g/ḡ + (1−c) ρ/ρ̄) + n h^α g)", at=NAMES[3:],
+    rtol=1e-12, atol=1e-18, defects=(23,),
+)  # fmt: skip
+def dilation_as_printed():
     ours = pressed(model="paper", normalize="peak", compressibility=0.3, dilation_strength=7)[1]
-    eps, g, peak = np.sqrt(AREA), np.exp(-DILATION * 25e-6), np.exp(-0.5) / np.sqrt(2 * DILATION)
-    w = DEPTH * (0.3 * g / peak + 0.7 * 2 * eps / (25e-6 + eps**2))
-    return _by_hand(
-        "Dilation as the paper prints it, model paper",
-        "u = s_d (r h (c g/ḡ + (1−c) ρ/ρ̄) + n h^α g)",
-        7 * (APART * w + np.array([0, 0, DEPTH**ALPHA * g])),
-        ours,
-        over=cases(NAMES[3:]),
-        defects=(23,),
-    )
+    eps, g = np.sqrt(AREA), np.exp(-DILATION * 25e-6)  # ε is the root of the mean area
+    w = DEPTH * (0.3 * g / PEAK + 0.7 * 2 * eps / (25e-6 + eps**2))
+    return 7 * (APART * w + np.array([0, 0, DEPTH**ALPHA * g])), ours
 
 
-def peak_of_the_kernel() -> Comparison:
-    """Return the largest in-plane displacement of the normalised kernel, over that of the plain one: ḡ."""
-    place = np.array([[1 / np.sqrt(2 * DILATION), 0, 0]])
-    up, here = np.array([[0, 0, 1.0]]), np.array([[0.0, 0, 0]])
-    printed, plain = (
-        float(Gaussian(DILATION, SHEAR, 1.0, 1e-3, is_normalized).spread(place, up, here)[0, 0, 0, 0])
-        for is_normalized in (True, False)
-    )
-    return Comparison(
-        "The printed kernel is divided by its peak",
-        "maximum of r exp(−λr²) at r = 1/√2λ",
-        "ḡ = e^(−1/2)/√2λ",
-        KINDS,
-        "1/ḡ",
-        "1/m",
-        cases(["at r = 1/√2λ"]),
-        array(np.sqrt(2 * DILATION) * np.exp(0.5)),
-        array(printed / plain),
-        rtol=1e-12,
-        defects=(23,),
-    )
+def spread(r: float, compressibility: float, eps: float, is_normalized: bool) -> np.ndarray:
+    """Return the displacement (3,) over its strength of a kernel at a distance along the skin [m]."""
+    here, up = np.array([[0.0, 0, 0]]), np.array([[0, 0, 1.0]])
+    kernel = Gaussian(DILATION, SHEAR, compressibility, eps, is_normalized)
+    return kernel.spread(np.array([[r, 0, 0]]), up, here)[:, 0, 0, 0]
 
 
-def normalized_peak() -> Comparison:
-    """Return the largest in-plane displacement of the normalised kernel: 1, at r = 1/√2λ."""
-    place, up, here = np.array([[1 / np.sqrt(2 * DILATION), 0, 0]]), np.array([[0, 0, 1.0]]), np.array([[0.0, 0, 0]])
-    return Comparison(
-        "The normalised kernel peaks at 1",
-        "maximum of r exp(−λr²) at r = 1/√2λ",
-        "max r g/ḡ = 1",
-        KINDS,
-        "displacement over its strength",
-        "1",
-        cases(["at r = 1/√2λ"]),
-        array(1.0),
-        array(Gaussian(DILATION, SHEAR, 1.0, 1e-3, True).spread(place, up, here)[0, 0, 0, 0]),
-        rtol=1e-12,
-        defects=(23,),
-    )
+@oracle(
+    "The printed kernel is divided by its peak", "ḡ = e^(−1/2)/√2λ", "maximum of r exp(−λr²) at r = 1/√2λ", "1/ḡ [1/m]",
+    at=["at r = 1/√2λ"], rtol=1e-12, defects=(23,),
+)  # fmt: skip
+def peak_of_the_kernel():
+    printed, plain = (spread(1 / np.sqrt(2 * DILATION), 1.0, 1e-3, is_normalized)[0] for is_normalized in (True, False))
+    return np.sqrt(2 * DILATION) * np.exp(0.5), printed / plain
 
 
-def far_part(eps: float = 1e-3) -> Comparison:
-    """Return the in-plane displacement of an incompressible skin, at r = ε and far off, where it falls off as 1/r."""
-    here, up, ours = np.array([[0.0, 0, 0]]), np.array([[0, 0, 1.0]]), []
-    for r in (eps, 1.0):
-        u = Gaussian(DILATION, SHEAR, 0.0, eps, False).spread(np.array([[r, 0, 0]]), up, here)[:, 0, 0, 0]
-        ours += u.tolist()
-    peak = np.exp(-0.5) / np.sqrt(2 * DILATION)
-    return Comparison(
-        "The far part of the dilation falls off as 1/r",
-        SOURCE,
-        "u = ḡ/ρ̄ r/(r² + ε²), ρ̄ = 1/2ε",
-        KINDS,
-        "displacement over its strength",
-        "m",
-        cases([f"u_{a} at {r}" for r in ("ε", "1 m") for a in "xyz"]),
-        array([peak, 0, 0, peak * 2 * eps, 0, 0]),
-        array(ours),
-        rtol=1e-5,
-    )
+@oracle(
+    "The normalised kernel peaks at 1", "max r g/ḡ = 1", "maximum of r exp(−λr²) at r = 1/√2λ",
+    "displacement over its strength [1]", at=["at r = 1/√2λ"], rtol=1e-12, defects=(23,),
+)  # fmt: skip
+def normalized_peak():
+    return 1.0, spread(1 / np.sqrt(2 * DILATION), 1.0, 1e-3, True)[0]
 
 
-def stretch_over_thickness() -> Comparison:
-    """Return the far part of the dilation of a skin whose thickness is given."""
-    peak = np.exp(-0.5) / np.sqrt(2 * DILATION)
-    return _by_hand(
-        "The length of the stretch is the thickness",
-        "u = a s_d r h ḡ/ρ̄ ρ, ρ = 1/(r² + t²)",
-        WEIGHT * APART[:2] * DEPTH * peak * 2 * 2e-3 / (25e-6 + 4e-6),
-        pressed(compressibility=0, thickness="2 mm", dilation_strength=1)[1, :2],
-        over=cases(NAMES[3:5]),
-    )
+@oracle(
+    "The far part of the dilation falls off as 1/r", "u = ḡ/ρ̄ r/(r² + ε²), ρ̄ = 1/2ε", SOURCE,
+    "displacement over its strength [m]", at=[f"u_{a} at {r}" for r in ("ε", "1 m") for a in "xyz"], rtol=1e-5,
+)  # fmt: skip
+def far_part(eps: float = 1e-3):
+    ours = np.concatenate([spread(r, 0.0, eps, False) for r in (eps, 1.0)])
+    return [PEAK, 0, 0, PEAK * 2 * eps, 0, 0], ours
 
 
-def shear() -> Comparison:
-    """Return what a ball that slides by 0.1 mm does: markers follow its motion."""
+@by_hand(
+    "The length of the stretch is the thickness", "u = a s_d r h ḡ/ρ̄ ρ, ρ = 1/(r² + t²)", at=NAMES[3:5], rtol=1e-12, atol=1e-18
+)
+def stretch_over_thickness():
+    ours = pressed(compressibility=0, thickness="2 mm", dilation_strength=1)[1, :2]
+    return WEIGHT * APART[:2] * DEPTH * PEAK * 2 * 2e-3 / (25e-6 + 4e-6), ours
+
+
+@by_hand("Shear of two taxels", "u = u_dilation + a s_s t h exp(−λ_s r²)", at=NAMES, rtol=1e-9, atol=1e-15)
+def shear():
     way = (1e-4, -0.5e-4)
     h, g = 0.01 - np.hypot(0.01 - DEPTH, np.hypot(*way)), np.exp(-DILATION * 25e-6)
     t, a = np.array([*way, 0.0]), WEIGHT * STRENGTH
-    own = a * (t * h + np.array([0, 0, h**ALPHA]))
+    source = a * (t * h + np.array([0, 0, h**ALPHA]))
     other = a * (APART * h * g + np.array([0, 0, h**ALPHA * g]) + t * h * np.exp(-SHEAR * 25e-6))
-    return _by_hand(
-        "Shear of two taxels",
-        "u = u_dilation + a s_s t h exp(−λ_s r²)",
-        np.concatenate([own, other]),
-        pressed(way).ravel(),
-        rtol=1e-9,
-        atol=1e-15,
-    )
+    return np.concatenate([source, other]), pressed(way).ravel()
 
 
-def capped_shear() -> Comparison:
-    """Return the shear of a ball dragged by 5 mm: where friction ends it. Mindlin's ratio of stiffnesses with ν = 1/2."""
-    way = np.array([3e-3, 4e-3])
+@by_hand("Friction caps the shear", "|t| ≤ μ h (2−ν)/2(1−ν)", source="Mindlin 1949; Johnson 1985, 7.4", at=NAMES[:2], rtol=1e-9)
+def capped_shear():
     h = 0.01 - np.hypot(0.01 - 2e-3, 5e-3)
-    return _by_hand(
-        "Friction caps the shear",
-        "|t| ≤ μ h (2−ν)/2(1−ν)",
-        WEIGHT * STRENGTH * h * 1.5 * 0.2 * h * np.array([0.6, 0.8]),
-        pressed(way, probes=PROBES[:1], depth=2e-3, friction=0.2)[0, :2],
-        over=cases(NAMES[:2]),
-        source="Mindlin 1949; Johnson 1985, 7.4",
-        rtol=1e-9,
-        atol=0.0,
-    )
+    ours = pressed([3e-3, 4e-3], probes=PROBES[:1], depth=2e-3, friction=0.2)[0, :2]
+    return WEIGHT * STRENGTH * h * 1.5 * 0.2 * h * np.array([0.6, 0.8]), ours  # ν = 1/2
 
 
-def elastic_skin() -> Comparison:
-    """Return an elastic skin's markers: pressed in and, for ν < 1/2, towards the load; carried along by a tangential load."""
+@by_hand(
+    "An elastic skin under a ball that slides", "u = G(r) [τ, p] A, p = K_n h, τ = K_n 2(1−ν)/(2−ν) t",
+    source="Johnson 1985, 3.18, 3.75 and 7.4", at=NAMES, rtol=1e-9, atol=1e-15,
+)  # fmt: skip
+def elastic_skin():
     way, nu = (5e-5, 0.0), 0.48
     h = 0.01 - np.hypot(0.01 - DEPTH, way[0])
     pressure, pull = 1e8 * h * AREA, 1e8 * 2 * (1 - nu) / (2 - nu) * way[0] * AREA
@@ -195,32 +134,18 @@ def elastic_skin() -> Comparison:
     e = np.array([0.8, 0.6])
     x, y = g.spread[1] * pressure * e + pull * (g.along[1] * np.array([1, 0]) + g.bend[1] * (1.6 * e - [1, 0]))
     other = [x, y, -g.normal[1] * pressure - g.lift[1] * pull * 0.8]
-    return _by_hand(
-        "An elastic skin under a ball that slides",
-        "u = G(r) [τ, p] A, p = K_n h, τ = K_n 2(1−ν)/(2−ν) t",
-        [g.along[0] * pull, 0, -g.normal[0] * pressure, *other],
-        pressed(way, **ELASTIC).ravel(),
-        source="Johnson 1985, 3.18, 3.75 and 7.4",
-        rtol=1e-9,
-        atol=1e-15,
-    )
+    return [g.along[0] * pull, 0, -g.normal[0] * pressure, *other], pressed(way, **ELASTIC).ravel()
 
 
-def standoff(gate: str | None = None) -> Comparison:
-    """Return the bulge of a skin of 1.5 mm above the taxels while a ball comes down: from its first touch on."""
+@by_hand(
+    "A standoff is felt above the taxels", "u_z = a s_d max(0, s − φ)^α", over="height [m]", rtol=1e-9, atol=1e-12,
+    defects=(5,), also=["geometric"],
+)  # fmt: skip
+def standoff(gate: str | None = None):
     heights = np.array([2e-3, 1.5e-3, 1.4e-3, 7e-4, 1e-5, 0.0, -3e-4])
     touch = probed(PROBES[:1], BALL, kind="elastomer", gate=gate, standoff="1.5 mm", shear_strength=0)
-    found = [float(touch(state(touch, pos=[0, 0, 0.01 + height]))["s"][0, 0, 2]) for height in heights]
-    return _by_hand(
-        "A standoff is felt above the taxels",
-        "u_z = a s_d max(0, s − φ)^α",
-        WEIGHT * STRENGTH * np.maximum(0.0, 1.5e-3 - heights) ** ALPHA,
-        array(found),
-        over=along("height", "m", heights),
-        rtol=1e-9,
-        atol=1e-12,
-        defects=(5,),
-    )
+    ours = [float(touch(state(touch, pos=[0, 0, 0.01 + height]))["s"][0, 0, 2]) for height in heights]
+    return Values(WEIGHT * STRENGTH * np.maximum(0.0, 1.5e-3 - heights) ** ALPHA, ours, at=heights)
 
 
 def sheet(n: int, side: float, curve: float | None = None) -> LinkTaxels:
@@ -252,95 +177,52 @@ def _means(n: int, fields: dict[str, Any]) -> list[float]:
     """Return the mean displacements over a pad of n² taxels under a ball, for each part of the response [m]."""
     part = sheet(n, 0.02)
     h = np.maximum(0.0, 1e-3 - (part.pos[:, 0] ** 2 + part.pos[:, 1] ** 2) / (2 * 0.012))
-    found, every = responses(spec(**fields), part, None), np.arange(n * n)
+    kernels, every = responses(spec(**fields), part, None), np.arange(n * n)
     if "kernel" in fields:
-        u = np.einsum("klji,li->kj", found["traction"](every), 1e8 * np.stack([0.3 * h, 0.0 * h, -h]))
+        u = np.einsum("klji,li->kj", kernels["traction"](every), 1e8 * np.stack([0.3 * h, 0.0 * h, -h]))
         parts = [np.abs(u[2]), np.hypot(u[0], u[1])]
     else:
-        u = np.einsum("kji,i->kj", found["spread"](every)[:, 0], h)
-        parts = [np.hypot(u[0], u[1]), found["bulge"](every)[0, 0] @ h**ALPHA]
-        parts += [found["drag"](every)[0, 0] @ h] if "drag" in found else []
+        u = np.einsum("kji,i->kj", kernels["spread"](every)[:, 0], h)
+        parts = [np.hypot(u[0], u[1]), kernels["bulge"](every)[0, 0] @ h**ALPHA]
+        parts += [kernels["drag"](every)[0, 0] @ h] if "drag" in kernels else []
     return [float(np.mean(p)) for p in parts]
 
 
-def resolution(kernel: str) -> Comparison:
-    """Return how the mean displacement changes with the number of taxels: not at all; the paper's sums grow with it."""
+@oracle(
+    "Twice the taxels change nothing, kernel {kernel}", "mean |u| of 17², 24² taxels over that of 12²",
+    "sums are integrals over the area", "ratio of means [1]", rtol=0.02, defects=(9,),
+    each=list(SKINS),
+)  # fmt: skip
+def resolution(kernel: str):
     nums = (12, 17, 24)
     means = np.array([_means(n, SKINS[kernel]) for n in nums])
-    paper = np.array([_means(n, {"model": "paper", "anchors": "taxels"}) for n in nums]) if kernel == "gaussian" else None
-    num_parts = means.shape[1]
-    return Comparison(
-        f"Twice the taxels change nothing, kernel {kernel}",
-        "sums are integrals over the area",
-        "mean |u| of 17², 24² taxels over that of 12²",
-        KINDS,
-        "ratio of means",
-        "1",
-        cases([f"{n}², part {i}" for n in nums[1:] for i in range(num_parts)]),
-        np.ones(2 * num_parts),
-        (means[1:] / means[0]).ravel(),
-        rtol=0.02,
-        paper=None if paper is None else (paper[1:, :num_parts] / paper[0, :num_parts]).ravel(),
-        defects=(9,),
-    )
+    num_parts, paper = means.shape[1], None
+    if kernel == "gaussian":
+        sums = np.array([_means(n, {"model": "paper", "anchors": "taxels"}) for n in nums])[:, :num_parts]
+        paper = (sums[1:] / sums[0]).ravel()
+    labels = [f"{n}², part {i}" for n in nums[1:] for i in range(num_parts)]
+    return Values(1.0, (means[1:] / means[0]).ravel(), paper, at=labels)
 
 
-def paper_grows(n: int = 10) -> Comparison:
-    """Return how the paper's sums, `model: paper`, grow with four times the taxels: fourfold."""
+@oracle(
+    "The paper's model grows with the number of taxels, model paper", "mean u of 4 N taxels over that of N",
+    "a sum without areas", "ratio of means [1]", at=["10² to 20²"], rtol=0.02, defects=(9,),
+)  # fmt: skip
+def paper_grows(n: int = 10):
     h = np.full(n * n, 1e-3)
     few, many = (responses(spec(model="paper"), sheet(k, 0.02), None)["bulge"](np.arange(k * k))[0, 0] for k in (n, 2 * n))
-    return Comparison(
-        "The paper's model grows with the number of taxels, model paper",
-        "a sum without areas",
-        "mean u of 4 N taxels over that of N",
-        KINDS,
-        "ratio of means",
-        "1",
-        cases([f"{n}² to {2 * n}²"]),
-        array(4.0),
-        array(float(np.mean(many @ np.repeat(h, 4)) / np.mean(few @ h))),
-        rtol=0.02,
-        defects=(9,),
-    )
+    return 4.0, np.mean(many @ np.repeat(h, 4)) / np.mean(few @ h)
 
 
-def curved_offsets(radius: float = 8e-3) -> Comparison:
-    """Return tangential offsets of neighbours on a cylinder, up to 70° off the middle; the paper's are on one mean plane."""
+@oracle(
+    "Offsets on a curved fingertip", "|r| = R sin Δ", "chord in a circle's tangent plane", "offset of neighbours [m]",
+    "place on the arc", rtol=1e-12, defects=(8,),
+)  # fmt: skip
+def curved_offsets(radius: float = 8e-3):
     step = np.deg2rad(2 * 80 / 8)
     part = sheet(8, 8 * step * radius, curve=radius)
     r = np.linalg.norm(offset(part.pos, part.normal, part.pos), axis=0)
-    # Taxels are ordered by rows along the arc, 8 in each: the first of each row is enough.
-    first = np.arange(0, 64, 8)
-    ours = np.array([r[i, j] for i, j in pairwise(first)])
+    first = np.arange(0, 64, 8)  # of each row along the arc
+    ours = [r[i, j] for i, j in pairwise(first)]
     plane = np.linalg.norm(part.pos[first[1:], :2] - part.pos[first[:-1], :2], axis=1)
-    return Comparison(
-        "Offsets on a curved fingertip",
-        "chord in a circle's tangent plane",
-        "|r| = R sin Δ",
-        KINDS,
-        "offset of neighbours",
-        "m",
-        cases([f"{np.rad2deg(step) * (i - 3):.0f}°" for i in range(7)], "place on the arc"),
-        np.full(7, radius * np.sin(step)),
-        ours,
-        rtol=1e-12,
-        paper=plane,
-        defects=(8,),
-    )
-
-
-ORACLES: tuple[Oracle, ...] = (
-    dilation,
-    dilation_as_printed,
-    peak_of_the_kernel,
-    normalized_peak,
-    far_part,
-    stretch_over_thickness,
-    shear,
-    capped_shear,
-    elastic_skin,
-    standoff,
-    *(partial(resolution, kernel) for kernel in SKINS),
-    paper_grows,
-    curved_offsets,
-)
+    return Values(radius * np.sin(step), ours, plane, at=[f"{np.rad2deg(step) * (i - 3):.0f}°" for i in range(7)])

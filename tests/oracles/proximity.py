@@ -5,7 +5,7 @@ S0 = ∫ (R − |p − q|)₊ dA, S1 = ∫ (R − |p − q|)₊ (p − q) dA ove
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.integrate import quad
 
-from oracles.results import Comparison, Oracle, along, array, cases
+from oracles.comparison import Values, field
 from oracles.setups.scenes import probed, state
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moments.clouds import sample_cloud
@@ -27,13 +27,13 @@ R = 0.01
 """Radius of the probes [m]."""
 TOLERANCE, LIMIT, COARSE = 0.008, 0.01, 0.04
 """Of a field; what it may err at points spread otherwise than the compiler's; of fields whose accuracy is not the question."""
-KINDS = ("proximity",)
 PLANE, CUBE = '<geom type="plane" size="1 1 .1"/>', '<geom type="box" size=".02 .02 .02"/>'
 AREA = 6 * 0.04**2
 DENSITY = 100 / AREA
 STIFFNESS, SLIP = 300.0, 10.0
 """The paper's k_n and k_s."""
 SOURCE = "Chung et al., appendix, ProximityTaxel; S0 and S1 by hand"
+oracle = field("proximity", "proximity")
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 
@@ -129,8 +129,11 @@ def over_a_plane(d: float) -> float:
     return 2 * np.pi * (R**3 / 6 - R * d**2 / 2 + d**3 / 3)
 
 
-def plane_integral(heights: tuple[float, ...] = (0.0, 0.003, -0.003, 0.0099, 0.01, 0.02, -0.5)) -> Comparison:
-    """Return S0 of a plane and S1 across it, against quadrature over the disc within reach."""
+@oracle(
+    "Moments of a plane", "S0 = ∫ 2πs (R − √(s² + z²)) ds", "quadrature over the disc", "S0/R³, S1_z/R⁴ [1]", "height [m]",
+    rtol=1e-10, atol=1e-14, series=("S0", "S1_z"),
+)  # fmt: skip
+def plane_integral(heights: tuple[float, ...] = (0.0, 0.003, -0.003, 0.0099, 0.01, 0.02, -0.5)):
     exact, ours = [], []
     for height in heights:
         d = abs(height)
@@ -140,24 +143,16 @@ def plane_integral(heights: tuple[float, ...] = (0.0, 0.003, -0.003, 0.0099, 0.0
         mass, first = plane_moments(place, torch.tensor(R, dtype=torch.float64))
         exact.append([area / R**3, -height * area / R**4])
         ours.append([float(mass) / R**3, float(first[2]) / R**4 if float(first[0]) == float(first[1]) == 0 else np.nan])
-    return Comparison(
-        "Moments of a plane",
-        "quadrature over the disc",
-        "S0 = ∫ 2πs (R − √(s² + z²)) ds",
-        KINDS,
-        "S0/R³, S1_z/R⁴",
-        "1",
-        along("height", "m", heights),
-        np.array(exact).T,
-        np.array(ours).T,
-        rtol=1e-10,
-        atol=1e-14,
-        series=("S0", "S1_z"),
-    )
+    return Values(np.array(exact).T, np.array(ours).T, at=heights)
 
 
-def solid_moments(solid: str) -> Comparison:
-    """Return errors of sums and of a baked field, around a ball or a box; and of 5,000 points, as the paper samples."""
+@oracle(
+    "Moments of a {solid}", "S0, S1", "one-dimensional quadrature over the ball; midpoint sums over the box's faces",
+    "RMS error over full scale, over what is allowed [1]",
+    at=["S0 of sums", "S1 of sums", "S0 of the field", "S1 of the field"], atol=1.0,
+    each=["ball", "box"], slow=True,
+)  # fmt: skip
+def solid_moments(solid: str):
     if solid == "ball":
         geom, pos, closed = felt("sphere", [0.02]), places(), partial(sphere_moments, b=0.02)
     else:
@@ -166,38 +161,20 @@ def solid_moments(solid: str) -> Comparison:
     exact = closed(pos)
     by_sums, by_field = rms(sums([geom], pos), exact), rms(asked(bake_field([geom], R, TOLERANCE), pos), exact)
     few = rms(cloud_reads(sample_cloud([geom], R, 5_000), pos), exact)
-    return Comparison(
-        f"Moments of a {solid}",
-        "one-dimensional quadrature over the ball; midpoint sums over the box's faces",
-        "S0, S1",
-        KINDS,
-        "RMS error over full scale, over what is allowed",
-        "1",
-        cases(["S0 of sums", "S1 of sums", "S0 of the field", "S1 of the field"]),
-        np.zeros(4),
-        array([part / 2e-3 for part in by_sums] + [part / LIMIT for part in by_field]),
-        atol=1.0,
-        paper=array([part / 2e-3 for part in few] + [part / LIMIT for part in few]),
-    )
+    allowed = np.array([2e-3, 2e-3, LIMIT, LIMIT])
+    return 0.0, np.array([*by_sums, *by_field]) / allowed, np.array([*few, *few]) / allowed
 
 
-def sampling_noise() -> Comparison:
-    """Return how the error of sampled points falls with their number: as its root."""
+@oracle(
+    "Sampled points err by the root of their number", "ε ∝ 1/√N", "variance of a sum over independent points",
+    "error of 5,000 over that of 100,000 points [1]", at=["S0"], rtol=0.4,
+    slow=True,
+)  # fmt: skip
+def sampling_noise():
     pos = places(200)
     exact = box_moments(pos, [0.02] * 3)
     few, many = (rms(cloud_reads(sample_cloud([felt("box", [0.02] * 3)], R, n), pos), exact)[0] for n in (5_000, 100_000))
-    return Comparison(
-        "Sampled points err by the root of their number",
-        "variance of a sum over independent points",
-        "ε ∝ 1/√N",
-        KINDS,
-        "error of 5,000 over that of 100,000 points",
-        "1",
-        cases(["S0"]),
-        array(np.sqrt(20)),
-        array(few / many),
-        rtol=0.4,
-    )
+    return np.sqrt(20), few / many
 
 
 def _scalene(a: float, b: float, c: float) -> float:
@@ -224,23 +201,15 @@ AREAS: dict[str, tuple[list[float], float]] = {
 """Sizes [m] and areas [m²] of primitives."""
 
 
-def areas(names: Sequence[str] = tuple(AREAS)) -> Comparison:
-    """Return the surface areas of primitives."""
+@field("proximity", "proximity", "geometry")(
+    "Areas of primitives", "A", "geometry; an ellipsoid by quadrature, one of revolution in closed form",
+    "area over the exact one, off 1 over what is allowed [1]", atol=1.0,
+)  # fmt: skip
+def areas(names: Sequence[str] = tuple(AREAS)):
     ours = [surface_area([felt(name.split()[0].rstrip(","), AREAS[name][0], pos=(0.1, -0.2, 0.3))]) for name in names]
-    exact = array([AREAS[name][1] for name in names])
+    exact = np.array([AREAS[name][1] for name in names])
     allowed = np.array([1e-7 if "almost" in name else 1e-10 for name in names])
-    return Comparison(
-        "Areas of primitives",
-        "geometry; an ellipsoid by quadrature, one of revolution in closed form",
-        "A",
-        (*KINDS, "geometry"),
-        "area over the exact one, off 1 over what is allowed",
-        "1",
-        cases(names),
-        np.zeros(len(names)),
-        (array(ours) / exact - 1) / allowed,
-        atol=1.0,
-    )
+    return Values(0.0, (np.array(ours) / exact - 1) / allowed, at=names)
 
 
 def read(geom: str = PLANE, probe: Any = (0, 0, 0), sensor: Any = None, **item: Any) -> np.ndarray:
@@ -250,61 +219,34 @@ def read(geom: str = PLANE, probe: Any = (0, 0, 0), sensor: Any = None, **item: 
     return touch(state(touch, **item))["s"][0, 0].numpy()
 
 
-def _reading(name: str, equation: str, exact: Any, of: Callable[[dict[str, Any]], np.ndarray], **more: Any) -> Comparison:
-    return Comparison(
-        name, SOURCE, equation, KINDS, "force [N], torque [N·m]", "", cases(CHANNELS), array(exact), of({}),
-        rtol=1e-12, atol=1e-15, paper=of({"model": "paper"}), **more,
-    )  # fmt: skip
+reading = partial(
+    oracle, source=SOURCE, quantity="force [N], torque [N·m] []", at=CHANNELS, rtol=1e-12, atol=1e-15
+)  # fmt: skip
 
 
-def plane_in_front(d: float = 0.004) -> Comparison:
-    """Return the force of a plane before a probe: it pushes back; the paper's pulls."""
-    exact = [0, 0, -STIFFNESS * DENSITY * over_a_plane(d), 0, 0, 0]
-
-    def of(sensor: dict[str, Any]) -> np.ndarray:
-        return read(sensor=sensor, pos=[0.2, 0.1, d], quat=[0, 1, 0, 0])
-
-    return _reading("A plane in front pushes the sensor back", "f = −k ρ S0 n", exact, of, defects=(3,))
+@reading("A plane in front pushes the sensor back", "f = −k ρ S0 n", defects=(3,))
+def plane_in_front(d: float = 0.004):
+    ours, paper = (read(sensor=model, pos=[0.2, 0.1, d], quat=[0, 1, 0, 0]) for model in ({}, {"model": "paper"}))
+    return [0, 0, -STIFFNESS * DENSITY * over_a_plane(d), 0, 0, 0], ours, paper
 
 
-def plane_at_the_side(about: str, d: float = 0.006) -> Comparison:
-    """Return force and torque of a wall beside a probe: τ = −k ρ S1 × a, about the taxel or the link's origin."""
+@reading("A plane at the side twists the sensor, about the {about}", "τ = −k ρ S1 × a", defects=(24,), each=["taxel", "link"])
+def plane_at_the_side(about: str, d: float = 0.006):
     quat = [np.sqrt(0.5), 0, -np.sqrt(0.5), 0]  # its normal points to −x
+    ours, paper = (
+        read(probe=(0.02, 0, 0), sensor={"torque_about": about, **model}, pos=[0.026, 0, 0], quat=quat)
+        for model in ({}, {"model": "paper"})
+    )
     force, arm = -STIFFNESS * DENSITY * over_a_plane(d), {"taxel": 0.0, "link": 0.02}[about]
-    exact = [0, 0, force, 0, STIFFNESS * DENSITY * d * over_a_plane(d) - arm * force, 0]
-
-    def of(sensor: dict[str, Any]) -> np.ndarray:
-        return read(probe=(0.02, 0, 0), sensor={"torque_about": about, **sensor}, pos=[0.026, 0, 0], quat=quat)
-
-    return _reading(f"A plane at the side twists the sensor, about the {about}", "τ = −k ρ S1 × a", exact, of, defects=(24,))
+    return [0, 0, force, 0, STIFFNESS * DENSITY * d * over_a_plane(d) - arm * force, 0], ours, paper
 
 
-def slip() -> Comparison:
-    """Return the friction of a cube that slides by: along its motion, nothing across."""
+@oracle(
+    "Slip drags the sensor along with the object", "f_t = k_s ρ S0 v_t", SOURCE,
+    "change of force [N], torque [N·m] []", at=CHANNELS, atol=1e-12, defects=(3,),
+)  # fmt: skip
+def slip():
     at: dict[str, Any] = {"pos": [0, 0, -0.026]}
     still, moving = read(CUBE, **at), read(CUBE, **at, linvel=[0.3, -0.1, 0.7])
     s0 = -still[2] / (STIFFNESS * DENSITY)
-    return Comparison(
-        "Slip drags the sensor along with the object",
-        SOURCE,
-        "f_t = k_s ρ S0 v_t",
-        KINDS,
-        "change of force [N], torque [N·m]",
-        "",
-        cases(CHANNELS),
-        array([SLIP * DENSITY * s0 * 0.3, -SLIP * DENSITY * s0 * 0.1, 0, 0, 0, 0]),
-        moving - still,
-        atol=1e-12,
-        defects=(3,),
-    )
-
-
-ORACLES: tuple[Oracle, ...] = (
-    plane_integral,
-    *(partial(solid_moments, solid) for solid in ("ball", "box")),
-    sampling_noise,
-    areas,
-    plane_in_front,
-    *(partial(plane_at_the_side, about) for about in ("taxel", "link")),
-    slip,
-)
+    return [SLIP * DENSITY * s0 * 0.3, -SLIP * DENSITY * s0 * 0.1, 0, 0, 0, 0], moving - still

@@ -1,4 +1,4 @@
-"""Sheets as text and files: what stands in them, and that they are the same each time."""
+"""Sheets as text and files: what they contain, and that they are the same each time."""
 
 import csv
 import json
@@ -6,28 +6,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from oracles import every, filters, half_space
-from oracles.hard import every as hard
-from oracles.hard.results import Allowed, HardCase
+from oracles import report
+from oracles.comparison import CASES
+from oracles.hard.case import Allowed, HardCase
 from tgdsl.report.defects import DEFECTS, answers
-from tgdsl.report.sheets.files import write_sheet
-from tgdsl.report.sheets.page import sheet_page, sheet_text
+from tgdsl.report.sheet import sheet_page, sheet_text, write_sheet
 
 
 def sheet():
-    oracles = {"filters": (filters.crosstalk_edges, filters.maxwell_step), "loads": (half_space.loaded_disc,)}
-    return every.sheet_of(every.run(oracles))
+    names = ("filters.crosstalk_edges()", "filters.maxwell_step()", "half_space.loaded_disc()")
+    return report.sheet_of("oracles", report.run([case for case in CASES if case.name in names]))
 
 
 def test_files_have_every_number_and_a_plot_of_each(tmp_path):
     written = write_sheet(sheet(), tmp_path)
     assert [file.name for file in written] == ["oracles.csv", "oracles.json", "oracles.html"]
     rows = list(csv.DictReader(written[0].read_text().splitlines()))
-    assert [row["section"] for row in rows] == ["filters", "filters", "loads"]
-    assert float(rows[0]["paper_error"]) > 0.6 and rows[0]["holds"] == "True"
-    told = json.loads(written[1].read_text())["entries"]
-    np.testing.assert_allclose(told[0]["exact"], [1, 1, 1])
-    assert told[0]["defects"] == [10]
+    assert [row["section"] for row in rows] == ["contact mechanics: half-space", "filters", "filters"]
+    assert float(rows[2]["paper_error"]) > 0.6 and rows[2]["holds"] == "True"
+    entries = json.loads(written[1].read_text())["entries"]
+    np.testing.assert_allclose(entries[2]["exact"], [1, 1, 1])
+    assert entries[2]["defects"] == [10]
     text = written[2].read_text()
     assert text.count("<svg") == 3
     assert "http://" not in text.replace("http://www.w3.org", "") and "src=" not in text
@@ -41,7 +40,7 @@ def test_files_have_every_number_and_a_plot_of_each(tmp_path):
 def test_the_text_says_what_does_not_hold():
     assert sheet_text(sheet()).endswith("3 of 3 hold")
     case = HardCase("name", "risk", "reference", "m", ("a",), {"float64": Allowed(np.array([2.0]), 1.0)}, (5,))
-    failed = hard.sheet_of({"group": ([case], [("other", "no extra")])})
+    failed = report.sheet_of("hard", {"group": ([case], [("other", "no extra")])})
     text = sheet_text(failed)
     assert text.endswith("1 of 1 do not hold (✗)")
     assert "✗" in text and "not to be had: other: no extra" in text
@@ -50,5 +49,5 @@ def test_the_text_says_what_does_not_hold():
 
 
 def test_the_first_entry_answers_a_finding():
-    found = answers([("a", "1", (3,)), ("b", "2", (3, 4))])
-    assert {number: answer.title for number, answer in found.items()} == {3: "a", 4: "b"}
+    first = answers([("a", "1", (3,)), ("b", "2", (3, 4))])
+    assert {number: answer.title for number, answer in first.items()} == {3: "a", 4: "b"}

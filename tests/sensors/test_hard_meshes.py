@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from brute import brute_force
 from oracles.hard import probes
-from oracles.hard.probes import TOLERANCE
-from oracles.hard.trembling import NUM_STEPS, jittered
+from oracles.hard.probes import NUM_STEPS, TOLERANCE, jittered
+from oracles.setups.brute import brute_force
 
 import tgdsl
 from tgdsl.module.state import SceneState

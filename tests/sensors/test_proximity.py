@@ -4,7 +4,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from held import assert_holds
 from oracles import proximity
 from oracles.proximity import AREA, COARSE, CUBE, R, read
 from oracles.proximity import DENSITY as RHO
@@ -56,7 +55,6 @@ SIDES = (proximity.plane_in_front, *(partial(proximity.plane_at_the_side, about)
 def test_a_plane_by_hand(compare):
     """In front it pushes the sensor back, at the side it twists it; the paper's pulls."""
     found = compare()
-    assert_holds(found)
     assert found.paper_error > found.magnitude
 
 
@@ -68,7 +66,6 @@ def test_the_papers_model_pulls():
 
 def test_slip_drags_the_sensor_along_with_the_object():
     """A cube that slides: f_t = k_s ρ S0 v_t, and the velocity along the normal does nothing."""
-    assert_holds(proximity.slip())
     s0 = -read(CUBE, pos=[0, 0, -0.026])[2] / (300 * RHO)
     assert s0 == pytest.approx(proximity.over_a_plane(0.006), rel=0.1)
 

@@ -9,12 +9,12 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from tgdsl.commands.report.sheets import from_clone
+from tgdsl.commands.report.sheets import tests_of_clone
 from tgdsl.report.defects import DEFECTS, answers
 from tgdsl_docs.tables import inline, table
 
 HEADER = ("comparison", "quantity", "largest exact", "error", "of what is allowed", "error of the paper's", "source")
-every = from_clone("every")
+report = tests_of_clone()
 MOST = 4
 """Comparisons that a kind's plot shows."""
 
@@ -23,7 +23,7 @@ class Accuracy:
     """All comparisons, computed once per build."""
 
     def __init__(self) -> None:
-        self.fields = {field: comparisons for field, (comparisons, _) in every.run().items()}
+        self.fields = {field: comparisons for field, (comparisons, _) in report.run().items()}
 
     def of(self, kind: str) -> list[Any]:
         """Return a kind's comparisons."""
@@ -43,7 +43,7 @@ class Accuracy:
         figure = Figure(figsize=(9.0, 3.1 * -(-len(found) // 2)))
         for i, own in enumerate(found):
             axes = figure.add_subplot(-(-len(found) // 2), 2, i + 1)
-            every.draw(own, axes)
+            report.draw(own, axes)
             axes.set_title(own.name, fontsize=8)
             axes.tick_params(labelsize=7)
         figure.tight_layout()
@@ -57,7 +57,7 @@ class Accuracy:
         parts = ["# All comparisons\n\n[Accuracy](../accuracy.md) says what they are.\n"]
         for field, comparisons in self.fields.items():
             parts.append(f"## {field[0].upper()}{field[1:]}\n\n{_table(comparisons)}")
-        entries = [every.entry_of(own) for comparisons in self.fields.values() for own in comparisons]
+        entries = [report.entry_of(own) for comparisons in self.fields.values() for own in comparisons]
         found = answers((entry.title, entry.figure, entry.defects) for entry in entries)
         rows = []
         for defect in DEFECTS:
@@ -73,5 +73,5 @@ class Accuracy:
 
 
 def _table(found: Sequence[Any]) -> str:
-    rows = [(inline(entry.title), *map(inline, entry.cells)) for entry in map(every.entry_of, found)]
+    rows = [(inline(entry.title), *map(inline, entry.cells)) for entry in map(report.entry_of, found)]
     return table(HEADER, rows)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
-from oracles.hard.results import Allowed, Case, HardCase
-from oracles.hard.scene import DTYPES
-from oracles.setups.boxes import begin, heat_module, heat_state
-from oracles.setups.scenes import compiled, folder
+from oracles.hard import case
+from oracles.setups.boxes import heat_module, heat_state, heated
+from oracles.setups.scenes import compiled, folder, temporary
 from tgdsl.fields.materials import MATERIALS
 
 STEPS = (1e-4, 0.01, 1.0, 10.0)
 """Seconds between calls."""
 ONE_CONTACT = [((0, 0, 0.005), (0, 0, -1), 2.0)]
+GRID = list(itertools.product(STEPS, (0.1, 400.0), (1e-9, 1e-5, 1e-2)))
+"""Step [s], conductivity [W/(m·K)] and contact area [m²]."""
+hard = partial(case.hard, "heat")
 
 
 def _beyond(dt: float, k: float, area: float, dtype: torch.dtype, rng: np.random.Generator) -> float:
@@ -30,113 +33,92 @@ def _beyond(dt: float, k: float, area: float, dtype: torch.dtype, rng: np.random
         "cells": [2, 3, 2], "material": {"like": "steel", "conductivity": k}, "contact_area": area, "convection": 50.0,
         "emissivity": 0.9,
     }  # fmt: skip
-    with folder() as where:
-        module = heat_module(where, {"tip": [0.01, 0.012, 0.008]}, sensor, objects, dtype)
     pairs = zip(objects, np.eye(3), strict=True)
     contacts = {("tip", name): [(tuple(rng.uniform(-5e-3, 5e-3, 3)), tuple(n), 1.0)] for name, n in pairs}
-    state = heat_state(module, dt, contacts)
-    begin(module, state)
     worst = 0.0
-    for _ in range(4):
-        readings = module(state)
+    for readings in heated({"tip": [0.01, 0.012, 0.008]}, sensor, dt, 4, objects, contacts, dtype=dtype):
         every = torch.cat([readings["heat"][0, :, 0], readings["heat/objects"][0, :, 0]]).double()
         worst = max(worst, float(-20.0 - every.min()), float(every.max() - 80.0))
         worst = worst if torch.isfinite(every).all() else np.inf
     return worst
 
 
-def bounds() -> HardCase:
-    """Return how far temperatures leave the range of what there is, for any step, conductivity and contact area."""
-    cases = list(itertools.product(STEPS, (0.1, 400.0), (1e-9, 1e-5, 1e-2)))
-    errors: dict[str, Allowed] = {}
-    for precision, dtype in DTYPES.items():
-        rng = np.random.default_rng(1)
-        found = [_beyond(dt, k, area, dtype, rng) for dt, k, area in cases]
-        errors[precision] = Allowed(np.array(found), 1e-10 if precision == "float64" else 3e-5)
-    return HardCase(
-        "conduction for any step, conductivity and area", "an explicit step that overshoots", "the range of all bodies", "K",
-        tuple(f"{dt:g} s, {k:g} W/mK, {area:g} m²" for dt, k, area in cases), errors, defects=(13,),
-    )  # fmt: skip
+@hard(
+    "conduction for any step, conductivity and area", "an explicit step that overshoots", "the range of all bodies", "K",
+    [f"{dt:g} s, {k:g} W/mK, {area:g} m²" for dt, k, area in GRID], float64=1e-10, float32=3e-5, defects=(13,),
+)  # fmt: skip
+def bounds(dtype: torch.dtype):
+    rng = np.random.default_rng(1)
+    return [_beyond(dt, k, area, dtype, rng) for dt, k, area in GRID]
 
 
-def energy() -> HardCase:
-    """Return how much heat is made or lost between a link and an object that touch, of what flowed, for any step."""
-    errors: dict[str, Allowed] = {}
-    for precision, dtype in DTYPES.items():
-        found = []
-        for dt in STEPS:
-            ball = {"material": "rubber", "temperature": 45.0, "cells": [2, 2, 2]}
-            with folder() as where:
-                sensor = {"cells": [2, 2, 2], "material": "steel", "contact_area": "20 mm2", "temperature": 60.0}
-                module = heat_module(where, {"tip": [0.01] * 3}, sensor, {"ball": ([0.02] * 3, ball)}, dtype)
-            state = heat_state(module, dt, {("tip", "ball"): ONE_CONTACT})
-            totals, flowed = [], []
-            for _ in range(20):
-                readings = module(state)
-                link, other = readings["heat/heat"][..., 0].double(), readings["heat/objects"][..., 1].double()
-                totals.append(float(link.sum() + other.sum()))
-                flowed.append(float(other.sum()))
-            found.append((max(totals) - min(totals)) / abs(totals[0]) if flowed[-1] != flowed[0] else np.inf)
-        errors[precision] = Allowed(np.array(found), 1e-12 if precision == "float64" else 1e-5)
-    return HardCase(
-        "energy of a pair in contact", "heat is made by the step", "what was there at first", "of the heat",
-        tuple(f"{dt:g} s" for dt in STEPS), errors, defects=(13,),
-    )  # fmt: skip
+@hard(
+    "energy of a pair in contact", "heat is made by the step", "what was there at first", "of the heat",
+    [f"{dt:g} s" for dt in STEPS], float64=1e-12, float32=1e-5, defects=(13,),
+)  # fmt: skip
+def energy(dtype: torch.dtype):
+    errors = []
+    for dt in STEPS:
+        ball = {"material": "rubber", "temperature": 45.0, "cells": [2, 2, 2]}
+        sensor = {"cells": [2, 2, 2], "material": "steel", "contact_area": "20 mm2", "temperature": 60.0}
+        module = temporary(heat_module, {"tip": [0.01] * 3}, sensor, {"ball": ([0.02] * 3, ball)}, dtype)
+        state = heat_state(module, dt, {("tip", "ball"): ONE_CONTACT})
+        totals, flows = [], []
+        for _ in range(20):
+            readings = module(state)
+            link, other = readings["heat/heat"][..., 0].double(), readings["heat/objects"][..., 1].double()
+            totals.append(float(link.sum() + other.sum()))
+            flows.append(float(other.sum()))
+        errors.append((max(totals) - min(totals)) / abs(totals[0]) if flows[-1] != flows[0] else np.inf)
+    return errors
 
 
-def reset_with_lag() -> HardCase:
-    """Return how far the first readings are off the link's temperature after a reset, with lags of 0.1 to 100 s."""
-    lags, errors = (0.1, 2.0, 100.0), dict[str, Allowed]()
-    for precision, dtype in DTYPES.items():
-        found = []
-        for lag in lags:
-            sensor = {
-                "cells": [1, 2, 1], "material": "aluminium", "temperature": 60.0, "convection": 900.0, "lag": lag,
-            }  # fmt: skip
-            with folder() as where:
-                module = heat_module(where, {"block": (0.02, 0.03, 0.04)}, sensor, dtype=dtype)
-            state = heat_state(module, 0.5, num_envs=3)
-            for _ in range(5):
-                before = module(state)["heat"].clone()
-            module.reset([1])
-            after = module(state)["heat"]
-            is_kept = bool((after[[0, 2]] < before[[0, 2]]).all())
-            found.append(float((after[1] - 60.0).abs().max()) if is_kept else np.inf)
-        errors[precision] = Allowed(np.array(found), 0.0)
-    return HardCase(
-        "a reset with a sensor's lag", "the filter starts from zero, or all environments do", "the link's temperature", "K",
-        tuple(f"{lag:g} s" for lag in lags), errors, defects=(14, 16),
-    )  # fmt: skip
+LAGS = (0.1, 2.0, 100.0)
 
 
-def turned_links() -> HardCase:
-    """Return how far a source warms a link otherwise than it must whose box is turned: its cells hold its volume."""
-    angles, steel, errors = (0, 45, 110, 200, 359), MATERIALS["steel"], dict[str, Allowed]()
+@hard(
+    "a reset with a sensor's lag", "the filter starts from zero, or all environments do", "the link's temperature", "K",
+    [f"{lag:g} s" for lag in LAGS], defects=(14, 16),
+)  # fmt: skip
+def reset_with_lag(dtype: torch.dtype):
+    errors = []
+    for lag in LAGS:
+        sensor = {"cells": [1, 2, 1], "material": "aluminium", "temperature": 60.0, "convection": 900.0, "lag": lag}
+        module = temporary(heat_module, {"block": (0.02, 0.03, 0.04)}, sensor, dtype=dtype)
+        state = heat_state(module, 0.5, num_envs=3)
+        for _ in range(5):
+            before = module(state)["heat"].clone()
+        module.reset([1])
+        after = module(state)["heat"]
+        others_go_on = bool((after[[0, 2]] < before[[0, 2]]).all())
+        errors.append(float((after[1] - 60.0).abs().max()) if others_go_on else np.inf)
+    return errors
+
+
+ANGLES = (0, 45, 110, 200, 359)
+
+
+@hard(
+    "cells of a turned link", "a box in the world's axes, of a negative volume", "P t/ρcV", "of the rise",
+    [f"{angle}°" for angle in ANGLES], float64=1e-11, float32=1e-5, defects=(12,),
+)  # fmt: skip
+def turned_links(dtype: torch.dtype):
+    steel, errors = MATERIALS["steel"], []
     exact = 0.5 * 5.0 / (steel.density * steel.specific_heat * 6e-6)
-    for precision, dtype in DTYPES.items():
-        found = []
-        for angle in angles:
-            with folder() as where:
-                path = where / "turned.xml"
-                path.write_text(
-                    '<mujoco><worldbody><body name="block" euler="10 20 30"><freejoint/>'
-                    f'<body name="tip" euler="0 {angle} 0"><joint axis="1 0 0"/><geom type="box" size=".005 .01 .015"/></body>'
-                    '<geom size=".01" contype="0" conaffinity="0"/></body></worldbody></mujoco>',
-                    encoding="utf-8",
-                )
-                fields = {"cells": [2, 2, 3], "material": "steel", "source": {"power": 0.5}}
-                sensor = {"kind": "temperature_grid", "links": "tip", "feels": [], **fields}
-                module = compiled({"tgdsl": 1, "robot": {"model": str(path)}, "sensors": {"heat": sensor}}, dtype)
-            state = heat_state(module, 0.1)
-            begin(module, state)
-            for _ in range(50):
-                readings = module(state)
-            found.append(float((readings["heat"].double() - 22.0 - exact).abs().max()) / exact)
-        errors[precision] = Allowed(np.array(found), 1e-11 if precision == "float64" else 1e-5)
-    return HardCase(
-        "cells of a turned link", "a box in the world's axes, of a negative volume", "P t/ρcV", "of the rise",
-        tuple(f"{angle}°" for angle in angles), errors, defects=(12,),
-    )  # fmt: skip
-
-
-CASES: tuple[Case, ...] = (bounds, energy, reset_with_lag, turned_links)
+    for angle in ANGLES:
+        with folder() as where:
+            path = where / "turned.xml"
+            path.write_text(
+                '<mujoco><worldbody><body name="block" euler="10 20 30"><freejoint/>'
+                f'<body name="tip" euler="0 {angle} 0"><joint axis="1 0 0"/><geom type="box" size=".005 .01 .015"/></body>'
+                '<geom size=".01" contype="0" conaffinity="0"/></body></worldbody></mujoco>',
+                encoding="utf-8",
+            )
+            fields = {"cells": [2, 2, 3], "material": "steel", "source": {"power": 0.5}}
+            sensor = {"kind": "temperature_grid", "links": "tip", "feels": [], **fields}
+            module = compiled({"tgdsl": 1, "robot": {"model": str(path)}, "sensors": {"heat": sensor}}, dtype)
+        state = heat_state(module, 0.1)
+        for _ in range(51):
+            readings = module(state)
+        errors.append(float((readings["heat"].double() - 22.0 - exact).abs().max()) / exact)
+    return errors

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +22,6 @@ from tgdsl.plan.plan import Plan
 from tgdsl.schema.load import load
 from tgdsl.sensors import KINDS
 
-DTYPES = {"float64": torch.float64, "float32": torch.float32}
 LINKS = ("palm", "tip")
 OBJECTS = ("item", "tool", "floor")
 STRUCK: Mapping[str, Any] = {
@@ -122,7 +120,7 @@ def fields_of(kind: str) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=64)
-def _planned(kind: str, scale: float, changes: str) -> tuple[Plan, Mapping[str, Any]]:
+def _planned(kind: str, scale: float) -> tuple[Plan, Mapping[str, Any]]:
     """Return a kind's plan, and the specs of its sensors."""
     sizes = {f"s{n}": f"{1e-3 * scale * n:.17g}" for n in MILLIMETRES}
     with folder() as where, quiet():
@@ -137,21 +135,14 @@ def _planned(kind: str, scale: float, changes: str) -> tuple[Plan, Mapping[str, 
             "tgdsl": 1,
             "robot": {"model": str(path), "layout": {"resolutions": {"r": layout}}},
             "objects": {name: {"body": name, **made_of.get(name, {})} for name in OBJECTS},
-            "sensors": {"s": {**fields_of(kind), **json.loads(changes)}, **READ.get(kind, {})},
+            "sensors": {"s": fields_of(kind), **READ.get(kind, {})},
         }
         return compile_plan(document), load(document).spec.sensors
 
 
-def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0, **changes: Any) -> Pair:
-    """Return a kind's module in a precision, and its reference, both at the start of an episode.
-
-    Args:
-        kind: Its name.
-        dtype: The module's precision.
-        scale: What all lengths of the scene are times.
-        **changes: Other fields of the sensor.
-    """
-    plan, specs = _planned(kind, scale, json.dumps(changes))
+def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0) -> Pair:
+    """Return a kind's module and its reference at the start of an episode; all lengths of the scene times a scale."""
+    plan, specs = _planned(kind, scale)
     kinds = {own.name: own for own in KINDS}
     read = {name: (kinds[fields["kind"]], specs[name]) for name, fields in READ.get(kind, {}).items()}
     return Pair(TactileModule(plan, KINDS, dtype), ReferenceModule(plan, kinds[kind], specs["s"], read, "s"))

@@ -5,13 +5,14 @@ Shapes: `env` environments, `link` links, `x`, `y`, `z` cells.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from oracles.setups.scenes import folder
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.tuning.compile import compile
@@ -59,10 +60,13 @@ def heat_state(
     dt: float | int,
     contacts: Mapping[tuple[str, str], Sequence[Contact]] | None = None,
     num_envs: int = 1,
+    heights: Mapping[str, float] | None = None,
 ) -> SceneState:
-    """Return a state whose bodies are all at the origin, with contacts by (link, object), in the world's axes."""
+    """Return a state with contacts by (link, object), in the world's axes; bodies are at the origin, or at heights [m]."""
     inputs, values = module.inputs, dict[str, Any]()
     values["body_pos"] = torch.zeros(num_envs, len(inputs.bodies), 3, dtype=torch.float64)
+    for name, height in (heights or {}).items():
+        values["body_pos"][:, inputs.bodies.index(name), 2] = height
     values["body_quat"] = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(num_envs, len(inputs.bodies), 4).clone()
     if inputs.pairs:
         shape = (num_envs, len(inputs.pairs), inputs.slots, 3)
@@ -99,3 +103,18 @@ def begin(module: TactileModule, state: SceneState, above: np.ndarray | None = N
     module(state)
     if above is not None:
         cells_of(module)[:, 0] = torch.as_tensor(above, dtype=cells_of(module).dtype)
+
+
+def heated(
+    links: Mapping[str, Sequence[Any]], sensor: Mapping[str, Any], dt: float, steps: int,
+    objects: Mapping[str, tuple[Sequence[Any] | None, Mapping[str, Any]]] | None = None,
+    contacts: Mapping[tuple[str, str], Sequence[Contact]] | None = None, heights: Mapping[str, float] | None = None,
+    above: np.ndarray | None = None, dtype: torch.dtype = torch.float64,
+) -> Iterator[Mapping[str, torch.Tensor]]:  # fmt: skip
+    """Yield the readings of each step after the first: see `heat_module`, `heat_state` and `begin`."""
+    with folder() as where:
+        module = heat_module(where, links, sensor, objects, dtype)
+    state = heat_state(module, dt, contacts, heights=heights)
+    begin(module, state, above)
+    for _ in range(steps):
+        yield module(state)

@@ -6,7 +6,7 @@ Shapes: `env` environments, `taxel` taxels, `slot` contacts of a pair.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,6 +30,12 @@ def folder() -> Iterator[Path]:
     """Yield a folder for a scene's files that is gone afterwards."""
     with TemporaryDirectory(prefix="tgdsl-") as name:
         yield Path(name)
+
+
+def temporary(build: Callable[..., Any], *arguments: Any, **fields: Any) -> Any:
+    """Return what a function builds in a folder, its first argument, that is removed afterwards."""
+    with folder() as where:
+        return build(where, *arguments, **fields)
 
 
 def compiled(document: Mapping[str, Any], dtype: torch.dtype = torch.float64) -> TactileModule:
@@ -73,19 +79,23 @@ def module(
         f'<body name="item">{joint}{geom}</body></worldbody></mujoco>',
         encoding="utf-8",
     )
-    document = {
+    sensor = {"links": "pad", "feels": ["item"], **({"gate": gate} if gate else {}), **sensor}
+    return compiled(document(path, "item", sensor, points(probes, radius)), dtype)
+
+
+def document(model: Path, item: str, sensor: Mapping[str, Any], pad: Mapping[str, Any], **target: Any) -> dict[str, Any]:
+    """Return a document with one sensor, `s`, that feels one body of a model; `pad` is the layout of the link `pad`."""
+    return {
         "tgdsl": 1,
-        "robot": {"model": str(path), "layout": {"resolutions": {"r": {"pad": points(probes, radius)}}}},
-        "objects": {"item": {"body": "item"}},
-        "sensors": {"s": {"links": "pad", "feels": ["item"], **({"gate": gate} if gate else {}), **sensor}},
+        "robot": {"model": str(model), "layout": {"resolutions": {"r": {"pad": pad}}}},
+        "objects": {item: {"body": item, **target}},
+        "sensors": {"s": sensor},
     }
-    return compiled(document, dtype)
 
 
 def probed(probes: Sequence[Point] | np.ndarray, geom: str, **sensor: Any) -> TactileModule:
-    """Return the same, its files being gone."""
-    with folder() as where:
-        return module(where, probes, geom, **sensor)
+    """Return `module` of a temporary scene file."""
+    return temporary(module, probes, geom, **sensor)
 
 
 def state(touch: TactileModule, **item: Any) -> SceneState:
@@ -129,16 +139,8 @@ def pad(
     text = PAD.format(mass=mass, place=place, mount=mount, friction=friction, qvel=qvel, timestep=timestep, gravity=gravity)
     (where / "scene.xml").write_text(text, encoding="utf-8")
     kind = {} if "kind" in sensor else {"kind": "force_taxel", "footprint": FOOTPRINT}
-    document = {
-        "tgdsl": 1,
-        "robot": {
-            "model": str(where / "scene.xml"),
-            "layout": {"resolutions": {"r": {"pad": points(taxels, 0.004)}}},
-        },
-        "objects": {"cube": {"body": "cube"}},
-        "sensors": {"s": {"links": "pad", "feels": ["cube"], **kind, **sensor}},
-    }
-    return compiled(document, dtype)
+    sensor = {"links": "pad", "feels": ["cube"], **kind, **sensor}
+    return compiled(document(where / "scene.xml", "cube", sensor, points(taxels, 0.004)), dtype)
 
 
 def settled(touch: TactileModule, steps: int = 1500, **options: Any) -> SceneState:
@@ -146,6 +148,13 @@ def settled(touch: TactileModule, steps: int = 1500, **options: Any) -> SceneSta
     sim = simulate(touch, 1, substeps=steps, **options)
     sim.step()
     return sim.state()
+
+
+def resting(**scene: Any) -> tuple[TactileModule, SceneState]:
+    """Return the module of a `pad` and its state once the cube has settled."""
+    with folder() as where:
+        touch = pad(where, **scene)
+        return touch, settled(touch)
 
 
 def in_link(touch: TactileModule, scene: SceneState, vector: np.ndarray) -> np.ndarray:

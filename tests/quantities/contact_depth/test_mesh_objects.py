@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from held import assert_holds
-from oracles import geometry
 
 import tgdsl
 from tgdsl.errors import SpecError
@@ -49,20 +47,6 @@ def compiled(folder, mesh, probes, *, kind="contact_depth", dtype=torch.float64,
     rest = torch.zeros(1, num, 3, dtype=torch.float64)
     quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(1, num, 4)
     return touch, SceneState(body_pos=rest, body_quat=quat, body_linvel=rest, body_angvel=rest)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", geometry.WAYS)
-def test_a_4_cm_cube_at_every_clearance_of_a_10_mm_probe(way):
-    assert_holds(geometry.cube_of_any_making(way))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("query", ["sdf", "raycast"])
-@pytest.mark.parametrize("scale", [1.0, 0.001])
-def test_distance_to_a_ball_inside_and_out(query, scale):
-    """A fine ball, also one in millimetres with a scale: distance and direction are the sphere's to its tessellation."""
-    assert_holds(geometry.ball_of_triangles(query, scale))
 
 
 L_SHAPE = trimesh.util.concatenate(

@@ -1,15 +1,96 @@
-"""A sheet as one HTML file that opens without a network, and as text for a terminal."""
+"""A sheet of results: entries in sections, as text, CSV, JSON and one HTML file that opens without a network."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from html import escape
+from pathlib import Path
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tgdsl.console.tables import text_table
+from tgdsl.files.write import atomic_write_all, check_writable
 from tgdsl.report.bench.page import STYLE, svg_of
 from tgdsl.report.defects import DEFECTS, Answer, Defect, answers
-from tgdsl.report.sheets.sheet import Entry, Section, Sheet
+
+Draw = Callable[[Axes], None]
+"""Draws an entry into axes."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A result.
+
+    Attributes:
+        title: What it is, in a line.
+        cells: Its cells of the table, after the title.
+        record: The same for CSV and JSON.
+        notes: Lines beside the plot.
+        draw: Draws its plot.
+        holds: Whether it is as it should be.
+        defects: Findings about the paper's implementation that it answers, by number.
+        figure: The number that answers them, for people.
+    """
+
+    title: str
+    cells: tuple[str, ...]
+    record: Mapping[str, Any]
+    notes: tuple[str, ...]
+    draw: Draw
+    holds: bool
+    defects: tuple[int, ...] = ()
+    figure: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Entries that belong together.
+
+    Attributes:
+        name: Its name.
+        entries: What it has.
+        left_out: What could not be computed here, and why.
+    """
+
+    name: str
+    entries: tuple[Entry, ...]
+    left_out: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A report.
+
+    Attributes:
+        stem: Stem of its files' names.
+        title: Its title.
+        about: What it says, in a paragraph.
+        header: Names of the table's columns, the title's first.
+        sections: What it has.
+    """
+
+    stem: str
+    title: str
+    about: str
+    header: tuple[str, ...]
+    sections: tuple[Section, ...]
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """All entries, section by section."""
+        return tuple(entry for section in self.sections for entry in section.entries)
+
+    @property
+    def failed(self) -> tuple[Entry, ...]:
+        """Entries that are not as they should be."""
+        return tuple(entry for entry in self.entries if not entry.holds)
+
 
 GRID = """
 .cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:1em 1.5em}
@@ -112,3 +193,40 @@ def sheet_text(sheet: Sheet) -> str:
     num = len(sheet.entries)
     parts.append(f"{num} of {num} hold" if not sheet.failed else f"{len(sheet.failed)} of {num} do not hold (✗)")
     return "\n\n".join(parts)
+
+
+SUFFIXES = (".csv", ".json", ".html")
+
+
+def check_sheet_files(stem: str, folder: Path) -> None:
+    """See that a sheet's files can be written, before the work that leads to them.
+
+    Raises:
+        FileError: If one cannot.
+    """
+    for suffix in SUFFIXES:
+        check_writable(folder / f"{stem}{suffix}")
+
+
+def write_sheet(sheet: Sheet, folder: Path) -> list[Path]:
+    """Write the files of a sheet, all or none, and return them.
+
+    Raises:
+        FileError: If one cannot be written.
+    """
+    told = [
+        {"section": section.name, "title": entry.title, "holds": entry.holds, "defects": list(entry.defects), **entry.record}
+        for section in sheet.sections
+        for entry in section.entries
+    ]
+    rows = [{key: value for key, value in row.items() if not isinstance(value, list | tuple)} for row in told]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), restval="")
+    writer.writeheader()
+    writer.writerows(rows)
+    left_out = [{"section": s.name, "title": name, "why": why} for s in sheet.sections for name, why in s.left_out]
+    whole = json.dumps({"title": sheet.title, "entries": told, "left_out": left_out}, indent=1, ensure_ascii=False)
+    contents = (text.getvalue(), whole, sheet_page(sheet))
+    files = [folder / f"{sheet.stem}{suffix}" for suffix in SUFFIXES]
+    atomic_write_all({file: content.encode() for file, content in zip(files, contents, strict=True)})
+    return files
