@@ -1,7 +1,5 @@
 """What whole bodies and single bits read: the weight on a link, and a contact's threshold and release."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from oracles.comparison import Values, field

@@ -1,9 +1,7 @@
-"""Comparisons with closed forms: what a decorated function returns, with its name, source, unit and tolerance.
+"""Comparisons with closed forms: what a decorated function returns, with its name, equation, source, unit and tolerance.
 
 Shapes: `point` places, times or cases; `series` curves over the same abscissa.
 """
-
-from __future__ import annotations
 
 import inspect
 import re
@@ -17,50 +15,25 @@ import torch
 
 
 class Values(NamedTuple):
-    """What a comparison computes, each (point,), (series, point) or a number, broadcast against each other.
-
-    Attributes:
-        exact: Known values.
-        ours: The same computed by tgdsl.
-        paper: The same by the paper's formula, if it differs.
-        at: Abscissa, if the decorator does not give it: numbers, or labels.
-        rtol: Relative tolerance, if the decorator does not give it.
-        atol: Absolute tolerance, if the decorator does not give it.
-        words: More words for the name.
-    """
+    """What a comparison computes; below `paper` what depends on its arguments and so cannot be in the decorator."""
 
     exact: Any
+    """Known values: (point,), (series, point), or a number; all three are broadcast against each other."""
     ours: Any
+    """The same computed by tgdsl."""
     paper: Any = None
+    """The same by the paper's formula, if it differs."""
     at: Any = None
+    """Abscissa: numbers, or labels."""
     rtol: float | None = None
     atol: float | None = None
     words: Mapping[str, Any] = {}
+    """More words for the name."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A quantity as tgdsl computes it beside its known value.
-
-    Attributes:
-        name: One line.
-        equation: Formula of the exact value.
-        source: Author, year and equation, or the principle it is derived from.
-        kinds: Sensor kinds that compute the quantity, or `noise`, `geometry`.
-        quantity: Name of the quantity.
-        unit: Its unit; empty or "1" for none.
-        label: Name of the abscissa.
-        label_unit: Unit of the abscissa; empty if `at` are labels.
-        at: Abscissa: numbers, or labels.
-        is_log: Whether the abscissa is drawn logarithmically.
-        exact: Known values.
-        ours: The same computed by tgdsl.
-        paper: The same by the paper's formula, if it differs.
-        rtol: Tolerance relative to the exact value.
-        atol: Absolute tolerance, added to it.
-        series: Names of the curves, if there are several.
-        defects: Numbers of the findings in `tgdsl.report.defects` that it answers.
-    """
+    """A quantity as tgdsl computes it beside its known value; see `oracle` for the fields."""
 
     name: str
     equation: str
@@ -74,11 +47,11 @@ class Comparison:
     is_log: bool
     exact: np.ndarray
     ours: np.ndarray
-    paper: np.ndarray | None = None
-    rtol: float = 0.0
-    atol: float = 0.0
-    series: tuple[str, ...] = ()
-    defects: tuple[int, ...] = ()
+    paper: np.ndarray | None
+    rtol: float
+    atol: float
+    series: tuple[str, ...]
+    defects: tuple[int, ...]
 
     @property
     def magnitude(self) -> float:
@@ -113,15 +86,7 @@ def _largest(values: np.ndarray) -> float:
 
 
 class Case(NamedTuple):
-    """A registered comparison with its arguments.
-
-    Attributes:
-        name: Name of the function, with its arguments.
-        section: Section of the report.
-        compute: Function without arguments.
-        is_reported: Whether the report has a row of it; tests check all.
-        is_slow: Whether its test is marked slow.
-    """
+    """A registered function with its arguments; the report has a row of it if `is_reported`, tests check all."""
 
     name: str
     section: str
@@ -155,37 +120,23 @@ class _Number(float):
 
 
 def field(section: str, *kinds: str) -> Callable[..., Callable]:
-    """Return `oracle` for a section of the report and the kinds that it is about."""
+    """Return `oracle` for a section of the report and the sensor kinds, `noise` or `geometry` that compute its quantities."""
     return partial(oracle, section, kinds)
 
 
 def oracle(
     section: str, kinds: tuple[str, ...], name: str, equation: str, source: str, quantity: str, over: str = "", *,
     at: Sequence | np.ndarray | None = None, is_log: bool = False, rtol: float = 0.0, atol: float = 0.0, of_peak: float = 0.0,
-    series: Sequence[str] = (), defects: Sequence[int] = (), each: Iterable = ((),), also: Iterable = (), slow: bool | Iterable = False,
+    series: Sequence[str] = (), defects: Sequence[int] = (), each: Iterable = ((),), also: Iterable = (),
+    slow: bool | Iterable = False,
 ) -> Callable[[Callable], Callable[..., Comparison]]:  # fmt: skip
     """Register a function that returns `(exact, ours)`, `(exact, ours, paper)` or `Values`, and let it return a `Comparison`.
 
-    Texts may contain the function's arguments in braces, as `str.format` has them; in float32 the name says so.
-
-    Args:
-        section: Section of the report.
-        kinds: See `Comparison`; likewise `name`, `equation`, `source`, `rtol`, `series` and `defects`.
-        name: One line.
-        equation: Formula of the exact value.
-        source: Where it is from.
-        quantity: Quantity with its unit in brackets at the end.
-        over: Abscissa with its unit in brackets at the end; without one `at` are labels.
-        at: Values of the abscissa, or labels.
-        is_log: Whether the abscissa is drawn logarithmically.
-        rtol: Relative tolerance.
-        atol: Absolute tolerance.
-        of_peak: Tolerance relative to the largest magnitude of the exact values.
-        series: Names of curves.
-        defects: Findings that it answers.
-        each: Arguments of each row of the report: tuples, or single arguments.
-        also: Arguments that tests check in addition.
-        slow: Whether tests are marked slow, or the arguments of those that are.
+    `name`, `equation` (of the exact value), `source` and labels may contain the function's arguments in braces, as
+    `str.format` has them; in float32 the name says so. `quantity` and `over`, the abscissa, end in their unit in brackets;
+    without a unit, `at` are labels. An error may be `atol + rtol·|exact|`; `of_peak` is `atol` over the largest exact value.
+    `series` names curves, `defects` the findings of `tgdsl.report.defects` that it answers. `each` are arguments of the rows
+    of the report, tuples or single ones, `also` those of more tests; `slow` those whose tests are slow, or all (True).
     """
     quantity, unit = _with_unit(quantity)
     label, label_unit = _with_unit(over)
@@ -199,18 +150,15 @@ def oracle(
             bound.apply_defaults()
             known = {key: _Number(value) if isinstance(value, float) else value for key, value in bound.arguments.items()}
             values = Values(*function(*args, **kwargs))
-            columns = [part for part in values[:3] if part is not None]
-            exact, ours, *paper = (np.array(part) for part in np.broadcast_arrays(*map(_column, columns)))
+            columns = np.broadcast_arrays(*(_column(part) for part in values[:3] if part is not None))
+            exact, ours, paper = (*map(np.array, columns), None)[:3]
             places = values.at if at is None else at
+            labels = _column(places).tolist() if label_unit else [str(place).format(**known) for place in places]
+            title = name.format(**known, **values.words) + (", float32" if torch.float32 in known.values() else "")
+            allowed = of_peak * float(abs(exact).max()) or (atol if values.atol is None else values.atol)
             return Comparison(
-                name=name.format(**known, **values.words) + (", float32" if torch.float32 in known.values() else ""),
-                equation=equation.format(**known), source=source.format(**known), kinds=tuple(kinds), quantity=quantity, unit=unit, label=label,
-                label_unit=label_unit,
-                at=tuple(_column(places).tolist()) if label_unit else tuple(str(own).format(**known) for own in places),
-                is_log=is_log, exact=exact, ours=ours, paper=paper[0] if paper else None,
-                rtol=rtol if values.rtol is None else values.rtol,
-                atol=of_peak * float(abs(exact).max()) or (atol if values.atol is None else values.atol),
-                series=tuple(series), defects=tuple(defects),
+                title, equation.format(**known), source.format(**known), kinds, quantity, unit, label, label_unit, tuple(labels),
+                is_log, exact, ours, paper, rtol if values.rtol is None else values.rtol, allowed, tuple(series), tuple(defects),
             )  # fmt: skip
 
         compare.kinds, compare.defects = kinds, defects
@@ -226,5 +174,5 @@ def _column(values: Any) -> np.ndarray:
 
 def _with_unit(text: str) -> tuple[str, str]:
     """Split "quantity [unit]"."""
-    found = re.fullmatch(r"(.*) \[([^\[]*)\]", text)
-    return (found[1], found[2]) if found else (text, "")
+    parts = re.fullmatch(r"(.*) \[([^\[]*)\]", text)
+    return (parts[1], parts[2]) if parts else (text, "")

@@ -1,7 +1,5 @@
 """Losses of a block to its surroundings, and the lag of a sensing element, against closed forms of one cell."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -41,8 +39,7 @@ def transmitted(h: float, axes: str = "xyz") -> float:
 
 @oracle(
     "Newton's law of cooling", "ΔT = ΔT₀ e^(−UAt/ρcV), 1/U = 1/h + Δ/6k", "Incropera 5.6", "temperature [°C]", "time [s]",
-    defects=(11,),
-    each=[torch.float64, torch.float32],
+    defects=(11,), each=[torch.float64, torch.float32],
 )  # fmt: skip
 def newton(dtype: torch.dtype = torch.float64):
     times = np.array([10.0, 50.0, 100.0])
@@ -113,8 +110,7 @@ def slab_mean(biot: float, fourier: float) -> float:
 @oracle(
     "A slab that air cools, Bi = {biot:g}, Fo = {fourier:g}, {num} cells, {steps} steps",
     "θ = Σ 4 sin β/(2β + sin 2β) cos(βx/L) e^(−β²Fo), β tan β = Bi", "Carslaw and Jaeger 3.11, Incropera 5.5",
-    "mean, then cells [1]", defects=(11,),
-    each=[(10, 1), (40, 7)], also=[(40, 1)],
+    "mean, then cells [1]", defects=(11,), each=[(10, 1), (40, 7)], also=[(40, 1)],
 )  # fmt: skip
 def slab(num: int, steps: int, biot: float = 10.0, fourier: float = 0.5):
     half, alpha = 0.01, 1e-6
@@ -147,8 +143,7 @@ def cube(num: int, material: str, steps: int = 60):
 
 @oracle(
     "A flux through a slab, to air, Δt = {dt:g} s", "ΔT = q (1/h + (L − x)/k)", "Incropera 3.1, resistances in series",
-    "rise of temperature [K]", "depth [m]", rtol=1e-3, defects=(11,),
-    each=[1.0, 20.0],
+    "rise of temperature [K]", "depth [m]", rtol=1e-3, defects=(11,), each=[1.0, 20.0],
 )  # fmt: skip
 def flux_through(dt: float):
     flux, h, thick, num, k = 3000.0, 1000.0, 0.02, 20, ALUMINIUM.conductivity
@@ -161,8 +156,7 @@ def flux_through(dt: float):
 
 @oracle(
     "A flux through a slab that radiates, Δt = {dt:g} s", "q = εσ(T_s⁴ − T_a⁴), ΔT = T_s − T_a + q (L − x)/k",
-    "Stefan and Boltzmann's law, Incropera 3.1", "rise of temperature [K]", "depth [m]", defects=(11,),
-    each=[5.0], also=[50.0],
+    "Stefan and Boltzmann's law, Incropera 3.1", "rise of temperature [K]", "depth [m]", defects=(11,), each=[5.0], also=[50.0],
 )  # fmt: skip
 def flux_radiated(dt: float):
     flux, thick, num, k, around = 400.0, 0.01, 4, MATERIALS["rubber"].conductivity, 22.0 + zero_celsius()
@@ -178,8 +172,8 @@ def flux_radiated(dt: float):
 
 @oracle(
     "A hot block stays hot for a second", "ΔT = εσ(T⁴−T_a⁴) A t/C",
-    "Stefan and Boltzmann's law; the paper's implementation as measured", "temperature lost [K]", at=["after 1 s"],
-    rtol=2e-3, defects=(11,),
+    "Stefan and Boltzmann's law; the paper's implementation as measured", "temperature lost [K]", at=["after 1 s"], rtol=2e-3,
+    defects=(11,),
 )  # fmt: skip
 def hot_block():
     lost = 0.85 * stefan_boltzmann() * (373.15**4 - 295.15**4) * AREA / HEAT
@@ -187,9 +181,8 @@ def hot_block():
 
 
 @oracle(
-    "A slow element trails a ramp, Δt = {dt:g} s", "T = r (t − τ(1 − e^(−t/τ)))", "first-order lag",
-    "rise of the reading [K]", "time [s]", rtol=1e-6, atol=1e-9,
-    each=[0.005, 0.07, 1.3],
+    "A slow element trails a ramp, Δt = {dt:g} s", "T = r (t − τ(1 − e^(−t/τ)))", "first-order lag", "rise of the reading [K]",
+    "time [s]", rtol=1e-6, atol=1e-9, each=[0.005, 0.07, 1.3],
 )  # fmt: skip
 def lag(dt: float, tau: float = 0.4):
     parameters = {"cells": [1, 1, 1], "material": "aluminium", "source": {"power": 3.0}, "lag": "400 ms"}

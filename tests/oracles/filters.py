@@ -1,7 +1,5 @@
 """Filters: a delay, one Maxwell branch, and crosstalk between taxels."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 
@@ -22,8 +20,7 @@ EXACT = 1e-12
 @oracle(
     "A reading is as old as its delay: {late:ms}, calls every {dt:ms}", "y(t) = x(max(t − Δ, 0))",
     "by definition, linear between calls", "reading of a clock [s]", "time [s]", atol=1e-14, series=("row 0", "row 1"),
-    defects=(19,),
-    each=[(0.5e-3, DT), (5.3e-3, DT / 0.1), (5.3e-3, DT / 10.0)],
+    defects=(19,), each=[(0.5e-3, DT), (5.3e-3, DT / 0.1), (5.3e-3, DT / 10.0)],
     also=product((0.0, 0.5e-3, 4e-3, 5.3e-3), (DT / 0.1, DT, DT / 2.0, DT / 10.0)),
 )  # fmt: skip
 def delay(late: float, dt: float):
@@ -70,8 +67,7 @@ def maxwell_step():
 
 @oracle(
     "Maxwell branch: on a ramp, Δt = {dt:g} s", "y = vt + βvτ(1 − e^(−t/τ))", "linear viscoelasticity", "reading [1]",
-    "time [s]", rtol=EXACT, defects=(21,),
-    each=[1e-6, 1e-3, 0.05, 10.0],
+    "time [s]", rtol=EXACT, defects=(21,), each=[1e-6, 1e-3, 0.05, 10.0],
 )  # fmt: skip
 def maxwell_ramp(dt: float):
     t, speed = dt * np.arange(200), 3.0 / dt
@@ -81,10 +77,9 @@ def maxwell_ramp(dt: float):
 
 
 @oracle(
-    "Maxwell branch: the same at any step, {step:g} ms",
-    "y = x + βτ Σ Δv (1 − e^(−(t−t_b)/τ)) over the signal's bends", "linear viscoelasticity", "reading [1]", "time [s]",
-    defects=(21,),
-    each=[1, 10, (1, torch.float32)], also=product((1, 2, 10), (torch.float64, torch.float32)),
+    "Maxwell branch: the same at any step, {step:g} ms", "y = x + βτ Σ Δv (1 − e^(−(t−t_b)/τ)) over the signal's bends",
+    "linear viscoelasticity", "reading [1]", "time [s]", defects=(21,), each=[1, 10, (1, torch.float32)],
+    also=product((1, 2, 10), (torch.float64, torch.float32)),
 )  # fmt: skip
 def maxwell_cycle(parts: int, dtype: torch.dtype = torch.float64):
     common = np.arange(31) * 0.01
@@ -125,8 +120,7 @@ UNEVEN: dict[str, Any] = {"crosstalk": {"strength": [0.2, 0.9], "sigma": ["1 mm"
 
 @oracle(
     "Crosstalk keeps the sum: {name}", "Σ_j K_ji = 1", "columns of the operator sum to 1", "sum [1]", "taxel", atol=1e-6,
-    defects=(10,),
-    each=["grid", "sphere cap", "irregular"], also=product(layouts(), (BLUR, UNEVEN)),
+    defects=(10,), each=["grid", "sphere cap", "irregular"], also=product(layouts(), (BLUR, UNEVEN)),
 )  # fmt: skip
 def crosstalk_sum(name: str, knobs: dict[str, Any] = BLUR):
     layout = layouts()[name]
@@ -153,8 +147,7 @@ def crosstalk_edges(num: int = 15, sigma: float = 2 * MM):
 
 @oracle(
     "A blur has the variance of its Gaussian, strength {strength:g}", "Σ K x² = χ σ²", "variance of a Gaussian",
-    "moments over σ, σ² [1]", at=["x", "y", "x²", "y²"], rtol=1e-6, atol=1e-12,
-    each=[1.0], also=[0.3],
+    "moments over σ, σ² [1]", at=["x", "y", "x²", "y²"], rtol=1e-6, atol=1e-12, each=[1.0], also=[0.3],
 )  # fmt: skip
 def crosstalk_variance(strength: float):
     # Sums over a grid are integrals to 4π²σ²/h² e^(−2π²σ²/h²), 2e-7 for σ = h; the grid reaches 10 σ.

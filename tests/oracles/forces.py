@@ -3,8 +3,6 @@
 "The paper" is its law of depth and velocity (`kinematic_taxel`, `model: paper`) on the same state.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -48,8 +46,7 @@ def weight(masses: tuple[float, ...] = (0.025, 0.25, 1.0)):
 
 @oracle(
     "The taxels carry the solver's force, {mass:g} kg", "Σ f_j = Σ f_c", "MuJoCo's contact forces", "force [N]", at=AXES,
-    atol=ROUNDING,
-    also=[0.025],
+    atol=ROUNDING, also=[0.025],
 )  # fmt: skip
 def solver_force(mass: float = MASS):
     touch, state = resting(mass=mass)
@@ -58,8 +55,7 @@ def solver_force(mass: float = MASS):
 
 @oracle(
     "Static shear: a cube at rest on a slope of {angle:g}°", "f_x = m g sin θ, f_z = −m g cos θ", "balance of forces",
-    "force [N]", at=AXES, atol=2e-3, defects=(2,),
-    each=[10.0, 25.0],
+    "force [N]", at=AXES, atol=2e-3, defects=(2,), each=[10.0, 25.0],
 )  # fmt: skip
 def static_shear(angle: float):
     turn = Rotation.from_euler("y", angle, degrees=True)
@@ -87,8 +83,7 @@ def _sliding(motion: tuple[float, float], **sensor: Any) -> tuple[TactileModule,
 
 @oracle(
     "Coulomb: a cube that slides along {motion} drags the sensor with it", "f_t = μ N along the object's motion",
-    "Coulomb's law", "force along the pad [N]", at=["x", "y"], atol=1e-3, defects=(3,),
-    each=[((0.0, 1.0),), ((-1.0, 0.0),)],
+    "Coulomb's law", "force along the pad [N]", at=["x", "y"], atol=1e-3, defects=(3,), each=[((0.0, 1.0),), ((-1.0, 0.0),)],
 )  # fmt: skip
 def sliding(motion: tuple[float, float]):
     touch, state, speed = _sliding(motion)
@@ -99,8 +94,7 @@ def sliding(motion: tuple[float, float]):
 
 @oracle(
     "No taxel leaves its friction cone", "|f_t| ≤ μ f_n", "Coulomb's law", "|f_t|/μ f_n − 1, where above 0 [1]", "taxel",
-    atol=1e-4, defects=(2,),
-    also=[((-1.0, 0.0),)],
+    atol=1e-4, defects=(2,), also=[((-1.0, 0.0),)],
 )  # fmt: skip
 def friction_cone(motion: tuple[float, float] = (0.0, 1.0)):
     touch, state, _ = _sliding(motion)
@@ -111,8 +105,8 @@ def friction_cone(motion: tuple[float, float] = (0.0, 1.0)):
 
 
 @oracle(
-    "An impact adds up to the change of momentum", "Σ f Δt = m Δv + m g T", "balance of momentum", "impulse [N·s]",
-    at=["f_z"], rtol=1e-2,
+    "An impact adds up to the change of momentum", "Σ f Δt = m Δv + m g T", "balance of momentum", "impulse [N·s]", at=["f_z"],
+    rtol=1e-2,
 )  # fmt: skip
 def impact(step: float = 5e-4, steps: int = 200):
     with folder() as where:
@@ -134,8 +128,8 @@ def _resting_at(place: tuple[float, float, float]) -> tuple[TactileModule, Scene
 
 @oracle(
     "The taxels carry the solver's moment, cube at {place}", "Σ x_j × f_j = Σ x_c × f_c", "MuJoCo's contact forces",
-    "moment about the pad's origin [N·m]", at=AXES, atol=1e-4 * (MASS * G * 0.01),
-    each=[(place,) for place in PLACES[1:]], also=[(PLACES[0],)],
+    "moment about the pad's origin [N·m]", at=AXES, atol=1e-4 * (MASS * G * 0.01), each=[(place,) for place in PLACES[1:]],
+    also=[(PLACES[0],)],
 )  # fmt: skip
 def moment(place: tuple[float, float, float]):
     touch, state = _resting_at(place)
@@ -144,8 +138,7 @@ def moment(place: tuple[float, float, float]):
 
 @oracle(
     "The centre of pressure is below the cube's centre, at {place}", "Σ f_z x/Σ f_z = x of the cube", "balance of moments",
-    "position [m]", at=["x", "y"], atol=5e-6,
-    each=[(PLACES[2],)], also=[(PLACES[0],), (PLACES[1],)],
+    "position [m]", at=["x", "y"], atol=5e-6, each=[(PLACES[2],)], also=[(PLACES[0],), (PLACES[1],)],
 )  # fmt: skip
 def centre_of_pressure(place: tuple[float, float, float]):
     touch, state = _resting_at(place)

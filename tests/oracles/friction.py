@@ -1,7 +1,5 @@
 """Stick and slip of a ball on a skin of taxels: the loop of a tangential cycle on a Winkler foundation, and Mindlin's."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 
@@ -64,8 +62,7 @@ def mindlin(ratio: np.ndarray) -> np.ndarray:
     "A tangential cycle is the Winkler–Coulomb loop: {part}",
     "Q/μP = 1 − (1 − s/s*)²; Mindlin's half-space: 1 − (1 − s/s*)^1.5",
     "Masing's rule; Johnson 1985, 7.2, for a foundation of springs", "pull over μP [1]",
-    "displacement over that of full slip [1]",
-    each=["out", "back", "again"],
+    "displacement over that of full slip [1]", each=["out", "back", "again"],
 )  # fmt: skip
 def cycle(part: str):
     pad, out = _Pad(), np.linspace(0, TURN, 9)
@@ -82,9 +79,8 @@ def cycle(part: str):
 
 
 @oracle(
-    "The loop closes", "Q(s) after a cycle = Q(s) before", "Masing's rule", "pull over μP [1]", at=[f"s = {TURN} s*"],
-    atol=1e-3,
-)  # fmt: skip
+    "The loop closes", "Q(s) after a cycle = Q(s) before", "Masing's rule", "pull over μP [1]", at=[f"s = {TURN} s*"], atol=1e-3
+)
 def loop_closes():
     pad = _Pad()
     first = [pad.pull(w * (SLIP * DEPTH)) for w in np.linspace(0, TURN, 9)][-1]
@@ -92,9 +88,7 @@ def loop_closes():
     return first, again
 
 
-@oracle(
-    "Beyond full slip the pull is μP", "Q = μP", "Coulomb's law", "pull over μP [1]", at=["s = 1.5 s*"], atol=1e-9,
-)  # fmt: skip
+@oracle("Beyond full slip the pull is μP", "Q = μP", "Coulomb's law", "pull over μP [1]", at=["s = 1.5 s*"], atol=1e-9)
 def full_slip():
     return 1.0, _Pad().pull(1.5 * SLIP * DEPTH)
 

@@ -3,8 +3,6 @@
 z points into the solid; a load is (Qx, Qy, P), P into it. The shear modulus of all is `G`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise, product
@@ -100,8 +98,7 @@ def far_field(nu: float = 0.48):
 
 @oracle(
     "Navier: equilibrium below a patch of {patch:mm}, load {load}", "∇²u + ∇(∇·u)/(1−2ν) = 0",
-    "Johnson 1985, 3.1; central differences of steps h", "what is left at h/2 over that at h [1]", at=["h = 0.1 mm"],
-    atol=0.03,
+    "Johnson 1985, 3.1; central differences of steps h", "what is left at h/2 over that at h [1]", at=["h = 0.1 mm"], atol=0.03,
     each=[(0.0, OBLIQUE), (1e-3, OBLIQUE)], also=product((0.0, 1e-3), (NORMAL, TANGENTIAL)),
 )  # fmt: skip
 def equilibrium(patch: float, load: Load, nu: float = 0.3):
@@ -130,8 +127,7 @@ def _stress(u: Callable[[np.ndarray], np.ndarray], point: np.ndarray, nu: float,
 
 @oracle(
     "Equilibrium: the stress below carries the load, patch of {patch:mm}", "∫ σ_zz dA = −P, ∫ σ_xz dA = −Q",
-    "balance of forces", "force [N]", at=["normal", "tangential"], atol=0.01,
-    each=[1e-3], also=[0.0],
+    "balance of forces", "force [N]", at=["normal", "tangential"], atol=0.01, each=[1e-3], also=[0.0],
 )  # fmt: skip
 def carried_load(patch: float, nu: float = 0.3, z: float = 2e-3):
     radii, forces = np.geomspace(1e-5, 0.4, 160), []
@@ -147,8 +143,8 @@ def carried_load(patch: float, nu: float = 0.3, z: float = 2e-3):
 
 @oracle(
     "Saint-Venant: a patch is a point load from six radii on, ν = {nu:g}, z = {z:mm}", "u → u of a point load",
-    "Johnson 1985, 3.18 and 3.75", "displacement over its largest component [1]", atol=0.01,
-    each=[(0.5e-3, 0.48)], also=product((0.0, 0.5e-3, 2e-3), NUS),
+    "Johnson 1985, 3.18 and 3.75", "displacement over its largest component [1]", atol=0.01, each=[(0.5e-3, 0.48)],
+    also=product((0.0, 0.5e-3, 2e-3), NUS),
 )  # fmt: skip
 def patch_far_off(z: float, nu: float, patch: float = 1e-3):
     exact, ours = [], []
@@ -186,8 +182,7 @@ def patch_moment(a: float = 1.3e-3):
 @oracle(
     "A patch's closed form is its Hankel integral, z = {z:mm}", "u(r) = 1/2π ∫ φ(k) M(k, z) J_n(kr) k dk",
     "Johnson 1985, 3.1, in wave numbers", "displacement of 1 N [m]", at=["normal", "spread", "lift", "along", "bend"],
-    rtol=1e-8,
-    each=[0.0, 0.4e-3],
+    rtol=1e-8, each=[0.0, 0.4e-3],
 )  # fmt: skip
 def hankel(z: float, a: float = 1e-3, nu: float = 0.35, r: float = 2.3e-3):
     scale = 1 / (2 * np.pi)
@@ -218,9 +213,8 @@ def flat_skin(x: np.ndarray, y: np.ndarray, pitch: float) -> LinkTaxels:
 
 
 @oracle(
-    "Hertz: the surface under Hertz's pressure is the ball's",
-    "u_z = δ − r²/2R, δ = a²/R, of p = p₀√(1−r²/a²), p₀ = 2E*a/πR", "Johnson 1985, 3.41a and 4.22",
-    "displacement into the skin [m]", "x [m]", rtol=0.02,
+    "Hertz: the surface under Hertz's pressure is the ball's", "u_z = δ − r²/2R, δ = a²/R, of p = p₀√(1−r²/a²), p₀ = 2E*a/πR",
+    "Johnson 1985, 3.41a and 4.22", "displacement into the skin [m]", "x [m]", rtol=0.02,
 )  # fmt: skip
 def hertz_surface(num: int = 41, nu: float = 0.45, radius: float = 0.02, a: float = 2e-3):
     # p = p₀ √(1 − r²/a²) with p₀ = 2 E* a/(πR) moves the surface by δ − r²/2R, δ = a²/R.

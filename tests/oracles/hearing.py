@@ -1,7 +1,5 @@
 """What a microphone hears of sources at rest and in motion, against closed forms."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,8 +14,7 @@ oracle = field("sound: microphone", "microphone")
 
 @oracle(
     "Sound falls off by the distance, p = {falloff:g}", "l/r^p", "the paper's law; of p = 1 a point source, Pierce 4.1",
-    "amplitude, over 60 periods [Pa]", "distance [m]", is_log=True, rtol=1e-3,
-    each=[1.0, 2.0], also=[0.5],
+    "amplitude, over 60 periods [Pa]", "distance [m]", is_log=True, rtol=1e-3, each=[1.0, 2.0], also=[0.5],
 )  # fmt: skip
 def level(falloff: float):
     distances = np.array([0.25, 0.5, 1.0, 2.7, 8.0])
@@ -36,8 +33,7 @@ def nearest(least: float = 0.4):
 
 @oracle(
     "A tone of {frequency:g} Hz is as late as its way is long", "t = r/c", "speed of sound", "delay, by phase [s]",
-    "distance [m]", atol=1 / 20 / RATE,
-    each=[400.0, 7000.0], also=[3000.0],
+    "distance [m]", atol=1 / 20 / RATE, each=[400.0, 7000.0], also=[3000.0],
 )  # fmt: skip
 def delay(frequency: float):
     distances = np.array([0.31, 0.5, 1.3333, 4.021])
@@ -84,17 +80,15 @@ def doppler(speeds: Sequence[float] = (-30.0, -10.0, 10.0, 30.0)):
 
 
 @oracle(
-    "Doppler's shift where both move", "f′ = f (1 − v_m/c)/(1 + v_s/c)", "Pierce 11.5", "frequency [Hz]",
-    at=["20 and 15 m/s"], atol=0.5,
+    "Doppler's shift where both move", "f′ = f (1 − v_m/c)/(1 + v_s/c)", "Pierce 11.5", "frequency [Hz]", at=["20 and 15 m/s"],
+    atol=0.5,
 )  # fmt: skip
 def doppler_of_both():
     samples = heard(temporary(listening), 160, source=(1.0, 0, 0), speeds=(20.0, -15.0))[-2400:]
     return PITCH * (1 - 15 / SPEED) / (1 + 20 / SPEED), frequency_of(samples)
 
 
-@oracle(
-    "Sounds of two sensors add up", "p = Σ l p_i", "linear acoustics", "pressure [Pa]", "time [s]", atol=1e-12,
-)  # fmt: skip
+@oracle("Sounds of two sensors add up", "p = Σ l p_i", "linear acoustics", "pressure [Pa]", "time [s]", atol=1e-12)
 def two_sensors():
     place: dict[str, Any] = {"kind": "microphone", "pos": [0.5, 1, 0]}
     alone: dict[str, Any] = {"m1": {**place, "hears": ["tone"]}, "m2": {**place, "hears": ["other"]}}

@@ -1,7 +1,5 @@
 """Heat: conduction within a link, and between what touches, against Carslaw and Jaeger, *Conduction of Heat in Solids*."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 
@@ -66,8 +64,8 @@ def modes_of_cells(numbers: Any, dt: float, dtype: torch.dtype = torch.float64):
 
 
 @oracle(
-    "A slab's mode by the spectral scheme", "exp(−α Σ (mπ/L)² t)", "Carslaw and Jaeger 3.4; Neumann walls",
-    "what is left [1]", at=["after {steps} steps"], atol=1e-6,
+    "A slab's mode by the spectral scheme", "exp(−α Σ (mπ/L)² t)", "Carslaw and Jaeger 3.4; Neumann walls", "what is left [1]",
+    at=["after {steps} steps"], atol=1e-6,
 )  # fmt: skip
 def spectral_mode(numbers: Any = (2, 1, 3), dt: float = 0.1, steps: int = 4):
     k = rate(numbers, COUNT, SIDES, continuous=True)
@@ -75,9 +73,8 @@ def spectral_mode(numbers: Any = (2, 1, 3), dt: float = 0.1, steps: int = 4):
 
 
 @oracle(
-    "The paper's scheme, scheme semi_implicit, {steps} steps", "(1 + αΔt k²)^−n", "Chung et al., appendix",
-    "what is left [1]", at=["after {steps} steps"], rtol=1e-9,
-    each=[10], also=[20, 40],
+    "The paper's scheme, scheme semi_implicit, {steps} steps", "(1 + αΔt k²)^−n", "Chung et al., appendix", "what is left [1]",
+    at=["after {steps} steps"], rtol=1e-9, each=[10], also=[20, 40],
 )  # fmt: skip
 def semi_implicit(steps: int, numbers: Any = (2, 1, 0)):
     k = rate(numbers, COUNT, SIDES, continuous=True)
@@ -106,8 +103,7 @@ def order_in_space(numbers: Any = (1, 2, 1)):
 
 @oracle(
     "A thick solid under a constant flux, after {seconds:g} s", "ΔT = 2q/k (√(αt/π) e^(−x²/4αt) − x/2 erfc(x/√4αt))",
-    "Carslaw and Jaeger 2.9", "rise of temperature [K]", "depth [m]",
-    each=[10.0], also=[1.0, 4.0], slow=[10.0],
+    "Carslaw and Jaeger 2.9", "rise of temperature [K]", "depth [m]", each=[10.0], also=[1.0, 4.0], slow=[10.0],
 )  # fmt: skip
 def thick_solid(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int = 200, dt: float = 0.01):
     sensor = {"cells": [1, 1, n], "material": "steel", "source": {"flux": f"{flux} W/m2", "face": "+z"}}
@@ -120,8 +116,7 @@ def thick_solid(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int
 
 @oracle(
     "A thick solid's surface under a constant flux, after {seconds:g} s", "ΔT = 2q/k √(αt/π)", "Carslaw and Jaeger 2.9",
-    "rise of temperature [K]", at=["surface"], rtol=0.01,
-    each=[10.0], also=[1.0, 4.0], slow=[10.0],
+    "rise of temperature [K]", at=["surface"], rtol=0.01, each=[10.0], also=[1.0, 4.0], slow=[10.0],
 )  # fmt: skip
 def thick_solids_surface(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int = 200):
     ours = thick_solid(seconds, flux, depth, n).ours[0] + flux * 0.5 * depth / n / STEEL.conductivity
@@ -129,8 +124,8 @@ def thick_solids_surface(seconds: float, flux: float = 5000.0, depth: float = 0.
 
 
 @oracle(
-    "A power warms all of a link", "ΔT = P t/ρcV", "balance of energy", "temperature [°C]", "cell", at=range(12), rtol=1e-12,
-)  # fmt: skip
+    "A power warms all of a link", "ΔT = P t/ρcV", "balance of energy", "temperature [°C]", "cell", at=range(12), rtol=1e-12
+)
 def power_of_a_link():
     sensor = {"cells": [2, 2, 3], "material": "steel", "source": {"power": "500 mW"}}
     *_, last = heated({"block": [0.01, 0.02, 0.03]}, sensor, 0.1, 50)
@@ -148,10 +143,8 @@ def effusivity(material: dict[str, Any]) -> float:
 
 
 @oracle(
-    "Two bodies in contact, after {seconds:g} s",
-    "T_c = (e₁T₁ + e₂T₂)/(e₁ + e₂), ΔT = ΔT_c erfc(x/√4αt), e = √(kρc)", "Carslaw and Jaeger 2.14",
-    "rise of temperature [K]", "depth [m]", defects=(13,),
-    each=[1000], also=[400], slow=[1000],
+    "Two bodies in contact, after {seconds:g} s", "T_c = (e₁T₁ + e₂T₂)/(e₁ + e₂), ΔT = ΔT_c erfc(x/√4αt), e = √(kρc)",
+    "Carslaw and Jaeger 2.14", "rise of temperature [K]", "depth [m]", defects=(13,), each=[1000], also=[400], slow=[1000],
 )  # fmt: skip
 def two_bodies(steps: int, dt: float = 0.0005):
     rise = 23.0 * effusivity(HARD_RUBBER) / (effusivity(ALLOY) + effusivity(HARD_RUBBER))
@@ -168,9 +161,8 @@ def two_bodies(steps: int, dt: float = 0.0005):
 
 
 @oracle(
-    "Heat between two solids, αΔt/Δ² = {fourier:.2g}", "Q = A √(kρc) (T₂ − T₁) √(t/π)", "Carslaw and Jaeger 2.14",
-    "heat [J]", at=["after {seconds:g} s"], rtol=0.01, defects=(13,),
-    each=[(1e-3, 80), (2.5e-4, 200), (1.25e-4, 320)],
+    "Heat between two solids, αΔt/Δ² = {fourier:.2g}", "Q = A √(kρc) (T₂ − T₁) √(t/π)", "Carslaw and Jaeger 2.14", "heat [J]",
+    at=["after {seconds:g} s"], rtol=0.01, defects=(13,), each=[(1e-3, 80), (2.5e-4, 200), (1.25e-4, 320)],
 )  # fmt: skip
 def two_solids(cell: float, num: int, dt: float = 0.005, seconds: float = 0.4):
     area, steps, sides = 4e-4, round(seconds / dt), [0.02, 0.02, num * cell]
@@ -186,8 +178,7 @@ def two_solids(cell: float, num: int, dt: float = 0.005, seconds: float = 0.4):
 
 @oracle(
     "Heat through a spot in long steps, αΔt/Δ² = {fourier:.2g}", "Q", "the same cells in steps of 2 ms", "heat [J]",
-    at=["after {seconds:g} s"], rtol=0.05, defects=(13,),
-    each=[(8, 0.2)], also=[(4, 1.0), (12, 1.0)],
+    at=["after {seconds:g} s"], rtol=0.05, defects=(13,), each=[(8, 0.2)], also=[(4, 1.0), (12, 1.0)],
 )  # fmt: skip
 def spot_in_long_steps(num: int, dt: float, seconds: float = 2.0):
     sensor = {"cells": [num] * 3, "material": "aluminium", "contact_area": "10 mm2"}
@@ -221,8 +212,8 @@ def greens_function():
 
 
 @oracle(
-    "The Green's function of a lattice's half-space, 20 cells off", "2πr g → 1", "the potential of a point source",
-    "2πr g [1]", at=["20 cells off"], rtol=1e-3,
+    "The Green's function of a lattice's half-space, 20 cells off", "2πr g → 1", "the potential of a point source", "2πr g [1]",
+    at=["20 cells off"], rtol=1e-3,
 )  # fmt: skip
 def greens_function_far_off():
     return 1.0, half_space(21)[20, 0] * 2 * np.pi * 20
@@ -230,8 +221,8 @@ def greens_function_far_off():
 
 @oracle(
     "A circular spot on cells of {cell:g} radii", "G = 4ka", "Carslaw and Jaeger 8.2",
-    "conductance, of unit cells that conduct 1 [1]", "place in the cell", rtol=0.02, defects=(15,),
-    each=[0.5, 1.0, 4.0], also=[0.25, 0.35, 0.7, 1.4, 2.0, 2.8, 8.0],
+    "conductance, of unit cells that conduct 1 [1]", "place in the cell", rtol=0.02, defects=(15,), each=[0.5, 1.0, 4.0],
+    also=[0.25, 0.35, 0.7, 1.4, 2.0, 2.8, 8.0],
 )  # fmt: skip
 def circular_spot(cell: float):
     # The half-space is a lattice known by its Green's function: what the spot's conductances leave to it is solved.

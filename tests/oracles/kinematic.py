@@ -3,8 +3,6 @@
 A box comes down on a probe at the origin of its link, 4 mm deep; its face looks down, so the contact's normal is −z.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -68,8 +66,7 @@ def rolling():
 
 
 @oracle(
-    "Torque about the {about}", "{equation}", SOURCE,
-    "torque [N·m]", at=["x", "y", "z"], atol=1e-12, defects=(4,),
+    "Torque about the {about}", "{equation}", SOURCE, "torque [N·m]", at=["x", "y", "z"], atol=1e-12, defects=(4,),
     each=[("link", "τ = x × f + k_ω (ω·m) m"), ("taxel", "τ = k_ω (ω·m) m")],
 )  # fmt: skip
 def lever(about: str, equation: str):
@@ -80,8 +77,7 @@ def lever(about: str, equation: str):
 
 @oracle(
     "Friction ends at the cone, model {model}", "|f_t| = min(k_t v, μ f_n)", "Coulomb's law", "force [N]", "speed [m/s]",
-    is_log=True, rtol=1e-12, series=FORCES, defects=(2,),
-    each=["tgdsl"], also=["paper"],
+    is_log=True, rtol=1e-12, series=FORCES, defects=(2,), each=["tgdsl"], also=["paper"],
 )  # fmt: skip
 def cone(model: str = "tgdsl", friction: float = 0.4):
     speeds = np.array([0.01, 0.1, 1.0, 100.0])
@@ -97,8 +93,8 @@ def cone(model: str = "tgdsl", friction: float = 0.4):
 
 
 @oracle(
-    "A pad sums to the law of its taxels, not to the load", "|f_j| = k_n d_j^α", SOURCE, "force [N]", "taxel",
-    at=range(36), rtol=1e-12,
+    "A pad sums to the law of its taxels, not to the load", "|f_j| = k_n d_j^α", SOURCE, "force [N]", "taxel", at=range(36),
+    rtol=1e-12,
 )  # fmt: skip
 def flat_pad():
     line = np.linspace(-0.025, 0.025, 6)
@@ -112,8 +108,7 @@ def flat_pad():
 
 @oracle(
     "Winkler: a ball on a dense pad, α = {alpha:g}", "F = k 2πB δ^(α+1)/((α+1) A)", "Johnson 1985, 4.3, of a power law",
-    "force [N]", "depth [m]", is_log=True, rtol=0.02, defects=(1,),
-    each=[1.0, 1.2], also=[1.5],
+    "force [N]", "depth [m]", is_log=True, rtol=0.02, defects=(1,), each=[1.0, 1.2], also=[1.5],
 )  # fmt: skip
 def winkler(alpha: float):
     # Probes of radius R below the skin, a taxel on each area A. Of one at r from the axis the geometric depth is
@@ -134,8 +129,8 @@ def winkler(alpha: float):
 
 @oracle(
     "Winkler: the power of a ball's force is α + 1, α = {alpha:g}; Hertz has 1.5", "d log F/d log δ = α + 1",
-    "Johnson 1985, 4.3, of a power law", "exponent [1]", at=["0.1 to 0.2 mm", "0.2 to 0.4 mm"], atol=0.02,
-    each=[1.2], also=[1.0, 1.5],
+    "Johnson 1985, 4.3, of a power law", "exponent [1]", at=["0.1 to 0.2 mm", "0.2 to 0.4 mm"], atol=0.02, each=[1.2],
+    also=[1.0, 1.5],
 )  # fmt: skip
 def winkler_exponent(alpha: float):
     force = winkler(alpha)
@@ -171,8 +166,7 @@ def balanced_weight():
 
 @oracle(
     "Balanced taxels press with the solver's force, model {model}", "f_n = f_n,law Σ f_c·m/Σ f_n,law", "by definition",
-    "force [N]", "taxel", at=range(6), rtol=1e-12,
-    each=["tgdsl"], also=["paper"],
+    "force [N]", "taxel", at=range(6), rtol=1e-12, each=["tgdsl"], also=["paper"],
 )  # fmt: skip
 def balanced_shares(model: str = "tgdsl"):
     dragged = {**ABOVE, "linvel": [0.1, -0.3, 0.2], "angvel": [0, 0, 2]}

@@ -1,7 +1,5 @@
 """Contact mechanics: an elastic layer bonded to a rigid base, against solutions by wave number and the contact of a ball."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -52,8 +50,7 @@ def boundary_value(kt: float, nu: float, t: float = 2e-3):
 @oracle(
     "Burmister: a bonded layer under a pressure wave, ν = {nu:g}",
     "W = (1−ν)/Gk ((3−4ν) sinh 2x − 2x)/((3−4ν) cosh 2x + 2x² + 5 − 12ν + 8ν²), x = kt", "Burmister 1945; Johnson 1985, 5.8",
-    "displacement per pressure [m/Pa]", "kt [1]", at=WAVES, is_log=True, rtol=1e-9,
-    each=[0.0, 0.48, 0.5], also=[0.3],
+    "displacement per pressure [m/Pa]", "kt [1]", at=WAVES, is_log=True, rtol=1e-9, each=[0.0, 0.48, 0.5], also=[0.3],
 )  # fmt: skip
 def surface_response(nu: float, t: float = 2e-3):
     x = WAVES
@@ -63,17 +60,15 @@ def surface_response(nu: float, t: float = 2e-3):
 
 @oracle(
     "A bonded layer under a transverse shear wave, ν = {nu:g}", "u = τ tanh(kt)/Gk", "u'' = k²u, u = 0 at the base",
-    "displacement per traction [m/Pa]", "kt [1]", at=WAVES, is_log=True, rtol=1e-13,
-    each=[0.48], also=NUS,
+    "displacement per traction [m/Pa]", "kt [1]", at=WAVES, is_log=True, rtol=1e-13, each=[0.48], also=NUS,
 )  # fmt: skip
 def shear_wave(nu: float, t: float = 2e-3):
     return t * np.tanh(WAVES) / (G * WAVES), response(WAVES / t, Layer(t, 0.0, G, nu)).transverse
 
 
 @oracle(
-    "Betti: pressure and shear of a layer do the same to each other, ν = {nu:g}", "V(p) = W(τ)",
-    "Betti's reciprocal theorem", "displacement per traction [m/Pa]", "kt [1]", at=WAVES, is_log=True, rtol=1e-8,
-    each=[0.3], also=NUS,
+    "Betti: pressure and shear of a layer do the same to each other, ν = {nu:g}", "V(p) = W(τ)", "Betti's reciprocal theorem",
+    "displacement per traction [m/Pa]", "kt [1]", at=WAVES, is_log=True, rtol=1e-8, each=[0.3], also=NUS,
 )  # fmt: skip
 def reciprocity(nu: float, t: float = 2e-3):
     u = response(WAVES / t, Layer(t, 0.0, G, nu))
@@ -107,8 +102,8 @@ def _off_half_space(z: float, nu: float, t: float, a: float = 1e-3) -> float:
 
 @oracle(
     "A thick layer is the half-space, ν = {nu:g}, z = {z:mm}", "u of t = 0.5 m → u of t = ∞", "Johnson 1985, 3.18 and 3.75",
-    "largest difference of profiles over their scale [1]", at=["t = 0.5 m"], atol=0.005,
-    each=[(1e-3, 0.5)], also=product((0.0, 1e-3), (0.3, 0.5)),
+    "largest difference of profiles over their scale [1]", at=["t = 0.5 m"], atol=0.005, each=[(1e-3, 0.5)],
+    also=product((0.0, 1e-3), (0.3, 0.5)),
 )  # fmt: skip
 def thick(z: float, nu: float):
     return 0.0, _off_half_space(z, nu, 0.5)
@@ -117,8 +112,7 @@ def thick(z: float, nu: float):
 @oracle(
     "A layer approaches the half-space as 1/t, ν = {nu:g}, z = {z:mm}", "|u_t − u_∞| ∝ 1/t",
     "displacement of a point load at the distance t", "difference at t = 0.25 m over that at 0.5 m [1]", at=["0.25/0.5 m"],
-    rtol=0.1,
-    each=[(1e-3, 0.5)], also=product((0.0, 1e-3), (0.3, 0.5)),
+    rtol=0.1, each=[(1e-3, 0.5)], also=product((0.0, 1e-3), (0.3, 0.5)),
 )  # fmt: skip
 def thick_order(z: float, nu: float):
     return 2.0, _off_half_space(z, nu, 0.25) / _off_half_space(z, nu, 0.5)
@@ -145,8 +139,8 @@ def bonded_base():
 
 
 @oracle(
-    "An incompressible layer keeps its volume", "∫ u_z 2πr dr = 0 for ν = 1/2", "div u = 0",
-    "volume over ∫ |u_z| 2πr dr [1]", at=["ν = 1/2"], atol=1e-4,
+    "An incompressible layer keeps its volume", "∫ u_z 2πr dr = 0 for ν = 1/2", "div u = 0", "volume over ∫ |u_z| 2πr dr [1]",
+    at=["ν = 1/2"], atol=1e-4,
 )  # fmt: skip
 def no_volume():
     r = np.linspace(0.0, 0.03, 3001)
@@ -184,8 +178,7 @@ def hertz_force(num: int = 21, nu: float = 0.45, radius: float = 0.02):
 
 
 @oracle(
-    "A ball on an incompressible bonded layer",
-    "F = 16/9 E √R δ^1.5 (1 + 1.133χ + 1.497χ² + 1.469χ³ + 0.755χ⁴), χ = √(Rδ)/t",
+    "A ball on an incompressible bonded layer", "F = 16/9 E √R δ^1.5 (1 + 1.133χ + 1.497χ² + 1.469χ³ + 0.755χ⁴), χ = √(Rδ)/t",
     "Garcia and Garcia 2018, Biophys. J. 114:2923; the term of χ² by hand", "force [N]", "depth [m]", is_log=True, rtol=0.03,
 )  # fmt: skip
 def thin_layer_force(num: int = 21, radius: float = 0.02, t: float = 4e-3):

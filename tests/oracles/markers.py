@@ -3,8 +3,6 @@
 "The paper" is `model: paper` with `normalize: peak`, the formula as printed.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -54,8 +52,8 @@ def dilation():
 
 
 @by_hand(
-    "Dilation as the paper prints it, model paper", "u = s_d (r h (c g/ḡ + (1−c) ρ/ρ̄) + n h^α g)", at=NAMES[3:],
-    rtol=1e-12, atol=1e-18, defects=(23,),
+    "Dilation as the paper prints it, model paper", "u = s_d (r h (c g/ḡ + (1−c) ρ/ρ̄) + n h^α g)", at=NAMES[3:], rtol=1e-12,
+    atol=1e-18, defects=(23,),
 )  # fmt: skip
 def dilation_as_printed():
     ours = pressed(model="paper", normalize="peak", compressibility=0.3, dilation_strength=7)[1]
@@ -190,8 +188,7 @@ def _means(n: int, fields: dict[str, Any]) -> list[float]:
 
 @oracle(
     "Twice the taxels change nothing, kernel {kernel}", "mean |u| of 17², 24² taxels over that of 12²",
-    "sums are integrals over the area", "ratio of means [1]", rtol=0.02, defects=(9,),
-    each=list(SKINS),
+    "sums are integrals over the area", "ratio of means [1]", rtol=0.02, defects=(9,), each=list(SKINS),
 )  # fmt: skip
 def resolution(kernel: str):
     nums = (12, 17, 24)

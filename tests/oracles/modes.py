@@ -4,8 +4,6 @@ Wave numbers are κ = ω L/c with c = √(E/ρ) and the longest side L of the bo
 much: tolerances are what the meshes leave, at most 2 %.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -26,8 +24,8 @@ oracle = field("sound: modes of bodies", "contact_audio")
 
 
 @oracle(
-    "A slender beam bends, both ends free", "κ = (βL)² √(I/A)/L, cos βL cosh βL = 1", "Bernoulli and Euler",
-    "wave number [1]", "mode", at=range(1, 6), rtol=0.01,
+    "A slender beam bends, both ends free", "κ = (βL)² √(I/A)/L, cos βL cosh βL = 1", "Bernoulli and Euler", "wave number [1]",
+    "mode", at=range(1, 6), rtol=0.01,
 )  # fmt: skip
 def slender_beam(length: float = 0.5, height: float = 0.0125, width: float = 0.008):
     beta = roots(lambda b: np.cos(b) - 1 / np.cosh(b), 3.5, 12.0)
@@ -71,8 +69,7 @@ def all_modes(surface: Surface, cell: float, poissons_ratio: float, count: int) 
 
 @oracle(
     "All modes of a ball, ν = {poissons_ratio:g}", "spheroidal modes, torsion, breathing: no traction on the surface",
-    "Lamb 1882", "wave number [1]", "mode", at=range(1, 25), rtol=0.01,
-    each=[0.3, 0.4999], also=[0.0],
+    "Lamb 1882", "wave number [1]", "mode", at=range(1, 25), rtol=0.01, each=[0.3, 0.4999], also=[0.0],
 )  # fmt: skip
 def modes_of_a_ball(poissons_ratio: float):
     shear = 1 / np.sqrt(2 * (1 + poissons_ratio))
@@ -102,9 +99,8 @@ SCALES = (1.0, 0.3, 17.0)
 
 
 @oracle(
-    "Frequencies scale by stiffness, density and size", "f ∝ √(E/ρ)/L", "similar bodies", "frequency [Hz]", "mode",
-    rtol=1e-6, at=range(1, 9), series=[f"{scale:g} times as long" for scale in SCALES],
-    also=[((0.2, 0.02, 0.012),)], slow=[()],
+    "Frequencies scale by stiffness, density and size", "f ∝ √(E/ρ)/L", "similar bodies", "frequency [Hz]", "mode", rtol=1e-6,
+    at=range(1, 9), series=[f"{scale:g} times as long" for scale in SCALES], also=[((0.2, 0.02, 0.012),)], slow=[()],
 )  # fmt: skip
 def scaled(sides: tuple[float, ...] = (0.06, 0.05, 0.04)):
     steel = MATERIALS["steel"]
@@ -123,8 +119,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @oracle(
     "Blows along a beam that bends, mode {mode}",
     "φ = cos βx / cos ½βL + cosh βx / cosh ½βL, odd: sin and sinh; over that of an end", "Bernoulli and Euler",
-    "gain at the contact, over that at an end [1]", "place from the middle over the length [1]", atol=0.01,
-    each=[0, 1],
+    "gain at the contact, over that at an end [1]", "place from the middle over the length [1]", atol=0.01, each=[0, 1],
 )  # fmt: skip
 def struck_along_a_beam(number: int, length: float = 0.4, height: float = 0.006, width: float = 0.01):
     node = max(roots(lambda at: bending(at, number), 0.1, 0.49))

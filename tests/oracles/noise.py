@@ -3,8 +3,6 @@
 Statistics are given in standard errors, or as √N times the largest distance of distributions (Kolmogorov and Smirnov).
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -82,11 +80,9 @@ def drift_distribution(sigma: float = 1e-3):
 
 
 @statistics(
-    "The quantiser's error is uniform",
-    "var = q²/12, |ε| ≤ q/2",
-    "Bennett 1948",
+    "The quantiser's error is uniform", "var = q²/12, |ε| ≤ q/2", "Bennett 1948",
     at=["mean", "variance", "within half a step, on the grid"],
-)
+)  # fmt: skip
 def quantiser(step: float = 0.01):
     t = np.linspace(0, 1, NUM).reshape(SIDE, SIDE, 1)
     signal = 3 * np.sin(7 * t) + t

@@ -3,8 +3,6 @@
 S0 = ∫ (R − |p − q|)₊ dA, S1 = ∫ (R − |p − q|)₊ (p − q) dA over the points p of a surface, q the probe.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -149,8 +147,7 @@ def plane_integral(heights: tuple[float, ...] = (0.0, 0.003, -0.003, 0.0099, 0.0
 @oracle(
     "Moments of a {solid}", "S0, S1", "one-dimensional quadrature over the ball; midpoint sums over the box's faces",
     "RMS error over full scale, over what is allowed [1]",
-    at=["S0 of sums", "S1 of sums", "S0 of the field", "S1 of the field"], atol=1.0,
-    each=["ball", "box"], slow=True,
+    at=["S0 of sums", "S1 of sums", "S0 of the field", "S1 of the field"], atol=1.0, each=["ball", "box"], slow=True,
 )  # fmt: skip
 def solid_moments(solid: str):
     if solid == "ball":
@@ -167,8 +164,7 @@ def solid_moments(solid: str):
 
 @oracle(
     "Sampled points err by the root of their number", "ε ∝ 1/√N", "variance of a sum over independent points",
-    "error of 5,000 over that of 100,000 points [1]", at=["S0"], rtol=0.4,
-    slow=True,
+    "error of 5,000 over that of 100,000 points [1]", at=["S0"], rtol=0.4, slow=True,
 )  # fmt: skip
 def sampling_noise():
     pos = places(200)
@@ -242,8 +238,8 @@ def plane_at_the_side(about: str, d: float = 0.006):
 
 
 @oracle(
-    "Slip drags the sensor along with the object", "f_t = k_s ρ S0 v_t", SOURCE,
-    "change of force [N], torque [N·m] []", at=CHANNELS, atol=1e-12, defects=(3,),
+    "Slip drags the sensor along with the object", "f_t = k_s ρ S0 v_t", SOURCE, "change of force [N], torque [N·m] []",
+    at=CHANNELS, atol=1e-12, defects=(3,),
 )  # fmt: skip
 def slip():
     at: dict[str, Any] = {"pos": [0, 0, -0.026]}

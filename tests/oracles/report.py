@@ -1,7 +1,5 @@
 """The sheets of `tgdsl bench --oracles` and `--hard`: every registered comparison and hard case that is reported."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any

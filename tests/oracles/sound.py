@@ -4,8 +4,6 @@
 rise of the force ΔF with ΔF Δt, of which the paper gives no formula.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -33,9 +31,8 @@ def times(samples: int, num_steps: int) -> np.ndarray:
 
 
 @contact(
-    "Three modes ring down after an impulse", "s = J Σ g e^(−dt) sin 2πft", IMPULSE_RESPONSE,
-    "velocity of the surface [m/s]", "time [s]",
-    each=[torch.float64, torch.float32],
+    "Three modes ring down after an impulse", "s = J Σ g e^(−dt) sin 2πft", IMPULSE_RESPONSE, "velocity of the surface [m/s]",
+    "time [s]", each=[torch.float64, torch.float32],
 )  # fmt: skip
 def ring_down(dtype: torch.dtype):
     ours = sound(temporary(plate, dtype, samples=16), [*STRIKE, *[0.0] * 60])[0]
@@ -46,9 +43,8 @@ def ring_down(dtype: torch.dtype):
 
 
 @contact(
-    "Two modes ring for 1,000,000 samples", "s = J Σ g e^(−dt) sin 2πft", IMPULSE_RESPONSE,
-    "velocity of the surface [m/s]", "time [s]",
-    each=[], also=[torch.float64, torch.float32],
+    "Two modes ring for 1,000,000 samples", "s = J Σ g e^(−dt) sin 2πft", IMPULSE_RESPONSE, "velocity of the surface [m/s]",
+    "time [s]", each=[], also=[torch.float64, torch.float32],
 )  # fmt: skip
 def million_samples(dtype: torch.dtype):
     modes, step = [{"frequency": 437.1, "decay": 1.0, "gain": 1.0}, {"frequency": 12345.6, "decay": 0.4, "gain": 0.5}], 0.05
@@ -94,8 +90,7 @@ def response_by_frequency():
 
 @contact(
     "{samples} samples per step are those of 20 at common times, struck and scraped, float32", "s(t) does not depend on K",
-    "the same sound at another rate", "velocity of the surface [m/s]", "time [s]", of_peak=1e-4,
-    each=[10, 40], also=[7],
+    "the same sound at another rate", "velocity of the surface [m/s]", "time [s]", of_peak=1e-4, each=[10, 40], also=[7],
 )  # fmt: skip
 def common_times(samples: int):
     forces, common = np.abs(np.sin(np.arange(24))) * 4, math.gcd(20, samples)
@@ -105,9 +100,8 @@ def common_times(samples: int):
 
 
 @contact(
-    "A collision of {duration:ms} strikes once, with its impulse, at any time step", "J = ∫F dt", "momentum",
-    "impulse [N·s]", "time step [s]", is_log=True,
-    each=[0.0005, 0.002], also=[0.004], slow=[0.002],
+    "A collision of {duration:ms} strikes once, with its impulse, at any time step", "J = ∫F dt", "momentum", "impulse [N·s]",
+    "time step [s]", is_log=True, each=[0.0005, 0.002], also=[0.004], slow=[0.002],
 )  # fmt: skip
 def collision(duration: float):
     modes, ours, paper = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}], [], []
@@ -173,8 +167,8 @@ def spectrum_of(samples: np.ndarray) -> np.ndarray:
 
 
 @motors(
-    "A whine's partials are at multiples of κ|ω|", "ℓ a_h, ℓ = β_load |τ| + β_pow |τω|",
-    "the paper's level and pitch; Fourier", "amplitude [Pa]", rtol=1e-6,
+    "A whine's partials are at multiples of κ|ω|", "ℓ a_h, ℓ = β_load |τ| + β_pow |τω|", "the paper's level and pitch; Fourier",
+    "amplitude [Pa]", rtol=1e-6,
 )  # fmt: skip
 def partials(speed: float = 8.0, effort: float = -0.3):
     touch = temporary(motor, load=0.02, power=0.05, partials=[1.0, 0.5, 0.25])
@@ -189,8 +183,7 @@ def partials(speed: float = 8.0, effort: float = -0.3):
 
 @motors(
     "A whine glides, phase and level", "s = β (1 + 2t) sin 2πκ(ω₀t + αt²/2)", "integral of the frequency",
-    "pressure at 1 m [Pa]", "time [s]", atol=1e-9,
-    each=[100], also=[400],
+    "pressure at 1 m [Pa]", "time [s]", atol=1e-9, each=[100], also=[400],
 )  # fmt: skip
 def glide(num_steps: int):
     steps = np.arange(num_steps) * STEP
@@ -211,8 +204,8 @@ def fading():
 
 
 @motors(
-    "A motor hums at rest", "s = a sin 2πft", "by definition", "pressure at 1 m [Pa]", "time [s]", atol=1e-9,
-    each=[40], also=[200],
+    "A motor hums at rest", "s = a sin 2πft", "by definition", "pressure at 1 m [Pa]", "time [s]", atol=1e-9, each=[40],
+    also=[200],
 )  # fmt: skip
 def hum(num_steps: int):
     time = times(20, num_steps)
@@ -221,9 +214,8 @@ def hum(num_steps: int):
 
 
 @motors(
-    "Noise of friction has one spectral density at every rate", "S = (β ω)²",
-    "mean square of white noise over half the rate", "spectral density [Pa²/Hz]", "sample rate", at=["20 kHz", "40 kHz"],
-    rtol=0.03,
+    "Noise of friction has one spectral density at every rate", "S = (β ω)²", "mean square of white noise over half the rate",
+    "spectral density [Pa²/Hz]", "sample rate", at=["20 kHz", "40 kHz"], rtol=0.03,
 )  # fmt: skip
 def friction():
     ours = []

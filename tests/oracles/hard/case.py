@@ -1,7 +1,5 @@
 """Numerical hard cases: a decorated function returns the error of each part in one precision."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,17 +16,11 @@ HARD: list[Case] = []
 
 
 class Errors(NamedTuple):
-    """What a hard case computes in one precision.
-
-    Attributes:
-        values: Error of each part; infinite or not-a-number where a reading is not finite.
-        parts: Names of the parts, if the decorator does not give them.
-        most: Largest allowed error, if the decorator does not give it.
-    """
+    """Errors in one precision, the largest allowed one, and the parts' names, if these depend on the arguments."""
 
     values: Any
-    parts: Sequence[str] | None = None
-    most: float | None = None
+    most: float
+    parts: Sequence[str] = ()
 
 
 class Allowed(NamedTuple):
@@ -45,17 +37,7 @@ class Allowed(NamedTuple):
 
 @dataclass(frozen=True)
 class HardCase:
-    """Errors of one risk.
-
-    Attributes:
-        name: One line.
-        risk: What could go wrong.
-        reference: What readings are compared with.
-        unit: Unit of the errors: "of full scale", "m", or the name of what is counted.
-        parts: What it was tried on: kinds, shapes, time steps.
-        errors: By precision, `float64` or `float32`.
-        defects: Numbers of the findings in `tgdsl.report.defects` that it answers.
-    """
+    """Errors of one risk by precision, `float64` or `float32`; see `hard` for the other fields."""
 
     name: str
     risk: str
@@ -77,42 +59,41 @@ class HardCase:
 
 
 def hard(
-    section: str, name: str, risk: str, reference: str, unit: str, parts: Sequence[str] = (), *, float64: float | None = 0.0,
-    float32: float | None = 0.0, defects: Sequence[int] = (), each: Iterable = ((),), also: Iterable = (),
+    section: str, name: str, risk: str, reference: str, unit: str, parts: Sequence[str] | Mapping[str, Any] = (), *,
+    float64: float | None = 0.0, float32: float | None = 0.0, defects: Sequence[int] = (), each: Iterable = ((),),
+    also: Iterable = (),
 ) -> Callable[[Callable], Callable[..., HardCase]]:  # fmt: skip
     """Register a function of a dtype that returns errors, or `Errors`, and let it return a `HardCase`.
 
-    Args:
-        section: Section of the report.
-        name: See `HardCase`, also for `risk`, `reference`, `unit`, `parts` and `defects`; arguments in braces are filled in.
-        risk: What could go wrong.
-        reference: What readings are compared with.
-        unit: Unit of the errors.
-        parts: Names of the parts.
-        float64: Largest allowed error; None: not tried in this precision.
-        float32: The same in float32.
-        defects: Findings that it answers.
-        each: Arguments of each row of the report: tuples, or single arguments.
-        also: Arguments that tests check in addition.
+    `name` and `risk`, what could go wrong, may contain the function's arguments in braces. `reference` is what readings are
+    compared with, `unit` that of the errors: "of full scale", "m", or the name of what is counted. `parts` name what it is
+    tried on; of a mapping the function is called with each value after the dtype, and returns one error. `float64` and
+    `float32` are the largest allowed errors; None: not tried. `defects`, `each` and `also` as in `oracle`.
     """
 
     def decorate(function: Callable) -> Callable[..., HardCase]:
         signature = inspect.signature(function)
 
+        def errors_of(dtype: torch.dtype, *arguments: Any) -> Any:
+            if not isinstance(parts, Mapping):
+                return function(dtype, *arguments)
+            results = [function(dtype, part, *arguments) for part in parts.values()]
+            is_limited = isinstance(results[0], Errors)
+            return Errors([own.values for own in results], results[0].most) if is_limited else results
+
         @wraps(function)
-        def run(*args: Any) -> HardCase:
-            bound = signature.bind(None, *args)
+        def run(*arguments: Any) -> HardCase:
+            bound = signature.bind(*([None] * (1 + isinstance(parts, Mapping))), *arguments)
             bound.apply_defaults()
-            names, errors = parts, {}
+            errors, names = {}, parts
             for precision, most in (("float64", float64), ("float32", float32)):
-                if most is None:
-                    continue
-                result = function(DTYPES[precision], *args)
-                result = result if isinstance(result, Errors) else Errors(result)
-                names = result.parts or names
-                errors[precision] = Allowed(np.array(result.values, dtype=float), most if result.most is None else result.most)
-            filled = (text.format(**bound.arguments) for text in (name, risk, reference, unit))
-            return HardCase(*filled, tuple(names), errors, tuple(defects))
+                if most is not None:
+                    result = errors_of(DTYPES[precision], *arguments)
+                    result = result if isinstance(result, Errors) else Errors(result, most)
+                    names = result.parts or names
+                    errors[precision] = Allowed(np.array(result.values, dtype=float), result.most)
+            title, danger = name.format(**bound.arguments), risk.format(**bound.arguments)
+            return HardCase(title, danger, reference, unit, tuple(names), errors, tuple(defects))
 
         run.defects = defects
         HARD.extend(cases_of(section, run, each, also))

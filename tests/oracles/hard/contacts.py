@@ -1,7 +1,5 @@
 """What is hard for contacts, memory and time: thousands of contacts, steps from 1 µs to 10 s, noise, resets, bytes."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import partial
 from typing import Any
@@ -24,7 +22,6 @@ from tgdsl.module.state import SceneState
 
 STEPS = (1e-6, 1e-4, 1e-2, 1.0, 10.0)
 """Seconds between calls."""
-LATE_STEPS = (1e-4, *STEPS[2:])
 hard = partial(case.hard, "contacts, time and memory")
 
 
@@ -63,45 +60,35 @@ def beyond_the_slots(dtype: torch.dtype):
 
 @hard(
     "calls from 1 µs to 10 s apart: {kind}", "memory that depends on the step, or overflows", "the kind's float64 definition",
-    "of full scale", [f"{dt:g} s" for dt in STEPS], each=["temperature_grid"],
+    "of full scale", {f"{dt:g} s": dt for dt in STEPS}, each=["temperature_grid"],
 )  # fmt: skip
-def memory_over_steps(dtype: torch.dtype, kind: str):
-    most, errors = 1e-9 if dtype == torch.float64 else 1e-5, []
-    for dt in STEPS:
-        pair, worst = pair_of(kind, dtype), 0.0
-        for call in range(4):
-            scene = dataclasses.replace(pair.module.example_state(3, seed=call), dt=dt)
-            worst = max(worst, worst_of(pair, scene, enough=most))
-        errors.append(worst)
-    return Errors(errors, most=most)
+def memory_over_steps(dtype: torch.dtype, dt: float, kind: str):
+    most, pair, worst = 1e-9 if dtype == torch.float64 else 1e-5, pair_of(kind, dtype), 0.0
+    for call in range(4):
+        scene = dataclasses.replace(pair.module.example_state(3, seed=call), dt=dt)
+        worst = max(worst, worst_of(pair, scene, enough=most))
+    return Errors(worst, most)
 
 
 @hard(
     "calls from 1 µs to 10 s apart: hysteresis", "1 − e^(−Δt/τ) loses its digits, or the branch depends on the step",
-    "the Maxwell branch's closed form", "of full scale", [f"{dt:g} s" for dt in STEPS], float64=1e-11, float32=1e-4,
+    "the Maxwell branch's closed form", "of full scale", {f"{dt:g} s": dt for dt in STEPS}, float64=1e-11, float32=1e-4,
     defects=(21,),
 )  # fmt: skip
-def hysteresis_over_steps(dtype: torch.dtype):
-    errors = []
-    for dt in STEPS:
-        t, speed = dt * np.arange(100), 3.0 / dt
-        exact = speed * t + STRENGTH * speed * TAU * (1 - np.exp(-t / TAU))
-        readings = one(Noise(BRANCH, dtype=dtype), (speed * t).tolist(), dt)[:, 0]
-        errors.append(np.abs(readings - exact).max() / np.abs(exact).max())
-    return errors
+def hysteresis_over_steps(dtype: torch.dtype, dt: float):
+    t, speed = dt * np.arange(100), 3.0 / dt
+    exact = speed * t + STRENGTH * speed * TAU * (1 - np.exp(-t / TAU))
+    return np.abs(one(Noise(BRANCH, dtype=dtype), (speed * t).tolist(), dt)[:, 0] - exact).max() / np.abs(exact).max()
 
 
 @hard(
     "calls from 0.1 ms to 10 s apart: delay", "a delay counted in calls", "x(t − Δ)", "of the time",
-    [f"{dt:g} s" for dt in LATE_STEPS], float64=1e-14, float32=1e-6, defects=(19,),
+    {f"{dt:g} s": dt for dt in (1e-4, *STEPS[2:])}, float64=1e-14, float32=1e-6, defects=(19,),
 )  # fmt: skip
-def delay_over_steps(dtype: torch.dtype, late: float = 5.3e-3):
-    errors = []
-    for dt in LATE_STEPS:
-        clock = dt * np.arange(60)
-        readings = one(Noise({"read_delay": late}, dt=dt, dtype=dtype), clock.tolist(), dt)[:, 0]
-        errors.append(np.abs(readings - np.maximum(clock - late, 0)).max() / clock.max())
-    return errors
+def delay_over_steps(dtype: torch.dtype, dt: float, late: float = 5.3e-3):
+    clock = dt * np.arange(60)
+    readings = one(Noise({"read_delay": late}, dt=dt, dtype=dtype), clock.tolist(), dt)[:, 0]
+    return np.abs(readings - np.maximum(clock - late, 0)).max() / clock.max()
 
 
 NOISY: dict[str, Any] = {
@@ -162,17 +149,16 @@ SENSORS: dict[str, tuple[dict[str, Any], int]] = {
 
 
 @hard(
-    "state of terms that are off", "memory that is never used", "counted by hand", "bytes per taxel", tuple(SENSORS),
-    float64=None, defects=(17, 18),
+    "state of terms that are off", "memory that is never used", "counted by hand", "bytes per taxel", SENSORS, float64=None,
+    defects=(17, 18),
 )  # fmt: skip
-def bytes_of_state(dtype: torch.dtype):
-    probes, excess = [(0.001 * i, 0.0, 0.02) for i in range(10)], []
-    for sensor, needed in SENSORS.values():
-        touch = probed(probes, BALL, kind="kinematic_taxel", outputs=["force"], dtype=dtype, **sensor)
-        touch(_of_envs(touch, 2, 0.025))
-        per_row = [b for n, b in touch.memory.named_buffers() if b.is_floating_point() and b.ndim > 2]
-        excess.append(sum(b[0].numel() * b.element_size() for b in per_row) / len(probes) - needed)
-    return excess
+def bytes_of_state(dtype: torch.dtype, part: tuple[dict[str, Any], int]):
+    sensor, needed = part
+    probes = [(0.001 * i, 0.0, 0.02) for i in range(10)]
+    touch = probed(probes, BALL, kind="kinematic_taxel", outputs=["force"], dtype=dtype, **sensor)
+    touch(_of_envs(touch, 2, 0.025))
+    per_row = [b for n, b in touch.memory.named_buffers() if b.is_floating_point() and b.ndim > 2]
+    return sum(b[0].numel() * b.element_size() for b in per_row) / len(probes) - needed
 
 
 TACTILE = """
@@ -222,7 +208,8 @@ def tactile_depth(shape: str) -> tuple[float, int]:
 
 @hard(
     "a turned pad off its centre of mass", "a wrong frame of the taxels", "MuJoCo's tactile sensor", "m",
-    tuple(TACTILE_SHAPES), float64=TACTILE_TOLERANCE, float32=None, defects=(22,),
+    dict(zip(TACTILE_SHAPES, TACTILE_SHAPES, strict=True)), float64=TACTILE_TOLERANCE, float32=None, defects=(22,),
 )  # fmt: skip
-def tactile_frames(dtype: torch.dtype):
-    return [worst if num > 500 else np.nan for worst, num in map(tactile_depth, TACTILE_SHAPES)]
+def tactile_frames(dtype: torch.dtype, shape: str):
+    worst, num_touched = tactile_depth(shape)
+    return worst if num_touched > 500 else np.nan

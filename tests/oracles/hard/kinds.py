@@ -1,10 +1,7 @@
 """What is hard for any kind: places far away, motion, sizes, contacts as no solver finds them, broken environments."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import torch
@@ -25,7 +22,6 @@ FLOAT32, FLOAT64, FAR = 1e-5, 1e-11, 1e-9
 READ_BY = {"contact_audio": ("contact_force",), "actuation_audio": ("joint_vel",)}
 """Fields to break for kinds that read no poses."""
 Change = Callable[[SceneState], SceneState]
-hard = partial(case.hard, "every kind")
 
 
 def _unchanged(state: SceneState) -> SceneState:
@@ -88,7 +84,11 @@ CHANGES = (
 """Name, risk, change of the state; whether the reference reads the changed state; error in float64, scale, kinds."""
 
 
-@hard("{name}", "{risk}", "the kind's float64 definition", "of full scale", each=CHANGES)
+def _in_all_kinds(name: str, risk: str, reference: str, unit: str, **limits):
+    return case.hard("every kind", name, risk, reference, unit, dict(zip(NAMES, NAMES, strict=True)), **limits)
+
+
+@case.hard("every kind", "{name}", "{risk}", "the kind's float64 definition", "of full scale", each=CHANGES)
 def against_reference(
     dtype: torch.dtype, name: str, risk: str, change: Change, is_truth: bool = True, float64: float = FLOAT64,
     scale: float = 1.0, kinds: tuple[str, ...] = NAMES,
@@ -101,93 +101,77 @@ def against_reference(
             changed = change(state)
             worst = max(worst, worst_of(pair, changed, changed if is_truth else state, most))
         errors.append(worst)
-    return Errors(errors, kinds, most)
+    return Errors(errors, most, kinds)
 
 
-@hard(
+@_in_all_kinds(
     "not-a-number in one environment", "it spreads to others, or is read as no contact", "the same states unbroken",
-    "units of the reading", NAMES,
+    "units of the reading",
 )  # fmt: skip
-def one_broken_environment(dtype: torch.dtype):
-    errors = []
-    for kind in NAMES:
-        whole, broken = pair_of(kind, dtype).module, pair_of(kind, dtype).module
-        worst = 0.0
-        for call in range(NUM_CALLS):
-            state = whole.example_state(3, seed=call)
-            parts = {name: getattr(state, name).clone() for name in READ_BY.get(kind, ("body_pos", "body_quat"))}
-            for part in parts.values():
-                part[1] = torch.nan
-            with quiet():
-                expected = whole(state)["s"]
-                reading = broken(dataclasses.replace(state, **parts))["s"]
-            worst = max(worst, float((reading[[0, 2]] - expected[[0, 2]]).abs().max()))
-            is_seen = bool(reading[1].isnan().any())
-        errors.append(worst if is_seen else np.inf)
-    return errors
+def one_broken_environment(dtype: torch.dtype, kind: str):
+    whole, broken = pair_of(kind, dtype).module, pair_of(kind, dtype).module
+    worst = 0.0
+    for call in range(NUM_CALLS):
+        state = whole.example_state(3, seed=call)
+        parts = {name: getattr(state, name).clone() for name in READ_BY.get(kind, ("body_pos", "body_quat"))}
+        for part in parts.values():
+            part[1] = torch.nan
+        with quiet():
+            expected = whole(state)["s"]
+            reading = broken(dataclasses.replace(state, **parts))["s"]
+        worst = max(worst, float((reading[[0, 2]] - expected[[0, 2]]).abs().max()))
+        is_seen = bool(reading[1].isnan().any())
+    return worst if is_seen else np.inf
 
 
-@hard(
-    "one environment at a time", "an environment sees others of its batch", "the batch as a whole", "of full scale", NAMES,
+@_in_all_kinds(
+    "one environment at a time", "an environment sees others of its batch", "the batch as a whole", "of full scale",
     float64=1e-13, float32=1e-6,
 )  # fmt: skip
-def split_batches(dtype: torch.dtype, num_envs: int = 3):
-    errors = []
-    for kind in NAMES:
-        whole, singles = pair_of(kind, dtype).module, [pair_of(kind, dtype).module for _ in range(num_envs)]
-        worst = 0.0
-        for call in range(NUM_CALLS):
-            state = whole.example_state(num_envs, seed=call)
-            with quiet():
-                together = whole(state)["s"].double()
-                alone = torch.cat([one(only(state, slice(i, i + 1)))["s"] for i, one in enumerate(singles)]).double()
-            worst = max(worst, float((together - alone).abs().max() / together.abs().max().clamp(min=1e-300)))
-        errors.append(worst)
-    return errors
+def split_batches(dtype: torch.dtype, kind: str, num_envs: int = 3):
+    whole, singles = pair_of(kind, dtype).module, [pair_of(kind, dtype).module for _ in range(num_envs)]
+    worst = 0.0
+    for call in range(NUM_CALLS):
+        state = whole.example_state(num_envs, seed=call)
+        with quiet():
+            together = whole(state)["s"].double()
+            alone = torch.cat([one(only(state, slice(i, i + 1)))["s"] for i, one in enumerate(singles)]).double()
+        worst = max(worst, float((together - alone).abs().max() / together.abs().max().clamp(min=1e-300)))
+    return worst
 
 
-@hard(
+@_in_all_kinds(
     "{num_envs:,} environments", "indices overflow, or an environment reads another's row", "three environments alone",
-    "of full scale", NAMES, float64=None, float32=1e-6,
+    "of full scale", float64=None, float32=1e-6,
 )  # fmt: skip
-def many_environments(dtype: torch.dtype, num_envs: int = 4096):
-    errors = []
-    for kind in NAMES:
-        many, few = pair_of(kind, dtype).module, pair_of(kind, dtype).module
-        state = many.example_state(num_envs, seed=0)
-        with quiet():
-            reading, expected = many(state)["s"][:3].double(), few(only(state, slice(0, 3)))["s"].double()
-        errors.append(float((reading - expected).abs().max() / expected.abs().max().clamp(min=1e-300)))
-    return errors
+def many_environments(dtype: torch.dtype, kind: str, num_envs: int = 4096):
+    many, few = pair_of(kind, dtype).module, pair_of(kind, dtype).module
+    state = many.example_state(num_envs, seed=0)
+    with quiet():
+        reading, expected = many(state)["s"][:3].double(), few(only(state, slice(0, 3)))["s"].double()
+    return float((reading - expected).abs().max() / expected.abs().max().clamp(min=1e-300))
 
 
-@hard(
+@_in_all_kinds(
     "reset of one environment", "others are reset too, or the one keeps what it remembers",
-    "modules without that reset, and never called", "units of the reading", NAMES, defects=(16,),
+    "modules without that reset, and never called", "units of the reading", defects=(16,),
 )  # fmt: skip
-def reset_of_some(dtype: torch.dtype):
-    errors = []
-    for kind in NAMES:
-        module, unreset, fresh = (pair_of(kind, dtype).module for _ in range(3))
-        first, second = (module.example_state(4, seed=seed) for seed in (0, 1))
-        with quiet():
-            for one in (module, unreset):
-                one(first)
-            module.reset([2])
-            reading, others, start = (one(second)["s"] for one in (module, unreset, fresh))
-        apart = (reading[[0, 1, 3]] - others[[0, 1, 3]], reading[2] - start[2])
-        errors.append(max(float(difference.abs().max()) for difference in apart))
-    return errors
+def reset_of_some(dtype: torch.dtype, kind: str):
+    module, unreset, fresh = (pair_of(kind, dtype).module for _ in range(3))
+    first, second = (module.example_state(4, seed=seed) for seed in (0, 1))
+    with quiet():
+        for one in (module, unreset):
+            one(first)
+        module.reset([2])
+        reading, others, start = (one(second)["s"] for one in (module, unreset, fresh))
+    return max(float(apart.abs().max()) for apart in (reading[[0, 1, 3]] - others[[0, 1, 3]], reading[2] - start[2]))
 
 
-@hard("states are left alone", "a reading changes the simulator's own tensors", "copies", "fields", NAMES, float64=None)
-def states_are_left_alone(dtype: torch.dtype):
-    counts = []
-    for kind in NAMES:
-        module = pair_of(kind, dtype).module
-        state = module.example_state(3)
-        before = {n: v.clone() for n in SHAPES if (v := getattr(state, n)) is not None}
-        with quiet():
-            module(state)
-        counts.append(sum(not torch.equal(getattr(state, name), value) for name, value in before.items()))
-    return counts
+@_in_all_kinds("states are left alone", "a reading changes the simulator's own tensors", "copies", "fields", float64=None)
+def states_are_left_alone(dtype: torch.dtype, kind: str):
+    module = pair_of(kind, dtype).module
+    state = module.example_state(3)
+    before = {n: v.clone() for n in SHAPES if (v := getattr(state, n)) is not None}
+    with quiet():
+        module(state)
+    return sum(not torch.equal(getattr(state, name), value) for name, value in before.items())

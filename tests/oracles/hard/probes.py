@@ -1,7 +1,5 @@
 """What is hard for probes: edges, medial axes, grazing contacts, deep overlap, ties, trembling, thin and sharp meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -61,8 +59,8 @@ HARD: dict[str, list[Place]] = {
     '<geom type="plane" size="1 1 .1"/>': [((0.3, 0.2, 0), R), ((0, 0, 0.004), 0.006), ((0, 0, -0.03), 0.04)],
 }
 """By a geom's MJCF: places [m], and how deep a probe there is in the geom [m]."""
-GEOMS = tuple(HARD)
-NAMES = tuple(geom.split('"')[1] for geom in GEOMS)
+GEOMS = {geom.split('"')[1]: geom for geom in HARD}
+"""Geoms by the names of their shapes."""
 BALL = '<geom type="sphere" size=".02"/>'
 BY_HAND = "geometry, by hand"
 hard = partial(case.hard, "probes and shapes")
@@ -93,51 +91,39 @@ def jittered(scene: SceneState, num: int, seed: int = 0) -> SceneState:
 
 @hard(
     "taxels on faces, edges, corners, medial axes{place}", "the nearest point is not unique; a normal of length zero", BY_HAND,
-    "m", NAMES, defects=(7,), each=["", ", 1 km away"],
+    "m", GEOMS, defects=(7,), each=["", ", 1 km away"],
 )  # fmt: skip
-def depths_at_places(dtype: torch.dtype, place: str):
-    errors = []
-    for geom in GEOMS:
-        places, depths = zip(*HARD[geom], strict=True)
-        touch = probed(places, geom, kind="contact_depth", radius=R, dtype=dtype)
-        scene = state(touch)
-        if place:
-            scene = moved(scene, np.array([600.0, -800.0, 50.0]), Rotation.from_rotvec([0.4, 1.0, -2.0]))
-        errors.append(np.abs(touch(scene)["s"][0, :, 0].double().numpy() - depths).max())
+def depths_at_places(dtype: torch.dtype, geom: str, place: str):
+    places, depths = zip(*HARD[geom], strict=True)
+    touch = probed(places, geom, kind="contact_depth", radius=R, dtype=dtype)
+    scene = state(touch)
+    if place:
+        scene = moved(scene, np.array([600.0, -800.0, 50.0]), Rotation.from_rotvec([0.4, 1.0, -2.0]))
     near, far = (1e-15, 2e-11) if dtype == torch.float64 else (3e-9, 2e-8)
-    return Errors(errors, most=far if place else near)
-
-
-GRAZES = (1e-3, 1e-5, 1e-7, 1e-9, 0.0, -1e-9, -1e-7)
+    return Errors(np.abs(touch(scene)["s"][0, :, 0].double().numpy() - depths).max(), far if place else near)
 
 
 @hard(
     "grazing contacts", "a depth that is all rounding; a sign that flips", BY_HAND, "of the radius",
-    [f"{depth:g} m" for depth in GRAZES], float64=1e-14, float32=4e-7,
+    {f"{depth:g} m": depth for depth in (1e-3, 1e-5, 1e-7, 1e-9, 0.0, -1e-9, -1e-7)}, float64=1e-14, float32=4e-7,
 )  # fmt: skip
-def grazing(dtype: torch.dtype):
-    errors = []
-    for depth in GRAZES:
-        touch = probed([(0, 0, 0.02 + R - depth)], BALL, kind="contact_depth", dtype=dtype)
-        errors.append(abs(float(touch(state(touch))["s"].item()) - max(depth, 0.0)) / R)
-    return errors
+def grazing(dtype: torch.dtype, depth: float):
+    touch = probed([(0, 0, 0.02 + R - depth)], BALL, kind="contact_depth", dtype=dtype)
+    return abs(float(touch(state(touch))["s"].item()) - max(depth, 0.0)) / R
 
 
 @hard(
-    "deep overlap", "forces without bound, normals that are not finite", "force at 10 cm", "of that force", NAMES,
-    float64=None, float32=1.0,
+    "deep overlap", "forces without bound, normals that are not finite", "force at 10 cm", "of that force", GEOMS, float64=None,
+    float32=1.0,
 )  # fmt: skip
-def deep_overlap(dtype: torch.dtype):
-    places, sizes = np.random.default_rng(0).normal(scale=0.004, size=(200, 3)), []
-    for geom in GEOMS:
-        touch = probed(places, geom, kind="kinematic_taxel", dtype=dtype)
-        worst = 0.0
-        for scale in (1e-12, 1e-3, 1.0):
-            reading = touch(state(touch, pos=scale * np.array([0.001, -0.002, 0.0005])))["s"]
-            size = float(reading[..., :3].norm(dim=-1).max()) if torch.isfinite(reading).all() else np.inf
-            worst = max(worst, size / (500 * 0.1**1.2))
-        sizes.append(worst)
-    return sizes
+def deep_overlap(dtype: torch.dtype, geom: str):
+    places, worst = np.random.default_rng(0).normal(scale=0.004, size=(200, 3)), 0.0
+    touch = probed(places, geom, kind="kinematic_taxel", dtype=dtype)
+    for scale in (1e-12, 1e-3, 1.0):
+        reading = touch(state(touch, pos=scale * np.array([0.001, -0.002, 0.0005])))["s"]
+        size = float(reading[..., :3].norm(dim=-1).max()) if torch.isfinite(reading).all() else np.inf
+        worst = max(worst, size / (500 * 0.1**1.2))
+    return worst
 
 
 @hard(
@@ -151,60 +137,52 @@ def fast_spin(dtype: torch.dtype, speed: float = 1000.0):
     return np.abs(reading[:3] - exact) / np.where(exact == 0, np.finfo(float).tiny, np.abs(exact))
 
 
-SPEEDS = (1e-6, 1.0, 1e3)
-
-
 @hard(
     "link and object moving as one", "differences of large velocities", "the same at rest", "of the force",
-    [f"{speed:g} rad/s" for speed in SPEEDS], float64=1e-12, float32=1e-6,
+    {f"{speed:g} rad/s": speed for speed in (1e-6, 1.0, 1e3)}, float64=1e-12, float32=1e-6,
 )  # fmt: skip
-def turned_velocity(dtype: torch.dtype):
-    errors = []
-    for speed in SPEEDS:
-        touch = probed([(0.01, 0.004, 0.0)], '<geom type="box" size=".02 .02 .02"/>', kind="kinematic_taxel", dtype=dtype)
-        still, moving = (state(touch, pos=[0, 0, 0.026]) for _ in range(2))
-        spin, drift = speed * np.array([1.0, -2.0, 0.5]), speed * np.array([0.3, 0.1, -0.2])
-        for i in range(moving.body_pos.shape[1]):
-            moving.body_angvel[0, i] = torch.tensor(spin)
-            moving.body_linvel[0, i] = torch.tensor(drift + np.cross(spin, moving.body_pos[0, i].numpy()))
-        apart = (touch(moving)["s"] - touch(still)["s"]).double().abs().max()
-        errors.append(float(apart) / (2 * speed * 0.05 + 0.66))
-    return errors
+def turned_velocity(dtype: torch.dtype, speed: float):
+    touch = probed([(0.01, 0.004, 0.0)], '<geom type="box" size=".02 .02 .02"/>', kind="kinematic_taxel", dtype=dtype)
+    still, moving = (state(touch, pos=[0, 0, 0.026]) for _ in range(2))
+    spin, drift = speed * np.array([1.0, -2.0, 0.5]), speed * np.array([0.3, 0.1, -0.2])
+    for i in range(moving.body_pos.shape[1]):
+        moving.body_angvel[0, i] = torch.tensor(spin)
+        moving.body_linvel[0, i] = torch.tensor(drift + np.cross(spin, moving.body_pos[0, i].numpy()))
+    return float((touch(moving)["s"] - touch(still)["s"]).double().abs().max()) / (2 * speed * 0.05 + 0.66)
 
 
 @hard(
-    "at rest on a tie, poses trembling by 1 nm", "the normal alternates between faces", "its first value", "rad", NAMES,
+    "at rest on a tie, poses trembling by 1 nm", "the normal alternates between faces", "its first value", "rad", GEOMS,
     float64=1e-3, float32=1e-3, each=[2000], also=[NUM_STEPS],
 )  # fmt: skip
-def trembling(dtype: torch.dtype, steps: int):
-    turns = []
-    for geom in GEOMS:
-        places = [place for place, depth in HARD[geom] if depth > 0]
-        touch = probed(places, geom, kind="kinematic_taxel", outputs=["force"], dtype=dtype)
-        force = touch(jittered(state(touch), steps))["s"].double()
-        way = force / force.norm(dim=2, keepdim=True)
-        turns.append(float((way - way[:1]).norm(dim=2).max()))
-    return turns
+def trembling(dtype: torch.dtype, geom: str, steps: int):
+    places = [place for place, depth in HARD[geom] if depth > 0]
+    touch = probed(places, geom, kind="kinematic_taxel", outputs=["force"], dtype=dtype)
+    force = touch(jittered(state(touch), steps))["s"].double()
+    way = force / force.norm(dim=2, keepdim=True)
+    return float((way - way[:1]).norm(dim=2).max())
+
+
+SHAPES_OF_ONE = (
+    ("sphere", (1.0, 0, 0)), ("capsule", (0.5, 1.5, 0)), ("box", (1, 0.75, 1.5)), ("cylinder", (0.6, 1.5, 0)),
+    ("ellipsoid", (1, 0.6, 1.5)), ("ellipsoid", (2.5, 0.05, 1)),
+)  # fmt: skip
 
 
 @hard("primitives of {scale:g} m", "squares underflow or overflow", "float64 definition", "of the size", each=[1e-6, 1e-3, 1e3])
 def sizes(dtype: torch.dtype, scale: float):
     """Places nearer to a tie than 1e-7 m count as on it, whatever the size: below 1 mm errors may be twice as much."""
-    shapes = [(shape, np.array(size) * scale) for shape, size in (
-        ("sphere", (1.0, 0, 0)), ("capsule", (0.5, 1.5, 0)), ("box", (1, 0.75, 1.5)), ("cylinder", (0.6, 1.5, 0)),
-        ("ellipsoid", (1, 0.6, 1.5)), ("ellipsoid", (2.5, 0.05, 1)),
-    )]  # fmt: skip
-    draws = np.random.default_rng(3).uniform(-1.5, 1.5, (2, len(shapes), 200, 3))[int(dtype == torch.float32)]
+    draws = np.random.default_rng(3).uniform(-1.5, 1.5, (2, len(SHAPES_OF_ONE), 200, 3))[int(dtype == torch.float32)]
     errors = []
-    for (shape, size), draw in zip(shapes, draws, strict=True):
+    for (shape, sides), draw in zip(SHAPES_OF_ONE, draws, strict=True):
+        size = np.array(sides) * scale
         pos = (draw * (size + 0.2 * size.max())).astype(np.float32).astype(np.float64)
         whole = torch.tensor(size.astype(np.float32), dtype=dtype)
         distance, _ = SHAPES[shape](split(torch.tensor(pos, dtype=dtype)), split(whole))
         exact = np.array([signed_distance(shape, whole.double().numpy(), point)[0] for point in pos])
         errors.append(np.abs(distance.double().numpy() - exact).max() / size.max())
-    tie = 2 * TIE / scale if scale < 1e-3 else 0.0
-    parts = [f"{shape} {size[0]:g}" for shape, size in shapes]
-    return Errors(errors, parts, tie + (1e-12 if dtype == torch.float64 else 1e-6))
+    most = (2 * TIE / scale if scale < 1e-3 else 0.0) + (1e-12 if dtype == torch.float64 else 1e-6)
+    return Errors(errors, most, [f"{shape} {sides[0] * scale:g}" for shape, sides in SHAPES_OF_ONE])
 
 
 CLEARANCES = (0.0, 3.4e-3, 3.6e-3, 4.1e-3)
@@ -214,20 +192,17 @@ GATES = {"geometric": ("geometric", 0.0), "pair in contact": ("contact_pair", 1.
 
 @hard(
     "probes that reach before the surfaces meet", "a bit that fires for the wrong reason", BY_HAND, "bits",
-    [f"{name}, {1e3 * c:g} mm" for name in GATES for c in CLEARANCES], float32=None, defects=(5,),
+    {f"{name}, {1e3 * c:g} mm": (*gate, c) for name, gate in GATES.items() for c in CLEARANCES}, float32=None, defects=(5,),
 )  # fmt: skip
-def early_contact(dtype: torch.dtype):
+def early_contact(dtype: torch.dtype, part: tuple[str, float, float]):
     """A probe of 4 mm fires 0.5 mm within its radius, with `gate: contact_pair` only if the pair is in contact too."""
-    errors = []
-    for gate, is_touching in GATES.values():
-        for clearance in CLEARANCES:
-            touch = probed([(0, 0, 0.02 + clearance)], BALL, kind="contact", radius=0.004, gate=gate, dtype=dtype)
-            scene = state(touch)
-            if scene.contact_found is not None:
-                scene.contact_found = torch.full_like(scene.contact_found, is_touching)
-            exact = float(0.004 - clearance > 5e-4 and (gate == "geometric" or is_touching > 0))
-            errors.append(abs(float(touch(scene)["s"].item()) - exact))
-    return errors
+    gate, is_touching, clearance = part
+    touch = probed([(0, 0, 0.02 + clearance)], BALL, kind="contact", radius=0.004, gate=gate, dtype=dtype)
+    scene = state(touch)
+    if scene.contact_found is not None:
+        scene.contact_found = torch.full_like(scene.contact_found, is_touching)
+    exact = float(0.004 - clearance > 5e-4 and (gate == "geometric" or is_touching > 0))
+    return abs(float(touch(scene)["s"].item()) - exact)
 
 
 def plate() -> trimesh.Trimesh:
@@ -262,17 +237,16 @@ TOLERANCE = 1e-4
 
 @hard(
     "sheets, needles, faces that coincide: query {query}", "no inside, triangles without area, ties",
-    "the nearest triangle by brute force", "m", tuple(MESHES), each=["sdf", "raycast"],
+    "the nearest triangle by brute force", "m", MESHES, each=["sdf", "raycast"],
 )  # fmt: skip
-def hard_meshes(dtype: torch.dtype, query: str):
-    errors, fields = [], {"surface": "visual", "query": query, "tolerance": TOLERANCE}
+def hard_meshes(dtype: torch.dtype, part: tuple[Callable[[], trimesh.Trimesh], Probes], query: str):
+    make, probes = part
     geoms = '<inertial pos="0 0 0" mass=".1" diaginertia="1e-4 1e-4 1e-4"/>'
     geoms += '<geom type="mesh" mesh="item" contype="0" conaffinity="0"/>'
-    for make, probes in MESHES.values():
-        with quiet():
-            touch, scene = mesh_scene(make(), np.array(probes), geoms=geoms, dtype=dtype, **fields)
-            depth = touch(scene)["s"][0, :, 0].double().numpy()
-        exact = np.maximum(R - brute_force(np.asarray(make().triangles), np.array(probes))[0], 0)
-        errors.append(np.abs(depth - exact).max())
+    fields = {"surface": "visual", "query": query, "tolerance": TOLERANCE}
+    with quiet():
+        touch, scene = mesh_scene(make(), np.array(probes), geoms=geoms, dtype=dtype, **fields)
+        depth = touch(scene)["s"][0, :, 0].double().numpy()
+    exact = np.maximum(R - brute_force(np.asarray(make().triangles), np.array(probes))[0], 0)
     # Near creases a grid is held to five times its tolerance.
-    return Errors(errors, most=5 * TOLERANCE if query == "sdf" else 1e-6)
+    return Errors(np.abs(depth - exact).max(), 5 * TOLERANCE if query == "sdf" else 1e-6)

@@ -1,7 +1,5 @@
 """A scene with objects of every primitive, and each kind as a sensor in it, with its float64 reference."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Iterator, Mapping

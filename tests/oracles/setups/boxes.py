@@ -3,8 +3,6 @@
 Shapes: `env` environments, `link` links, `x`, `y`, `z` cells.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

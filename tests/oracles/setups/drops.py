@@ -3,8 +3,6 @@
 Shapes: `env` environments, each a ball of its own height.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Shapes: `env` environments, `sample` samples, `row` rows of a sensor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

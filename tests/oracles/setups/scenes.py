@@ -3,8 +3,6 @@
 Shapes: `env` environments, `taxel` taxels, `slot` contacts of a pair.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 Shapes: `env` environments, `row` taxels, `channel` channels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

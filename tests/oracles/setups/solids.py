@@ -1,7 +1,5 @@
 """Solids that ring, as triangles, and closed forms of their modes, in units of their size, with E = 1 and ρ = 1."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

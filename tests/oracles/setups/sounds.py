@@ -3,8 +3,6 @@
 Shapes: `step` physics steps, `env` environments, `sample` samples of all steps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

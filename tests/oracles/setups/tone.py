@@ -1,7 +1,5 @@
 """A kind for oracles of what hears: a tone of each link, at the place of its frame's origin."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 import numpy as np
