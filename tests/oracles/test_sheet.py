@@ -49,5 +49,4 @@ def test_the_text_says_what_does_not_hold():
 
 
 def test_the_first_entry_answers_a_finding():
-    first = answers([("a", "1", (3,)), ("b", "2", (3, 4))])
-    assert {number: answer.title for number, answer in first.items()} == {3: "a", 4: "b"}
+    assert answers([("a", "1", (3,)), ("b", "2", (3, 4))]) == {3: ("a", "1"), 4: ("b", "2")}

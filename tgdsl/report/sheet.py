@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from html import escape
@@ -15,12 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tgdsl.console.tables import text_table
-from tgdsl.files.write import atomic_write_all, check_writable
 from tgdsl.report.bench.page import STYLE, svg_of
-from tgdsl.report.defects import DEFECTS, Answer, Defect, answers
-
-Draw = Callable[[Axes], None]
-"""Draws an entry into axes."""
+from tgdsl.report.defects import DEFECTS, Defect, answers
+from tgdsl.report.files import write_report_files
 
 
 @dataclass(frozen=True)
@@ -28,21 +22,21 @@ class Entry:
     """A result.
 
     Attributes:
-        title: What it is, in a line.
+        title: One line.
         cells: Its cells of the table, after the title.
         record: The same for CSV and JSON.
         notes: Lines beside the plot.
-        draw: Draws its plot.
-        holds: Whether it is as it should be.
-        defects: Findings about the paper's implementation that it answers, by number.
-        figure: The number that answers them, for people.
+        draw: Draws the plot.
+        holds: Whether the result is right.
+        defects: Numbers of the findings about the paper's implementation that it answers.
+        figure: The figure that answers them.
     """
 
     title: str
     cells: tuple[str, ...]
     record: Mapping[str, Any]
     notes: tuple[str, ...]
-    draw: Draw
+    draw: Callable[[Axes], None]
     holds: bool
     defects: tuple[int, ...] = ()
     figure: str = ""
@@ -50,13 +44,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Section:
-    """Entries that belong together.
-
-    Attributes:
-        name: Its name.
-        entries: What it has.
-        left_out: What could not be computed here, and why.
-    """
+    """Entries that belong together, and the names and reasons of what could not be computed here."""
 
     name: str
     entries: tuple[Entry, ...]
@@ -65,15 +53,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A report.
-
-    Attributes:
-        stem: Stem of its files' names.
-        title: Its title.
-        about: What it says, in a paragraph.
-        header: Names of the table's columns, the title's first.
-        sections: What it has.
-    """
+    """A report; `stem` names its files, `header` the table's columns after the mark, `about` is a paragraph."""
 
     stem: str
     title: str
@@ -88,7 +68,7 @@ class Sheet:
 
     @property
     def failed(self) -> tuple[Entry, ...]:
-        """Entries that are not as they should be."""
+        """Entries that are wrong."""
         return tuple(entry for entry in self.entries if not entry.holds)
 
 
@@ -97,8 +77,6 @@ GRID = """
 .card h3{font-size:14px;margin:.6em 0 .2em} .card p{margin:.15em 0;font-size:12.5px;color:#7b828c}
 td{white-space:normal} tr.failed td,.failed h3{color:#c0392b}
 """
-SIZE = (4.3, 2.7)
-"""Of a plot [inch]."""
 
 
 def sheet_page(sheet: Sheet) -> str:
@@ -142,18 +120,11 @@ def _failed(entry: Entry) -> str:
 def _card(entry: Entry, salt: str) -> str:
     name = "card" if entry.holds else "card failed"
     notes = "".join(f"<p>{escape(note)}</p>" for note in entry.notes)
-    return f'<div class="{name}"><h3>{escape(entry.title)}</h3>{plot(entry, salt)}{notes}</div>'
+    return f'<div class="{name}"><h3>{escape(entry.title)}</h3>{_plot(entry, salt)}{notes}</div>'
 
 
-def plot(entry: Entry, salt: str, size: tuple[float, float] = SIZE) -> str:
-    """Return an entry's plot as SVG, to stand in HTML.
-
-    Args:
-        entry: The entry.
-        salt: What makes the identifiers in it differ from those of other plots.
-        size: Its size [inch].
-    """
-    figure = Figure(figsize=size)
+def _plot(entry: Entry, salt: str) -> str:
+    figure = Figure(figsize=(4.3, 2.7))
     axes = figure.add_subplot()
     entry.draw(axes)
     axes.tick_params(labelsize=7)
@@ -165,17 +136,17 @@ def plot(entry: Entry, salt: str, size: tuple[float, float] = SIZE) -> str:
 
 def _findings(sheet: Sheet) -> str:
     rows = ["<table><tr><th>finding</th><th>there</th><th>answered by</th><th>figure here</th></tr>"]
-    for defect, found in _answered(sheet):
-        by, figure = (found.title, found.figure) if found else (f"tgdsl bench --{defect.answered_in}", "")
+    for defect, title, figure in _answered(sheet):
+        by = title or f"tgdsl bench --{defect.answered_in}"
         cells = (f"{defect.number}. {defect.about}", defect.measured, by, figure)
         rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
     about = "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
     return "\n".join([f'<section id="findings"><h2>Findings</h2><p>{about}</p>', *rows, "</table></section>"])
 
 
-def _answered(sheet: Sheet) -> list[tuple[Defect, Answer | None]]:
-    found = answers((entry.title, entry.figure, entry.defects) for entry in sheet.entries)
-    return [(defect, found.get(defect.number)) for defect in DEFECTS]
+def _answered(sheet: Sheet) -> list[tuple[Defect, str, str]]:
+    first = answers((entry.title, entry.figure, entry.defects) for entry in sheet.entries)
+    return [(defect, *first.get(defect.number, ("", ""))) for defect in DEFECTS]
 
 
 def sheet_text(sheet: Sheet) -> str:
@@ -185,27 +156,11 @@ def sheet_text(sheet: Sheet) -> str:
         table = text_table(("", *sheet.header), [("" if e.holds else "✗", e.title, *e.cells) for e in section.entries])
         lines = [section.name, table, *(f"not to be had: {name}: {why}" for name, why in section.left_out)]
         parts.append("\n".join(lines))
-    rows = [
-        (f"{d.number}", d.about, found.title if found else f"--{d.answered_in}", found.figure if found else "")
-        for d, found in _answered(sheet)
-    ]
+    rows = [(f"{d.number}", d.about, title or f"--{d.answered_in}", figure) for d, title, figure in _answered(sheet)]
     parts.append("findings about the paper's implementation\n" + text_table(("", "finding", "answered by", "figure"), rows))
     num = len(sheet.entries)
     parts.append(f"{num} of {num} hold" if not sheet.failed else f"{len(sheet.failed)} of {num} do not hold (✗)")
     return "\n\n".join(parts)
-
-
-SUFFIXES = (".csv", ".json", ".html")
-
-
-def check_sheet_files(stem: str, folder: Path) -> None:
-    """See that a sheet's files can be written, before the work that leads to them.
-
-    Raises:
-        FileError: If one cannot.
-    """
-    for suffix in SUFFIXES:
-        check_writable(folder / f"{stem}{suffix}")
 
 
 def write_sheet(sheet: Sheet, folder: Path) -> list[Path]:
@@ -214,19 +169,11 @@ def write_sheet(sheet: Sheet, folder: Path) -> list[Path]:
     Raises:
         FileError: If one cannot be written.
     """
-    told = [
+    rows = [
         {"section": section.name, "title": entry.title, "holds": entry.holds, "defects": list(entry.defects), **entry.record}
         for section in sheet.sections
         for entry in section.entries
     ]
-    rows = [{key: value for key, value in row.items() if not isinstance(value, list | tuple)} for row in told]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), restval="")
-    writer.writeheader()
-    writer.writerows(rows)
     left_out = [{"section": s.name, "title": name, "why": why} for s in sheet.sections for name, why in s.left_out]
-    whole = json.dumps({"title": sheet.title, "entries": told, "left_out": left_out}, indent=1, ensure_ascii=False)
-    contents = (text.getvalue(), whole, sheet_page(sheet))
-    files = [folder / f"{sheet.stem}{suffix}" for suffix in SUFFIXES]
-    atomic_write_all({file: content.encode() for file, content in zip(files, contents, strict=True)})
-    return files
+    document = {"title": sheet.title, "entries": rows, "left_out": left_out}
+    return write_report_files(folder, sheet.stem, rows, document, sheet_page(sheet))

@@ -58,11 +58,10 @@ class Accuracy:
         for field, comparisons in self.fields.items():
             parts.append(f"## {field[0].upper()}{field[1:]}\n\n{_table(comparisons)}")
         entries = [report.entry_of(own) for comparisons in self.fields.values() for own in comparisons]
-        found = answers((entry.title, entry.figure, entry.defects) for entry in entries)
+        first = answers((entry.title, entry.figure, entry.defects) for entry in entries)
         rows = []
         for defect in DEFECTS:
-            answer = found.get(defect.number)
-            by, figure = (answer.title, answer.figure) if answer else (f"`tgdsl bench --{defect.answered_in}`", "")
+            by, figure = first.get(defect.number, (f"`tgdsl bench --{defect.answered_in}`", ""))
             rows.append((str(defect.number), inline(defect.about), defect.measured, inline(by), figure))
         about = (
             "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."

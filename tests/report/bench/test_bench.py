@@ -14,7 +14,7 @@ import tgdsl
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.accuracy.states import narrowed, readings_of
 from tgdsl.report.bench.bench import Bench, bench
-from tgdsl.report.bench.files import write_files
+from tgdsl.report.bench.page import write_bench
 from tgdsl.report.bench.results import rows_of
 from tgdsl.report.bench.sensors import Options
 from tgdsl.tuning.recording import load_recording, record, save_recording, varied
@@ -119,7 +119,7 @@ class Links(HTMLParser):
 
 @pytest.mark.slow
 def test_the_page_opens_offline(report, folder):
-    files = {file.suffix: file for file in write_files(report, folder / "out")}
+    files = {file.suffix: file for file in write_bench(report, folder / "out")}
     text = files[".html"].read_text()
     parser = Links()
     parser.feed(text)

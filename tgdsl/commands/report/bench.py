@@ -73,12 +73,13 @@ class Bench:
         from tgdsl.files.write import check_writable
         from tgdsl.report.bench.bench import Bench as Work
         from tgdsl.report.bench.compare import compared, read_rows
-        from tgdsl.report.bench.files import check_files, write_files
+        from tgdsl.report.bench.page import write_bench
         from tgdsl.report.bench.sensors import Options
+        from tgdsl.report.files import check_report_files
         from tgdsl.tensors.devices import device_of
 
         options = Options(device_of(self.device), _numbers(self.envs), self.repeats, self.compiled, self.seed)
-        check_files(self.out)
+        check_report_files(self.out, "bench")
         earlier = None if self.against is None else read_rows(self.against)
         if self.save_states is not None:
             check_writable(self.save_states)
@@ -97,7 +98,7 @@ class Bench:
         print(_text(report))
         if earlier is not None:
             print("\n".join(["", f"against {self.against}", *compared(report, earlier).lines()]))
-        print("\n".join(["", *map(str, write_files(report, self.out))]))
+        print("\n".join(["", *map(str, write_bench(report, self.out))]))
 
     def _run_without_document(self) -> None:
         """Run `--oracles` and `--hard`."""

@@ -23,12 +23,13 @@ def report(oracles: bool, hard: bool, out: Path) -> None:
     from tqdm import tqdm
 
     from tgdsl.errors import TgdslError
-    from tgdsl.report.sheet import check_sheet_files, sheet_text, write_sheet
+    from tgdsl.report.files import check_report_files
+    from tgdsl.report.sheet import sheet_text, write_sheet
 
     tests, failed = tests_of_clone(), 0
     names = [name for name, is_wanted in (("oracles", oracles), ("hard", hard)) if is_wanted]
     for name in names:
-        check_sheet_files(name, out)
+        check_report_files(out, name)
     for name in names:
         with tqdm(desc=name, total=1, disable=None, leave=False, bar_format="{n_fmt}/{total_fmt} |{bar:20}| {desc}") as bar:
 

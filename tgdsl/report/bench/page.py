@@ -1,11 +1,13 @@
-"""A bench as one HTML file that opens without a network: its tables, and a plot of speed against error for each sensor."""
+"""A bench as CSV, JSON, and one HTML file that opens without a network: tables, and plots of speed against error."""
 
 from __future__ import annotations
 
 import io
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from html import escape
+from pathlib import Path
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -15,7 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from tgdsl.module.accuracy.errors import Interval
-from tgdsl.report.bench.results import Measured, Report, Subject
+from tgdsl.report.bench.results import Measured, Report, Subject, rows_of
+from tgdsl.report.files import write_report_files
 from tgdsl.view.style import FAINT, INK
 
 FLOOR = 1e-9
@@ -29,6 +32,18 @@ th:first-child,td:first-child{text-align:left}
 tr.own td{font-weight:600;color:#c0392b} tr.front td:first-child::before{content:"● ";color:#1f6f8b}
 svg{max-width:100%;height:auto} .note{color:#7b828c;font-size:13px} nav a{margin-right:1em}
 """
+
+
+def write_bench(report: Report, folder: Path) -> list[Path]:
+    """Write the files of a bench, all or none, and return them.
+
+    Raises:
+        FileError: If one cannot be written.
+    """
+    rows = list(rows_of(report))
+    subjects = [{key: value for key, value in asdict(own).items() if key != "points"} for own in report.subjects]
+    document = {"document": report.document, "machine": report.machine, "states": report.states}
+    return write_report_files(folder, "bench", rows, {**document, "rows": rows, "subjects": subjects}, page(report))
 
 
 def page(report: Report) -> str:

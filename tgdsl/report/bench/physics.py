@@ -18,9 +18,8 @@ from tgdsl.errors import SimulationError
 from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
-from tgdsl.report.bench.front import front_of
 from tgdsl.report.bench.results import Measured, Subject
-from tgdsl.report.bench.timing import median_of
+from tgdsl.report.bench.timing import front_of, median_of
 from tgdsl.runtime.scripted import Script
 from tgdsl.scene.scene import scene_model
 from tgdsl.sensors.known import known_kinds

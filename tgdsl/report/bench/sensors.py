@@ -24,9 +24,8 @@ from tgdsl.module.accuracy.variants import Variant, queried_objects
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.plan import Plan
-from tgdsl.report.bench.front import front_of
 from tgdsl.report.bench.results import Measured, Subject
-from tgdsl.report.bench.timing import times_of
+from tgdsl.report.bench.timing import front_of, times_of
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise.lower import quantity
 from tgdsl.tuning.recording import Recording
