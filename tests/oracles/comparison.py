@@ -101,12 +101,12 @@ CASES: list[Case] = []
 def cases_of(section: str, function: Callable, each: Iterable, also: Iterable, slow: bool | Iterable = False) -> list[Case]:
     """Return the cases of a function: each row of the report, and what tests check in addition."""
     rows, more, slow_rows = (
-        [own if isinstance(own, tuple) else (own,) for own in arguments]
+        [row if isinstance(row, tuple) else (row,) for row in arguments]
         for arguments in (each, also, () if isinstance(slow, bool) else slow)
     )
     name, cases = f"{function.__module__.rpartition('.')[2]}.{function.__name__}", []
-    for arguments in [*rows, *(own for own in more if own not in rows)]:
-        words = ", ".join(str(getattr(own, "name", own)) for own in arguments if not callable(own))
+    for arguments in [*rows, *(row for row in more if row not in rows)]:
+        words = ", ".join(str(getattr(value, "name", value)) for value in arguments if not callable(value))
         is_slow = slow is True or arguments in slow_rows
         cases.append(Case(f"{name}({words})", section, partial(function, *arguments), arguments in rows, is_slow))
     return cases

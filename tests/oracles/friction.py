@@ -39,8 +39,8 @@ class _Pad:
         zero = torch.zeros_like(depth)
         frame = Frame(rot((zero + 1, zero, zero, zero, zero + 1, zero, zero, zero, zero + 1)), (zero - s, zero, zero))
         distance = Distance(-depth, (zero, zero, zero))
-        felt = Penetration(self.pos, depth.clamp(min=0), None, None, None, {"o": distance}, {"o": frame})
-        displacement, self.memory = advance(felt, self.pos, self.normal, StickSlip(0.0, 0.0, 1e-2, SLIP), self.memory)
+        contact = Penetration(self.pos, depth.clamp(min=0), None, None, None, {"o": distance}, {"o": frame})
+        displacement, self.memory = advance(contact, self.pos, self.normal, StickSlip(0.0, 0.0, 1e-2, SLIP), self.memory)
         return float(displacement[0].sum()) / self.full
 
 

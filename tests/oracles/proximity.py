@@ -35,7 +35,7 @@ oracle = field("proximity", "proximity")
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 
-def felt(shape: str, size: Sequence[Any], pos: Sequence[Any] = (0, 0, 0), surface: Surface | None = None) -> SurfaceGeom:
+def geom_of(shape: str, size: Sequence[Any], pos: Sequence[Any] = (0, 0, 0), surface: Surface | None = None) -> SurfaceGeom:
     """Return an object's geom of some size [m] at a place [m]."""
     whole = np.array([*size, 0, 0][:3], float)
     kind = "mesh" if surface is not None else shape
@@ -54,20 +54,20 @@ def sphere_moments(pos: np.ndarray, b: float = 0.02, radius: float = R) -> np.nd
 
     With D the distance of the centre: dA = 2π (b/D) r dr, and p − q has the part (D² + r² − b²)/2D towards it.
     """
-    found = []
+    moments = []
     for q in pos:
         d = float(np.linalg.norm(q))
         low, high, mass, toward = abs(d - b), min(radius, d + b), 0.0, 0.0
         if low < high:
             mass = 2 * np.pi * b / d * quad(lambda r: (radius - r) * r, low, high)[0]
             toward = 2 * np.pi * b / d * quad(lambda r: (radius - r) * r * (d**2 + r**2 - b**2) / (2 * d), low, high)[0]  # noqa: B023
-        found.append([mass, *(-toward * q / d)])
-    return np.array(found)
+        moments.append([mass, *(-toward * q / d)])
+    return np.array(moments)
 
 
 def box_moments(pos: np.ndarray, half: Sequence[Any], radius: float = R, num: int = 120) -> np.ndarray:
     """Return S0 and S1 (point, 4) of a box by midpoint sums over each face."""
-    found = np.zeros((len(pos), 4))
+    moments = np.zeros((len(pos), 4))
     for axis in range(3):
         u, v = ((axis + k) % 3 for k in (1, 2))
         line = (np.arange(num) + 0.5) / num * 2 - 1
@@ -79,18 +79,16 @@ def box_moments(pos: np.ndarray, half: Sequence[Any], radius: float = R, num: in
             for i, q in enumerate(pos):
                 way = grid - q
                 weight = area * np.maximum(radius - np.sqrt((way**2).sum(axis=1)), 0)
-                found[i] += [weight.sum(), *(weight @ way)]
-    return found
+                moments[i] += [weight.sum(), *(weight @ way)]
+    return moments
 
 
-def rms(found: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
+def rms(moments: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
     """Return root mean square errors of S0 and of S1, over their full scale."""
-    error = found - exact
+    error = moments - exact
     full = np.abs(exact[:, 0]).max(), np.linalg.norm(exact[:, 1:4], axis=1).max()
-    return (
-        float(np.sqrt(np.mean(error[:, 0] ** 2)) / full[0]),
-        float(np.sqrt(np.mean((error[:, 1:4] ** 2).sum(axis=1))) / full[1]),
-    )
+    mean = np.mean(error[:, 0] ** 2), np.mean((error[:, 1:4] ** 2).sum(axis=1))
+    return float(np.sqrt(mean[0]) / full[0]), float(np.sqrt(mean[1]) / full[1])
 
 
 def sums(geoms: list[SurfaceGeom], pos: np.ndarray, radius: float = R, spacing: float = R / 8, channels: int = 4) -> np.ndarray:
@@ -98,7 +96,7 @@ def sums(geoms: list[SurfaceGeom], pos: np.ndarray, radius: float = R, spacing: 
     return moment_sums(outer_surface(geoms, spacing).quadrature(spacing), pos, radius, channels, 1)
 
 
-def asked(baked: Any, pos: np.ndarray) -> np.ndarray:
+def field_reads(baked: Any, pos: np.ndarray) -> np.ndarray:
     """Return what a field reads (point, channel), with slopes if it has them."""
     *num, channels = baked.values.shape
     place, cell = split(torch.tensor(baked.origin)), torch.tensor(baked.cell, dtype=torch.float64)
@@ -151,12 +149,12 @@ def plane_integral(heights: tuple[float, ...] = (0.0, 0.003, -0.003, 0.0099, 0.0
 )  # fmt: skip
 def solid_moments(solid: str):
     if solid == "ball":
-        geom, pos, closed = felt("sphere", [0.02]), places(), partial(sphere_moments, b=0.02)
+        geom, pos, closed = geom_of("sphere", [0.02]), places(), partial(sphere_moments, b=0.02)
     else:
         half = [0.02, 0.015, 0.01]
-        geom, pos, closed = felt("box", half), places(150), partial(box_moments, half=half)
+        geom, pos, closed = geom_of("box", half), places(150), partial(box_moments, half=half)
     exact = closed(pos)
-    by_sums, by_field = rms(sums([geom], pos), exact), rms(asked(bake_field([geom], R, TOLERANCE), pos), exact)
+    by_sums, by_field = rms(sums([geom], pos), exact), rms(field_reads(bake_field([geom], R, TOLERANCE), pos), exact)
     few = rms(cloud_reads(sample_cloud([geom], R, 5_000), pos), exact)
     allowed = np.array([2e-3, 2e-3, LIMIT, LIMIT])
     return 0.0, np.array([*by_sums, *by_field]) / allowed, np.array([*few, *few]) / allowed
@@ -169,7 +167,7 @@ def solid_moments(solid: str):
 def sampling_noise():
     pos = places(200)
     exact = box_moments(pos, [0.02] * 3)
-    few, many = (rms(cloud_reads(sample_cloud([felt("box", [0.02] * 3)], R, n), pos), exact)[0] for n in (5_000, 100_000))
+    few, many = (rms(cloud_reads(sample_cloud([geom_of("box", [0.02] * 3)], R, n), pos), exact)[0] for n in (5_000, 100_000))
     return np.sqrt(20), few / many
 
 
@@ -202,7 +200,7 @@ AREAS: dict[str, tuple[list[float], float]] = {
     "area over the exact one, off 1 over what is allowed [1]", atol=1.0,
 )  # fmt: skip
 def areas(names: Sequence[str] = tuple(AREAS)):
-    ours = [surface_area([felt(name.split()[0].rstrip(","), AREAS[name][0], pos=(0.1, -0.2, 0.3))]) for name in names]
+    ours = [surface_area([geom_of(name.split()[0].rstrip(","), AREAS[name][0], pos=(0.1, -0.2, 0.3))]) for name in names]
     exact = np.array([AREAS[name][1] for name in names])
     allowed = np.array([1e-7 if "almost" in name else 1e-10 for name in names])
     return Values(0.0, (np.array(ours) / exact - 1) / allowed, at=names)

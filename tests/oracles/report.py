@@ -65,7 +65,9 @@ def sheet(name: str, begun: Begun | None = None) -> Sheet:
 def sheet_of(name: str, results: Results) -> Sheet:
     """Return the sheet `oracles` of comparisons, or `hard` of hard cases."""
     entry = entry_of if name == "oracles" else hard_entry_of
-    sections = tuple(Section(title, tuple(map(entry, own)), tuple(left_out)) for title, (own, left_out) in results.items())
+    sections = tuple(
+        Section(title, tuple(map(entry, computed)), tuple(left_out)) for title, (computed, left_out) in results.items()
+    )
     if name == "oracles":
         return Sheet(name, "tgdsl against what is known", ABOUT, HEADER, sections)
     return Sheet(name, "numerical hard cases of tgdsl", HARD_ABOUT, HARD_HEADER, sections)
@@ -128,14 +130,14 @@ def _label(axes: Axes, labels: Sequence[Any]) -> None:
 
 def hard_entry_of(case: HardCase) -> Entry:
     """Return a hard case as an entry."""
-    spans = {name: f"{own.worst:.1e} ≤ {own.most:.0e}" for name, own in case.errors.items()}
+    spans = {name: f"{limit.worst:.1e} ≤ {limit.most:.0e}" for name, limit in case.errors.items()}
     is_finite = "yes" if case.is_finite else "no"
     cells = (case.risk, spans.get("float64", ""), spans.get("float32", ""), case.unit, is_finite, case.reference)
     record: dict[str, Any] = {"risk": case.risk, "reference": case.reference, "unit": case.unit, "finite": case.is_finite}
-    for name, own in case.errors.items():
-        record |= {f"{name}_worst": own.worst, f"{name}_allowed": own.most, f"{name}_errors": own.errors.tolist()}
+    for name, limit in case.errors.items():
+        record |= {f"{name}_worst": limit.worst, f"{name}_allowed": limit.most, f"{name}_errors": limit.errors.tolist()}
     record["parts"] = list(case.parts)
-    figure = ", ".join(f"{name} {own.worst:.1e} {case.unit}" for name, own in case.errors.items())
+    figure = ", ".join(f"{name} {limit.worst:.1e} {case.unit}" for name, limit in case.errors.items())
     notes = (case.risk, f"against {case.reference}")
     return Entry(case.name, cells, record, notes, lambda axes: draw_hard(case, axes), case.holds, case.defects, figure)
 
@@ -143,10 +145,10 @@ def hard_entry_of(case: HardCase) -> Entry:
 def draw_hard(case: HardCase, axes: Axes) -> None:
     """Draw the error of each part, and the largest allowed one as a line."""
     x = np.arange(len(case.parts))
-    for i, (name, own) in enumerate(case.errors.items()):
-        errors = np.maximum(np.nan_to_num(own.errors, nan=1e9, posinf=1e9), FLOOR)
+    for i, (name, limit) in enumerate(case.errors.items()):
+        errors = np.maximum(np.nan_to_num(limit.errors, nan=1e9, posinf=1e9), FLOOR)
         axes.plot(x + 0.15 * i, errors, "o", markersize=4, color=COLORS[name], label=name)
-        axes.axhline(max(own.most, FLOOR), color=COLORS[name], linewidth=0.8, linestyle="--")
+        axes.axhline(max(limit.most, FLOOR), color=COLORS[name], linewidth=0.8, linestyle="--")
     axes.set_yscale("log")
     axes.set_ylabel(f"error [{case.unit}]", fontsize=7.5)
     axes.legend(fontsize=6.5, frameon=False, labelcolor=FAINT)

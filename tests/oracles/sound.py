@@ -10,9 +10,22 @@ import numpy as np
 import torch
 
 from oracles.comparison import Values, field
-from oracles.setups.drops import dropped, loudest
 from oracles.setups.scenes import folder, temporary
-from oracles.setups.sounds import MODES, STEP, amplitudes, driven, half_sine, motor, plate, pressed, ringing, sound, struck
+from oracles.setups.sounds import (
+    MODES,
+    STEP,
+    amplitudes,
+    driven,
+    dropped,
+    half_sine,
+    loudest,
+    motor,
+    plate,
+    pressed,
+    ringing,
+    sound,
+    struck,
+)  # fmt: skip
 
 contact, motors = (field("sound: contacts and motors", kind) for kind in ("contact_audio", "actuation_audio"))
 IMPULSE_RESPONSE = "impulse response of damped oscillators"
@@ -81,10 +94,10 @@ def response_by_frequency():
     modes, ours, paper = [{"frequency": f, "decay": 1.0, "gain": 1.0} for f in frequency.tolist()], [], []
     with folder() as where:
         for samples in RATES:
-            given = {"modes": modes, "samples": samples, "scrape": 0}
-            ours.append(amplitudes(plate(where, **given), STRIKE)[3] * math.exp(STEP) / IMPULSE)
+            fields = {"modes": modes, "samples": samples, "scrape": 0}
+            ours.append(amplitudes(plate(where, **fields), STRIKE)[3] * math.exp(STEP) / IMPULSE)
             late = STEP * (1 - 1 / samples)  # the paper's strikes at the first sample
-            paper.append(amplitudes(plate(where, **given, **PAPER), STRIKE)[2] * math.exp(late) / IMPULSE)
+            paper.append(amplitudes(plate(where, **fields, **PAPER), STRIKE)[2] * math.exp(late) / IMPULSE)
     return Values(1.0, np.array(ours), np.array(paper), at=frequency)
 
 
@@ -107,9 +120,9 @@ def collision(duration: float):
     modes, ours, paper = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}], [], []
     steps = (0.00025, 0.0005, 0.001, 0.002)
     for step in steps:
-        given = {"modes": modes, "samples": 16, "scrape": 0, "timestep": step}
-        ours.append(struck(temporary(plate, **given), half_sine(duration, step), 10.0, step)[0])
-        printed = temporary(plate, **given, **PAPER)
+        fields = {"modes": modes, "samples": 16, "scrape": 0, "timestep": step}
+        ours.append(struck(temporary(plate, **fields), half_sine(duration, step), 10.0, step)[0])
+        printed = temporary(plate, **fields, **PAPER)
         paper.append(amplitudes(printed, half_sine(duration, step, rest=2 * step), step)[:, 0].max())
     return Values(0.02, ours, paper, at=steps, rtol=duration / 0.02 + 1e-9)
 

@@ -79,7 +79,7 @@ def hard(
                 return function(dtype, *arguments)
             results = [function(dtype, part, *arguments) for part in parts.values()]
             is_limited = isinstance(results[0], Errors)
-            return Errors([own.values for own in results], results[0].most) if is_limited else results
+            return Errors([result.values for result in results], results[0].most) if is_limited else results
 
         @wraps(function)
         def run(*arguments: Any) -> HardCase:

@@ -111,10 +111,10 @@ def taxels(num: int, seed: int, scale: float = 1.0) -> list[dict[str, Any]]:
 
 def fields_of(kind: str) -> dict[str, Any]:
     """Return a kind's sensor."""
-    spec = next(own for own in KINDS if own.name == kind).spec
+    spec = next(known for known in KINDS if known.name == kind).spec
     where = {"links": list(LINKS), "feels": list(OBJECTS)}
-    given = {name: value for name, value in where.items() if name in spec.model_fields}
-    return {"kind": kind, **given, **SENSORS.get(kind, {})}
+    fields = {name: value for name, value in where.items() if name in spec.model_fields}
+    return {"kind": kind, **fields, **SENSORS.get(kind, {})}
 
 
 @functools.lru_cache(maxsize=64)
@@ -141,20 +141,20 @@ def _planned(kind: str, scale: float) -> tuple[Plan, Mapping[str, Any]]:
 def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0) -> Pair:
     """Return a kind's module and its reference at the start of an episode; all lengths of the scene times a scale."""
     plan, specs = _planned(kind, scale)
-    kinds = {own.name: own for own in KINDS}
+    kinds = {known.name: known for known in KINDS}
     read = {name: (kinds[fields["kind"]], specs[name]) for name, fields in READ.get(kind, {}).items()}
     return Pair(TactileModule(plan, KINDS, dtype), ReferenceModule(plan, kinds[kind], specs["s"], read, "s"))
 
 
-def worst_of(pair: Pair, given: SceneState, truth: SceneState | None = None, enough: float = 0.0) -> float:
+def worst_of(pair: Pair, state: SceneState, truth: SceneState | None = None, enough: float = 0.0) -> float:
     """Return the largest error of a reading over full scale; infinite where it is not finite and the reference's is.
 
     Args:
         pair: The module and its reference, both of which go on to the next call.
-        given: What the module reads.
+        state: What the module reads.
         truth: What the reference reads; None: the same.
         enough: Errors up to this need no look at the other sides of ties.
     """
     with quiet():
-        errors = row_errors(pair.module(given)["s"], pair.reference, truth or given, enough)
+        errors = row_errors(pair.module(state)["s"], pair.reference, truth or state, enough)
     return float(np.where(np.isnan(errors), np.inf, errors).max())

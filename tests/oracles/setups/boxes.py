@@ -20,12 +20,9 @@ Contact = tuple[Sequence[Any], Sequence[Any], float | int]
 
 
 def heat_module(
-    folder: Path,
-    links: Mapping[str, Sequence[Any]],
-    sensor: Mapping[str, Any],
-    objects: Mapping[str, tuple[Sequence[Any] | None, Mapping[str, Any]]] | None = None,
-    dtype: torch.dtype = torch.float64,
-) -> TactileModule:
+    folder: Path, links: Mapping[str, Sequence[Any]], sensor: Mapping[str, Any],
+    objects: Mapping[str, tuple[Sequence[Any] | None, Mapping[str, Any]]] | None = None, dtype: torch.dtype = torch.float64,
+) -> TactileModule:  # fmt: skip
     """Return a module with one sensor, `heat`, on boxes.
 
     Args:
@@ -54,12 +51,9 @@ def heat_module(
 
 
 def heat_state(
-    module: TactileModule,
-    dt: float | int,
-    contacts: Mapping[tuple[str, str], Sequence[Contact]] | None = None,
-    num_envs: int = 1,
-    heights: Mapping[str, float] | None = None,
-) -> SceneState:
+    module: TactileModule, dt: float | int, contacts: Mapping[tuple[str, str], Sequence[Contact]] | None = None,
+    num_envs: int = 1, heights: Mapping[str, float] | None = None,
+) -> SceneState:  # fmt: skip
     """Return a state with contacts by (link, object), in the world's axes; bodies are at the origin, or at heights [m]."""
     inputs, values = module.inputs, dict[str, Any]()
     values["body_pos"] = torch.zeros(num_envs, len(inputs.bodies), 3, dtype=torch.float64)

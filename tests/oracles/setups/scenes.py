@@ -50,15 +50,9 @@ def points(places: Sequence[Point] | np.ndarray, radius: float, normal: Point = 
 
 
 def module(
-    where: Path,
-    probes: Sequence[Point] | np.ndarray,
-    geom: str,
-    *,
-    radius: float = 0.01,
-    dtype: torch.dtype = torch.float64,
-    gate: str | None = "geometric",
-    **sensor: Any,
-) -> TactileModule:
+    where: Path, probes: Sequence[Point] | np.ndarray, geom: str, *, radius: float = 0.01, dtype: torch.dtype = torch.float64,
+    gate: str | None = "geometric", **sensor: Any,
+) -> TactileModule:  # fmt: skip
     """Return a module with one sensor, `s`, whose probes [m] are on the body `pad`; the object's geom is MJCF text.
 
     Args:
@@ -81,14 +75,13 @@ def module(
     return compiled(document(path, "item", sensor, points(probes, radius)), dtype)
 
 
-def document(model: Path, item: str, sensor: Mapping[str, Any], pad: Mapping[str, Any], **target: Any) -> dict[str, Any]:
+def document(
+    model: Path, item: str, sensor: Mapping[str, Any], pad: Mapping[str, Any] | None = None, **target: Any
+) -> dict[str, Any]:
     """Return a document with one sensor, `s`, that feels one body of a model; `pad` is the layout of the link `pad`."""
-    return {
-        "tgdsl": 1,
-        "robot": {"model": str(model), "layout": {"resolutions": {"r": {"pad": pad}}}},
-        "objects": {item: {"body": item, **target}},
-        "sensors": {"s": sensor},
-    }
+    layout = {"layout": {"resolutions": {"r": {"pad": pad}}}} if pad else {}
+    robot = {"model": str(model), **layout}
+    return {"tgdsl": 1, "robot": robot, "objects": {item: {"body": item, **target}}, "sensors": {"s": sensor}}
 
 
 def probed(probes: Sequence[Point] | np.ndarray, geom: str, **sensor: Any) -> TactileModule:

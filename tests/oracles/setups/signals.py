@@ -47,22 +47,14 @@ class Noise:
     """The batched noise of one sensor, as a module would run it; what it remembers is NaN at first, so that no use escapes."""
 
     def __init__(
-        self,
-        knobs: Mapping[str, Any] | Sequence[Mapping[str, Any]],
-        layout: Layout | int = 1,
-        channels: Sequence[str] = ("depth",),
-        *,
-        num_envs: int = 1,
-        dt: float | int = 0.0,
-        seed: int = 0,
-        name: str = "touch",
-        first_env: int = 0,
-        dtype: torch.dtype = torch.float64,
-    ):
+        self, knobs: Mapping[str, Any] | Sequence[Mapping[str, Any]], layout: Layout | int = 1,
+        channels: Sequence[str] = ("depth",), *, num_envs: int = 1, dt: float | int = 0.0, seed: int = 0, name: str = "touch",
+        first_env: int = 0, dtype: torch.dtype = torch.float64,
+    ):  # fmt: skip
         """Take the knobs of all rows, or of each; `dt` is the shortest one [s], which a ring must hold."""
         self.layout = line(layout) if isinstance(layout, int) else layout
         count = self.layout.num_taxels
-        sets = [Knobs.model_validate(own) for own in ([knobs] if isinstance(knobs, Mapping) else knobs)]
+        sets = [Knobs.model_validate(row) for row in ([knobs] if isinstance(knobs, Mapping) else knobs)]
         which = np.zeros(count, dtype=np.int64) if len(sets) == 1 else np.arange(count)
         self.channels, self.num_envs, self.dtype = tuple(channels), num_envs, dtype
         self._rows, self.key = [sets[i] for i in which], random.sensor_key(seed, name)
@@ -99,10 +91,10 @@ class Noise:
         if "gain" in self.lowered.terms:
             signal = stages.gain(values, now, signal)[:, None] * signal
         signal, new = stages.disturb(signal, self.lowered.terms, values, self.memory, now)
-        for key, noted in new.items():
-            held = self.memory[key]
-            place = held[:, self.step % held.shape[1]] if key == "ring" else held
-            place.copy_(noted)
+        for key, value in new.items():
+            buffer = self.memory[key]
+            place = buffer[:, self.step % buffer.shape[1]] if key == "ring" else buffer
+            place.copy_(value)
         self.ages = torch.cat([torch.zeros_like(self.ages[:, :1]), self.ages[:, :-1] + dt], dim=1)
         self.step += 1
         self.age += 1
@@ -129,10 +121,10 @@ def normal_distance(sample: np.ndarray, deviation: float | int) -> float:
     return _distance(ndtr(np.sort(sample, axis=None) / deviation))
 
 
-def _distance(found: np.ndarray) -> float:
-    count = len(found)
+def _distance(quantiles: np.ndarray) -> float:
+    count = len(quantiles)
     steps = np.arange(count + 1) / count
-    return math.sqrt(count) * float(max((steps[1:] - found).max(), (found - steps[:-1]).max()))
+    return math.sqrt(count) * float(max((steps[1:] - quantiles).max(), (quantiles - steps[:-1]).max()))
 
 
 KOLMOGOROV = 2.7
@@ -145,6 +137,6 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
     return math.sqrt(a.size) * float((a @ b) / math.sqrt((a @ a) * (b @ b)))
 
 
-def standard_errors(found: float | int, expected: float | int, error: float | int) -> float:
+def standard_errors(estimate: float | int, expected: float | int, error: float | int) -> float:
     """Return how many standard errors a number is from what is expected."""
-    return abs(found - expected) / error
+    return abs(estimate - expected) / error

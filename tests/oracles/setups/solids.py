@@ -97,8 +97,8 @@ def timoshenko(length: float, height: float, width: float, poissons_ratio: float
         half = length / 2
         even, odd = (np.cosh, np.sinh) if is_even else (np.sinh, np.cosh)
         moment, force = slope * k * even(k * half), (slope - k) * odd(k * half)
-        found = moment[0] * force[1] - moment[1] * force[0]
-        return float(found.real if is_even else found.imag)
+        determinant = moment[0] * force[1] - moment[1] * force[0]
+        return float(determinant.real if is_even else determinant.imag)
 
     even, odd = (np.vectorize(lambda omega, is_even=is_even: ends(omega, is_even)) for is_even in (True, False))
     return sorted(roots(even, 1e-4, below) + roots(odd, 1e-4, below))

@@ -1,10 +1,10 @@
-"""What makes sound, driven as an oracle says: a plate that a ball presses and rubs, and a motor's joint.
+"""What makes sound: a plate that a ball presses, rubs or falls on, and a motor's joint.
 
 Shapes: `step` physics steps, `env` environments, `sample` samples of all steps.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from oracles.setups.scenes import document
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.tuning.compile import compile
 
 STEP = 0.001
@@ -49,13 +51,8 @@ MOTOR = """
 def plate_document(folder: Path, **sensor: Any) -> dict[str, Any]:
     """Return a document of a plate that feels a ball; its scene is written to a folder."""
     (folder / "plate.xml").write_text(PLATE, encoding="utf-8")
-    given = {"kind": "contact_audio", "links": "plate", "feels": ["ball"], "modes": MODES, **sensor}
-    return {
-        "tgdsl": 1,
-        "robot": {"model": str(folder / "plate.xml")},
-        "objects": {"ball": {"body": "ball"}},
-        "sensors": {"s": given},
-    }
+    fields = {"kind": "contact_audio", "links": "plate", "feels": ["ball"], "modes": MODES}
+    return document(folder / "plate.xml", "ball", {**fields, **sensor})
 
 
 def plate(folder: Path, dtype: torch.dtype = torch.float64, **sensor: Any) -> TactileModule:
@@ -74,10 +71,8 @@ def pressed(
     state = touch.example_state(len(forces))
     for name in ("contact_force", "contact_normal", "contact_netforce", "body_angvel"):
         getattr(state, name).zero_()
-    assert state.contact_normal is not None and state.contact_force is not None and state.contact_netforce is not None
-    assert state.body_linvel is not None
     normal, along = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64), torch.tensor([0.8, 0.0, 0.6], dtype=torch.float64)
-    pair = [own.link for own in touch.inputs.pairs].index("plate")
+    pair = [pair.link for pair in touch.inputs.pairs].index("plate")
     state.contact_normal[:, pair, 0] = normal
     state.contact_force[:, pair, 0] = forces[:, None] * (normal + 0.3 * along)
     state.contact_netforce[:, pair] = state.contact_force[:, pair, 0]
@@ -106,11 +101,16 @@ def amplitudes(
     touch: TactileModule, forces: Sequence[float | int] | np.ndarray, step: float = STEP
 ) -> Float[np.ndarray, "step mode"]:
     """Return the amplitude of the plate's modes, |z| [N·s], after each step of forces [N]."""
-    found = []
+    rows = []
     for force in forces:
         touch(pressed(touch, [float(force)], step=step))
-        found.append(touch.memory.get_buffer("s:phasors").double().view(2, -1).norm(dim=0).numpy())
-    return np.array(found)
+        rows.append(touch.memory.get_buffer("s:phasors").double().view(2, -1).norm(dim=0).numpy())
+    return np.array(rows)
+
+
+def energy(touch: TactileModule) -> float:
+    """Return Σ |z|² of all modes now [N²·s²]."""
+    return float((touch.memory.get_buffer("s:phasors").double() ** 2).sum())
 
 
 def half_sine(duration: float, step: float, impulse: float = 0.02, rest: float = 0.06) -> list[float]:
@@ -124,9 +124,9 @@ def struck(
     touch: TactileModule, forces: Sequence[float | int] | np.ndarray, decay: float, step: float = STEP
 ) -> tuple[float, int]:
     """Return the amplitude of the only mode at the time of the last strike, if it were alone, |z| e^(d Δt) [N·s]; its step."""
-    found = amplitudes(touch, forces, step)[:, 0]
-    last = int(np.argmax(np.diff([0.0, *found]) > 0))
-    return float(found[last] * math.exp(decay * step)), last
+    amplitude = amplitudes(touch, forces, step)[:, 0]
+    last = int(np.argmax(np.diff([0.0, *amplitude]) > 0))
+    return float(amplitude[last] * math.exp(decay * step)), last
 
 
 def motor(folder: Path, dtype: torch.dtype | str = torch.float64, **fields: Any) -> TactileModule:
@@ -143,9 +143,56 @@ def driven(
 ) -> Float[np.ndarray, "env sample"]:
     """Return all samples of a joint whose velocity [rad/s] and effort [N·m] are given at each step [Pa]."""
     state, blocks = touch.example_state(num_envs), []
-    assert state.joint_vel is not None
     one = torch.ones_like(state.joint_vel)
     for velocity, effort in zip(velocities, np.broadcast_to(efforts, len(velocities)), strict=True):
         state = replace(state, joint_vel=float(velocity) * one, joint_effort=float(effort) * one, dt=STEP)
         blocks.append(touch(state)["motors"][:, :, 0, 0])
     return torch.cat(blocks, dim=1).double().numpy()
+
+
+MASS, GRAVITY = 0.05, 9.81
+"""Of the ball [kg, m/s²]."""
+DROPS = """
+<mujoco>
+  <option timestep="{step}" integrator="implicitfast" cone="elliptic"/>
+  <worldbody>
+    <body name="plate"><geom type="box" size=".1 .1 .005" solref="{stiffness}"/></body>
+    <body name="ball" pos="0 0 .0160"><freejoint/><geom type="sphere" size=".01" mass="0.05" solref="{stiffness}"/></body>
+  </worldbody>
+</mujoco>
+"""
+HEIGHTS = np.array([0.005, 0.01, 0.02, 0.04, 0.08, 0.16])
+"""Of the ball's lowest point above the plate [m]."""
+
+
+def dropped(
+    folder: Path, simulator: Callable[..., Any] = BatchSimulation, heights: np.ndarray = HEIGHTS, step: float = 0.001,
+    stiffness: str = "-1e6 -4", substeps: int = 1, **sensor: Any,
+) -> tuple[Any, TactileModule]:  # fmt: skip
+    """Return a simulation of balls that fall from heights [m], and its module."""
+    (folder / "drops.xml").write_text(DROPS.format(step=step, stiffness=stiffness), encoding="utf-8")
+    fields = {"kind": "contact_audio", "links": "plate", "feels": ["ball"], "modes": MODES, "scrape": 0}
+    sensor = {**fields, "samples": 8, "substeps": substeps, **sensor}
+    touch = compile(document(folder / "drops.xml", "ball", sensor))
+    sim = simulator(touch, len(heights), substeps=substeps)
+    place = sim.qpos.clone()
+    place[:, sim.joints["ball"].qpos.start + 2] = torch.as_tensor(0.015 + heights, dtype=place.dtype)
+    sim.reset(qpos=place)
+    return sim, touch
+
+
+def loudest(sim: Any, touch: TactileModule, seconds: float) -> tuple[Float[np.ndarray, " env"], Float[np.ndarray, " env"]]:
+    """Return of each environment the amplitude of its first mode after its first collision, and that one's impulse [N·s]."""
+    largest, impulse = np.zeros((2, sim.num_envs))
+    is_over, is_next = np.zeros((2, sim.num_envs), dtype=bool)
+    for _ in range(round(seconds / sim.model.opt.timestep)):
+        sim.step()
+        state = sim.state()
+        touch(state)
+        force = state.contact_netforce[:, 0].norm(dim=-1).double().numpy()
+        is_next |= is_over & (force > 0)
+        is_over |= (impulse > 0) & (force == 0)
+        impulse += np.where(is_over, 0.0, force * sim.model.opt.timestep)
+        phasors = touch.memory.get_buffer("s:phasors")[:, 0].double().numpy()
+        largest = np.where(is_next, largest, np.maximum(largest, np.hypot(phasors[:, 0], phasors[:, len(MODES)])))
+    return largest, impulse

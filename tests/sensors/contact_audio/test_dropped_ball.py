@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import pytest
 import torch
-from oracles.setups import drops
-from oracles.setups.drops import GRAVITY, HEIGHTS, MASS, loudest
+from oracles.setups import sounds
+from oracles.setups.sounds import GRAVITY, HEIGHTS, MASS, loudest
 from oracles.sound import impact
 
 from tgdsl.runtime.batch.simulation import BatchSimulation
@@ -19,7 +19,7 @@ def dropped(tmp_path):
 
     def build(simulator=BatchSimulation, *given, **keys):
         kind = functools.partial(WarpSimulation, device="cpu") if simulator is WarpSimulation else simulator
-        return drops.dropped(tmp_path, kind, *given, **keys)
+        return sounds.dropped(tmp_path, kind, *given, **keys)
 
     return build
 

@@ -6,8 +6,7 @@ import math
 import numpy as np
 import torch
 from oracles import sound as oracles
-from oracles.setups.sounds import STEP, plate, pressed, sound
-from struck_plate import energy
+from oracles.setups.sounds import STEP, energy, plate, pressed, sound
 
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.loads import Loads, PairLoads

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from oracles.setups.listening import RATE, SCENE, heard, listening
-from oracles.setups.tone import TONE
+from oracles.setups.listening import RATE, SCENE, TONE, heard, listening
 
 import tgdsl
 from tgdsl.errors import SpecError

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from oracles.setups.tone import TONE
+from oracles.setups.listening import TONE
 
 from tgdsl.module.accuracy.changed import only
 from tgdsl.sensors import MICROPHONE

@@ -41,7 +41,7 @@ def write_bench(report: Report, folder: Path) -> list[Path]:
         FileError: If one cannot be written.
     """
     rows = list(rows_of(report))
-    subjects = [{key: value for key, value in asdict(own).items() if key != "points"} for own in report.subjects]
+    subjects = [{key: value for key, value in asdict(subject).items() if key != "points"} for subject in report.subjects]
     document = {"document": report.document, "machine": report.machine, "states": report.states}
     return write_report_files(folder, "bench", rows, {**document, "rows": rows, "subjects": subjects}, page(report))
 
@@ -163,7 +163,7 @@ def svg_of(figure: Figure, salt: str) -> str:
 
 
 def _draw(axes: Axes, point: Measured) -> None:
-    times, errors = ([factor * part for part in own] for factor, own in ((1e3, point.time), (1.0, point.chosen.rms)))
+    times, errors = ([factor * part for part in interval] for factor, interval in ((1e3, point.time), (1.0, point.chosen.rms)))
     x, (y, low, high) = times, (max(part, FLOOR) for part in errors)
     color = OWN if point.is_own else FRONT if point.is_on_front else FAINT
     is_marked = point.is_own or point.is_on_front
@@ -185,7 +185,7 @@ def _label(axes: Axes, points: Sequence[Measured]) -> None:
     assert isinstance(figure, Figure)
     renderer, taken = FigureCanvasAgg(figure).get_renderer(), []
     sides = [(x, step) for step in (5, -11, 16, -22, 27, -33, 38, -44, 49) for x in (6, -6)]
-    for point in sorted(points, key=lambda own: not own.is_own):
+    for point in sorted(points, key=lambda point: not point.is_own):
         label = f"{point.label}, {point.precision}" + (" (now)" if point.is_own else "")
         at = (1e3 * point.time.value, max(point.chosen.rms.value, FLOOR))
         text = axes.annotate(label, at, textcoords="offset points", xytext=sides[0], fontsize=7.5, color=INK)
@@ -193,6 +193,6 @@ def _label(axes: Axes, points: Sequence[Measured]) -> None:
             text.set_position((x, y))
             text.set_horizontalalignment("left" if x > 0 else "right")
             box = text.get_window_extent(renderer)
-            if axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1) and not any(box.overlaps(own) for own in taken):
+            if axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1) and not any(box.overlaps(label) for label in taken):
                 break
         taken.append(text.get_window_extent(renderer))

@@ -140,14 +140,14 @@ def _errors(sensor: Sensor, way: Way, recording: Recording, exact: Exact, option
     progress(f"{sensor.name}: {way.name}, errors")
     touch = _built(way, options.device)
     with _precision(way):
-        found = readings_of(touch, recording.for_module(touch.inputs), sensor.name)
+        readings = readings_of(touch, recording.for_module(touch.inputs), sensor.name)
     if way.precision == "bfloat16 readings":
-        found = torch.from_numpy(found).to(torch.bfloat16).double().numpy()
+        readings = torch.from_numpy(readings).to(torch.bfloat16).double().numpy()
     common = common_of(exact.module, touch, sensor.name)
-    found, expected = common.of_other(found), common.of_one(exact.readings)
-    magnitude, channels = exact.magnitude._replace(active=common.of_one(exact.magnitude.active)), range(found.shape[-1])
+    readings, expected = common.of_other(readings), common.of_one(exact.readings)
+    magnitude, channels = exact.magnitude._replace(active=common.of_one(exact.magnitude.active)), range(readings.shape[-1])
     chosen, verified = (
-        errors_of(found[:, half], expected[:, half], magnitude.of(half, channels), seed=options.seed)
+        errors_of(readings[:, half], expected[:, half], magnitude.of(half, channels), seed=options.seed)
         for half in halves(recording.num_envs)
     )
     size = 2 if way.precision == "bfloat16 readings" else torch.finfo(touch.dtype).bits // 8

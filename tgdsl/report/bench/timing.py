@@ -48,7 +48,7 @@ def times_of(calls: Mapping[str, Callable[[], Any]], repeats: int, device: torch
                 _wait(device)
                 if i >= WARM_UP:
                     times[name].append(time.perf_counter() - start)
-    return {name: median_of(np.array(own)) for name, own in times.items()}
+    return {name: median_of(np.array(seconds)) for name, seconds in times.items()}
 
 
 def _wait(device: torch.device) -> None:
