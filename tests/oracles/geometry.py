@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from oracles.comparison import Values, field
-from oracles.setups.scenes import compiled, document, folder, points, probed, state
+from oracles.setups.scenes import probed, state
 from tgdsl.geometry.planes import split
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.module.state import SceneState
@@ -205,33 +205,14 @@ def nearest_vector():
     return [0.005, -0.003, -0.004, 0, -0.005, 0, 0, 0.005, 0.05, 0, 0, 0], touch(state(touch))["s"][0].numpy().ravel()
 
 
-def mesh_scene(mesh: trimesh.Trimesh | None, probes: np.ndarray, *, kind: str = "contact_depth", geoms: str = "",
-               scale: float = 1.0, dtype: torch.dtype = torch.float64, **target: Any) -> tuple[Any, SceneState]:  # fmt: skip
-    """Return a module whose probes of 10 mm feel a mesh (or geoms given as MJCF), and its scene with all at the origin.
-
-    Args:
-        mesh: The mesh [m], written in units of `scale` metres; None: there is none.
-        probes: Places of the probes [m].
-        kind: The sensor's.
-        geoms: The object's geoms, if not the mesh alone.
-        scale: Unit of the mesh's file [m].
-        dtype: The module's.
-        **target: Other fields of the object.
-    """
-    with folder() as where:
-        asset = ""
-        if mesh is not None:
-            mesh.copy().apply_scale(1 / scale).export(where / "item.stl")
-            geoms = geoms or '<geom name="item" type="mesh" mesh="item"/>'
-            asset = f'<asset><mesh name="item" file="item.stl" scale="{scale} {scale} {scale}" inertia="shell"/></asset>'
-        (where / "scene.xml").write_text(
-            f'<mujoco><compiler balanceinertia="true"/>{asset}<worldbody><body name="pad"><freejoint/><geom size=".05"/></body>'
-            f'<body name="item"><freejoint/>{geoms}</body></worldbody></mujoco>',
-            encoding="utf-8",
-        )
-        gate = {} if kind == "surface_distance" else {"gate": "geometric"}
-        sensor = {"kind": kind, "links": "pad", "feels": ["item"], **gate}
-        touch = compiled(document(where / "scene.xml", "item", sensor, points(probes, REACH), **target), dtype)
+def mesh_scene(
+    mesh: trimesh.Trimesh | None, probes: np.ndarray, *, kind: str = "contact_depth", scale: float = 1.0,
+    geoms: str = '<geom type="mesh" mesh="item"/>', dtype: torch.dtype = torch.float64, **target: Any,
+) -> tuple[Any, SceneState]:  # fmt: skip
+    """Return a module whose probes of 10 mm feel a mesh, or geoms, and its scene with all at the origin: see `module`."""
+    gate = None if kind == "surface_distance" else "geometric"
+    fields = {"kind": kind, "gate": gate, "mesh": mesh, "scale": scale, "target": target, "dtype": dtype, "radius": REACH}
+    touch = probed(probes, geoms, **fields)
     return touch, state(touch)
 
 
@@ -254,7 +235,7 @@ def cube_of_any_making(way: str):
     clearances = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 9.0, 9.9]) * 1e-3
     probes = np.array([(x, y, HALF + c) for c in clearances for x, y in SPOTS])
     mesh = None if target is None else trimesh.creation.box((0.04, 0.04, 0.04))
-    touch, scene = mesh_scene(mesh, probes, geoms=BOX if mesh is None else "", **(target or {}))
+    touch, scene = mesh_scene(mesh, probes, **({"geoms": BOX} if target is None else target))
     ours = touch(scene)["s"][0, :, 0].numpy().reshape(len(clearances), len(SPOTS))
     return Values(REACH - clearances, ours.T, at=clearances, atol=tolerance)
 

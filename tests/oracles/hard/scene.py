@@ -147,13 +147,9 @@ def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0) -> Pair:
 
 
 def worst_of(pair: Pair, state: SceneState, truth: SceneState | None = None, enough: float = 0.0) -> float:
-    """Return the largest error of a reading over full scale; infinite where it is not finite and the reference's is.
+    """Return the largest error of a reading over full scale, infinite where it alone is not finite.
 
-    Args:
-        pair: The module and its reference, both of which go on to the next call.
-        state: What the module reads.
-        truth: What the reference reads; None: the same.
-        enough: Errors up to this need no look at the other sides of ties.
+    The reference reads `truth`, or the same state. Errors up to `enough` need no look at the other sides of ties.
     """
     with quiet():
         errors = row_errors(pair.module(state)["s"], pair.reference, truth or state, enough)

@@ -23,15 +23,7 @@ def heat_module(
     folder: Path, links: Mapping[str, Sequence[Any]], sensor: Mapping[str, Any],
     objects: Mapping[str, tuple[Sequence[Any] | None, Mapping[str, Any]]] | None = None, dtype: torch.dtype = torch.float64,
 ) -> TactileModule:  # fmt: skip
-    """Return a module with one sensor, `heat`, on boxes.
-
-    Args:
-        folder: Where the scene's file goes.
-        links: Sides of each link's box [m].
-        sensor: The sensor, but for its kind, links and objects.
-        objects: Sides of each object's box, or None for a plane, and what the document says of it.
-        dtype: The module's.
-    """
+    """Return a module with one sensor, `heat`, on boxes with sides [m]; objects have sides, None for a plane, and fields."""
     objects, bodies = objects or {}, []
     for name, sides in {**links, **{name: sides for name, (sides, _) in objects.items()}}.items():
         if sides is None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import UnfeltWarning
@@ -51,28 +52,26 @@ def points(places: Sequence[Point] | np.ndarray, radius: float, normal: Point = 
 
 def module(
     where: Path, probes: Sequence[Point] | np.ndarray, geom: str, *, radius: float = 0.01, dtype: torch.dtype = torch.float64,
-    gate: str | None = "geometric", **sensor: Any,
+    gate: str | None = "geometric", mesh: trimesh.Trimesh | None = None, scale: float = 1.0,
+    target: Mapping[str, Any] | None = None, **sensor: Any,
 ) -> TactileModule:  # fmt: skip
     """Return a module with one sensor, `s`, whose probes [m] are on the body `pad`; the object's geom is MJCF text.
 
-    Args:
-        where: Folder for the scene's file.
-        probes: Places of the probes in the pad's frame [m].
-        geom: The object's geoms.
-        radius: The probes' [m].
-        dtype: The module's.
-        gate: The sensor's; None for kinds without.
-        **sensor: Its other fields.
+    A `mesh` [m] is a file `item` in units of `scale` metres; `target` are other fields of the object; kinds without a gate
+    take None.
     """
-    path = where / "scene.xml"
+    asset = ""
+    if mesh is not None:
+        mesh.copy().apply_scale(1 / scale).export(where / "item.stl")
+        asset = f'<asset><mesh name="item" file="item.stl" scale="{scale} {scale} {scale}" inertia="shell"/></asset>'
     joint = "" if "plane" in geom else "<freejoint/>"  # MuJoCo allows planes in static bodies only
-    path.write_text(
-        f'<mujoco><worldbody><body name="pad"><freejoint/><geom type="sphere" size=".05"/></body>'
+    (where / "scene.xml").write_text(
+        f'<mujoco><compiler balanceinertia="true"/>{asset}<worldbody><body name="pad"><freejoint/><geom size=".05"/></body>'
         f'<body name="item">{joint}{geom}</body></worldbody></mujoco>',
         encoding="utf-8",
     )
     sensor = {"links": "pad", "feels": ["item"], **({"gate": gate} if gate else {}), **sensor}
-    return compiled(document(path, "item", sensor, points(probes, radius)), dtype)
+    return compiled(document(where / "scene.xml", "item", sensor, points(probes, radius), **(target or {})), dtype)
 
 
 def document(

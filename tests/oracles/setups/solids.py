@@ -67,12 +67,7 @@ def roots(function: Callable[[np.ndarray], np.ndarray], low: float, high: float)
 
 
 def bending(x: np.ndarray | float, number: int) -> np.ndarray:
-    """Return how a free beam of unit length is displaced at places from its middle, by Bernoulli and Euler: 2 at its ends.
-
-    Args:
-        x: From −0.5 to 0.5.
-        number: Of the way of bending, from 0.
-    """
+    """Return the displacement of a free beam of unit length in a mode, from 0, at −0.5 to 0.5 (Bernoulli and Euler); ±2 at ends."""
     beta = roots(lambda b: np.cos(b) - 1 / np.cosh(b), 3.5, 12.0)[number]
     one, other = (np.cos, np.cosh) if number % 2 == 0 else (np.sin, np.sinh)
     at = beta * np.asarray(x)
