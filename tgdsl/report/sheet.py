@@ -12,9 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tgdsl.console.tables import text_table
-from tgdsl.report.bench.page import STYLE, svg_of
 from tgdsl.report.defects import DEFECTS, Defect, answers
-from tgdsl.report.files import write_report_files
+from tgdsl.report.files import page_of, svg_of, table_of, write_report_files
 
 
 @dataclass(frozen=True)
@@ -81,40 +80,31 @@ td{white-space:normal} tr.failed td,.failed h3{color:#c0392b}
 
 def sheet_page(sheet: Sheet) -> str:
     """Return the HTML file of a sheet."""
-    links = "".join(f'<a href="#{_anchor(section)}">{escape(section.name)}</a>' for section in sheet.sections)
-    parts = [
-        "<!DOCTYPE html>",
-        '<html lang="en"><head><meta charset="utf-8">',
-        f"<title>tgdsl: {escape(sheet.title)}</title><style>{STYLE}{GRID}</style></head><body>",
-        f"<h1>{escape(sheet.title)}</h1><p>{escape(sheet.about)}</p>",
-        f'<nav>{links}<a href="#findings">findings</a></nav>',
-    ]
-    index = 0
+    links = [(_anchor(section), section.name) for section in sheet.sections]
+    sections, index = [], 0
     for section in sheet.sections:
-        parts.append(_section(sheet, section, index))
+        sections.append(_section(sheet, section, index))
         index += len(section.entries)
-    return "\n".join([*parts, _findings(sheet), "</body></html>"])
+    about, links = [f"<p>{escape(sheet.about)}</p>"], [*links, ("findings", "findings")]
+    return page_of(sheet.title, about, links, [*sections, _findings(sheet)], GRID)
 
 
 def _anchor(section: Section) -> str:
-    return escape("".join(char if char.isalnum() else "-" for char in section.name))
+    return "".join(char if char.isalnum() else "-" for char in section.name)
 
 
 def _section(sheet: Sheet, section: Section, index: int) -> str:
-    head = "".join(f"<th>{escape(name)}</th>" for name in sheet.header)
-    rows = [f'<section id="{_anchor(section)}"><h2>{escape(section.name)}</h2><table><tr>{head}</tr>']
-    for entry in section.entries:
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in (entry.title, *entry.cells))
-        rows.append(f"<tr{_failed(entry)}>{cells}</tr>")
-    rows.append('</table><div class="cards">')
-    rows += [_card(entry, f"{sheet.stem}{index + i}") for i, entry in enumerate(section.entries)]
-    rows.append("</div>")
-    rows += [f'<p class="note">not to be had: {escape(name)}: {escape(why)}</p>' for name, why in section.left_out]
-    return "\n".join([*rows, "</section>"])
-
-
-def _failed(entry: Entry) -> str:
-    return "" if entry.holds else ' class="failed"'
+    rows = [(entry.title, *entry.cells) for entry in section.entries]
+    cards = [_card(entry, f"{sheet.stem}{index + i}") for i, entry in enumerate(section.entries)]
+    return "\n".join(
+        [
+            f'<section id="{_anchor(section)}"><h2>{escape(section.name)}</h2>',
+            table_of(sheet.header, rows, ["" if entry.holds else "failed" for entry in section.entries]),
+            *('<div class="cards">', *cards, "</div>"),
+            *(f'<p class="note">not to be had: {escape(name)}: {escape(why)}</p>' for name, why in section.left_out),
+            "</section>",
+        ]
+    )
 
 
 def _card(entry: Entry, salt: str) -> str:
@@ -135,13 +125,13 @@ def _plot(entry: Entry, salt: str) -> str:
 
 
 def _findings(sheet: Sheet) -> str:
-    rows = ["<table><tr><th>finding</th><th>there</th><th>answered by</th><th>figure here</th></tr>"]
-    for defect, title, figure in _answered(sheet):
-        by = title or f"tgdsl bench --{defect.answered_in}"
-        cells = (f"{defect.number}. {defect.about}", defect.measured, by, figure)
-        rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
+    rows = [
+        (f"{defect.number}. {defect.about}", defect.measured, title or f"tgdsl bench --{defect.answered_in}", figure)
+        for defect, title, figure in _answered(sheet)
+    ]
     about = "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
-    return "\n".join([f'<section id="findings"><h2>Findings</h2><p>{about}</p>', *rows, "</table></section>"])
+    table = table_of(("finding", "there", "answered by", "figure here"), rows)
+    return f'<section id="findings"><h2>Findings</h2><p>{about}</p>\n{table}</section>'
 
 
 def _answered(sheet: Sheet) -> list[tuple[Defect, str, str]]:

@@ -18,8 +18,8 @@ from tgdsl.errors import SimulationError
 from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
-from tgdsl.report.bench.results import Measured, Subject
-from tgdsl.report.bench.timing import front_of, median_of
+from tgdsl.report.bench.results import Measured, Subject, with_front
+from tgdsl.report.bench.timing import median_of
 from tgdsl.runtime.scripted import Script
 from tgdsl.scene.scene import scene_model
 from tgdsl.sensors.known import known_kinds
@@ -144,13 +144,11 @@ def _subject(
         )
         time_of_step = {num_envs: median_of(np.array(times[k]))}
         points.append(Measured(setting.label, "float64", setting.is_own, chosen, verified, time_of_step, cost))
-    on_front = front_of([(point.time, point.chosen.rms) for point in points])
     units = {"angle": "rad", "position": "m"}
     scales = {name: f"{scale:.4g} {units[name]}" for name, scale in zip(quantities, magnitude.scale, strict=True)}
-    points = [dataclasses.replace(point, is_on_front=own) for point, own in zip(points, on_front, strict=True)]
     what = f"time step 1/{FINE}, up to {ITERATIONS} iterations to {TOLERANCE:g}"
     left_out = tuple((tried[k].label, why) for k, why in faults.items())
-    return Subject("physics", "physics", what, "", scales, tuple(points), left_out)
+    return Subject("physics", "physics", what, "", scales, with_front(points), left_out)
 
 
 def coordinates(model: mujoco.MjModel) -> tuple[list[int], list[str]]:
