@@ -96,6 +96,16 @@ def order_of_losses():
     return 2.0, np.log2(np.divide(errors[1:], errors[:-1]))
 
 
+@oracle(
+    "A hot block stays hot for a second", "ΔT = εσ(T⁴−T_a⁴) A t/C",
+    "Stefan and Boltzmann's law; the paper's implementation as measured", "temperature lost [K]", at=["after 1 s"], rtol=2e-3,
+    defects=(11,),
+)  # fmt: skip
+def hot_block():
+    lost = 0.85 * stefan_boltzmann() * (373.15**4 - 295.15**4) * AREA / HEAT
+    return lost, 100.0 - cooled(0.005, 1.0, emissivity=0.85, cells=[2, 3, 4]), 119.6
+
+
 def slab_roots(biot: float, count: int = 60) -> np.ndarray:
     """Return the roots of β tan β = Bi."""
     return np.array([brentq(lambda b: b * np.sin(b) - biot * np.cos(b), m * np.pi, (m + 0.5) * np.pi) for m in range(count)])
@@ -168,16 +178,6 @@ def flux_radiated(dt: float):
     exact = (flux / 0.9 / stefan_boltzmann() + around**4) ** 0.25 - around + flux * (thick - depth) / k
     *_, last = heated({"slab": [0.02, 0.02, thick]}, sensor, dt, round(5000.0 / dt), above=exact[None, None])
     return Values(exact, last["heat"][0, :, 0].numpy() - 22.0, at=depth, atol=0.01 * exact[-1])
-
-
-@oracle(
-    "A hot block stays hot for a second", "ΔT = εσ(T⁴−T_a⁴) A t/C",
-    "Stefan and Boltzmann's law; the paper's implementation as measured", "temperature lost [K]", at=["after 1 s"], rtol=2e-3,
-    defects=(11,),
-)  # fmt: skip
-def hot_block():
-    lost = 0.85 * stefan_boltzmann() * (373.15**4 - 295.15**4) * AREA / HEAT
-    return lost, 100.0 - cooled(0.005, 1.0, emissivity=0.85, cells=[2, 3, 4]), 119.6
 
 
 @oracle(
