@@ -4,7 +4,7 @@ import numpy as np
 
 from oracles.comparison import Values, field
 from oracles.forces import AT_REST, AXES, MASS, G
-from oracles.setups.scenes import probed, resting, state
+from oracles.setups.scenes import BALL, probed, resting, state
 
 
 @field("forces: bodies and bits", "link_contact")(
@@ -22,7 +22,6 @@ def link_weight():
 )  # fmt: skip
 def threshold():
     depths = np.array([0.0, 0.4, 0.6, 0.4, 0.21, 0.19, 0.4, 0.51, 0.0])
-    ball = '<geom type="sphere" size=".02"/>'
-    touch = probed([(0, 0, 0)], ball, kind="contact", threshold="0.5 mm", release_threshold="0.2 mm")
+    touch = probed([(0, 0, 0)], BALL, kind="contact", threshold="0.5 mm", release_threshold="0.2 mm")
     bits = [float(touch(state(touch, pos=[0.03 - 1e-3 * depth, 0, 0]))["s"].item()) for depth in depths]
     return Values([0, 0, 1, 1, 1, 0, 0, 1, 0], bits, at=np.arange(len(depths)))

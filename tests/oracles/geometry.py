@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from oracles.comparison import Values, field
-from oracles.setups.scenes import probed, state
+from oracles.setups.scenes import BOX, probed, state
 from tgdsl.geometry.planes import split
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.module.state import SceneState
@@ -48,7 +48,6 @@ PRIMITIVES = (
     ("ellipsoid", (0.05, 0.005, 0.02)),
 )
 """Shapes and sizes [m] whose surfaces points are built on."""
-BOX = '<geom type="box" size=".02 .02 .02"/>'
 HALF, REACH = 0.02, 0.01
 """Half the edge of the cube of 4 cm, and the radius of its probes [m]."""
 

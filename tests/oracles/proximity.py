@@ -12,7 +12,7 @@ import torch
 from scipy.integrate import quad
 
 from oracles.comparison import Values, field
-from oracles.setups.scenes import probed, state
+from oracles.setups.scenes import BOX, probed, state
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moments.clouds import sample_cloud
 from tgdsl.quantities.moments.fields import bake_field, moment_sums, surface_area
@@ -25,7 +25,7 @@ R = 0.01
 """Radius of the probes [m]."""
 TOLERANCE, LIMIT, COARSE = 0.008, 0.01, 0.04
 """Of a field; what it may err at points spread otherwise than the compiler's; of fields whose accuracy is not the question."""
-PLANE, CUBE = '<geom type="plane" size="1 1 .1"/>', '<geom type="box" size=".02 .02 .02"/>'
+PLANE = '<geom type="plane" size="1 1 .1"/>'
 AREA = 6 * 0.04**2
 DENSITY = 100 / AREA
 STIFFNESS, SLIP = 300.0, 10.0
@@ -241,6 +241,6 @@ def plane_at_the_side(about: str, d: float = 0.006):
 )  # fmt: skip
 def slip():
     at: dict[str, Any] = {"pos": [0, 0, -0.026]}
-    still, moving = read(CUBE, **at), read(CUBE, **at, linvel=[0.3, -0.1, 0.7])
+    still, moving = read(BOX, **at), read(BOX, **at, linvel=[0.3, -0.1, 0.7])
     s0 = -still[2] / (STIFFNESS * DENSITY)
     return [SLIP * DENSITY * s0 * 0.3, -SLIP * DENSITY * s0 * 0.1, 0, 0, 0, 0], moving - still

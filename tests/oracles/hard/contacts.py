@@ -13,9 +13,9 @@ from oracles.filters import BRANCH, STRENGTH, TAU
 from oracles.forces import made_up
 from oracles.hard import case
 from oracles.hard.case import Errors
-from oracles.hard.probes import BALL, repeated
+from oracles.hard.probes import repeated
 from oracles.hard.scene import pair_of, quiet, worst_of
-from oracles.setups.scenes import compiled, document, folder, pad, points, probed, state, temporary
+from oracles.setups.scenes import BALL, compiled, document, folder, pad, points, probed, state, temporary
 from oracles.setups.signals import Noise, one
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState

@@ -14,7 +14,7 @@ from oracles.hard import case
 from oracles.hard.case import Errors
 from oracles.hard.scene import quiet
 from oracles.setups.brute import brute_force
-from oracles.setups.scenes import probed, state
+from oracles.setups.scenes import BALL, BOX, probed, state
 from tgdsl.geometry.planes import split
 from tgdsl.geometry.reference import TIE, signed_distance
 from tgdsl.geometry.shapes import SHAPES
@@ -28,7 +28,7 @@ DIAGONAL = np.sqrt(0.5)
 
 Place = tuple[tuple[float, float, float], float]
 HARD: dict[str, list[Place]] = {
-    '<geom type="box" size=".02 .02 .02"/>': [
+    BOX: [
         ((HALF, 0, 0), R),  # on a face
         ((HALF, HALF, 0), R),  # on an edge
         ((HALF, HALF, HALF), R),  # on a corner
@@ -36,7 +36,7 @@ HARD: dict[str, list[Place]] = {
         ((HALF + 0.006, HALF + 0.008, 0), 0.0),  # one radius off an edge: just out of reach
         ((HALF + 0.003, HALF + 0.004, 0), 0.005),
     ],
-    '<geom type="sphere" size=".02"/>': [((HALF, 0, 0), R), ((0, 0, 0), R + HALF), ((0, 0, HALF + 0.004), 0.006)],
+    BALL: [((HALF, 0, 0), R), ((0, 0, 0), R + HALF), ((0, 0, HALF + 0.004), 0.006)],
     '<geom type="capsule" size=".01 .02"/>': [
         ((0, 0, 0), R + 0.01),  # at the centre
         ((0, 0, 0.02), R + 0.01),  # on the axis, at the end of the segment
@@ -61,7 +61,6 @@ HARD: dict[str, list[Place]] = {
 """By a geom's MJCF: places [m], and how deep a probe there is in the geom [m]."""
 GEOMS = {geom.split('"')[1]: geom for geom in HARD}
 """Geoms by the names of their shapes."""
-BALL = '<geom type="sphere" size=".02"/>'
 BY_HAND = "geometry, by hand"
 hard = partial(case.hard, "probes and shapes")
 
@@ -142,7 +141,7 @@ def fast_spin(dtype: torch.dtype, speed: float = 1000.0):
     {f"{speed:g} rad/s": speed for speed in (1e-6, 1.0, 1e3)}, float64=1e-12, float32=1e-6,
 )  # fmt: skip
 def turned_velocity(dtype: torch.dtype, speed: float):
-    touch = probed([(0.01, 0.004, 0.0)], '<geom type="box" size=".02 .02 .02"/>', kind="kinematic_taxel", dtype=dtype)
+    touch = probed([(0.01, 0.004, 0.0)], BOX, kind="kinematic_taxel", dtype=dtype)
     still, moving = (state(touch, pos=[0, 0, 0.026]) for _ in range(2))
     spin, drift = speed * np.array([1.0, -2.0, 0.5]), speed * np.array([0.3, 0.1, -0.2])
     for i in range(moving.body_pos.shape[1]):

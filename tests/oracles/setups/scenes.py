@@ -21,6 +21,8 @@ from tgdsl.module.state import SceneState
 from tgdsl.runtime.simulate import simulate
 from tgdsl.tuning.compile import compile
 
+BOX = '<geom type="box" size=".02 .02 .02"/>'
+BALL = '<geom type="sphere" size=".02"/>'
 Point = Sequence[Any]
 
 

@@ -34,9 +34,9 @@ class Bench:
     document: Annotated[tyro.conf.Positional[Path | None], FILE] = None
     """The YAML document; not for `--oracles` and `--hard`."""
     oracles: bool = False
-    """Compare the package with all closed forms instead: ours, exact, and the paper's formula where it differs."""
+    """In a clone, compare the package with all closed forms instead: ours, exact, and the paper's formula where it differs."""
     hard: bool = False
-    """Run the numerical hard cases of all kinds instead."""
+    """In a clone, run the numerical hard cases of all kinds instead."""
     device: str = "cpu"
     """Where sensors are computed: cpu, cuda or cuda:1."""
     envs: Annotated[str, tyro.conf.arg(metavar="N,N…")] = "256"
