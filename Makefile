@@ -32,7 +32,7 @@ test: $(READY)
 # The rest: each kind compiled by itself, learning, the physics of tasks, the wheel; and calls with their types and shapes checked.
 test-full: $(READY)
 	@$(PYTEST) -m slow
-	@$(PYTEST) -m "not slow" --check-types tests/geometry tests/observations tests/quantities tests/surfaces tests/tensors tests/sensors --ignore=tests/sensors/test_compiled.py
+	@$(PYTEST) -m "not slow" --check-types tests/geometry tests/observations tests/oracles tests/quantities tests/surfaces tests/tensors tests/sensors --ignore=tests/sensors/test_compiled.py
 
 # Change one thing at a time in a room and list what no test notices: make mutate ROOM=sensors MUTATE="--count 60".
 ROOM ?= fields

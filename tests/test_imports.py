@@ -81,7 +81,7 @@ def own(file: Path) -> list[str]:
     return [name if name in MODULES or not name else name.rpartition(".")[0] for name in names]
 
 
-BESIDE = {"helpers", "benchmarks", "robots", "examples", "docs"}
+BESIDE = {"helpers", "oracles", "benchmarks", "robots", "examples", "docs"}
 """Folders of tests that are no rooms."""
 CLAMPED = "sensors.elastomer.clamped."
 """Finite elements of a pad at compile time; a module, once compiled, does without."""

@@ -41,22 +41,32 @@ def test_mistakes_end_in_their_message(here, tmp_path, arguments, message):
 
 
 def test_without_a_document_there_are_oracles_and_hard_cases(here, tmp_path, monkeypatch):
-    from tgdsl.report.hard import contacts
-    from tgdsl.report.hard import every as hard
-    from tgdsl.report.oracles import every, filters
+    from oracles import filters, report
 
-    few, cases = {"filters": (filters.maxwell_step,)}, {"contacts": (contacts.first_reading,)}
-    monkeypatch.setattr(every, "run", lambda begun, run=every.run: run(few, begun))
-    monkeypatch.setattr(hard, "run", lambda begun, run=hard.run: run(cases, begun))
+    for name, function in (("CASES", "filters.maxwell_step()"), ("HARD", "contacts.first_reading()")):
+        monkeypatch.setattr(report, name, [case for case in getattr(report, name) if case.name == function])
     code, said, error = here(tmp_path, "bench", "--oracles", "--hard", "-o", "out")
     assert code == 0, error
     assert "Maxwell branch: after a step" in said and "the first reading of filters" in said and said.count("1 of 1 hold") == 2
     names = {f"{stem}.{suffix}" for stem in ("oracles", "hard") for suffix in ("csv", "json", "html")}
     assert {file.name for file in (tmp_path / "out").iterdir()} == names
     monkeypatch.setattr(filters, "STRENGTH", 0.6)  # the closed form's; the noise is that of the default
-    monkeypatch.setattr(every, "run", lambda begun, run=every.run: run(begun))
     code, said, error = here(tmp_path, "bench", "--oracles", "-o", "out")
     assert code == 2 and error == "tgdsl: 1 results are not as they should be; they are marked in out\n" and "✗" in said
+
+
+def test_an_installed_package_says_that_oracles_need_a_clone(here, tmp_path, monkeypatch):
+    from tgdsl.commands.report import sheets
+
+    monkeypatch.setattr(sheets, "__file__", str(tmp_path / "site-packages" / "tgdsl" / "commands" / "report" / "sheets.py"))
+    for option in ("--oracles", "--hard"):
+        code, said, error = here(tmp_path, "bench", option)
+        assert code == 2 and not said
+        assert error == (
+            "tgdsl: bench --oracles and --hard run tgdsl's tests, which an installed package does not contain: in a clone of the "
+            "repository, run `pip install -e .` and then the command again\n"
+        )
+        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

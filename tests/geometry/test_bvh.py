@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from brute import brute_force
+from oracles.setups.brute import brute_force
 
 from tgdsl.errors import TgdslError
 from tgdsl.geometry.bvh import ON_SURFACE, TriangleMesh, nearest

@@ -3,11 +3,10 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from held import assert_holds
+from oracles import geometry
 
 from tgdsl.geometry.reference import signed_distance
 from tgdsl.geometry.shapes import SHAPES
-from tgdsl.report.oracles import geometry
 
 SIZES = {
     "plane": [(1.0, 1.0, 0.1)],
@@ -111,9 +110,3 @@ def test_ellipsoid_derivative_with_respect_to_its_size(size):
         assert torch.autograd.gradcheck(
             distance, torch.tensor(size, dtype=torch.float64, requires_grad=True), eps=1e-9, atol=1e-4
         )
-
-
-@pytest.mark.parametrize("compare", [geometry.known_distances, geometry.ellipsoid_normals])
-def test_known_distances(compare):
-    """Distances that need no code, and P = X + t n with X on an ellipsoid and n its normal: t, exact for every X."""
-    assert_holds(compare())

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from noise_cases import MM, Noise, make_layout
+from oracles.setups.signals import MM, Noise, make_layout
 
 EXACT = 1e-12
 """Both are float64."""

@@ -2,9 +2,8 @@
 
 import numpy as np
 import trimesh
+from oracles.setups.solids import box
 from scipy.spatial.transform import Rotation
-
-from tgdsl.report.oracles.setups.solids import box
 
 
 def hollow(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from oracles.setups.solids import ball, box, surface_of
 from ringing_bodies import hollow, slabs, thin_box, turned
 
 from tgdsl.modal import cells, grid
 from tgdsl.modal.closed import closed
-from tgdsl.report.oracles.setups.solids import ball, box, surface_of
 from tgdsl.surfaces.surface import Surface
 
 

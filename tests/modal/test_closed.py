@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from oracles.setups.solids import ball, box, surface_of
 from ringing_bodies import hollow, thin_box
 
 from tgdsl.errors import LowerError
 from tgdsl.modal.closed import closed, enclosed
-from tgdsl.report.oracles.setups.solids import ball, box, surface_of
 from tgdsl.surfaces.surface import Surface
 
 CUBE = 0.1**3

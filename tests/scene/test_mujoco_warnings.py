@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from cube_on_pad import pad
+from oracles.setups.scenes import pad
 
 import tgdsl
 from tgdsl.formats.robot import load_model

@@ -1,10 +1,8 @@
 import pytest
 import torch
-from held import assert_holds
-from scenes import module, state
+from oracles.setups.scenes import module, state
 
 from tgdsl.errors import SpecError
-from tgdsl.report.oracles import bodies
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.testing import KindConformance
 
@@ -27,10 +25,6 @@ SPHERE = '<geom type="sphere" size=".02"/>'
 def bits(touch, depths):
     """Press a 10 mm probe at the origin to one depth after the other, in mm."""
     return [int(touch(state(touch, pos=[0.03 - 1e-3 * depth, 0, 0]))["s"].item()) for depth in depths]
-
-
-def test_threshold_and_release():
-    assert_holds(bodies.threshold())
 
 
 def test_without_release_there_is_no_memory(tmp_path):

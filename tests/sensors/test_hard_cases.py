@@ -3,18 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from at_rest import NUM_STEPS, jittered, repeated
-from hard_places import HARD
-from held import assert_stands
-from scenes import module, state
+from oracles.hard.probes import HARD, NUM_STEPS, jittered, repeated
+from oracles.setups.scenes import module, state
 
 import tgdsl
-from tgdsl.report.hard import probes
-
-
-def test_at_rest_on_a_face_edge_corner_or_centre_the_normal_does_not_alternate():
-    """Off a surface of curvature 1/r the normal turns by jitter / r at the most; 1e-3 is far below any jump between faces."""
-    assert_stands(probes.trembling(NUM_STEPS))
 
 
 def two_cubes(tmp_path, dtype=torch.float64, bodies=("left", "right")):
@@ -68,16 +60,6 @@ def test_clearly_deeper_wins_whatever_the_order(tmp_path):
     touch, scene = two_cubes(tmp_path)
     scene.body_pos[0, touch.inputs.bodies.index("right"), 0] -= 1e-5
     assert touch(scene)["s"][0, 0, 1].item() == pytest.approx(2.0)
-
-
-def test_deep_overlap_is_bounded():
-    """A whole ball of probes inside: depths are at most radius plus the object's inner radius, forces finite."""
-    assert_stands(probes.deep_overlap())
-
-
-def test_a_fast_spin_is_felt_as_it_is():
-    """1,000 rad/s of a ball over a probe 4 mm inside: v = ω × r, exactly, and no heed of the rest."""
-    assert_stands(probes.fast_spin())
 
 
 def test_quaternions_need_not_have_unit_length(tmp_path):

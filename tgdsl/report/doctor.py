@@ -151,19 +151,19 @@ def packages(requirements: Sequence[str] | None = None) -> tuple[Package, ...]:
             requirements = importlib.metadata.requires("tgdsl") or []
         except importlib.metadata.PackageNotFoundError as error:
             raise TgdslError("tgdsl is not installed, it is only imported: pip install -e .") from error
-    found: dict[str, Package] = {}
+    known: dict[str, Package] = {}
     for text in requirements:
-        own = Requirement(text)
-        marker = str(own.marker or "")
+        requirement = Requirement(text)
+        marker = str(requirement.marker or "")
         extra = match[1] if (match := re.search(r'extra == "(\w+)"', marker)) else ""
-        if own.marker is not None and not own.marker.evaluate({"extra": extra}):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
             continue
-        name = own.name.lower().replace("_", "-").replace(".", "-")
+        name = requirement.name.lower().replace("_", "-").replace(".", "-")
         if extra in DEVELOPMENT and name not in WITHOUT:
             continue
-        if name not in found or found[name].extra in DEVELOPMENT:
-            found[name] = Package(name, installed_version(name), str(own.specifier), extra)
-    return tuple(sorted(found.values(), key=lambda package: (package.extra != "", package.name)))
+        if name not in known or known[name].extra in DEVELOPMENT:
+            known[name] = Package(name, installed_version(name), str(requirement.specifier), extra)
+    return tuple(sorted(known.values(), key=lambda package: (package.extra != "", package.name)))
 
 
 def installed_version(name: str) -> str | None:
@@ -178,11 +178,11 @@ def devices() -> dict[str, str]:
     """Return where a module can be, by torch's name."""
     import torch
 
-    found = {"cpu": f"{torch.get_num_threads()} threads"}
+    places = {"cpu": f"{torch.get_num_threads()} threads"}
     for i in range(torch.cuda.device_count()):
-        own = torch.cuda.get_device_properties(i)
-        found[f"cuda:{i}"] = f"{own.name}, {own.total_memory / 2**30:.0f} GiB, compute capability {own.major}.{own.minor}"
-    return found
+        gpu = torch.cuda.get_device_properties(i)
+        places[f"cuda:{i}"] = f"{gpu.name}, {gpu.total_memory / 2**30:.0f} GiB, compute capability {gpu.major}.{gpu.minor}"
+    return places
 
 
 def compilers(known: Sequence[Package]) -> dict[str, str | None]:
@@ -218,8 +218,8 @@ def caches() -> dict[str, int | None]:
 
 def _warp_cache() -> Path:
     """Return where Warp keeps its kernels: it has a folder for each version."""
-    if own := os.environ.get("WARP_CACHE_PATH"):
-        return Path(own)
+    if path := os.environ.get("WARP_CACHE_PATH"):
+        return Path(path)
     shared = os.environ.get("XDG_CACHE_HOME")
     return (Path(shared) if shared else Path(os.path.expanduser("~/.cache"))) / "warp"
 
@@ -234,56 +234,58 @@ def findings(
 ) -> tuple[Finding, ...]:
     """Return what a user should know of some packages, compilers, devices and ways to OpenGL, the worst first."""
     has_gpu = any(name.startswith("cuda") for name in places)
-    found = [*_wrong_versions(known), *_known_faults(known), *_not_there(known, has_gpu)]
+    results = [*_wrong_versions(known), *_known_faults(known), *_not_there(known, has_gpu)]
     if compiled_by[CPP] is None:
-        found.append(Finding("slower", "no C++ compiler (g++, clang++ or $CXX)", "`module.compile()` on a CPU leaves it eager"))
+        results.append(
+            Finding("slower", "no C++ compiler (g++, clang++ or $CXX)", "`module.compile()` on a CPU leaves it eager")
+        )
     if not has_gpu:
-        found.append(
+        results.append(
             Finding("note", "torch sees no GPU", "everything runs on the CPU; `python -m torch.utils.collect_env` says more")
         )
     setting = os.environ.get("MUJOCO_GL", OPENGL[0])
     if not drawn_by.get(setting, True):
         others = [f"MUJOCO_GL={name}" for name, draws in drawn_by.items() if draws]
         then = f"set {others[0]}" if others else "install libegl1 or libosmesa6; pictures of `tgdsl run` need none"
-        found.append(Finding("missing", f"no OpenGL by MUJOCO_GL={setting}: `tgdsl play --video` is refused", then))
+        results.append(Finding("missing", f"no OpenGL by MUJOCO_GL={setting}: `tgdsl play --video` is refused", then))
     order: tuple[Level, ...] = ("fault", "slower", "missing", "note")
-    return tuple(sorted(found, key=lambda finding: order.index(finding.level)))
+    return tuple(sorted(results, key=lambda finding: order.index(finding.level)))
 
 
 def _wrong_versions(known: Sequence[Package]) -> list[Finding]:
-    found = []
+    results = []
     for package in known:
         install = f'pip install "{package.name}{package.wanted}"'
         if not package.extra and package.installed is None:
-            found.append(Finding("fault", f"{package.name} is not installed, and tgdsl cannot do without it", install))
+            results.append(Finding("fault", f"{package.name} is not installed, and tgdsl cannot do without it", install))
         elif not package.fits:
-            found.append(Finding("fault", f"{package.name} is {package.installed}, expected {package.wanted}", install))
-    return found
+            results.append(Finding("fault", f"{package.name} is {package.installed}, expected {package.wanted}", install))
+    return results
 
 
 def _known_faults(known: Sequence[Package]) -> list[Finding]:
     """Return faults of what is installed that tgdsl's own range of versions does not tell of."""
     versions = {package.name: package.installed for package in known}
-    found = []
+    results = []
     mujoco, warp = versions.get("mujoco"), versions.get("mujoco-warp")
     if mujoco and Version(mujoco) == Version("4.0.0"):
         what = "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse"
-        found.append(Finding("fault", what, "forces are wrong there: take another version"))
+        results.append(Finding("fault", what, "forces are wrong there: take another version"))
     if mujoco and warp and Version(mujoco).release[:2] != Version(warp).release[:2]:
         what = f"MuJoCo {mujoco} beside MuJoCo Warp {warp}"
-        found.append(Finding("fault", what, "their models differ between such versions: take the same of both"))
+        results.append(Finding("fault", what, "their models differ between such versions: take the same of both"))
     torch = versions.get("torch")
     if torch and Version(torch) >= Version("2.11"):
         what = f"torch {torch} compiles a copy wrongly whose source is changed after it (pytorch#198131)"
-        found.append(Finding("note", what, "tgdsl compiles nothing that does so; look out in a step of your own"))
-    return found
+        results.append(Finding("note", what, "tgdsl compiles nothing that does so; look out in a step of your own"))
+    return results
 
 
 def _not_there(known: Sequence[Package], has_gpu: bool) -> list[Finding]:
-    found = []
+    results = []
     for package in known:
         if package.installed is None and package.name in WITHOUT and (has_gpu or package.name != "triton"):
             level, then = WITHOUT[package.name]
             wanted = package.name if package.extra in DEVELOPMENT else f'"tgdsl[{package.extra}]"'
-            found.append(Finding(level, f"{package.name} is not installed", f"{then} (pip install {wanted})"))
-    return found
+            results.append(Finding(level, f"{package.name} is not installed", f"{then} (pip install {wanted})"))
+    return results

@@ -29,7 +29,7 @@ SAMPLES, PLACE = "sound/samples", "sound/place"
 
 `sound/samples` (env, sample, row): sound pressure at 1 m from each row [Pa], the last sample at the instant of the state,
 earlier ones evenly since the (sub)step before, `Lowered.sound` of them. `sound/place` (env, 3, row): where it comes from, in
-the world, at the instant of the state [m], in the dtype of the state, as `quantities.places` has points of bodies. Float64
+the world, at the instant of the state [m], in the dtype of the state, as `quantities.kinematics` has points of bodies. Float64
 references return (sample, row) and (3, row).
 """
 SOUND = frozenset({SAMPLES, PLACE})

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
 
+from tgdsl.commands.report.sheets import tests_of_clone
 from tgdsl.report.defects import DEFECTS, answers
-from tgdsl.report.oracles.every import draw, entry_of, run
-from tgdsl.report.oracles.results import Comparison
 from tgdsl_docs.tables import inline, table
 
 HEADER = ("comparison", "quantity", "largest exact", "error", "of what is allowed", "error of the paper's", "source")
+report = tests_of_clone()
 MOST = 4
 """Comparisons that a kind's plot shows."""
 
@@ -22,9 +23,9 @@ class Accuracy:
     """All comparisons, computed once per build."""
 
     def __init__(self) -> None:
-        self.fields = {field: comparisons for field, (comparisons, _) in run().items()}
+        self.fields = {field: comparisons for field, (comparisons, _) in report.run().items()}
 
-    def of(self, kind: str) -> list[Comparison]:
+    def of(self, kind: str) -> list[Any]:
         """Return a kind's comparisons."""
         return [own for comparisons in self.fields.values() for own in comparisons if kind in own.kinds]
 
@@ -42,7 +43,7 @@ class Accuracy:
         figure = Figure(figsize=(9.0, 3.1 * -(-len(found) // 2)))
         for i, own in enumerate(found):
             axes = figure.add_subplot(-(-len(found) // 2), 2, i + 1)
-            draw(own, axes)
+            report.draw(own, axes)
             axes.set_title(own.name, fontsize=8)
             axes.tick_params(labelsize=7)
         figure.tight_layout()
@@ -56,12 +57,11 @@ class Accuracy:
         parts = ["# All comparisons\n\n[Accuracy](../accuracy.md) says what they are.\n"]
         for field, comparisons in self.fields.items():
             parts.append(f"## {field[0].upper()}{field[1:]}\n\n{_table(comparisons)}")
-        entries = [entry_of(own) for comparisons in self.fields.values() for own in comparisons]
-        found = answers((entry.title, entry.figure, entry.defects) for entry in entries)
+        entries = [report.entry_of(own) for comparisons in self.fields.values() for own in comparisons]
+        first = answers((entry.title, entry.figure, entry.defects) for entry in entries)
         rows = []
         for defect in DEFECTS:
-            answer = found.get(defect.number)
-            by, figure = (answer.title, answer.figure) if answer else (f"`tgdsl bench --{defect.answered_in}`", "")
+            by, figure = first.get(defect.number, (f"`tgdsl bench --{defect.answered_in}`", ""))
             rows.append((str(defect.number), inline(defect.about), defect.measured, inline(by), figure))
         about = (
             "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
@@ -71,6 +71,6 @@ class Accuracy:
         return "\n".join(parts)
 
 
-def _table(found: Sequence[Comparison]) -> str:
-    rows = [(inline(entry.title), *map(inline, entry.cells)) for entry in map(entry_of, found)]
+def _table(found: Sequence[Any]) -> str:
+    rows = [(inline(entry.title), *map(inline, entry.cells)) for entry in map(report.entry_of, found)]
     return table(HEADER, rows)

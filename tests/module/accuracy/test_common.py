@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from oracles.setups.sounds import MODES, plate, pressed
 
 from tgdsl.module.accuracy.states import common_of, readings_of
-from tgdsl.report.oracles.setups.sounds import MODES, plate, pressed
 
 FORCES = (0.0, 2.0, 0.5, 0.0, 0.0)
 

@@ -14,7 +14,7 @@ import tgdsl
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.accuracy.states import narrowed, readings_of
 from tgdsl.report.bench.bench import Bench, bench
-from tgdsl.report.bench.files import write_files
+from tgdsl.report.bench.page import write_bench
 from tgdsl.report.bench.results import rows_of
 from tgdsl.report.bench.sensors import Options
 from tgdsl.tuning.recording import load_recording, record, save_recording, varied
@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def work(folder):
-    return Bench(bench_document(folder), kept=folder / "states.npz", state_envs=4, steps=9, options=FEW)
+    return Bench(bench_document(folder), save_states=folder / "states.npz", state_envs=4, steps=9, options=FEW)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_counted_bytes_are_those_of_the_tensors(report):
 
 @pytest.mark.slow
 def test_two_runs_agree_on_errors_exactly(work, report):
-    again = bench(Bench(work.document, states=work.kept, sensors=("skin",), options=FEW))
+    again = bench(Bench(work.document, states=work.save_states, sensors=("skin",), options=FEW))
     for one, two in zip(report.subjects[1].points, again.subjects[0].points, strict=True):
         assert (one.chosen, one.verified, one.cost) == (two.chosen, two.verified, two.cost)
     physics = bench(Bench(work.document, sensors=("physics",), state_envs=4, steps=9, options=FEW)).subjects[0]
@@ -119,7 +119,7 @@ class Links(HTMLParser):
 
 @pytest.mark.slow
 def test_the_page_opens_offline(report, folder):
-    files = {file.suffix: file for file in write_files(report, folder / "out")}
+    files = {file.suffix: file for file in write_bench(report, folder / "out")}
     text = files[".html"].read_text()
     parser = Links()
     parser.feed(text)
@@ -186,7 +186,7 @@ def test_what_cannot_be_measured_is_refused(work, wrong, message):
 
 @pytest.mark.slow
 def test_states_of_another_document_are_refused(work, report, tmp_path):
-    arrays = dict(np.load(work.kept))
+    arrays = dict(np.load(work.save_states))
     arrays["names:body"] = np.array(["pad", "ball"])
     np.savez(tmp_path / "other.npz", **arrays)
     with pytest.raises(StateError, match="these states lack the body cube: they are of another document"):
@@ -207,7 +207,7 @@ def test_files_that_are_no_states_are_refused(tmp_path, content):
 @pytest.mark.slow
 def test_a_field_that_is_missing_is_told(work, report):
     touch = tgdsl.compile(work.document, overrides={"observations": "{}"})
-    recording = load_recording(work.kept)
+    recording = load_recording(work.save_states)
     recording.states[0].contact_found = None
     with pytest.raises(StateError, match="these states have no contact_found"):
         narrowed(recording.states[0], recording.names, touch.inputs)

@@ -6,7 +6,7 @@ import pytest
 from chosen_pads import chosen_document
 
 from tgdsl.report.bench.bench import Bench, bench
-from tgdsl.report.bench.files import write_files
+from tgdsl.report.bench.page import write_bench
 from tgdsl.report.bench.sensors import Options
 from tgdsl.tuning import choose as choosing
 
@@ -34,6 +34,6 @@ def test_what_accuracy_chose_is_what_the_compiler_takes_now(report):
 
 @pytest.mark.slow
 def test_files_say_why(report, tmp_path):
-    files = {file.suffix: file.read_text() for file in write_files(report, tmp_path)}
+    files = {file.suffix: file.read_text() for file in write_bench(report, tmp_path)}
     assert "accuracy 10 %: grid, 1 mm<br>" in files[".html"]
     assert json.loads(files[".json"])["subjects"][0]["chosen"][0] == "accuracy 10 %: grid, 1 mm"

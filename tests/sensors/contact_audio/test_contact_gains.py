@@ -5,6 +5,8 @@ import re
 import numpy as np
 import pytest
 import torch
+from oracles.setups.solids import box, surface_of
+from oracles.setups.sounds import STEP, plate, plate_document, pressed
 from scipy.spatial.transform import Rotation
 
 import tgdsl
@@ -15,8 +17,6 @@ from tgdsl.modal.analysis import analysed
 from tgdsl.modal.spec import ShapeModes
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.report.oracles.setups.solids import box, surface_of
-from tgdsl.report.oracles.setups.sounds import STEP, plate, plate_document, pressed
 
 GIVEN = {"modes": {"material": "steel", "count": 4}, "gains": "contact", "samples": 32}
 PLACES = np.array([[0.0, 0.0, 0.005], [0.1, 0.1, 0.005], [0.1, 0.0, 0.005], [-0.043, 0.061, 0.005]])

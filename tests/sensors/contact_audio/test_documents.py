@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from oracles.setups.sounds import MODES, plate, plate_document, pressed
 
 import tgdsl
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.modal.modes import Modes
-from tgdsl.report.oracles.setups.sounds import MODES, plate, plate_document, pressed
 from tgdsl.sensors.contact_audio import given_modes
 
 HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 10.0}]

@@ -4,40 +4,22 @@ import itertools
 import math
 
 import numpy as np
-import pytest
 import torch
-from held import assert_holds
-from struck_plate import energy
+from oracles import sound as oracles
+from oracles.setups.sounds import STEP, energy, plate, pressed, sound
 
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads, PairLoads
-from tgdsl.report.oracles import sound as oracles
-from tgdsl.report.oracles.setups.sounds import STEP, plate, pressed, sound
 from tgdsl.sensors.base import Context
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.sensors.contact_audio.operators import operators
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_an_impulse_rings_as_damped_sines(dtype):
-    """J Σ g e^(−dt) sin 2πft from the impulse on, and nothing at all before."""
-    assert_holds(oracles.ring_down(dtype))
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_a_million_samples(dtype):
-    """Two modes that ring for all of it, by blocks of 2500 samples through the module."""
-    found = oracles.million_samples(dtype)
-    assert found.exact.shape == (1_000_000,)
-    assert_holds(found)
-
-
 def test_a_mode_is_as_loud_as_the_impulse_at_every_frequency_and_rate():
     """The paper's is 1/sin θ as loud: at 50 Hz and 40 kHz by 127 times."""
     found = oracles.response_by_frequency()
-    assert_holds(found)
-    theta = 2 * np.pi * found.over.numbers / np.array([[1e4], [4e4]])
+    theta = 2 * np.pi * np.array(found.at) / np.array([[1e4], [4e4]])
     np.testing.assert_allclose(found.paper, 1 / np.sin(theta), rtol=1e-9)
 
 
@@ -73,12 +55,6 @@ def test_energy_never_grows_unless_struck(tmp_path):
     assert held[-1] == 0 and held[-2] < 1e-22
 
 
-@pytest.mark.parametrize("samples", [7, 10, 40])
-def test_samples_at_common_times_are_the_same_for_all_numbers_of_samples(samples):
-    """Struck and scraped: what 20 samples and another number have in common."""
-    assert_holds(oracles.common_times(samples))
-
-
 def test_calls_of_several_steps_sound_as_calls_of_one(tmp_path):
     """The blocks of all physics steps come together, and the noise is that of the physics step."""
     forces = np.abs(np.cos(np.arange(12))) * 2
@@ -93,16 +69,10 @@ def test_calls_of_several_steps_sound_as_calls_of_one(tmp_path):
     np.testing.assert_allclose(torch.cat(found).numpy()[None], expected, rtol=0, atol=1e-15)
 
 
-def test_the_papers_response_is_as_printed():
-    """y[k] = r^k sin((k+1)θ)/sin θ times the rise of the force, from the first sample of the step of the rise on."""
-    assert_holds(oracles.two_pole({"frequency": 1171.0, "decay": 20.0, "gain": 1.0}))
-
-
 def test_bands_are_the_mean_squares_of_modes(tmp_path):
     """½ (g J)² e^(−2dt) at the end of each step, 523 Hz in that of 501, 1171 in 1259, 2903 in 3162."""
     touch = plate(tmp_path, outputs="bands", samples=16, scrape=0)
     assert touch.outputs[0].shape == (1, 1, 9) and touch.outputs[0].units == ("m²/s²",) * 9
-    assert_holds(oracles.bands())
 
 
 def test_levels_are_in_decibels(tmp_path):

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from oracles.setups.solids import box, surface_of
+from oracles.setups.sounds import plate_document
 from ringing_bodies import slabs, thin_box
 
 import tgdsl
@@ -10,8 +12,6 @@ from tgdsl.errors import SpecError
 from tgdsl.modal import spectrum as spectra
 from tgdsl.modal.analysis import analysed
 from tgdsl.modal.spec import ShapeModes
-from tgdsl.report.oracles.setups.solids import box, surface_of
-from tgdsl.report.oracles.setups.sounds import plate_document
 
 SIDE, WALL = 0.1, 0.004
 WALLS = "".join(

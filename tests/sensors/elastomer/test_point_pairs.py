@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from scenes import state
+from oracles.setups.scenes import state
 
 import tgdsl
 from tgdsl.compiler.pipeline import compile_plan

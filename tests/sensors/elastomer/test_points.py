@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scenes import module, state
+from oracles.setups.scenes import module, state
 from scipy.spatial.transform import Rotation
 
 import tgdsl

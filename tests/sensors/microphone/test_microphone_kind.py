@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from oracles.setups.listening import TONE
 
 from tgdsl.module.accuracy.changed import only
-from tgdsl.report.oracles.setups.tone import TONE
 from tgdsl.sensors import MICROPHONE
 from tgdsl.testing import KindConformance
 

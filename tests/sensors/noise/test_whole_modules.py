@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from noise_cases import MM
 from noise_stages import ALL_TOGETHER, DT, NORMAL
+from oracles.setups.signals import MM
 
 import tgdsl
 from tgdsl.module.module import TactileModule

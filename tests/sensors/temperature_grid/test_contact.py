@@ -5,33 +5,16 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from held import assert_holds
+from oracles import heat
+from oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 from scipy.linalg import expm
 
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.report.oracles import heat
-from tgdsl.report.oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 
 
 def test_aluminium_on_warm_rubber_warms_as_two_solids_do():
-    """Carslaw and Jaeger, 2.14: both surfaces go to (e₁T₁ + e₂T₂)/(e₁ + e₂) at once and stay there, √(kρc) being e.
-
-    Aluminium at 22 °C on rubber at 45 °C: its surface rises by 0.69 K, and erfc(x/√4αt) of it at depth x.
-    """
-    found = heat.two_bodies(400)
-    assert_holds(found)
-    assert found.atol == pytest.approx(0.01 * 0.69, rel=0.01)
-
-
-@pytest.mark.parametrize("is_far", [False, True])
-def test_the_lattices_green_function_is_known(is_far):
-    assert_holds(heat.greens_function(is_far))
-
-
-@pytest.mark.parametrize("cell", [0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0])
-def test_a_circular_spot_has_its_resistance(cell):
-    """An isothermal disc on a half-space: 1/4ka (Carslaw and Jaeger, 8.2), whatever the size of cells over a, and wherever it is."""
-    assert_holds(heat.circular_spot(cell))
+    """Aluminium at 22 °C on rubber at 45 °C: its surface rises by 0.69 K."""
+    assert heat.two_bodies(1).atol == pytest.approx(0.01 * 0.69, rel=0.01)
 
 
 def test_a_patch_that_covers_the_face_is_not_constricted():
@@ -54,11 +37,6 @@ def test_a_patch_that_covers_the_face_is_not_constricted():
     np.testing.assert_allclose(of(0.0004, 0.01, 0.01), whole, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(of(0.0004, 0.03, -0.01), whole, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(of(0.01, 0.01, 0.01), whole, rtol=1e-12, atol=1e-15)
-
-
-def test_two_lumps_in_contact_find_their_mean():
-    """In the end, by their heat capacities; and the film between them says how fast at first."""
-    assert_holds(heat.two_lumps())
 
 
 def test_an_object_between_two_links_is_told_by_both_alike(tmp_path):
@@ -105,12 +83,6 @@ def test_nothing_leaves_the_range_of_what_there_is(tmp_path, cells, dtype):
                 assert float(every.min()) >= -20.0 - slack and float(every.max()) <= 80.0 + slack
 
 
-@pytest.mark.parametrize(("cell", "num"), [(1e-3, 80), (2.5e-4, 200), (1.25e-4, 320)])
-def test_two_solids_exchange_what_they_must_however_long_a_step_is(cell, num):
-    """αΔt/Δ² = 0.5, 8 and 31: their contact sees what the cells conduct within a step."""
-    assert_holds(heat.two_solids(cell, num))
-
-
 @pytest.mark.parametrize("dt", [0.001, 0.004, 0.02])
 def test_two_solids_exchange_what_their_cells_equations_say(tmp_path, dt):
     """Twice 8 cells of 2 mm, against the exponential of all of them: αΔt/Δ² from 0.02 to 0.5."""
@@ -128,12 +100,6 @@ def test_two_solids_exchange_what_their_cells_equations_say(tmp_path, dt):
     rate = own.conductivity / (own.density * own.specific_heat * cell**2)
     after = expm(-0.4 * rate * coupled.T @ coupled) @ np.repeat([0.0, 23.0], num)
     assert found == pytest.approx(after[:num].sum() * own.density * own.specific_heat * cell * area, rel=0.003)
-
-
-@pytest.mark.parametrize(("num", "dt"), [(4, 1.0), (8, 0.2), (12, 1.0)])
-def test_a_spot_conducts_in_long_steps_what_it_does_in_short_ones(num, dt):
-    """αΔt/Δ² from 3 to 35: heat spreads from the cells below it in all directions."""
-    assert_holds(heat.spot_in_long_steps(num, dt))
 
 
 @pytest.mark.parametrize("area", [1e-6, 1e-4])

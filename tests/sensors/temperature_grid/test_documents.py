@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import pytest
+from oracles.setups.boxes import heat_module
 
 import tgdsl
-from tgdsl.report.oracles.setups.boxes import heat_module
 
 ROOT = Path(__file__).parents[3]
 BLOCKS = [part.split("```")[0] for part in (ROOT / "docs" / "heat.md").read_text().split("```yaml\n")[1:]]

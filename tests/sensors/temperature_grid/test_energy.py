@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from oracles.setups.boxes import heat_module, heat_state
 
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.report.oracles.setups.boxes import heat_module, heat_state
 
 LINKS = {"tip": [0.012, 0.01, 0.02], "thumb": [0.015, 0.01, 0.01]}
 OBJECTS = {

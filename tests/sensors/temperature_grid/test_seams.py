@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 from scipy.spatial.transform import Rotation
-
-from tgdsl.report.oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 
 TIP = {"tip": [0.012, 0.01, 0.02]}
 SENSOR = {"cells": [2, 3, 2], "material": "steel", "convection": 20.0, "lag": 0.3}

@@ -34,9 +34,9 @@ class Bench:
     document: Annotated[tyro.conf.Positional[Path | None], FILE] = None
     """The YAML document; not for `--oracles` and `--hard`."""
     oracles: bool = False
-    """Compare the package with all closed forms instead: ours, exact, and the paper's formula where it differs."""
+    """In a clone, compare the package with all closed forms instead: ours, exact, and the paper's formula where it differs."""
     hard: bool = False
-    """Run the numerical hard cases of all kinds instead."""
+    """In a clone, run the numerical hard cases of all kinds instead."""
     device: str = "cpu"
     """Where sensors are computed: cpu, cuda or cuda:1."""
     envs: Annotated[str, tyro.conf.arg(metavar="N,N…")] = "256"
@@ -73,12 +73,13 @@ class Bench:
         from tgdsl.files.write import check_writable
         from tgdsl.report.bench.bench import Bench as Work
         from tgdsl.report.bench.compare import compared, read_rows
-        from tgdsl.report.bench.files import check_files, write_files
+        from tgdsl.report.bench.page import write_bench
         from tgdsl.report.bench.sensors import Options
+        from tgdsl.report.files import check_report_files
         from tgdsl.tensors.devices import device_of
 
         options = Options(device_of(self.device), _numbers(self.envs), self.repeats, self.compiled, self.seed)
-        check_files(self.out)
+        check_report_files(self.out, "bench")
         earlier = None if self.against is None else read_rows(self.against)
         if self.save_states is not None:
             check_writable(self.save_states)
@@ -97,7 +98,7 @@ class Bench:
         print(_text(report))
         if earlier is not None:
             print("\n".join(["", f"against {self.against}", *compared(report, earlier).lines()]))
-        print("\n".join(["", *map(str, write_files(report, self.out))]))
+        print("\n".join(["", *map(str, write_bench(report, self.out))]))
 
     def _run_without_document(self) -> None:
         """Run `--oracles` and `--hard`."""

@@ -37,7 +37,7 @@ class Bench:
         overrides: By dotted path YAML text, or a plain value.
         sensors: Sensors, and `physics`, that are measured; empty: all.
         states: File of states; None: a scripted run.
-        kept: File that the states of the run are written to; None: none.
+        save_states: File that the states of the run are written to; None: none.
         state_envs: Environments of the scripted run; half of them verify.
         steps: Its control steps, about.
         substeps: Physics steps of each.
@@ -48,7 +48,7 @@ class Bench:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     sensors: tuple[str, ...] = ()
     states: Path | None = None
-    kept: Path | None = None
+    save_states: Path | None = None
     state_envs: int = 16
     steps: int = 90
     substeps: int = 5
@@ -81,8 +81,8 @@ def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], 
     for name in wanted:
         if begun is not None:
             begun(len(subjects), len(wanted))
-        found = _subject(what, name, touch, recording, progress)
-        subjects.append(replace(found, chosen=choice.notes.get(name, ())))
+        subject = _subject(what, name, touch, recording, progress)
+        subjects.append(replace(subject, chosen=choice.notes.get(name, ())))
     if begun is not None:
         begun(len(wanted), len(wanted))
     title = str(what.document) if not isinstance(what.document, Mapping) else "<mapping>"
@@ -105,30 +105,30 @@ def _recording(what: Bench, names: Sequence[str], progress: Progress) -> Recordi
     recording = record(
         touch, what.state_envs, steps=what.steps, substeps=what.substeps, seed=what.options.seed, progress=progress
     )
-    if what.kept is not None:
-        save_recording(recording, what.kept)
+    if what.save_states is not None:
+        save_recording(recording, what.save_states)
     return recording
 
 
 def _check(options: Options) -> None:
     if not options.num_envs or min(options.num_envs) < 1:
-        found = ", ".join(map(str, options.num_envs)) or "none"
-        raise TgdslError(f"environments that are timed: found {found}, expected numbers of at least 1")
+        counts = ", ".join(map(str, options.num_envs)) or "none"
+        raise TgdslError(f"environments that are timed: found {counts}, expected numbers of at least 1")
     if options.repeats < 1:
         raise TgdslError(f"timed calls: found {options.repeats}, expected at least 1")
 
 
-def _wanted(asked: Collection[str], names: Sequence[str]) -> list[str]:
+def _wanted(sensors: Collection[str], names: Sequence[str]) -> list[str]:
     """Return what is measured, in the document's order.
 
     Raises:
         TgdslError: If there is no such sensor.
     """
     known = [*names, *([] if PHYSICS in names else [PHYSICS])]
-    for name in asked:
+    for name in sensors:
         if name not in known:
             raise TgdslError(f'there is no sensor "{name}"; {did_you_mean(name, known, "sensors")}')
-    return [name for name in known if not asked or name in asked]
+    return [name for name in known if not sensors or name in sensors]
 
 
 def _machine(device: torch.device) -> str:

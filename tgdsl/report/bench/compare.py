@@ -41,16 +41,16 @@ class Comparison(NamedTuple):
 
     def lines(self) -> list[str]:
         """Return what is said of it."""
-        found = [f"only in the earlier bench: {name}" for name in self.only_before]
-        found += [f"not in the earlier bench: {name}" for name in self.only_now]
-        found += [f"{name}: {listed(changes, 4)}" for name, changes in self.changed.items()]
-        found += [f"{one} was faster than {other}, and is slower now" for one, other in self.turned]
+        lines = [f"only in the earlier bench: {name}" for name in self.only_before]
+        lines += [f"not in the earlier bench: {name}" for name in self.only_now]
+        lines += [f"{name}: {listed(changes, 4)}" for name, changes in self.changed.items()]
+        lines += [f"{one} was faster than {other}, and is slower now" for one, other in self.turned]
         if not self.changed:
-            found.append("errors and counts are those of the earlier bench")
+            lines.append("errors and counts are those of the earlier bench")
         if not self.turned:
             ties = f", but for ties: {listed(self.tied)}" if self.tied else ""
-            found.append(f"the front is that of the earlier bench{ties}")
-        return found
+            lines.append(f"the front is that of the earlier bench{ties}")
+        return lines
 
 
 def read_rows(file: Path) -> list[Row]:

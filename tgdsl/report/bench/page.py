@@ -1,77 +1,68 @@
-"""A bench as one HTML file that opens without a network: its tables, and a plot of speed against error for each sensor."""
+"""A bench as CSV, JSON, and one HTML file that opens without a network: tables, and plots of speed against error."""
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from html import escape
+from pathlib import Path
 
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from tgdsl.module.accuracy.errors import Interval
-from tgdsl.report.bench.results import Measured, Report, Subject
+from tgdsl.report.bench.results import Measured, Report, Subject, rows_of
+from tgdsl.report.files import page_of, svg_of, table_of, write_report_files
 from tgdsl.view.style import FAINT, INK
 
 FLOOR = 1e-9
 """Errors below this are drawn here: an axis of powers of ten has no zero."""
 OWN, FRONT = "#c0392b", "#1f6f8b"
-STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;color:#2b2f36;max-width:1100px;margin:2em auto;padding:0 1em}
-table{border-collapse:collapse;font-size:13px;margin:1em 0;width:100%}
-th,td{padding:.25em .6em;text-align:right;border-bottom:1px solid #e3e5e8;white-space:nowrap}
-th:first-child,td:first-child{text-align:left}
-tr.own td{font-weight:600;color:#c0392b} tr.front td:first-child::before{content:"● ";color:#1f6f8b}
-svg{max-width:100%;height:auto} .note{color:#7b828c;font-size:13px} nav a{margin-right:1em}
-"""
+
+
+def write_bench(report: Report, folder: Path) -> list[Path]:
+    """Write the files of a bench, all or none, and return them.
+
+    Raises:
+        FileError: If one cannot be written.
+    """
+    rows = list(rows_of(report))
+    subjects = [{key: value for key, value in asdict(subject).items() if key != "points"} for subject in report.subjects]
+    document = {"document": report.document, "machine": report.machine, "states": report.states}
+    return write_report_files(folder, "bench", rows, {**document, "rows": rows, "subjects": subjects}, page(report))
 
 
 def page(report: Report) -> str:
     """Return the HTML file of a bench."""
-    names = [subject.name for subject in report.subjects]
-    links = "".join(f'<a href="#{escape(name)}">{escape(name)}</a>' for name in names)
-    return "\n".join(
-        [
-            "<!DOCTYPE html>",
-            '<html lang="en"><head><meta charset="utf-8">',
-            f"<title>tgdsl bench: {escape(report.document)}</title><style>{STYLE}</style></head><body>",
-            f"<h1>{escape(report.document)}: speed against error</h1>",
-            f'<p class="note">{escape(report.states)}.<br>{escape(report.machine)}.</p>',
-            "<p>● on the front: nothing else is better in time or error and worse in neither; where 95 % intervals overlap, "
-            "two count as equal. Red: what the compiler takes now. Errors: relative to the largest change of a quantity; those "
-            f"below {FLOOR:g} are drawn there.</p>",
-            f"<nav>{links}</nav>",
-            *(_section(subject, i) for i, subject in enumerate(report.subjects)),
-            "</body></html>",
-        ]
-    )
+    about = [
+        f'<p class="note">{escape(report.states)}.<br>{escape(report.machine)}.</p>',
+        "<p>● on the front: nothing else is better in time or error and worse in neither; where 95 % intervals overlap, "
+        "two count as equal. Red: what the compiler takes now. Errors: relative to the largest change of a quantity; those "
+        f"below {FLOOR:g} are drawn there.</p>",
+    ]
+    links = [(subject.name, subject.name) for subject in report.subjects]
+    sections = [_section(subject, i) for i, subject in enumerate(report.subjects)]
+    return page_of(f"{report.document}: speed against error", about, links, sections)
 
 
 def _section(subject: Subject, index: int) -> str:
     scales = ", ".join(f"{name} {scale}" for name, scale in subject.magnitudes.items())
+    header, *rows = cells_of(subject)
     lines = [
         f'<section id="{escape(subject.name)}"><h2>{escape(subject.name)} <small>{escape(subject.kind)}</small></h2>',
         f"<p>Errors are against: {escape(subject.reference)}. Magnitudes: {escape(scales)}. {escape(subject.check)}</p>",
         *([f'<p class="chosen">{"<br>".join(map(escape, subject.chosen))}</p>'] if subject.chosen else []),
         plot(subject, f"tgdsl{index}"),
-        _table(subject),
+        table_of(header, rows, map(_classes, subject.points)),
     ]
     lines += [f'<p class="note">not to be had: {escape(label)}: {escape(why)}</p>' for label, why in subject.left_out]
     return "\n".join([*lines, "</section>"])
 
 
-def _table(subject: Subject) -> str:
-    header, *rows = cells_of(subject)
-    lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in header) + "</tr>"]
-    for point, row in zip(subject.points, rows, strict=True):
-        marks = " ".join(name for name, is_on in (("own", point.is_own), ("front", point.is_on_front)) if is_on)
-        lines.append(f'<tr class="{marks}">' + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
-    return "\n".join([*lines, "</table>"])
+def _classes(point: Measured) -> str:
+    return " ".join(name for name, is_on in (("own", point.is_own), ("front", point.is_on_front)) if is_on)
 
 
 def cells_of(subject: Subject) -> Iterator[tuple[str, ...]]:
@@ -108,12 +99,7 @@ def _bytes(size: int) -> str:
 
 
 def plot(subject: Subject, salt: str) -> str:
-    """Return a plot of time against RMS error as SVG, to stand in HTML.
-
-    Args:
-        subject: What is drawn.
-        salt: What makes the identifiers in it differ from those of other plots.
-    """
+    """Return a plot of time against RMS error as SVG: see `svg_of`."""
     figure = Figure(figsize=(9.5, 4.2))
     axes = figure.add_subplot()
     axes.set_xscale("log")
@@ -132,23 +118,8 @@ def plot(subject: Subject, salt: str) -> str:
     return svg_of(figure, salt)
 
 
-def svg_of(figure: Figure, salt: str) -> str:
-    """Return a figure as SVG, to stand in HTML; the same bytes each time.
-
-    Args:
-        figure: What is drawn.
-        salt: What makes the identifiers in it differ from those of other plots.
-    """
-    text = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": salt, "svg.fonttype": "none"}):
-        FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    drawn = text.getvalue()
-    drawn = re.sub(r'<g id="[^"]*"', "<g", drawn)  # nothing refers to groups, and their names are the same in all plots
-    return re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", drawn[drawn.index("<svg") :]).replace("xlink:href", "href")
-
-
 def _draw(axes: Axes, point: Measured) -> None:
-    times, errors = ([factor * part for part in own] for factor, own in ((1e3, point.time), (1.0, point.chosen.rms)))
+    times, errors = ([factor * part for part in interval] for factor, interval in ((1e3, point.time), (1.0, point.chosen.rms)))
     x, (y, low, high) = times, (max(part, FLOOR) for part in errors)
     color = OWN if point.is_own else FRONT if point.is_on_front else FAINT
     is_marked = point.is_own or point.is_on_front
@@ -170,7 +141,7 @@ def _label(axes: Axes, points: Sequence[Measured]) -> None:
     assert isinstance(figure, Figure)
     renderer, taken = FigureCanvasAgg(figure).get_renderer(), []
     sides = [(x, step) for step in (5, -11, 16, -22, 27, -33, 38, -44, 49) for x in (6, -6)]
-    for point in sorted(points, key=lambda own: not own.is_own):
+    for point in sorted(points, key=lambda point: not point.is_own):
         label = f"{point.label}, {point.precision}" + (" (now)" if point.is_own else "")
         at = (1e3 * point.time.value, max(point.chosen.rms.value, FLOOR))
         text = axes.annotate(label, at, textcoords="offset points", xytext=sides[0], fontsize=7.5, color=INK)
@@ -178,6 +149,6 @@ def _label(axes: Axes, points: Sequence[Measured]) -> None:
             text.set_position((x, y))
             text.set_horizontalalignment("left" if x > 0 else "right")
             box = text.get_window_extent(renderer)
-            if axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1) and not any(box.overlaps(own) for own in taken):
+            if axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1) and not any(box.overlaps(label) for label in taken):
                 break
         taken.append(text.get_window_extent(renderer))

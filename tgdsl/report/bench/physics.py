@@ -18,8 +18,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
-from tgdsl.report.bench.front import front_of
-from tgdsl.report.bench.results import Measured, Subject
+from tgdsl.report.bench.results import Measured, Subject, with_front
 from tgdsl.report.bench.timing import median_of
 from tgdsl.runtime.scripted import Script
 from tgdsl.scene.scene import scene_model
@@ -50,14 +49,14 @@ def settings(model: mujoco.MjModel, substeps: int) -> list[Setting]:
         substeps: Physics steps of a control step, as the user has them.
     """
     step, cones = model.opt.timestep, ("pyramidal", "elliptic")
-    found = [Setting(f"as written: {cones[model.opt.cone]} cone, time step {1e3 * step:g} ms", {}, substeps, True)]
-    found.append(Setting(f"{cones[1 - model.opt.cone]} cone", {"cone": cones[1 - model.opt.cone]}, substeps))
-    found += [Setting(f"{n} iterations", {"iterations": n}, substeps) for n in (1, 3, 10) if n != model.opt.iterations]
+    tried = [Setting(f"as written: {cones[model.opt.cone]} cone, time step {1e3 * step:g} ms", {}, substeps, True)]
+    tried.append(Setting(f"{cones[1 - model.opt.cone]} cone", {"cone": cones[1 - model.opt.cone]}, substeps))
+    tried += [Setting(f"{n} iterations", {"iterations": n}, substeps) for n in (1, 3, 10) if n != model.opt.iterations]
     for times in (substeps, 0.5):
         if substeps / times >= 1 and times != 1:
-            own = round(substeps / times)
-            found.append(Setting(f"time step {1e3 * step * times:g} ms", {"timestep": step * times}, own))
-    return found
+            setting = {"timestep": step * times}
+            tried.append(Setting(f"time step {1e3 * step * times:g} ms", setting, round(substeps / times)))
+    return tried
 
 
 def measure_physics(
@@ -87,9 +86,12 @@ def measure_physics(
     seconds = steps / phases * substeps * model.opt.timestep
     inputs = dataclasses.replace(plan.inputs, substeps=1)  # no sensor is read, so those of blocks want no steps of theirs
     unread = dataclasses.replace(plan, inputs=inputs)
-    runs = [script.begin(TactileModule(unread, known_kinds()), num_envs, own.substeps, seconds, own.options) for own in tried]
+    runs = [
+        script.begin(TactileModule(unread, known_kinds()), num_envs, setting.substeps, seconds, setting.options)
+        for setting in tried
+    ]
     controls = _controls(runs[0].controls, runs[0].sim.model, num_envs, seed)
-    found: list[list[np.ndarray]] = [[] for _ in tried]
+    visited: list[list[np.ndarray]] = [[] for _ in tried]
     times: list[list[float]] = [[] for _ in tried]
     faults: dict[int, str] = {}
     for i, control in enumerate(controls):
@@ -104,12 +106,12 @@ def measure_physics(
                 faults[k] = str(error)
                 continue
             times[k].append(time.perf_counter() - start)
-            found[k].append(run.sim.qpos.cpu().numpy().copy())
+            visited[k].append(run.sim.qpos.cpu().numpy().copy())
     for run in runs:
         run.sim.close()
     if len(tried) - 1 in faults or 0 in faults:
         raise SimulationError(faults.get(len(tried) - 1) or faults[0])
-    return _subject(tried, faults, found, times, model, num_envs, seed)
+    return _subject(tried, faults, visited, times, model, num_envs, seed)
 
 
 def _controls(controls: np.ndarray, model: mujoco.MjModel, num_envs: int, seed: int) -> Float[np.ndarray, "step env actuator"]:
@@ -120,7 +122,7 @@ def _controls(controls: np.ndarray, model: mujoco.MjModel, num_envs: int, seed: 
 def _subject(
     tried: list[Setting],
     faults: dict[int, str],
-    found: list[list[np.ndarray]],
+    visited: list[list[np.ndarray]],
     times: list[list[float]],
     model: mujoco.MjModel,
     num_envs: int,
@@ -128,7 +130,7 @@ def _subject(
 ) -> Subject:
     """Return the settings with their errors."""
     columns, quantities = coordinates(model)
-    paths = {k: np.stack(own)[:, :, None, columns] for k, own in enumerate(found) if k not in faults}
+    paths = {k: np.stack(places)[:, :, None, columns] for k, places in enumerate(visited) if k not in faults}
     exact = paths[len(tried) - 1]
     magnitude = magnitude_of(exact, quantities)
     cost = Cost(None, 0, 8 * (model.nq + model.nv), 8 * (model.nq + model.nv))
@@ -142,13 +144,11 @@ def _subject(
         )
         time_of_step = {num_envs: median_of(np.array(times[k]))}
         points.append(Measured(setting.label, "float64", setting.is_own, chosen, verified, time_of_step, cost))
-    on_front = front_of([(point.time, point.chosen.rms) for point in points])
     units = {"angle": "rad", "position": "m"}
     scales = {name: f"{scale:.4g} {units[name]}" for name, scale in zip(quantities, magnitude.scale, strict=True)}
-    points = [dataclasses.replace(point, is_on_front=own) for point, own in zip(points, on_front, strict=True)]
     what = f"time step 1/{FINE}, up to {ITERATIONS} iterations to {TOLERANCE:g}"
     left_out = tuple((tried[k].label, why) for k, why in faults.items())
-    return Subject("physics", "physics", what, "", scales, tuple(points), left_out)
+    return Subject("physics", "physics", what, "", scales, with_front(points), left_out)
 
 
 def coordinates(model: mujoco.MjModel) -> tuple[list[int], list[str]]:

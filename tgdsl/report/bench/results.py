@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from tgdsl.module.accuracy.errors import Errors, Interval
+from tgdsl.report.bench.timing import front_of
 from tgdsl.tuning.trials import Cost
 
 
@@ -85,6 +86,12 @@ class Report:
     machine: str
     states: str
     subjects: tuple[Subject, ...]
+
+
+def with_front(points: Sequence[Measured]) -> tuple[Measured, ...]:
+    """Return the points, marked where no other is better in time or RMS error and worse in neither."""
+    is_on_front = front_of([(point.time, point.chosen.rms) for point in points])
+    return tuple(replace(point, is_on_front=is_on) for point, is_on in zip(points, is_on_front, strict=True))
 
 
 def rows_of(report: Report) -> Iterator[dict[str, Any]]:

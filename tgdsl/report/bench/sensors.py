@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
+from tgdsl.module.accuracy.changed import only
 from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.accuracy.reference import ReferenceModule
 from tgdsl.module.accuracy.states import common_of, readings_of
@@ -24,8 +25,7 @@ from tgdsl.module.accuracy.variants import Variant, queried_objects
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.plan import Plan
-from tgdsl.report.bench.front import front_of
-from tgdsl.report.bench.results import Measured, Subject
+from tgdsl.report.bench.results import Measured, Subject, with_front
 from tgdsl.report.bench.timing import times_of
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise.lower import quantity
@@ -90,19 +90,23 @@ def measure(sensor: Sensor, recording: Recording, options: Options, progress: Pr
     more = ["float64", "bfloat16 readings", *(["tf32"] if options.device.type == "cuda" else [])]
     ways += [Way(sensor.variants.own, sensor.own, precision) for precision in more]
     measured = [_errors(sensor, way, recording, exact, options, progress) for way in ways]
-    times = {num: _times(ways, recording, num, sensor.name, options, progress) for num in options.num_envs}
+    times = {}
+    for num in options.num_envs:
+        progress(f"{sensor.name}: timing {len(ways)} variants, {num} environments")
+        calls = {way.name: _call(way, recording, num, sensor.name, options) for way in ways}
+        times[num] = times_of(calls, options.repeats, options.device)
     points = [
         dataclasses.replace(point, times={num: times[num][way.name] for num in times})
         for way, point in zip(ways, measured, strict=True)
     ]
-    is_on_front = front_of([(point.time, point.chosen.rms) for point in points])
+    named = zip(exact.quantities, exact.units, exact.magnitude.scale, strict=True)
     return Subject(
         name=sensor.name,
         kind=sensor.kind.name,
         reference=f"{exact.variant.label}, float64",
         check=_check(sensor, states),
-        magnitudes=_magnitudes(exact),
-        points=tuple(dataclasses.replace(p, is_on_front=f) for p, f in zip(points, is_on_front, strict=True)),
+        magnitudes={name: f"{scale:.4g} {unit}" for name, unit, scale in named},
+        points=with_front(points),
         left_out=tuple(left_out.items()),
     )
 
@@ -141,28 +145,19 @@ def _errors(sensor: Sensor, way: Way, recording: Recording, exact: Exact, option
     progress(f"{sensor.name}: {way.name}, errors")
     touch = _built(way, options.device)
     with _precision(way):
-        found = readings_of(touch, recording.for_module(touch.inputs), sensor.name)
+        readings = readings_of(touch, recording.for_module(touch.inputs), sensor.name)
     if way.precision == "bfloat16 readings":
-        found = torch.from_numpy(found).to(torch.bfloat16).double().numpy()
+        readings = torch.from_numpy(readings).to(torch.bfloat16).double().numpy()
     common = common_of(exact.module, touch, sensor.name)
-    found, expected = common.of_other(found), common.of_one(exact.readings)
-    magnitude, channels = exact.magnitude._replace(active=common.of_one(exact.magnitude.active)), range(found.shape[-1])
+    readings, expected = common.of_other(readings), common.of_one(exact.readings)
+    magnitude, channels = exact.magnitude._replace(active=common.of_one(exact.magnitude.active)), range(readings.shape[-1])
     chosen, verified = (
-        errors_of(found[:, half], expected[:, half], magnitude.of(half, channels), seed=options.seed)
+        errors_of(readings[:, half], expected[:, half], magnitude.of(half, channels), seed=options.seed)
         for half in halves(recording.num_envs)
     )
     size = 2 if way.precision == "bfloat16 readings" else torch.finfo(touch.dtype).bits // 8
     is_own = way.variant.is_own and way.precision == "float32"
     return Measured(way.variant.label, way.precision, is_own, chosen, verified, {}, cost_of(touch, size))
-
-
-def _times(
-    ways: Sequence[Way], recording: Recording, num_envs: int, name: str, options: Options, progress: Progress
-) -> dict[str, Any]:
-    """Return the median time of a call of each variant [s], by its name."""
-    progress(f"{name}: timing {len(ways)} variants, {num_envs} environments")
-    calls = {way.name: _call(way, recording, num_envs, name, options) for way in ways}
-    return times_of(calls, options.repeats, options.device)
 
 
 def _call(way: Way, recording: Recording, num_envs: int, name: str, options: Options) -> Callable[[], Tensor]:
@@ -195,7 +190,7 @@ def _check(sensor: Sensor, states: Sequence[SceneState]) -> str:
     """Return how far the document's own variant in float64 is from the kind's float64 definition."""
     if queried_objects(sensor.own):
         return "the kind's definition knows primitives alone, and meshes are felt"
-    few = [first_envs(state, CHECKED_ENVS) for state in states[-CHECKED_STEPS:]]
+    few = [only(state, slice(CHECKED_ENVS)) for state in states[-CHECKED_STEPS:]]
     touch = TactileModule(sensor.own, known_kinds(), torch.float64)
     reference, expected = ReferenceModule(sensor.own, sensor.kind, sensor.spec, sensor.others, sensor.name), []
     for state in few:
@@ -206,15 +201,3 @@ def _check(sensor: Sensor, states: Sequence[SceneState]) -> str:
     magnitude = magnitude_of(exact, [quantity(channel) for channel in sensor.reading.channels])
     largest = errors_of(readings_of(touch, few, sensor.name), exact, magnitude).largest.value
     return f"as written, float64 differs from the kind's NumPy definition by {largest:.1e} at most ({len(few)} steps)"
-
-
-def first_envs(state: SceneState, count: int) -> SceneState:
-    """Return the first environments of a state."""
-    values: dict[str, Any] = {name: value[:count] for name in SHAPES if (value := getattr(state, name)) is not None}
-    return SceneState(**values, dt=state.dt, substeps=tuple(first_envs(part, count) for part in state.substeps))
-
-
-def _magnitudes(exact: Exact) -> dict[str, str]:
-    """Return the magnitude of each quantity, with its unit."""
-    named = zip(exact.quantities, exact.units, exact.magnitude.scale, strict=True)
-    return {name: f"{scale:.4g} {unit}" for name, unit, scale in named}

@@ -1,4 +1,4 @@
-"""Times of calls made in turn, so that a machine that drifts disturbs all alike.
+"""Times of calls made in turn, so that a machine that drifts disturbs all alike; the front of time and error.
 
 Shapes: `call` calls of one kind.
 """
@@ -6,7 +6,7 @@ Shapes: `call` calls of one kind.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ def times_of(calls: Mapping[str, Callable[[], Any]], repeats: int, device: torch
         repeats: Timed calls of each.
         device: Where it computes.
     """
-    found: dict[str, list[float]] = {name: [] for name in calls}
+    times: dict[str, list[float]] = {name: [] for name in calls}
     with torch.no_grad():
         for i in range(repeats + WARM_UP):
             for name, call in calls.items():
@@ -47,10 +47,21 @@ def times_of(calls: Mapping[str, Callable[[], Any]], repeats: int, device: torch
                 call()
                 _wait(device)
                 if i >= WARM_UP:
-                    found[name].append(time.perf_counter() - start)
-    return {name: median_of(np.array(own)) for name, own in found.items()}
+                    times[name].append(time.perf_counter() - start)
+    return {name: median_of(np.array(seconds)) for name, seconds in times.items()}
 
 
 def _wait(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def dominates(one: Sequence[Interval], other: Sequence[Interval]) -> bool:
+    """Return whether a point is better in something, and worse in nothing; overlapping intervals are equal."""
+    apart = [(a, b) for a, b in zip(one, other, strict=True) if not a.overlaps(b)]
+    return bool(apart) and all(a.value < b.value for a, b in apart)
+
+
+def front_of(points: Sequence[Sequence[Interval]]) -> list[bool]:
+    """Return which points no other point dominates."""
+    return [not any(dominates(other, point) for other in points if other is not point) for point in points]

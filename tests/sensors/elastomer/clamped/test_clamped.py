@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.polynomial.legendre import leggauss
-from scenes import state
+from oracles.setups.scenes import state
 from scipy.linalg import lu_factor, lu_solve
 
 import tgdsl

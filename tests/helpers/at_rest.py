@@ -1,5 +1,0 @@
-"""Scenes at rest that tremble."""
-
-from tgdsl.report.hard.trembling import NUM_STEPS, jittered, repeated
-
-__all__ = ["NUM_STEPS", "jittered", "repeated"]

@@ -1,0 +1,52 @@
+"""Sheets as text and files: what they contain, and that they are the same each time."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+
+from oracles import report
+from oracles.comparison import CASES
+from oracles.hard.case import Allowed, HardCase
+from tgdsl.report.defects import DEFECTS, answers
+from tgdsl.report.sheet import sheet_page, sheet_text, write_sheet
+
+
+def sheet():
+    names = ("filters.crosstalk_edges()", "filters.maxwell_step()", "half_space.loaded_disc()")
+    return report.sheet_of("oracles", report.run([case for case in CASES if case.name in names]))
+
+
+def test_files_have_every_number_and_a_plot_of_each(tmp_path):
+    written = write_sheet(sheet(), tmp_path)
+    assert [file.name for file in written] == ["oracles.csv", "oracles.json", "oracles.html"]
+    rows = list(csv.DictReader(written[0].read_text().splitlines()))
+    assert [row["section"] for row in rows] == ["contact mechanics: half-space", "filters", "filters"]
+    assert float(rows[2]["paper_error"]) > 0.6 and rows[2]["holds"] == "True"
+    entries = json.loads(written[1].read_text())["entries"]
+    np.testing.assert_allclose(entries[2]["exact"], [1, 1, 1])
+    assert entries[2]["defects"] == [10]
+    text = written[2].read_text()
+    assert text.count("<svg") == 3
+    assert "http://" not in text.replace("http://www.w3.org", "") and "src=" not in text
+    for defect in DEFECTS:
+        assert f"{defect.number}. {defect.about}".replace("'", "&#x27;") in text
+    again = tmp_path / "again"
+    again.mkdir()
+    assert [file.read_bytes() for file in write_sheet(sheet(), again)] == [file.read_bytes() for file in written]
+
+
+def test_the_text_says_what_does_not_hold():
+    assert sheet_text(sheet()).endswith("3 of 3 hold")
+    case = HardCase("name", "risk", "reference", "m", ("a",), {"float64": Allowed(np.array([2.0]), 1.0)}, (5,))
+    failed = report.sheet_of("hard", {"group": ([case], [("other", "no extra")])})
+    text = sheet_text(failed)
+    assert text.endswith("1 of 1 do not hold (✗)")
+    assert "✗" in text and "not to be had: other: no extra" in text
+    assert 'class="failed"' in sheet_page(failed)
+    assert replace(failed, sections=()).failed == ()
+
+
+def test_the_first_entry_answers_a_finding():
+    assert answers([("a", "1", (3,)), ("b", "2", (3, 4))]) == {3: ("a", "1"), 4: ("b", "2")}
