@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.compiler.lowered import Surfaces
 from tgdsl.modal.modes import Modes, ModeShapes
-from tgdsl.sensors.contact_audio import given_modes
+from tgdsl.modal import analysis
 from tgdsl.sensors.contact_audio import reference as definition
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.surfaces.surface import Surface
@@ -152,7 +152,7 @@ class TestAtContacts(TestSamples):
 
     @pytest.fixture(autouse=True)
     def own_shapes(self, monkeypatch):
-        monkeypatch.setattr(given_modes, "analysed", shaped)
+        monkeypatch.setattr(analysis, "analysed", shaped)
         monkeypatch.setattr(definition, "_no_surface", lambda name: NOTHING)
         monkeypatch.setattr(Surfaces, "of_object", lambda own, name: NOTHING)  # the suite's floor has none
 

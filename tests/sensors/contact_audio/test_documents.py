@@ -10,7 +10,7 @@ from oracles.setups.sounds import MODES, plate, plate_document, pressed
 import tgdsl
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.modal.modes import Modes
-from tgdsl.sensors.contact_audio import given_modes
+from tgdsl.modal import analysis
 
 HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 10.0}]
 
@@ -108,7 +108,7 @@ def test_a_shape_is_analysed_in_its_bodys_frame(tmp_path, monkeypatch, of):
         asked.append((name, np.ptp(surface.vertices, axis=0).round(6).tolist(), given.material.name, below))
         return Modes(np.array([700.0]), np.array([3.0]), np.array([1.0]))
 
-    monkeypatch.setattr(given_modes, "analysed", analysed)
+    monkeypatch.setattr(analysis, "analysed", analysed)
     touch = plate(tmp_path, modes="steel", of=of)
     assert touch.plan.sensors[0].constants["frequency"].tolist() == [[700.0]]
     size = [0.2, 0.2, 0.01] if of == "link" else [0.02, 0.02, 0.02]
