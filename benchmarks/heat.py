@@ -172,7 +172,7 @@ def run_sweep(options: argparse.Namespace, name: str) -> Iterator[dict[str, Any]
     step_kernel.heat_step, found = own, {}
     turn = turns.Turn(options.turn)
     for fewest, of_warp in SWEPT:
-        step_kernel.FEWEST, step_kernel.OF_WARP = fewest, (of_warp, of_warp)
+        step_kernel.MIN_PROGRAMS, step_kernel.OF_WARP = fewest, (of_warp, of_warp)
         turn.give_back()
         step_kernel.launch(step_kernel.step_kernel, *given[-1])
         turn.take()

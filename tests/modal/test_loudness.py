@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ortho_group
 
-from tgdsl.modal.loudness import ALIKE, groups, loudness
+from tgdsl.modal.loudness import MERGE_TOLERANCE, groups, loudness
 
 
 def shapes(num: int = 6, points: int = 40) -> tuple[np.ndarray, np.ndarray]:
@@ -13,8 +13,12 @@ def shapes(num: int = 6, points: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_groups():
-    near = 1 + 0.5 * ALIKE
-    assert groups(np.array([1.0, near, 1.5, 2.0, 2 * near, 2 + 1.9 * ALIKE])) == [slice(0, 2), slice(2, 3), slice(3, 6)]
+    near = 1 + 0.5 * MERGE_TOLERANCE
+    assert groups(np.array([1.0, near, 1.5, 2.0, 2 * near, 2 + 1.9 * MERGE_TOLERANCE])) == [
+        slice(0, 2),
+        slice(2, 3),
+        slice(3, 6),
+    ]
     assert groups(np.zeros(0)) == []
 
 

@@ -80,7 +80,7 @@ def varied_task(folder):
 
 @pytest.mark.parametrize(("most", "threads"), [(0, 2), (2**16, 1)])
 def test_logic_has_one_thread_and_readings_of_many_taxels_have_all(tmp_path, monkeypatch, most, threads):
-    monkeypatch.setattr(env_file, "MOST_OF_ONE_THREAD", most)
+    monkeypatch.setattr(env_file, "SINGLE_THREAD_MAX_TAXELS", most)
     env, seen = TouchEnv(varied_task(tmp_path), 4, threads=1), {}
 
     def noted(owner, name):

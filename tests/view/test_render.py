@@ -14,7 +14,7 @@ from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.view.cameras import VIEWS, camera_of, pose_of
 from tgdsl.view.discs import discs, group_of, legend, radii
-from tgdsl.view.render import FEWEST, HEIGHT, drawing, render
+from tgdsl.view.render import HEIGHT, MIN_SIZE, drawing, render
 from tgdsl.view.taxels import Pose, taxels_of
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
@@ -266,7 +266,7 @@ def test_size_and_frame(hand: Drawn, tmp_path: Path) -> None:
         ({"view": "frnt"}, r'^there is no view "frnt"; did you mean "front"\?$'),
         ({"view": "x"}, r'^there is no view "x"; known views: back, bottom, front, iso, left, right, top$'),
         ({"keyframe": "bend"}, r'^the scene has no keyframe "bend"; did you mean "bent"\?$'),
-        ({"size": (500, 20)}, rf"^a picture of 500 × 20 pixels is too small, expected at least {FEWEST} of each$"),
+        ({"size": (500, 20)}, rf"^a picture of 500 × 20 pixels is too small, expected at least {MIN_SIZE} of each$"),
     ],
 )
 def test_bad_choices(hand: Drawn, tmp_path: Path, chosen: dict, message: str) -> None:

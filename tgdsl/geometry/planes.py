@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.tensors.env_ids import may_look
+from tgdsl.tensors.env_ids import is_cheap_to_read
 
 Plane = TypeVar("Plane", Tensor, np.ndarray)
 VecOf = tuple[Plane, Plane, Plane]
@@ -166,7 +166,7 @@ def _safe_roots(squared: Tensor) -> tuple[Tensor, Tensor]:
 def power(depth: Tensor, exponent: Tensor | float) -> Tensor:
     """Return d^α of depths d ≥ 0, to α |log₂ d| roundings; where d = 0 its derivatives are 0, not infinite, even for α < 1."""
     is_none = depth <= 0
-    if may_look(depth) and bool(is_none.all()):
+    if is_cheap_to_read(depth) and bool(is_none.all()):
         return torch.zeros_like(depth)
     logarithm = torch.log2(torch.where(is_none, 1.0, depth))  # a general power takes ten times as many instructions
     return torch.where(is_none, torch.zeros_like(depth), torch.exp2(exponent * logarithm))

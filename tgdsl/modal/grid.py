@@ -22,7 +22,7 @@ MAX_PLANES = 24
 """Most such planes across each axis."""
 LEAST_LAYER = 0.1
 """Of planes nearer than this to each other, in cell sizes, those with less than a third of another one's area are left out."""
-ALIKE = 1e-2
+MERGE_TOLERANCE = 1e-2
 """Relative difference below which two principal moments are equal, and their axes those of the body's frame."""
 ROUNDING = 1e-5
 """Difference of places along an axis up to which they are one, over the size of the body: meshes are float32."""
@@ -84,7 +84,7 @@ def _main(normal: np.ndarray, area: np.ndarray, whole: float | None = None) -> n
 def _principal(moments: np.ndarray) -> np.ndarray:
     """Return the long principal axis; where several are as long, what is nearest to an axis of the frame among them."""
     value, vector = np.linalg.eigh(moments)
-    long = vector[:, value > (1 - ALIKE) * value[-1]]
+    long = vector[:, value > (1 - MERGE_TOLERANCE) * value[-1]]
     onto = long @ long.T
     found = onto[int(np.flatnonzero(np.diag(onto) > np.diag(onto).max() - 1e-6)[0])]
     return found / np.linalg.norm(found)

@@ -1,8 +1,8 @@
 """How strongly modes are struck and heard: mode shapes along the surface's normal, and modes of one frequency taken together.
 
-Modes whose frequencies are nearer than `ALIKE` are one: a square plate, a can or a ball has pairs and multiplets that symmetry
-makes equal, any mixture of which is a mode as well. What is computed for a group is the same for all mixtures. With φ the
-column of its mode shapes along the surface's normal and M = (1/A) ∫ φ φᵀ dA their mean products over it, an impulse J at the
+Modes whose frequencies are nearer than `MERGE_TOLERANCE` are one. A square plate, a can or a ball has pairs and multiplets that
+symmetry makes equal, and any mixture of them is a mode too. What is computed for a group is the same for all mixtures. With φ
+the column of its mode shapes along the surface's normal and M = (1/A) ∫ φ φᵀ dA their mean products over it, an impulse J at the
 point x makes all of them ring in phase, at amplitudes φ(x) J; the root mean square over the surface of what is then heard is
 
     √(φᵀ(x) M φ(x)) J,   and its root mean square over all x   g J,   g = ‖M‖ = √(Σ M_ij²)
@@ -28,7 +28,7 @@ from tgdsl.modal.cells import Crossings
 
 INAUDIBLE = 1e-3
 """Gain below which a group is left out, over the largest gain."""
-ALIKE = 1e-3
+MERGE_TOLERANCE = 1e-3
 """Relative difference of frequencies up to which modes are one: less than the elements resolve."""
 
 
@@ -65,10 +65,10 @@ def of_groups(
 
 
 def groups(wave_number: Float[np.ndarray, " mode"]) -> list[slice]:
-    """Return which modes, by ascending frequency, are one: those up to `ALIKE` above the first of them."""
+    """Return which modes, by ascending frequency, are one: those up to `MERGE_TOLERANCE` above the first of them."""
     found, start = [], 0
     for mode in range(1, len(wave_number) + 1):
-        if mode == len(wave_number) or wave_number[mode] > (1 + ALIKE) * wave_number[start]:
+        if mode == len(wave_number) or wave_number[mode] > (1 + MERGE_TOLERANCE) * wave_number[start]:
             found.append(slice(start, mode))
             start = mode
     return found

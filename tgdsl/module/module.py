@@ -162,7 +162,7 @@ class TactileModule(HookedModule):
             self.memory.keep_no_other(num_envs)
         memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
         readings = self._run(step, tensors, memory)
-        self.hand_out(readings)
+        self.record_outputs(readings)
         return self.memory.with_views(readings)
 
     def read_few(self, state: SceneState, rows: Int[Tensor, " n"], num_envs: int) -> dict[str, Tensor]:
@@ -172,12 +172,12 @@ class TactileModule(HookedModule):
         self.memory.keep_last(num_envs)
         memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
         readings = read_rows(self.calls.of(self.flat_core), rows, tensors, memory)
-        self.hand_out(readings)
+        self.record_outputs(readings)
         return self.memory.with_views(readings)
 
-    def hand_out(self, readings: Mapping[str, Tensor]) -> None:
+    def record_outputs(self, readings: Mapping[str, Tensor]) -> None:
         """Note what a call has handed out; for who replays a captured graph of calls in their place."""
-        self.memory.note_last(readings)
+        self.memory.cache_readings(readings)
 
     def peek(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
         """Return what a call would read, and advance nothing: the next call draws the same random numbers.

@@ -38,7 +38,7 @@ from tgdsl.quantities.geoms import Geoms, GeomTable, ReferenceGeom, account_of_g
 from tgdsl.quantities.pairs import PairedObject
 from tgdsl.quantities.reference import ReferenceBody, ReferenceScene
 from tgdsl.quantities.search_tables import geom_tables
-from tgdsl.tensors.env_ids import may_look
+from tgdsl.tensors.env_ids import is_cheap_to_read
 
 Tables = Mapping[str, GeomTable[np.ndarray]]
 
@@ -124,7 +124,7 @@ def _are_closed(scene: Scene) -> bool:
     False where the values are not to be looked at: on a GPU, in code that is traced, and where derivatives are wanted.
     """
     pairs = scene.pairs
-    if pairs is None or pairs.gate is None or not may_look(pairs.gate) or not bool((pairs.gate == -torch.inf).all()):
+    if pairs is None or pairs.gate is None or not is_cheap_to_read(pairs.gate) or not bool((pairs.gate == -torch.inf).all()):
         return False
     sizes = scene.tensors.get("object_size", pairs.gate[:, :0])
     return bool((torch.stack([*pairs.rotation, *pairs.offset]).abs() < FAR).all() and sizes.isfinite().all())

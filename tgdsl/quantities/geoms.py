@@ -25,7 +25,7 @@ from tgdsl.geometry.reference import TIE, signed_distance
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.quantities.base import Scene, variant_of
 from tgdsl.quantities.pairs import PairedObject
-from tgdsl.tensors.env_ids import may_look
+from tgdsl.tensors.env_ids import is_cheap_to_read
 
 
 class RaycastSurface(NamedTuple):
@@ -253,7 +253,7 @@ def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -
         variant=variant,
         surfaces=tuple(_surface(own, variant) for own in table.surfaces),
     )
-    return geoms if is_absent is None or not may_look(is_absent) else _had_by_some(geoms, is_absent)
+    return geoms if is_absent is None or not is_cheap_to_read(is_absent) else _had_by_some(geoms, is_absent)
 
 
 def _had_by_some(geoms: Geoms, is_absent: Bool[Tensor, "env geom"]) -> Geoms:

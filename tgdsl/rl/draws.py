@@ -32,7 +32,7 @@ class _Streams(NamedTuple):
     index: Int[Tensor, " num"]
 
 
-class _Ahead(NamedTuple):
+class _Prefetched(NamedTuple):
     """Shares that were made ahead: the counter at which the first of them is due, and those that are left."""
 
     counter: Int[Tensor, " env"]
@@ -71,7 +71,7 @@ class Draws:
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._is_on_host = self._device.type == "cpu" and not is_compiled
         self._known: dict[tuple[tuple[str, int], ...], _Streams] = {}
-        self._ahead: dict[tuple[str, int], _Ahead] = {}
+        self._ahead: dict[tuple[str, int], _Prefetched] = {}
         self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
 
     def reseed(self, seed: int) -> None:
@@ -125,8 +125,8 @@ class Draws:
             each = (counts[:, None] + np.arange(ahead)).ravel()
             found = uniform_on_host(_hash_on_host(begun.repeat(ahead, axis=0), purpose, index, each))
             found = found.reshape(len(counts), ahead, num).transpose(1, 0, 2)
-            made = _Ahead(counter, list(torch.from_numpy(np.ascontiguousarray(found)).unbind()))
-        self._ahead[what, num] = _Ahead(counter + 1, made.left[1:])
+            made = _Prefetched(counter, list(torch.from_numpy(np.ascontiguousarray(found)).unbind()))
+        self._ahead[what, num] = _Prefetched(counter + 1, made.left[1:])
         return made.left[0]
 
     def uniform(

@@ -34,12 +34,12 @@ from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints
 from tgdsl.rl.task import Now
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
-from tgdsl.tensors.env_ids import may_hold
+from tgdsl.tensors.env_ids import may_be_nonempty
 from tgdsl.tensors.fused import FusedCall
 from tgdsl.tensors.threads import one_thread
 from tgdsl.tensors.torch_internals import below_autograd
 
-MOST_OF_ONE_THREAD = 2**16
+SINGLE_THREAD_MAX_TAXELS = 2**16
 """Up to so many taxels of all environments one thread reads on a CPU: each of two would get less than 2¹⁵ numbers."""
 FAR_BEYOND = 10.0
 """Actions of that size are a mistake, such as angles in degrees."""
@@ -139,7 +139,7 @@ class TouchEnv:
         self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
         is_plain = not (is_compiled or is_cuda)
-        is_small = is_plain and num_envs * self.touch.plan.layout.num_taxels <= MOST_OF_ONE_THREAD
+        is_small = is_plain and num_envs * self.touch.plan.layout.num_taxels <= SINGLE_THREAD_MAX_TAXELS
         self._dispatch = below_autograd if is_plain else nullcontext
         self._step_by, self._logic_by = (one_thread if own else nullcontext for own in (is_small, is_plain and not is_small))
         self._has_stepped = True
@@ -204,7 +204,7 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             if seed is not None:
                 self._draws.reseed(seed)
-                self._episodes.count_anew()
+                self._episodes.restart_counters()
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
@@ -256,7 +256,7 @@ class TouchEnv:
             self.sim.step(self.sim.ctrl)
             now = self._instant = self._now(self.sim.read())
             self._measure(now)
-            self.task.keep_up(now, self.sim.faults)
+            self.task.advance_healthy(now, self.sim.faults)
             made = self._judged(now, self.sim.faults)
         self._obs, self._is_loaded = made.obs, False
         return made
@@ -287,7 +287,7 @@ class TouchEnv:
             SimulationError: If they were others; nothing has changed.
         """
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
-        own["episodes"], saved = self._episodes.alike(state.get("episodes", {}))
+        own["episodes"], saved = self._episodes.with_matching_sums(state.get("episodes", {}))
         state = {**state, "episodes": saved} if "episodes" in state else state
         saving.refuse_other_parts(own, {part: kept for part, kept in state.items() if part != "sim"})
         self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
@@ -345,9 +345,9 @@ class TouchEnv:
         """Return what a control step has brought, by its readings, and its instant; begin episodes where some have ended."""
         sim, now = self.sim, self._now(readings)
         self._measure(now)
-        self.task.keep_up(now, sim.faults)
+        self.task.advance_healthy(now, sim.faults)
         made = self._judged(now, sim.faults)
-        if may_hold(made.info.ended):
+        if may_be_nonempty(made.info.ended):
             self._begin(made.info.ended)
             now = self._now(sim.read(made.info.ended))
             self._measure(now, made.info.ended)
@@ -384,7 +384,7 @@ class TouchEnv:
         self._episodes.add(tuple(rates), earned, reward)
         truncated = (self.steps >= self.max_steps) & ~terminated
         obs = self._observe(now)
-        if may_hold(faults):
+        if may_be_nonempty(faults):
             obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in obs.items()}
         episodes = self._episodes
         sums = dict(zip(rates, episodes.sums.clone(), strict=True))
@@ -436,4 +436,5 @@ class TouchEnv:
         own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
         terms = {name: term for name, term in self.loaded.terms.items() if isinstance(term, ObservationTerm)}
         own |= {name: self._checked(name, term.observe(now, self.task.setup), proprio, ndim=2) for name, term in terms.items()}
-        return {name: value.to(self.device, torch.float32) for name, value in (own | self.task.told(now, own)).items()}
+        own |= self.task.checked_observations(now, own)
+        return {name: value.to(self.device, torch.float32) for name, value in own.items()}

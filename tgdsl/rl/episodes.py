@@ -142,7 +142,7 @@ class Episodes:
         self._sim.reset(chosen, contacts=start.contacts, **start.values)
         self._restarted(chosen, "ctrl" in start.values)
 
-    def count_anew(self) -> None:
+    def restart_counters(self) -> None:
         """Begin to count episodes from 0, so that random numbers are those of environments just made."""
         self.number.zero_()
 
@@ -158,7 +158,7 @@ class Episodes:
         if not self.terms:
             self.terms, self.sums = terms, self.total.new_zeros((len(terms), len(self.total)))
 
-    def alike(self, saved: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def with_matching_sums(self, saved: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what is kept here, and what was saved, both with the sums that either has: before the first step none are."""
         own, before = self.memory(), dict(saved)
         for one, other in ((own, saved), (before, self.memory())):

@@ -22,7 +22,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl.draws import Draws, whole
-from tgdsl.tensors.env_ids import may_hold, put_rows
+from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 
 ZERO: Range = (0.0, 0.0)
 Force = Annotated[Range, RangeOf("force")]
@@ -95,7 +95,7 @@ class Pushes:
         """Begin and end pushes: once per control step, before its physics."""
         self._left -= 1
         begins, ends = self._left == 0, self._left == -self._length
-        if not may_hold(changes := begins | ends):
+        if not may_be_nonempty(changes := begins | ends):
             return
         self._count += ends
         found = self._draws.shares(_DRAWN, self._count, changes)

@@ -34,7 +34,7 @@ from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
-from tgdsl.tensors.env_ids import may_hold, put_rows
+from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 
 S = TypeVar("S", bound=TaskSpec)
 
@@ -226,9 +226,9 @@ class Task(ABC, Generic[S]):
     def advance(self, now: Now) -> None:
         """Bring what is remembered up to date: once per control step, after its physics."""
 
-    def keep_up(self, now: Now, faults: Bool[Tensor, " env"]) -> None:
+    def advance_healthy(self, now: Now, faults: Bool[Tensor, " env"]) -> None:
         """Bring what is remembered up to date, but for environments with a fault, whose instant is none."""
-        kept = {name: value.clone() for name, value in self.memory.items()} if may_hold(faults) else {}
+        kept = {name: value.clone() for name, value in self.memory.items()} if may_be_nonempty(faults) else {}
         self.advance(now)
         for name, value in kept.items():
             put_rows(self.memory[name], faults, value)
@@ -264,7 +264,7 @@ class Task(ABC, Generic[S]):
             raise SimulationError(f"{type(self).__name__}: `reward` has no terms, expected one at least")
         return found
 
-    def told(self, now: Now, taken: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+    def checked_observations(self, now: Now, taken: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return what `observe` returns, seen to be that.
 
         Raises:

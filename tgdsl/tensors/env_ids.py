@@ -101,7 +101,7 @@ def broadcast_over(mask: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "
 def few_ids(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
     """Return the environments of a mask, if they are few enough on a CPU that what is done for them alone takes less.
 
-    None too where a mask's values are not to be looked at: see `may_hold`.
+    None too where a mask's values are not to be looked at: see `may_be_nonempty`.
     """
     if mask.is_cuda or torch.compiler.is_compiling():
         return None
@@ -130,12 +130,12 @@ def put(target: Tensor, where: Bool[Tensor, "*mask"], new: Tensor | float) -> No
         torch.where(where, new, target, out=target)
 
 
-def may_look(values: Tensor) -> bool:
+def is_cheap_to_read(values: Tensor) -> bool:
     """Return whether Python may branch on values: not on a GPU, where derivatives are wanted, or operations are followed."""
     return not (torch.is_grad_enabled() or is_out_of_sight(values))
 
 
-def may_hold(mask: Bool[Tensor, "*n"]) -> bool:
+def may_be_nonempty(mask: Bool[Tensor, "*n"]) -> bool:
     """Return whether a mask holds anywhere, or its values are not to be looked at: on a GPU, and where operations are followed.
 
     What is done only where a mask holds can be left out if this is False; the result must be the same bytes.

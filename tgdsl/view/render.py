@@ -37,7 +37,7 @@ Array = np.ndarray
 COLOURS = ("#0f7fb8", "#e8871e", "#c2315b", "#3a9d5d", "#7a55b0", "#8c6d46", "#d4b106", "#4f5d75")
 HEIGHT = 750
 """Rows of the file if no size is asked for."""
-FEWEST = 200
+MIN_SIZE = 200
 """Columns and rows that a file has at least."""
 _INCHES = 6.0  # the figure's height, whatever its pixels: text scales with it
 _HEAD, _FOOT, _GAP = 0.085, 0.085, 0.03  # parts of the figure's height
@@ -130,8 +130,8 @@ def _check(layouts: Mapping[str, Layout], view: str, size: tuple[int, int] | Non
     angles_of(view)
     if not any((layout.radius > 0).any() for layout in layouts.values()):
         raise ViewError("there is nothing to draw: no layout has a taxel")
-    if size is not None and min(size) < FEWEST:
-        raise ViewError(f"a picture of {size[0]} × {size[1]} pixels is too small, expected at least {FEWEST} of each")
+    if size is not None and min(size) < MIN_SIZE:
+        raise ViewError(f"a picture of {size[0]} × {size[1]} pixels is too small, expected at least {MIN_SIZE} of each")
 
 
 # The hand -------------------------------------------------------------------------------------------------------------

@@ -6,8 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tgdsl.compiler.lowered import Surfaces
-from tgdsl.modal.modes import Modes, ModeShapes
 from tgdsl.modal import analysis
+from tgdsl.modal.modes import Modes, ModeShapes
 from tgdsl.sensors.contact_audio import reference as definition
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.surfaces.surface import Surface

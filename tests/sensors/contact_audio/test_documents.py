@@ -9,8 +9,8 @@ from oracles.setups.sounds import MODES, plate, plate_document, pressed
 
 import tgdsl
 from tgdsl.errors import SimulationError, SpecError
-from tgdsl.modal.modes import Modes
 from tgdsl.modal import analysis
+from tgdsl.modal.modes import Modes
 
 HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 10.0}]
 

@@ -240,12 +240,12 @@ class _Part:
             file: Where what the run goes on with is written, once nothing is refused any more; None: it has been.
         """
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.playing.surroundings import changes_around
+        from tgdsl.rl.playing.provenance import changes_around
         from tgdsl.rl.students.learner import Distiller
         from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import made_from
+        from tgdsl.rl.train.logging import ProgressBar
         from tgdsl.rl.train.run import Run
-        from tgdsl.rl.train.telling import ProgressBar
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
         state = self._state

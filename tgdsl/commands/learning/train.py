@@ -113,8 +113,8 @@ class Train:
         from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import changes, made_from
         from tgdsl.rl.train.learner import Learner
+        from tgdsl.rl.train.logging import ProgressBar
         from tgdsl.rl.train.run import Run
-        from tgdsl.rl.train.telling import ProgressBar
 
         envs = self.envs or before.get("envs", ENVS)
         seed = self.seed if self.seed is not None else before.get("seed", 0)

@@ -174,7 +174,7 @@ class Memory(HookedModule):
         """Number of environments whose last readings are kept; None if none are."""
         return next((buffer.shape[0] for name, buffer in held_buffers(self).items() if name.startswith(KEPT)), None)
 
-    def note_last(self, readings: Mapping[str, Tensor]) -> None:
+    def cache_readings(self, readings: Mapping[str, Tensor]) -> None:
         """Note what is handed out, (env, row, channel): where it lies, or once it is kept, that it is."""
         self._is_filled = self.num_kept is not None
         self._last = {}

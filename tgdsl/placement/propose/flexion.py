@@ -25,7 +25,7 @@ LINK_SNAP, PALM_SNAP = np.radians(30.1), np.radians(40.1)
 No angles that people draw: the last bits of a pose shall not decide."""
 STEP = 0.02
 """Share of its way by which a joint closes to see where a link goes."""
-ALIKE = 0.5
+MIN_COSINE = 0.5
 """Least cosine of the angle between directions to which fingers curl for these to say where the palm faces."""
 PARALLEL, BESIDE = 0.99, 0.25
 """A bar beside a finger turns about an axis with at least this cosine to the finger's, nearer than this share of its length."""
@@ -235,7 +235,7 @@ class Flexion:
         for chain in self.hand.chains:
             carried = [self._carried(body) for s in chain for body in self.tree.bodies[s]]
             found += [c[1] for c in carried if c is not None and self.closing.motions[c[0]].is_curling][:1]
-        alike = [[other for other in found if one @ other > ALIKE] for one in found]
+        alike = [[other for other in found if one @ other > MIN_COSINE] for one in found]
         most = max(alike, key=len, default=[])
         return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 

@@ -30,7 +30,7 @@ from tgdsl.rl.playing.policy import (
     check_learned,
     read_policy,
 )
-from tgdsl.rl.playing.surroundings import changes_around
+from tgdsl.rl.playing.provenance import changes_around
 from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
 from tgdsl.rl.start import moved_joints
 from tgdsl.scene.scene import SceneModels

@@ -30,7 +30,7 @@ from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
 from tgdsl.rl.playing.differences import is_close, spec_differences
-from tgdsl.rl.playing.surroundings import changes_around
+from tgdsl.rl.playing.provenance import changes_around
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.spec import TaskSpec
 

@@ -66,7 +66,7 @@ from tgdsl.rl.spec import TaskSpec, Time, Weight
 from tgdsl.rl.task import HandNow, Now, Setup, Start, Task
 from tgdsl.rl.tasks.placing import object_qpos
 from tgdsl.runtime.simulators.model_ids import keyframe_id
-from tgdsl.tensors.env_ids import may_hold
+from tgdsl.tensors.env_ids import may_be_nonempty
 
 Force = Annotated[float, Quantity("force", gt=0.0)]
 
@@ -232,7 +232,7 @@ class GripForce(Task[GripForceSpec]):
         self.samples += is_settled
         self.left -= 1
         is_due = self.left <= 0
-        if may_hold(is_due):
+        if may_be_nonempty(is_due):
             self.count += is_due
             self._command(is_due, now.mass, now.friction)
 

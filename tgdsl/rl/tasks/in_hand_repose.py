@@ -64,7 +64,7 @@ from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task
 from tgdsl.rl.tasks.placing import placed
 from tgdsl.rl.train.spec import TrainSpec
-from tgdsl.tensors.env_ids import may_hold
+from tgdsl.tensors.env_ids import may_be_nonempty
 
 
 class Rewards(SpecModel):
@@ -259,7 +259,7 @@ class InHandRepose(Task[InHandReposeSpec]):
         for count in (self.held, self.waited):
             count.masked_fill_(self.is_reached, 0)
         self.left.copy_(error)
-        if may_hold(self.is_reached):
+        if may_be_nonempty(self.is_reached):
             self.goal.copy_(torch.where(self.is_reached[:, None], self._goal_after(self.goal), self.goal))
             self.left.copy_(rotations.between(self.goal, quat))
 

@@ -38,7 +38,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.differences import differences, spec_differences
-from tgdsl.rl.playing.surroundings import surroundings
+from tgdsl.rl.playing.provenance import provenance
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
@@ -271,7 +271,7 @@ def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[s
         "joints": list(env.joint_names),
         "module": hashlib.sha256(env.touch.plan.to_json().encode()).hexdigest(),
         "taxels": env.touch.taxels_id,
-        **surroundings(loaded, env.sim.model),
+        **provenance(loaded, env.sim.model),
         "versions": versions(),
     }
 

@@ -22,7 +22,7 @@ from tgdsl.rl.train.config import config
 from tgdsl.rl.train.iteration import Clock, EpisodeTally, Iteration
 from tgdsl.rl.train.ppo import LOSSES, CapturedPPO
 from tgdsl.rl.train.ranks import Ranks
-from tgdsl.tensors.env_ids import may_hold
+from tgdsl.tensors.env_ids import may_be_nonempty
 
 
 class Learner:
@@ -83,7 +83,7 @@ class Learner:
             step = self.env.step(algorithm.act(obs))
             obs = self._seen(step.obs)
             extras: dict[str, Any] = {"time_outs": step.truncated}
-            if may_hold(step.truncated):
+            if may_be_nonempty(step.truncated):
                 extras["final_obs"] = self._seen(step.info.final_obs)
             algorithm.process_env_step(obs, step.reward, step.info.ended, extras)
             self._tally.add(step)

@@ -88,7 +88,9 @@ class CapturedPPO(PPO):
         self._autocast = {"device_type": "cuda", "dtype": torch.bfloat16, "enabled": is_cuda and precision == "bfloat16"}
         self._chosen = Captured(self._choose, device, tf32)
         self._valued = Captured(self._final_value, device, tf32)
-        self._judged = Captured(self._surprise, device, tf32, is_captured=not self.is_multi_gpu)  # all processes join in it
+        self._rnd_graph = Captured(
+            self._intrinsic_reward, device, tf32, is_captured=not self.is_multi_gpu
+        )  # all processes join in it
         self._returned = Captured(self._returns, device, tf32)
         self._learned = Captured(self._epoch, device, tf32)
         self._parts = [Captured(lambda i=i: self._differentiate(i), device, tf32) for i in range(self.num_mini_batches)]
@@ -133,7 +135,7 @@ class CapturedPPO(PPO):
             paid += self.gamma * self._value[:, 0] * extras["time_outs"]
         if self.rnd is not None:
             self._see(obs)
-            self.intrinsic_rewards = self._judged() * self.rnd.next_weight()
+            self.intrinsic_rewards = self._rnd_graph() * self.rnd.next_weight()
             paid += self.intrinsic_rewards
         own.rewards = paid
         self.storage.add_transition(own)
@@ -183,7 +185,15 @@ class CapturedPPO(PPO):
         for group in self.optimizer.param_groups:
             self.rate.fill_(float(group["lr"]))
             group["lr"] = self.rate
-        for captured in (self._chosen, self._valued, self._judged, self._returned, self._learned, *self._parts, self._applied):
+        for captured in (
+            self._chosen,
+            self._valued,
+            self._rnd_graph,
+            self._returned,
+            self._learned,
+            *self._parts,
+            self._applied,
+        ):
             captured.forget()
         return is_loaded
 
@@ -243,7 +253,7 @@ class CapturedPPO(PPO):
         with torch.no_grad():
             return self._judge(self._obs)
 
-    def _surprise(self) -> Tensor:
+    def _intrinsic_reward(self) -> Tensor:
         assert isinstance(self.rnd, Distillation)
         return self.rnd.surprise(self._obs)
 

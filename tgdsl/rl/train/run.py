@@ -15,7 +15,7 @@ from tgdsl.errors import FileError, TgdslError
 from tgdsl.rl.train.checkpoint import not_finite, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder
 from tgdsl.rl.train.iteration import Iteration, Learning
-from tgdsl.rl.train.telling import Board
+from tgdsl.rl.train.logging import Board
 
 
 class DivergedError(TgdslError):

@@ -353,7 +353,7 @@ class WarpSimulation(Simulation):
         self._begin_step(control)
         readings = self._step_and_read()
         self._earlier.stepped(self._faults.restarted)
-        self._touch.hand_out(readings)
+        self._touch.record_outputs(readings)
         self._finish_step(is_evaluated=True)
         return readings
 

@@ -38,7 +38,7 @@ OVERHEAD = 24
 """Cost of a row beside that of its slots, in slots."""
 WORTHWHILE = 0.75
 """Largest share of the dense sum's cost at which compaction pays."""
-FEWEST = 2
+MIN_ACTIVE = 2
 """Rows of a link at least: torch.compile treats sizes 0 and 1 apart."""
 EXPECTED = (1000, 100)
 """Numbers of rows and slots for Inductor's estimates: without any it does not fuse the exponential and the sums."""
@@ -90,7 +90,7 @@ def compacted(planes: list[Tensor], is_active: Tensor) -> tuple[list[Tensor], li
     index = _index(is_active, count, num_rows, length).split([length * num for num in sizes])
     rows, envs = [], []
     for own, of_env in zip(index, env, strict=True):
-        lacking = max(FEWEST - len(of_env), 0)
+        lacking = max(MIN_ACTIVE - len(of_env), 0)
         row = planes[0].new_zeros((6, length * (len(of_env) + lacking), size))
         at = own.clamp(min=0)
         for of_plane, to in zip(blocks, row, strict=True):
@@ -105,7 +105,7 @@ def compacted(planes: list[Tensor], is_active: Tensor) -> tuple[list[Tensor], li
 def _(planes: list[Tensor], is_active: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     context = torch.library.get_ctx()
     slots = expect_size(context.new_dynamic_size(min=1), EXPECTED[1])
-    nums = [expect_size(context.new_dynamic_size(min=FEWEST), EXPECTED[0]) for _ in range(is_active.shape[1])]
+    nums = [expect_size(context.new_dynamic_size(min=MIN_ACTIVE), EXPECTED[0]) for _ in range(is_active.shape[1])]
     rows = [planes[0].new_empty((6, num, slots)) for num in nums]
     return rows, [planes[0].new_empty((num,), dtype=torch.int64) for num in nums]
 

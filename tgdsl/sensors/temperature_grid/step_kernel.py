@@ -29,7 +29,7 @@ LEAST = tl.constexpr(least_width())
 PI = tl.constexpr(3.141592653589793)
 UNROLLED = tl.constexpr(8)
 """Modes up to which they are written out one by one."""
-FEWEST = 512
+MIN_PROGRAMS = 512
 """Numbers of a program's block at least: more environments are taken together."""
 OF_WARP = (256, 512)
 """Numbers of a block for each warp: an environment's, within these bounds. Between warps, sums go through shared memory."""
@@ -89,7 +89,7 @@ def launch(
     got, nodes_got = cells.new_empty((num_envs, 3, num_rows)), cells.new_empty((num_envs, 3, num_sides))
     block = block_of(num_rows, num_sides, x * y * z)
     size = block[0] * block[1] * block[2]
-    envs = max(1, FEWEST // size)
+    envs = max(1, MIN_PROGRAMS // size)
     strides = [(part.stride(0) if part.shape[0] > 1 else 0, part.stride(1)) for part in objects]
     run[(triton.cdiv(num_envs, envs),)](
         cells, nodes, *(part.contiguous() for part in patches), *(part.contiguous() for part in (*rows, *films)),

@@ -1,4 +1,4 @@
-"""What is told while a policy is learned: a progress bar or lines, and TensorBoard."""
+"""Logging of a training run: a progress bar or lines, and TensorBoard."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from small_runs import small_learner
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.policy import policy_for, read_policy
-from tgdsl.rl.playing.surroundings import SCENE, changes_around, surroundings
+from tgdsl.rl.playing.provenance import SCENE, changes_around, provenance
 from tgdsl.rl.train.folder import made_from
 from tgdsl.rl.train.policies import card_of, write_policy
 
@@ -72,7 +72,7 @@ def test_rounding_is_no_difference(tmp_path):
     """Of each array of floats every number a few units in its last place greater; one number that is 1 % and 0.001 greater is another scene."""
     loaded = load_task(small_tasks.small_task(tmp_path))
     model = mujoco.MjModel.from_xml_string(small_tasks.SCENE)
-    card = json.loads(json.dumps(surroundings(loaded, model)))
+    card = json.loads(json.dumps(provenance(loaded, model)))
     arrays = [getattr(model, name) for names in SCENE.values() for name in names if not name.startswith("opt.")]
     for array in arrays:
         if array.dtype == np.float64:

@@ -1,4 +1,4 @@
-"""What a policy acts among beside its task's document: the sensors' document and the scene, as its card has them."""
+"""What a policy was learned with, besides its task's document: the sensors' document and the scene, as its card has them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LEAST = 1e-12
 """What counts as 0, in the array's unit: rounding differs between machines."""
 
 
-def surroundings(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:
+def provenance(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:
     """Return what a card says of sensors and scene, as plain values.
 
     Args:
@@ -60,7 +60,7 @@ def changes_around(card: Mapping[str, Any], loaded: LoadedTask, model: mujoco.Mj
     """
     if "sensors" not in card:
         return []
-    now, scene = surroundings(loaded, model), card["scene"]
+    now, scene = provenance(loaded, model), card["scene"]
     lines = differences(card["sensors"], _known(card["sensors"], now["sensors"]))
     found = [f"{loaded.spec.document}: {line}" for line in lines]
     return found + [f"the scene's {part}" for part, digest in now["scene"].items() if scene.get(part, digest) != digest]
