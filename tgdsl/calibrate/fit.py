@@ -140,8 +140,8 @@ def time_offset(
         return float(np.mean(error**2))
 
     width = 5 * step
-    found: Any = minimize_scalar(misfit, bounds=(best - width, best + width), method="bounded", options={"xatol": 1e-5})
-    return float(found.x)
+    result: Any = minimize_scalar(misfit, bounds=(best - width, best + width), method="bounded", options={"xatol": 1e-5})
+    return float(result.x)
 
 
 def forces_at(
@@ -150,8 +150,8 @@ def forces_at(
     known_force: Float[np.ndarray, "step component"],
 ) -> tuple[Float[np.ndarray, "sample component"], Bool[np.ndarray, " sample"]]:
     """Return known forces at other times, linear in between, and which of the times lie within theirs."""
-    found = np.column_stack([np.interp(time, known_time, component) for component in known_force.T])
-    return found, (time >= known_time[0]) & (time <= known_time[-1])
+    result = np.column_stack([np.interp(time, known_time, component) for component in known_force.T])
+    return result, (time >= known_time[0]) & (time <= known_time[-1])
 
 
 def _correlation(time: np.ndarray, size: np.ndarray, known_time: np.ndarray, known_size: np.ndarray) -> float:

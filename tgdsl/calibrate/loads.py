@@ -242,10 +242,10 @@ def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             missing = [name for name in names if name not in archive]
-            found = {} if missing else {name: archive[name] for name in names}
+            result = {} if missing else {name: archive[name] for name in names}
             known = sorted(name for name in archive.files if ":" not in name)
     except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
         raise TgdslError(f"{path}: expected an .npz file with arrays {' and '.join(names)}: {error}") from error
     if missing:
         raise TgdslError(f"{path}: there is no array {' and '.join(missing)}; it holds {', '.join(known)}")
-    return found
+    return result

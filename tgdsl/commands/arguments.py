@@ -65,14 +65,14 @@ def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
     Raises:
         TgdslError: If one has no equals sign.
     """
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for pair in pairs:
         if "=" not in pair:
             raise TgdslError(f'--set {pair}: expected KEY=VALUE, such as "resolution=high"')
         key, _, value = pair.partition("=")
-        found.pop(key, None)
-        found[key] = value
-    return found
+        result.pop(key, None)
+        result[key] = value
+    return result
 
 
 def joined_overrides(before: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:

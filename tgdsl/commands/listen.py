@@ -89,9 +89,9 @@ class Listen:
         blocks: dict[str, list[np.ndarray]] = {sensor.name: [] for sensor in chosen}
         with tqdm(total=len(controls), desc="listening", unit="step", disable=None, leave=False) as bar:
             for step in rollout(touch, sim, controls):
-                for name, found in blocks.items():
-                    found.append(step.readings[name][0, :, :, 0].double().sum(dim=1).numpy())
+                for name, result in blocks.items():
+                    result.append(step.readings[name][0, :, :, 0].double().sum(dim=1).numpy())
                 bar.update()
         units = {sensor.name: sensor.readings[0].units[0] for sensor in chosen}
-        rates = {name: len(found[0]) / sim.control_step for name, found in blocks.items()}
-        return [Sound(name, units[name], rates[name], np.concatenate(found)) for name, found in blocks.items()]
+        rates = {name: len(result[0]) / sim.control_step for name, result in blocks.items()}
+        return [Sound(name, units[name], rates[name], np.concatenate(result)) for name, result in blocks.items()]

@@ -129,7 +129,7 @@ class Shared(NamedTuple):
 def share(sensors: Sensors, joined: Joined, layout: Layout, quantities: Sequence[Quantity]) -> Shared:
     """Return the distinct uses of each quantity: all that ask alike at the same taxels are one."""
     places: dict[bytes, np.ndarray] = {}
-    found: dict[tuple[Hashable, ...], Use] = {}
+    result: dict[tuple[Hashable, ...], Use] = {}
     keys: dict[str, list[tuple[Hashable, ...]]] = {}
     of_sensor: dict[str, dict[str, int]] = {}
     for sensor in sensors:
@@ -142,16 +142,16 @@ def share(sensors: Sensors, joined: Joined, layout: Layout, quantities: Sequence
             noise = sensor.name if request.is_within_radii and sensor.radius_noise > 0 else ""
             name = _quantity_of(request, quantities).name
             key = taxels.tobytes(), tuple(own.links), noise, request.key()
-            before = found.get(key)
+            before = result.get(key)
             merged = request if before is None else before.request.merged(request)
             users = (*(before.sensors if before is not None else ()), sensor.sensor)
             shift = sensor.radius_noise if noise else 0.0
-            found[key] = Use(merged, tuple(dict.fromkeys(users)), own.links, taxels, pos, noise, shift)
+            result[key] = Use(merged, tuple(dict.fromkeys(users)), own.links, taxels, pos, noise, shift)
             order = keys.setdefault(name, [])
             if key not in order:
                 order.append(key)
             of_sensor.setdefault(sensor.name, {})[name] = order.index(key)
-    return Shared({name: [found[key] for key in own] for name, own in keys.items()}, of_sensor)
+    return Shared({name: [result[key] for key in own] for name, own in keys.items()}, of_sensor)
 
 
 def _of_group(requests: Sequence[Request]) -> Request:
@@ -159,11 +159,11 @@ def _of_group(requests: Sequence[Request]) -> Request:
 
 
 def _quantity_of(request: Request, quantities: Sequence[Quantity]) -> Quantity:
-    found = next((quantity for quantity in quantities if quantity.request is type(request)), None)
-    if found is None:
+    result = next((quantity for quantity in quantities if quantity.request is type(request)), None)
+    if result is None:
         hint = "give its kind the quantity, `Kind(quantities=(…,))`, or install the package that brings it"
         raise TgdslError(f'no known quantity answers the request "{type(request).__name__}"; {hint}')
-    return found
+    return result
 
 
 def rows_of(sensor: LoweredSensor, joined: Joined) -> tuple[int, int]:

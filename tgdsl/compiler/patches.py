@@ -95,7 +95,7 @@ def check_regions(owner: Loaded | LoadedLayout, value: object, path: Path, robot
 
 def patches_of(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: dict[str, Placement]) -> list[Patch]:
     """Return the links that carry taxels, in the robot's body order."""
-    found: dict[str, Patch] = {}
+    result: dict[str, Patch] = {}
     for pattern, placement in placements.items():
         path: Path = ("resolutions", str(loaded.resolution), pattern)
         check_regions(layout, placement, path, robot, loaded.problems)
@@ -105,15 +105,15 @@ def patches_of(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: d
             what = f'no body, geom or mesh matches "{pattern}"'
             loaded.problems.append(layout.problem(path, what, did_you_mean(pattern, known, "links"), on_key=True))
         for link, geoms in hits:
-            if link.name in found:
-                what = f'link "{link.name}" already has a layout, by "{found[link.name].path[-1]}"'
+            if link.name in result:
+                what = f'link "{link.name}" already has a layout, by "{result[link.name].path[-1]}"'
                 loaded.problems.append(layout.problem(path, what, "give each link one", on_key=True))
             elif not geoms:
                 loaded.problems.append(layout.problem(path, f'link "{link.name}" has no geoms', on_key=True))
             else:
-                found[link.name] = Patch(link, geoms, placement, path)
+                result[link.name] = Patch(link, geoms, placement, path)
     order = {body: i for i, body in enumerate(robot.bodies)}
-    return sorted(found.values(), key=lambda patch: (order[patch.link.body], patch.geoms[0].id))
+    return sorted(result.values(), key=lambda patch: (order[patch.link.body], patch.geoms[0].id))
 
 
 def matched(robot: Model, pattern: str) -> list[tuple[Link, tuple[Geom, ...]]]:

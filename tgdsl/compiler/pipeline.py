@@ -131,8 +131,8 @@ def layouts(
     kinds: Sequence[Kind] = (),
 ) -> tuple[mujoco.MjModel, dict[str, Layout]]:
     """Return the model and the layouts of `placed`."""
-    found = placed(document, overrides, resolutions, kinds)
-    return found.model, found.layouts
+    result = placed(document, overrides, resolutions, kinds)
+    return result.model, result.layouts
 
 
 def placed(
@@ -167,8 +167,8 @@ def placed(
             raise TgdslError(f'the layout has no resolution "{name}"; {did_you_mean(name, names, "resolutions")}')
     texts = {name: chosen if name == own else {**chosen, "resolution": name} for name in wanted}
     each = {name: resolve(load(document, text, known, needs_sensors=False), progress) for name, text in texts.items()}
-    found = {name: unfelt(own.colliders, own.layout, own.reach) for name, own in each.items()}
-    return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, found)
+    result = {name: unfelt(own.colliders, own.layout, own.reach) for name, own in each.items()}
+    return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, result)
 
 
 def _origin(loaded: Loaded) -> Origin:

@@ -351,16 +351,16 @@ def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
         loaded.problems.append(loaded.problem(place, what, "expected `collision: mesh`, or such a file"))
         return ()
     try:
-        found = load_colliders(file)
+        result = load_colliders(file)
     except SpecError as error:
         loaded.problems += error.problems
         return ()
-    unknown = [own.body for own in found if own.body not in scene.bodies]
+    unknown = [own.body for own in result if own.body not in scene.bodies]
     if unknown:
         what = f'{file.name} has colliders of "{unknown[0]}", which is no body of the scene'
         loaded.problems.append(loaded.problem(place, what, did_you_mean(unknown[0], scene.bodies, "bodies")))
         return ()
-    return found
+    return result
 
 
 def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:

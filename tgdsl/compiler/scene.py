@@ -116,13 +116,13 @@ def _margins(spec: mujoco.MjSpec, between: Touching) -> tuple[set[tuple[float, f
 
 
 def _geoms(spec: mujoco.MjSpec, part: ContactPart) -> list[mujoco.MjsGeom]:
-    found = (spec.geom if part.kind == "geom" else spec.body)(part.name)
-    if found is None:
+    result = (spec.geom if part.kind == "geom" else spec.body)(part.name)
+    if result is None:
         kind = "geom" if part.kind == "geom" else "body"
         raise RobotError(f'this model has no {kind} "{part.name}", which the module wants contacts of')
     if part.kind == "geom":
-        return [found]
-    return [*found.geoms, *(geom for child in found.bodies if part.kind == "subtree" for geom in _below(child))]
+        return [result]
+    return [*result.geoms, *(geom for child in result.bodies if part.kind == "subtree" for geom in _below(child))]
 
 
 def _below(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:

@@ -188,7 +188,7 @@ def variant_scenes(scene: Model, target: SceneObject, contents: Mapping[str, byt
     Raises:
         RobotError: If MuJoCo cannot compile it.
     """
-    found = []
+    results = []
     for variant, geoms in enumerate(target.variants):
         spec = scene.spec.copy()
         spec.assets = {**spec.assets, **{key: readable(key, content) for key, content in contents.items()}}
@@ -199,5 +199,5 @@ def variant_scenes(scene: Model, target: SceneObject, contents: Mapping[str, byt
         except ValueError as error:
             message = " ".join(str(error).split())
             raise RobotError(f"{scene.file}: object {target.name}, variant {variant}: {message}") from error
-        found.append((model, tuple(geom_name(target, i) for i, geom in enumerate(geoms) if geom is not None)))
-    return found
+        results.append((model, tuple(geom_name(target, i) for i, geom in enumerate(geoms) if geom is not None)))
+    return results

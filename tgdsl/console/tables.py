@@ -73,8 +73,8 @@ class TaxelTable(np.ndarray):
     """A structured array that prints as a table, a row per taxel; what is taken out of it is an ordinary array."""
 
     def __getitem__(self, key: Any) -> Any:
-        found = super().__getitem__(key)
-        return found.view(np.ndarray) if isinstance(found, TaxelTable) and found.dtype.names is None else found
+        result = super().__getitem__(key)
+        return result.view(np.ndarray) if isinstance(result, TaxelTable) and result.dtype.names is None else result
 
     def __repr__(self) -> str:
         names = self.dtype.names

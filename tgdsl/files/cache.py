@@ -63,14 +63,14 @@ class Entry:
 
 def entries() -> list[Entry]:
     """Return the files of the cache, the least recently used first; other files in the folder are none of it."""
-    found = []
+    results = []
     for file in folder().glob("*") if folder().is_dir() else ():
         with contextlib.suppress(OSError):  # another process has just removed it
             state = file.stat()
             is_abandoned = _TEMPORARY.fullmatch(file.name) and time.time() - state.st_mtime > _ABANDONED
             if _ENTRY.fullmatch(file.name) or is_abandoned:
-                found.append(Entry(state.st_mtime, file, state.st_size))
-    return sorted(found)
+                results.append(Entry(state.st_mtime, file, state.st_size))
+    return sorted(results)
 
 
 def evict(limit: int) -> list[Entry]:
@@ -91,10 +91,10 @@ def evict(limit: int) -> list[Entry]:
 
 def digest(format: bytes, arrays: Sequence[np.ndarray]) -> str:
     """Return a hash of a format's name and of shapes and contents of arrays."""
-    found = hashlib.sha256(format)
+    result = hashlib.sha256(format)
     for array in arrays:
-        found.update(f"{array.shape} {array.dtype.str} ".encode() + np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
+        result.update(f"{array.shape} {array.dtype.str} ".encode() + np.ascontiguousarray(array).tobytes())
+    return result.hexdigest()
 
 
 def cached(

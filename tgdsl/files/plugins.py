@@ -33,22 +33,22 @@ def known(
     Raises:
         TgdslError: If two have one name, or one that is given is none.
     """
-    found: dict[str, tuple[Any, str]] = {}
+    result: dict[str, tuple[Any, str]] = {}
     of_tgdsl = [(thing, "tgdsl") for thing in own]
     for thing, whence in (*of_tgdsl, *installed(group, what, wrong), *((thing, f"`{argument}`") for thing in given)):
         if reason := wrong(thing):
             raise TgdslError(f"{whence}: {reason}")
-        other, first = found.setdefault(thing.name, (thing, whence))  # type: ignore[attr-defined]
+        other, first = result.setdefault(thing.name, (thing, whence))  # type: ignore[attr-defined]
         if other is not thing:
             name = thing.name  # type: ignore[attr-defined]
             raise TgdslError(f'two {argument} are called "{name}": one of {first}, one of {whence}; rename or remove one')
-    return tuple(thing for thing, _ in found.values())
+    return tuple(thing for thing, _ in result.values())
 
 
 @cache
 def installed(group: str, what: str, wrong: Wrong) -> tuple[tuple[Any, str], ...]:
     """Return what installed packages bring, and which package each is of."""
-    found = []
+    results = []
     for point in sorted(entry_points(group=group), key=lambda point: (_package(point), point.name)):
         try:
             thing = point.load()
@@ -59,8 +59,8 @@ def installed(group: str, what: str, wrong: Wrong) -> tuple[tuple[Any, str], ...
             message = f'the {what} "{point.name}" of {_package(point)} ({point.value}) is left out: {reason}'
             warnings.warn(message, stacklevel=4)
         else:
-            found.append((thing, _package(point)))
-    return tuple(found)
+            results.append((thing, _package(point)))
+    return tuple(results)
 
 
 def _package(point: EntryPoint) -> str:

@@ -91,13 +91,13 @@ def _bodies_of(model: mujoco.MjModel, actuator: int) -> set[str]:
     """Return the bodies that an actuator without joints acts on: by sites, a spatial tendon, or adhesion."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind == mujoco.mjtTrn.mjTRN_BODY:
-        found = [target]
+        results = [target]
     elif kind in _SITE_DRIVES:
-        found = [int(model.site_bodyid[target])]
+        results = [int(model.site_bodyid[target])]
     elif kind == mujoco.mjtTrn.mjTRN_TENDON:
         path = slice(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
         is_site = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
-        found = model.site_bodyid[np.asarray(model.wrap_objid[path])[is_site]].tolist()
+        results = model.site_bodyid[np.asarray(model.wrap_objid[path])[is_site]].tolist()
     else:
-        found = []
-    return {model.body(i).name for i in found}
+        results = []
+    return {model.body(i).name for i in results}

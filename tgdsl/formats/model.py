@@ -85,8 +85,8 @@ class Model:
     @cached_property
     def geoms(self) -> tuple[Geom, ...]:
         """All geoms of named bodies."""
-        found = (self.geom(i) for i in range(self.compiled.ngeom))
-        return tuple(geom for geom in found if geom.body)
+        result = (self.geom(i) for i in range(self.compiled.ngeom))
+        return tuple(geom for geom in result if geom.body)
 
     def geom(self, i: int) -> Geom:
         """Return a geom by its index."""
@@ -124,11 +124,11 @@ class Model:
             others: Names of bodies that are none of its parts.
         """
         model = self.compiled
-        found = [int(model.body(body).id)]
-        for i in range(found[0] + 1, model.nbody if found[0] else 0):
-            if model.body_parentid[i] in found and not model.body_jntnum[i] and model.body(i).name not in others:
-                found.append(i)
-        return tuple(found)
+        results = [int(model.body(body).id)]
+        for i in range(results[0] + 1, model.nbody if results[0] else 0):
+            if model.body_parentid[i] in results and not model.body_jntnum[i] and model.body(i).name not in others:
+                results.append(i)
+        return tuple(results)
 
     def rigid_geoms(self, bodies: Sequence[int]) -> tuple[Geom, ...]:
         """Return the geoms of bodies that are one rigid body, see `rigid_bodies`, in the first one's frame."""
@@ -137,14 +137,14 @@ class Model:
         for i in bodies[1:]:
             pos, rotation = placed[int(model.body_parentid[i])]
             placed[i] = pos + rotation @ model.body_pos[i], rotation @ _matrix(model.body_quat[i])
-        found = []
+        results = []
         for i in np.flatnonzero(np.isin(model.geom_bodyid, bodies)).tolist():
             geom, body = self.geom(i), int(model.geom_bodyid[i])
             if body != bodies[0]:
                 pos, rotation = placed[body]
                 geom = replace(geom, pos=pos + rotation @ geom.pos, rotation=rotation @ geom.rotation)
-            found.append(geom)
-        return tuple(found)
+            results.append(geom)
+        return tuple(results)
 
     def can_collide(self, first: str, second: str) -> bool:
         """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""

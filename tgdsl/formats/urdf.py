@@ -175,11 +175,11 @@ def _mesh_file(name: str, urdf: Path) -> Path:
             if (folder / inside).is_file():
                 return folder / inside
         raise RobotError(f'{urdf}: mesh "{name}": no folder above the file holds "{inside}"')
-    found = urdf.resolve().parent / name.removeprefix("file://")
-    if not found.is_file():
-        alike = [own.name for own in found.parent.glob("*") if own.name.lower() == found.name.lower()]
-        raise RobotError(f'{urdf}: mesh "{name}": there is no file {found}' + (f"; there is {alike[0]}" if alike else ""))
-    return found
+    result = urdf.resolve().parent / name.removeprefix("file://")
+    if not result.is_file():
+        alike = [own.name for own in result.parent.glob("*") if own.name.lower() == result.name.lower()]
+        raise RobotError(f'{urdf}: mesh "{name}": there is no file {result}' + (f"; there is {alike[0]}" if alike else ""))
+    return result
 
 
 def _package_name(folder: Path) -> str | None:

@@ -114,12 +114,12 @@ def filled(
     index = np.argwhere(weight.sum(axis=-1) > least)
     low = np.stack([line[:-1][at] for line, at in zip(lines, index.T, strict=True)], axis=1)
     size = np.stack([np.diff(line)[at] for line, at in zip(lines, index.T, strict=True)], axis=1)
-    found = Filled(index, low, size, weight[tuple(index.T)])
+    result = Filled(index, low, size, weight[tuple(index.T)])
     row = np.full(weight.shape[:3], -1)
     row[tuple(index.T)] = np.arange(len(index))
     cell = np.concatenate([row[tuple(view.cell.T)] for view in views])
     pos, normal, area = (np.concatenate([getattr(view, name) for view in views]) for name in ("pos", "normal", "area"))
-    return found, Crossings(cell[cell >= 0], pos[cell >= 0], normal[cell >= 0], area[cell >= 0])
+    return result, Crossings(cell[cell >= 0], pos[cell >= 0], normal[cell >= 0], area[cell >= 0])
 
 
 class _View:

@@ -34,8 +34,8 @@ NODES = 27
 
 def _shape_functions(pos: Float[np.ndarray, "point 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Return values (node, point) and gradients (node, axis, point) of a cell's shape functions at points of [0, 1]³."""
-    found = [_ELEMENT.lbasis(pos.T, node) for node in range(NODES)]
-    return np.stack([value for value, _ in found]), np.stack([gradient for _, gradient in found])
+    results = [_ELEMENT.lbasis(pos.T, node) for node in range(NODES)]
+    return np.stack([value for value, _ in results]), np.stack([gradient for _, gradient in results])
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +109,10 @@ class Elements:
         dofs = (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(self.nodes), -1)
         rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
         size = 3 * len(self.pos)
-        found = csc_array(coo_array((local.ravel(), (rows.ravel(), columns.ravel())), (size, size)))
-        found.sum_duplicates()
-        found.eliminate_zeros()
-        return found
+        result = csc_array(coo_array((local.ravel(), (rows.ravel(), columns.ravel())), (size, size)))
+        result.sum_duplicates()
+        result.eliminate_zeros()
+        return result
 
     def displacement(
         self, cell: Int[np.ndarray, " x"], pos: Float[np.ndarray, "x 3"], values: Float[np.ndarray, "dof mode"]
@@ -121,7 +121,7 @@ class Elements:
         within = (pos - self.filled.low[cell]) / self.filled.size[cell]
         at = values.reshape(len(self.pos), 3, -1)
         value = _shape_functions(within)[0]
-        found = np.zeros((len(cell), 3, at.shape[2]))
+        result = np.zeros((len(cell), 3, at.shape[2]))
         for node in range(NODES):
-            found += value[node][:, None, None] * at[self.nodes[cell, node]]
-        return found
+            result += value[node][:, None, None] * at[self.nodes[cell, node]]
+        return result

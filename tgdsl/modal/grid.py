@@ -86,8 +86,8 @@ def _principal(moments: np.ndarray) -> np.ndarray:
     value, vector = np.linalg.eigh(moments)
     long = vector[:, value > (1 - MERGE_TOLERANCE) * value[-1]]
     onto = long @ long.T
-    found = onto[int(np.flatnonzero(np.diag(onto) > np.diag(onto).max() - 1e-6)[0])]
-    return found / np.linalg.norm(found)
+    result = onto[int(np.flatnonzero(np.diag(onto) > np.diag(onto).max() - 1e-6)[0])]
+    return result / np.linalg.norm(result)
 
 
 def planes(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], axis: int) -> Planes:

@@ -3,7 +3,8 @@
 Modes whose frequencies are nearer than `MERGE_TOLERANCE` are one. A square plate, a can or a ball has pairs and multiplets that
 symmetry makes equal, and any mixture of them is a mode too. What is computed for a group is the same for all mixtures. With φ
 the column of its mode shapes along the surface's normal and M = (1/A) ∫ φ φᵀ dA their mean products over it, an impulse J at
-the point x makes all of them ring in phase, at amplitudes φ(x) J; the root mean square over the surface of what is then heard is
+the point x makes all of them ring in phase, at amplitudes φ(x) J; the root mean square over the surface of what is then
+heard is
 
     √(φᵀ(x) M φ(x)) J,   and its root mean square over all x   g J,   g = ‖M‖ = √(Σ M_ij²)
 
@@ -60,18 +61,18 @@ def of_groups(
 ) -> Float[np.ndarray, "*point group"]:
     """Return the share of each of so many groups: its field, or of several the root of the sum of their squares."""
     own = [fields[..., owner == group] for group in range(count)]
-    found = [part[..., 0] if part.shape[-1] == 1 else np.sqrt((part**2).sum(axis=-1)) for part in own]
-    return np.stack(found, axis=-1) if found else fields[..., :0]
+    results = [part[..., 0] if part.shape[-1] == 1 else np.sqrt((part**2).sum(axis=-1)) for part in own]
+    return np.stack(results, axis=-1) if results else fields[..., :0]
 
 
 def groups(wave_number: Float[np.ndarray, " mode"]) -> list[slice]:
     """Return which modes, by ascending frequency, are one: those up to `MERGE_TOLERANCE` above the first of them."""
-    found, start = [], 0
+    result, start = [], 0
     for mode in range(1, len(wave_number) + 1):
         if mode == len(wave_number) or wave_number[mode] > (1 + MERGE_TOLERANCE) * wave_number[start]:
-            found.append(slice(start, mode))
+            result.append(slice(start, mode))
             start = mode
-    return found
+    return result
 
 
 def loudness(

@@ -66,8 +66,8 @@ class ModeShapes:
         from tgdsl.modal.loudness import of_groups
         from tgdsl.modal.shapes import interpolated
 
-        found = interpolated(self.low, self.step, self.num, self.value, pos @ self.axes.T)
-        return of_groups(np.einsum("xif,xi->xf", found, along @ self.axes.T), self.owner, int(self.owner.max()) + 1)
+        result = interpolated(self.low, self.step, self.num, self.value, pos @ self.axes.T)
+        return of_groups(np.einsum("xif,xi->xf", result, along @ self.axes.T), self.owner, int(self.owner.max()) + 1)
 
     def of(self, kept: Bool[np.ndarray, " mode"]) -> ModeShapes:
         """Return those of some modes."""

@@ -59,12 +59,12 @@ def interpolated(
     at = np.clip((pos - low) / step, 0.0, num - 1)
     first = np.minimum(at.astype(np.int64), num - 2)
     share = at - first
-    found = np.zeros((len(pos), *value.shape[1:]))
+    result = np.zeros((len(pos), *value.shape[1:]))
     for corner in np.ndindex(2, 2, 2):
         weight = np.where(np.array(corner), share, 1 - share).prod(axis=1)
         node = np.ravel_multi_index(tuple((first + corner).T), tuple(num))
-        found += weight[:, None, None] * value[node]
-    return found
+        result += weight[:, None, None] * value[node]
+    return result
 
 
 def on_grid(elements: Elements, crossings: Crossings, lines: Lines, fields: Float[np.ndarray, "dof field"]) -> ShapeGrid:

@@ -100,8 +100,10 @@ def spectrum(
     size, middle = float((high - low).max()), (low + high) / 2
     vertices = np.round((vertices - middle) / size, DIGITS) + 0.0
     key = cache.digest(FORMAT, [vertices, faces, np.array(poissons_ratio), np.array([count, unknowns])])
-    found = cache.cached(key, lambda: _computed(vertices, faces, poissons_ratio, count, unknowns, progress), _packed, _unpacked)
-    return found, size, middle
+    result = cache.cached(
+        key, lambda: _computed(vertices, faces, poissons_ratio, count, unknowns, progress), _packed, _unpacked
+    )
+    return result, size, middle
 
 
 def _computed(
@@ -117,12 +119,12 @@ def _computed(
     stiffness, mass = elements.matrices(poissons_ratio)
     progress(f"eigenproblem of {3 * len(elements.pos)} unknowns")
     # A few more than asked for: some are one, and the last group may lack some of its modes.
-    found = vibration(stiffness, mass, count + 8)
+    result = vibration(stiffness, mass, count + 8)
     progress("mode shapes on a grid")
-    displacement = elements.displacement(crossings.cell, crossings.pos, found.shape)
+    displacement = elements.displacement(crossings.cell, crossings.pos, result.shape)
     normal = np.einsum("xim,xi->xm", displacement, crossings.normal)
     volume = float(elements.filled.volume.sum())
-    heard = loudness(found.wave_number, normal, crossings.area, volume)
+    heard = loudness(result.wave_number, normal, crossings.area, volume)
     kept, at = slice(None, count), picked(crossings)
     wanted = heard.owner < count
     return Spectrum(
@@ -135,7 +137,7 @@ def _computed(
         unknowns=3 * len(elements.pos),
         axes=turned,
         owner=heard.owner[wanted],
-        grid=on_grid(elements, crossings, lines, found.shape @ heard.mixture[:, wanted]),
+        grid=on_grid(elements, crossings, lines, result.shape @ heard.mixture[:, wanted]),
     )
 
 
@@ -158,20 +160,20 @@ def _lines(vertices: np.ndarray, faces: np.ndarray, wanted: int) -> cells.Lines:
 
     cell, best = size / 8, None
     for _ in range(ROUNDS):
-        found, unknowns = at(cell)
+        result, unknowns = at(cell)
         if unknowns <= wanted and (best is None or unknowns > best[1]):
-            best = found, unknowns
+            best = result, unknowns
         at_end = (unknowns > wanted and cell >= COARSEST * size) or (unknowns <= wanted and cell <= finest)
         if at_end or 0.8 * wanted <= unknowns <= wanted:
             break
         cell = float(np.clip(cell * (unknowns / (0.9 * wanted)) ** 0.4, finest, COARSEST * size))
     if best is None and unknowns > MAX_UNKNOWNS:
-        walls = " × ".join(str(len(line) - 1) for line in found)
+        walls = " × ".join(str(len(line) - 1) for line in result)
         raise refused(
             f"its flat walls ask for a grid of {walls} cells and {unknowns} unknowns, {MAX_UNKNOWNS} are allowed",
             "leave out small details",
         )
-    return found if best is None else best[0]
+    return result if best is None else best[0]
 
 
 def _whole(elements: Elements, crossings: cells.Crossings) -> tuple[Elements, cells.Crossings]:
@@ -198,6 +200,6 @@ def _packed(found: Spectrum) -> Mapping[str, np.ndarray]:
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray]) -> Spectrum:
-    found = {name: arrays[name] for name in Spectrum.__dataclass_fields__ if name != "grid"}
+    result = {name: arrays[name] for name in Spectrum.__dataclass_fields__ if name != "grid"}
     on_nodes = ShapeGrid(**{name: arrays[f"grid_{name}"] for name in ShapeGrid.__dataclass_fields__})
-    return Spectrum(**{**found, "volume": float(found["volume"]), "unknowns": int(found["unknowns"])}, grid=on_nodes)
+    return Spectrum(**{**result, "volume": float(result["volume"]), "unknowns": int(result["unknowns"])}, grid=on_nodes)

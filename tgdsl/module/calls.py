@@ -84,5 +84,5 @@ def inductor_options(plan: Plan, quantities: Sequence[Quantity], device: torch.d
 
 def cpp_compiler() -> str | None:
     """Return the C++ compiler that Inductor needs for a CPU; None if there is none."""
-    found = (shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)
-    return next((path for path in found if path), None)
+    result = (shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)
+    return next((path for path in result if path), None)

@@ -66,11 +66,11 @@ def _contacts(values: dict[str, Tensor], inputs: Inputs, spread: float) -> dict[
     tangential = raw - along * normal
     size = tangential.norm(dim=-1, keepdim=True)
     force = along.abs() * (normal + 0.5 * tangential / (size + 1.0))
-    found = {
+    result = {
         "contact_pos": links + spread * values["contact_pos"],
         "contact_force": force,
         "contact_torque": 1e-3 * along * normal,
         "contact_normal": normal,
     }
-    found = {name: torch.where(is_used, value, 0.0) for name, value in found.items()}
-    return {**found, "contact_netforce": found["contact_force"].sum(dim=2)}
+    result = {name: torch.where(is_used, value, 0.0) for name, value in result.items()}
+    return {**result, "contact_netforce": result["contact_force"].sum(dim=2)}

@@ -136,8 +136,8 @@ def explain(touch: Explained) -> str:
 
 def _account(touch: Explained, asked: Quantity) -> list[str]:
     """Return what was measured of what a quantity computes beforehand."""
-    found = asked.account(touch.plan.quantities[asked.name], touch.plan.objects)
-    return [line for headline, lines in found.items() for line in ["", headline, *(f"  {own}" for own in lines)]]
+    result = asked.account(touch.plan.quantities[asked.name], touch.plan.objects)
+    return [line for headline, lines in result.items() for line in ["", headline, *(f"  {own}" for own in lines)]]
 
 
 def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:

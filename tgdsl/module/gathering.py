@@ -38,9 +38,9 @@ def parts(plan: Plan) -> dict[str, Any]:
 
 def constant_arrays(plan: Plan) -> dict[str, np.ndarray]:
     """Return the arrays of these parts, by the names that the plan gives them."""
-    names, found = {id(array): name for name, array in plan.arrays.items()}, {}
-    tree.mapped(parts(plan), lambda array: found.setdefault(names[id(array)], array), _stays_on_host)
-    return found
+    names, result = {id(array): name for name, array in plan.arrays.items()}, {}
+    tree.mapped(parts(plan), lambda array: result.setdefault(names[id(array)], array), _stays_on_host)
+    return result
 
 
 def bind(plan: Plan, tensor_of: Callable[[str], Tensor]) -> Tree:

@@ -172,7 +172,7 @@ class Incoming:
 
     def _substeps(self, state: SceneState, device: torch.device, num_envs: int) -> dict[str, Tensor]:
         """Return the fields of earlier substeps."""
-        inputs, found = self._plan.inputs, {}
+        inputs, result = self._plan.inputs, {}
         if not (isinstance(state.substeps, (tuple, list)) and all(isinstance(part, SceneState) for part in state.substeps)):
             raise StateError("SceneState.substeps: expected a tuple of tgdsl.SceneState")
         if len(state.substeps) != inputs.substeps - 1:
@@ -184,8 +184,8 @@ class Incoming:
             for name, value in part.checked(inputs, device, with_dt=False).items():
                 if len(value) != num_envs:
                     raise StateError(f"SceneState.substeps[{i}].{name} holds {len(value)} environments, body_pos {num_envs}")
-                found[f"substep/{i}/{name}"] = value
-        return found
+                result[f"substep/{i}/{name}"] = value
+        return result
 
     def _look_at_poses(self, tensors: Mapping[str, Tensor]) -> None:
         """Warn of environments with a pose that is not finite, the first time."""

@@ -220,8 +220,8 @@ class TactileModule(HookedModule):
         rows = few_rows(tensors["mask"]) if name == "advance_some" else None
         if rows is not None:
             return read_rows(self.calls.of(self.flat_core), rows, rows_of(tensors, rows), memory)
-        found = self.calls.of(getattr(self, name))(tensors, memory)
-        return {name: found[name] for name in self.plan.readings()}
+        result = self.calls.of(getattr(self, name))(tensors, memory)
+        return {name: result[name] for name in self.plan.readings()}
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and put the new state in the place of the old one."""

@@ -46,8 +46,8 @@ def joined_signal(
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
         rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
         of_taxels = dict(zip(names, materialised(torch.stack(rows)).unbind(), strict=True))
-    found, _ = kind.forward(gathered, UNTIMED, of_taxels, {})
-    return _stacked(found, "signal", sensors[0].signal)
+    result, _ = kind.forward(gathered, UNTIMED, of_taxels, {})
+    return _stacked(result, "signal", sensors[0].signal)
 
 
 def read(
@@ -82,8 +82,8 @@ def read(
     if at is not None and kind.gains_depth:
         felt = gathered[ContactDepth]
         gathered = gathered.replaced(ContactDepth, felt._replace(depth=stages.gain(knobs, at, felt.depth) * felt.depth))
-    found, new = ({}, {}) if joined is not None else _answer(sensor, kind, gathered, context, constants, _own(memory))
-    signal = clean = _stacked(found, "signal", sensor.signal) if joined is None else joined
+    result, new = ({}, {}) if joined is not None else _answer(sensor, kind, gathered, context, constants, _own(memory))
+    signal = clean = _stacked(result, "signal", sensor.signal) if joined is None else joined
     if at is not None and not kind.gains_depth:
         signal = stages.gain(knobs, at, clean[:, 0])[:, None] * clean
     if terms:
@@ -105,10 +105,10 @@ def read(
         readings[reading.name] = made.transpose(1, 2)
     for reading in sensor.readings[len(own) :]:
         report = reading.name.rpartition("/")[2]
-        readings[reading.name] = _stacked(found, f"{report}/signal", reading.channels).transpose(1, 2)
+        readings[reading.name] = _stacked(result, f"{report}/signal", reading.channels).transpose(1, 2)
     if now is not None and now.period is not None:
         new["sample/phase"] = _phase(memory["sample/phase"], now.period, now)
-    return readings, new, found
+    return readings, new, result
 
 
 def block(
@@ -153,8 +153,8 @@ def _answer(
     answer = kind.forward(gathered, context, constants, state)
     if not torch.compiler.is_compiling():
         _check_answer(sensor, answer, state)
-    found, new = answer
-    return dict(found), dict(new)
+    result, new = answer
+    return dict(result), dict(new)
 
 
 def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None:

@@ -40,13 +40,13 @@ def frozen_files(spec: LayoutSpec, layouts: Mapping[str, Layout], out: Path, ori
 
 def _table_names(layouts: Mapping[str, Layout], out: Path) -> dict[str, str]:
     """Return the name of each resolution's table; characters that a file's name may lack are left out."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for name in layouts:
         stem = f"{out.stem}.{re.sub(r'[^A-Za-z0-9_-]', '_', name)}"
-        taken = {other.lower() for other in found.values()}
+        taken = {other.lower() for other in result.values()}
         tries = (f"{stem}{suffix}.csv" for suffix in ("", *(f"_{i}" for i in range(2, len(layouts) + 2))))
-        found[name] = next(own for own in tries if own.lower() not in taken)
-    return found
+        result[name] = next(own for own in tries if own.lower() not in taken)
+    return result
 
 
 def _table(layout: Layout) -> str:

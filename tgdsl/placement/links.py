@@ -112,14 +112,14 @@ def _aligned(blocks: Sequence[Sequence[tuple[str, ...]]]) -> list[str]:
 
 
 def _joints(model: mujoco.MjModel, body: int) -> tuple[str, ...]:
-    found = []
+    results = []
     first = int(model.body_jntadr[body])
     for joint in range(first, first + int(model.body_jntnum[body])):
         kind = _JOINTS[int(model.jnt_type[joint])]
         name = model.joint(joint).name
         span = f" {_range(model, joint, kind)}" if kind != "free" else ""
-        found.append(f"{name}: {kind}{span}" if name else f"{kind}{span}")
-    return tuple(found)
+        results.append(f"{name}: {kind}{span}" if name else f"{kind}{span}")
+    return tuple(results)
 
 
 def _range(model: mujoco.MjModel, joint: int, kind: str) -> str:
@@ -131,12 +131,12 @@ def _range(model: mujoco.MjModel, joint: int, kind: str) -> str:
 
 
 def _geoms(robot: Model, body: int) -> tuple[str, ...]:
-    found = []
+    results = []
     first = int(robot.compiled.body_geomadr[body])
     for geom in map(robot.geom, range(first, first + int(robot.compiled.body_geomnum[body]))):
         kind = f"{geom.shape} {geom.mesh}" if geom.mesh else geom.shape
-        found.append(f"{geom.name + ': ' if geom.name else ''}{kind}, {'colliding' if geom.is_colliding else 'visual'}")
-    return tuple(found)
+        results.append(f"{geom.name + ': ' if geom.name else ''}{kind}, {'colliding' if geom.is_colliding else 'visual'}")
+    return tuple(results)
 
 
 def _area(robot: Model, body: int) -> str:
@@ -159,14 +159,14 @@ def _groups(robot: Model, layout: LoadedLayout) -> dict[str, list[str]]:
     candidates = [[body, *(n for geom in robot.touchable(body) for n in geom.names)] for body in robot.bodies]
     names = [name for geom in robot.geoms for name in geom.names]
     problems: list[Problem] = []
-    found: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     for group, selection in layout.spec.groups.items():
 
         def report(where: tuple[str, int], what: str, hint: str, group: str = group) -> None:
             problems.append(layout.problem(("groups", group), what, hint))
 
         for i in select(selection, candidates, layout.spec.groups, report, group, names):
-            found.setdefault(robot.bodies[i], []).append(group)
+            result.setdefault(robot.bodies[i], []).append(group)
     if problems:
         raise SpecError(problems)
-    return found
+    return result

@@ -92,8 +92,8 @@ class Colliders:
 
     def depths(self, solids: Int[np.ndarray, " own"], pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "own n"]:
         """Return how deep points of the world are inside each of some solids [m], see `ConvexSolid.depth`."""
-        found = [self.solids[i].depth(pos) for i in solids]
-        return np.stack(found) if found else np.zeros((0, len(pos)))
+        results = [self.solids[i].depth(pos) for i in solids]
+        return np.stack(results) if results else np.zeros((0, len(pos)))
 
     def is_buried(
         self, body: int, pos: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, " n"]
@@ -157,19 +157,19 @@ def reach(colliders: Colliders, layout: Layout, ignored: Collection[int] = ()) -
         ignored: Bodies that are no links, such as objects, by their indices.
     """
     count, model = layout.num_taxels, colliders.robot.compiled
-    found = Reach(np.ones(count, bool), np.full(count, -np.inf), np.zeros(count, bool), np.full(count, -1))
+    result = Reach(np.ones(count, bool), np.full(count, -np.inf), np.zeros(count, bool), np.full(count, -1))
     for place, name in enumerate(layout.bodies):
         taxels = np.flatnonzero((layout.body_id == place) & (layout.radius > 0))
         body, pos = int(model.body(name).id), layout.pos[taxels]
-        found.is_collided[taxels] = colliders.collides(body)
-        found.is_buried[taxels], found.depth[taxels] = colliders.is_buried(body, pos, layout.radius[taxels])
+        result.is_collided[taxels] = colliders.collides(body)
+        result.is_buried[taxels], result.depth[taxels] = colliders.is_buried(body, pos, layout.radius[taxels])
         others = colliders.others(body, ignored)
         depths = colliders.depths(others, colliders.in_world(body, pos))
         if len(others):
             deepest = depths.argmax(axis=0)
             is_inside = depths.max(axis=0) > INSIDE
-            found.cover[taxels] = np.where(is_inside, colliders.body[others[deepest]], -1)
-    return found
+            result.cover[taxels] = np.where(is_inside, colliders.body[others[deepest]], -1)
+    return result
 
 
 def unfelt(colliders: Colliders, layout: Layout, found: Reach) -> tuple[Unfelt, ...]:

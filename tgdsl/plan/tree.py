@@ -78,8 +78,8 @@ def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[A
             new = {name: walk(part) for name, part in parts.items()}
             return value if all(new[name] is part for name, part in parts.items()) else type(value)(**new)
         if isinstance(value, Mapping):
-            found = {key: walk(part) for key, part in value.items()}
-            return value if all(found[key] is part for key, part in value.items()) else found
+            result = {key: walk(part) for key, part in value.items()}
+            return value if all(result[key] is part for key, part in value.items()) else result
         if isinstance(value, (tuple, list)):
             parts = tuple(walk(part) for part in value)
             return value if all(a is b for a, b in zip(parts, value, strict=True)) else parts

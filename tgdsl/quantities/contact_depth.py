@@ -241,12 +241,12 @@ class _ContactDepth(Quantity):
             if geoms is not None
         }
         measured: dict[int, tuple[ObjectDistance, ...]] = {}
-        found, are_closed = [], _are_closed(scene)
+        result, are_closed = [], _are_closed(scene)
         for use in part.uses:
             query = part.queries[use.query]
             probes, own = Probes(vec(query.pos.unbind()), query.pair), [targets[o] for o in query.objects]
             if are_closed and use.is_gated and not {"distance", "frame"} & {*use.wants}:  # as right after a reset
-                found.append(penetration(pairs_for(scene, True), probes, (), use.reach[:0], use.wants))
+                result.append(penetration(pairs_for(scene, True), probes, (), use.reach[:0], use.wants))
                 continue
             answer = _searched(use, probes, own, scene)
             if answer is None:
@@ -254,13 +254,13 @@ class _ContactDepth(Quantity):
                     measured[use.query] = measure(pairs_for(scene, True), probes, own)
                 near = [measured[use.query][o] for o in use.objects]
                 answer = penetration(pairs_for(scene, use.is_gated), probes, near, _reach(use, scene), use.wants)
-            found.append(answer)
-        return tuple(found)
+            result.append(answer)
+        return tuple(result)
 
     def reference(self, part: ContactDepthPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferencePenetration:
         own, layout = part.uses[use], scene.layout
         radius = own.reach[:, scene.rows].max(axis=0, initial=-np.inf)
-        found = []
+        results = []
         for i, link in enumerate(layout.links):
             objects: list[tuple[ReferenceBody, list[ReferenceGeom]] | None] = []
             for o in (part.queries[own.query].objects[o] for o in own.objects):
@@ -270,9 +270,9 @@ class _ContactDepth(Quantity):
                 geoms = geoms_of(table, scene.variant(target), scene.size(target))
                 objects.append((scene.object_body(target), geoms) if is_felt else None)
             at = layout.link_id == i
-            found.append(_reference_penetration(scene.body(link.body), layout.pos[at], radius[at], objects))
+            results.append(_reference_penetration(scene.body(link.body), layout.pos[at], radius[at], objects))
         names = ReferencePenetration.__dataclass_fields__
-        return ReferencePenetration(**{name: np.concatenate([getattr(one, name) for one in found]) for name in names})
+        return ReferencePenetration(**{name: np.concatenate([getattr(one, name) for one in results]) for name in names})
 
     def fields(self, part: ContactDepthPart) -> set[str]:
         is_moving = any("motion" in use.wants for use in part.uses)
@@ -346,7 +346,7 @@ def _query(
     felt, taxels = list(names), uses[0].taxels
     pair = planning.pair_table(felt, taxels)
     query = ProbeQuery(tuple(known.index(name) for name in felt), uses[0].pos, pair)
-    bodies, found = planning.bodies_of(taxels), []
+    bodies, result = planning.bodies_of(taxels), []
     for use in uses:
         request = _request(use)
         chosen = [name for name in request.objects if name in known] if use in measuring else []
@@ -355,8 +355,8 @@ def _query(
         reach = np.where(can_meet.reshape(len(chosen), len(bodies)), request.reach(planning.layout.radius[taxels]), -np.inf)
         objects = tuple(felt.index(name) for name in chosen)
         search = _search(planning, chosen, request.wants, pair[list(objects)], tables)
-        found.append(DepthUse(number, objects, request.is_gated, request.wants, use.radius_noise, reach, search))
-    return query, found
+        result.append(DepthUse(number, objects, request.is_gated, request.wants, use.radius_noise, reach, search))
+    return query, result
 
 
 def _search(

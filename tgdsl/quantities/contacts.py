@@ -201,10 +201,10 @@ def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]
 
 def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
     """Return where any of some numbers is not zero; not-a-number is none."""
-    found = parts[0] != 0
+    result = parts[0] != 0
     for part in parts[1:]:
-        found = found | (part != 0)
-    return found
+        result = result | (part != 0)
+    return result
 
 
 def _told(normal: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:

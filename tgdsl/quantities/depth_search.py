@@ -158,11 +158,11 @@ def measure(pairs: Pairs, probes: Probes, targets: Sequence[Target]) -> tuple[Ob
 
     Not-a-number in a pose comes out as not-a-number.
     """
-    found = []
+    results = []
     for (target, geoms), pair in zip(targets, probes.pair, strict=True):
         distance, gradient = _distance(pairs, probes, geoms, target.pairs, pair)
-        found.append(ObjectDistance(target.name, target.pairs, pair, distance, gradient))
-    return tuple(found)
+        results.append(ObjectDistance(target.name, target.pairs, pair, distance, gradient))
+    return tuple(results)
 
 
 def penetration(
@@ -267,15 +267,15 @@ def search(
     """
     if not DEEPEST.takes_kernel(pairs, probes, targets, known, reach):
         return None
-    found = DEEPEST.kernel(pairs, probes, targets, known, reach)
+    result = DEEPEST.kernel(pairs, probes, targets, known, reach)
     velocity = angular = None
     if "motion" in wants and pairs.motion is not None:
-        own, is_met = found.pair.clamp(min=0).long(), found.pair >= 0
+        own, is_met = result.pair.clamp(min=0).long(), result.pair >= 0
         motion = (*pairs.motion.linear, *pairs.motion.angular)
         x, y, z, u, v, w = (torch.where(is_met, part.gather(1, own), 0.0) for part in motion)
         velocity, angular = planes.add((x, y, z), planes.cross((u, v, w), probes.pos)), (u, v, w)
-    normal = found.normal if "normal" in wants else None
-    return Penetration(probes.pos, found.depth, normal, velocity, angular, {}, {})
+    normal = result.normal if "normal" in wants else None
+    return Penetration(probes.pos, result.depth, normal, velocity, angular, {}, {})
 
 
 def deepest(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapping[str, Tensor], reach: Reach) -> Deepest:

@@ -174,13 +174,13 @@ class TriangleTable:
     def prepared(self) -> RaycastSurface:
         """What is queried; cases with the same triangles share a mesh."""
         meshes: dict[tuple[bytes, bytes], TriangleMesh] = {}
-        found = []
+        results = []
         for vertices, faces in zip(self.vertices, self.faces, strict=True):
             key = vertices.tobytes(), faces.tobytes()
             if key not in meshes:
                 meshes[key] = TriangleMesh(vertices, faces)
-            found.append(meshes[key])
-        return RaycastSurface(tuple(found), self.max_distance)
+            results.append(meshes[key])
+        return RaycastSurface(tuple(results), self.max_distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,12 +312,12 @@ class ReferenceGeom:
 
 def geoms_of(table: GeomTable[np.ndarray], case: int, size: Float[np.ndarray, " 3"] | None = None) -> list[ReferenceGeom]:
     """Return the geoms of a case of a table; with a size, that of its only geom [m]."""
-    found = []
+    results = []
     for g, shape in enumerate(table.shapes):
         if table.is_absent is None or not table.is_absent[case, g]:
             own = np.asarray(table.size[case, g]) if size is None else size
-            found.append(ReferenceGeom(shape, own, table.pos[case, g], table.rotation[case, g].reshape(3, 3)))
-    return found
+            results.append(ReferenceGeom(shape, own, table.pos[case, g], table.rotation[case, g].reshape(3, 3)))
+    return results
 
 
 def distance_to(geoms: Sequence[ReferenceGeom], point: Float[np.ndarray, " 3"]) -> tuple[float, Float[np.ndarray, " 3"]]:

@@ -233,14 +233,14 @@ def gradient_sums(surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: fl
 
     With u the unit vector from q to p and r = |p − q| < R: ∇S0 = ∫ u dA [m²], ∇S1 = ∫ (r u uᵀ − (R − r) 1) dA [m³].
     """
-    found = np.zeros((len(pos), 4, 3))
-    for own, near, q in zip(found, surface.tree.query_ball_point(pos, radius), pos, strict=True):
+    result = np.zeros((len(pos), 4, 3))
+    for own, near, q in zip(result, surface.tree.query_ball_point(pos, radius), pos, strict=True):
         way, area = surface.pos[near] - q, surface.area[near]
         r = np.linalg.norm(way, axis=1)
         unit = way / np.maximum(r, 1e-12)[:, None]
         own[0] = area @ unit
         own[1:] = (area[:, None] * way).T @ unit - (area @ (radius - r)) * np.eye(3)
-    return found
+    return result
 
 
 def _around(pieces: Pieces, radius: float, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
@@ -270,7 +270,7 @@ def moment_sums(
         channels: 4, or 8 with the derivatives.
         block: How many are computed at once.
     """
-    found = np.zeros((len(pos), channels))
+    result = np.zeros((len(pos), channels))
     for start in range(0, len(pos), block):
         own = pos[start : start + block]
         middle = (own.min(axis=0) + own.max(axis=0)) / 2
@@ -286,8 +286,8 @@ def moment_sums(
         for first in range(0, channels, 4):
             sums = torch.nn.functional.linear(weight if first == 0 else (weight > 0).double(), parts)
             sums[:, 1:] -= sums[:, :1] * here
-            found[start : start + block, first : first + 4] = sums.numpy()
-    return found
+            result[start : start + block, first : first + 4] = sums.numpy()
+    return result
 
 
 def _node_sums(
@@ -319,11 +319,11 @@ def _splines(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x
     """Return the factors of the quadratic B-splines whose sum equals the values at the nodes; zero in the two outer layers."""
     from scipy.ndimage import spline_filter
 
-    found = np.zeros_like(values)
+    result = np.zeros_like(values)
     within = (slice(2, -2),) * 3
     for channel in range(values.shape[3]):
-        found[within + (channel,)] = spline_filter(values[..., channel], order=2)[within]
-    return found
+        result[within + (channel,)] = spline_filter(values[..., channel], order=2)[within]
+    return result
 
 
 def _errors(
@@ -473,14 +473,14 @@ def _lists(
     index = np.stack(np.unravel_index(np.arange(np.prod(num)), num), axis=1)
     middle = origin + cell * (index + 0.5)
     tree = KDTree(points)
-    found = []
+    results = []
     for own in middle:
         near = np.sort(np.array(tree.query_ball_point(own, reach + cell * np.sqrt(0.75)), dtype=np.int64))
         gap = np.maximum(np.abs(points[near] - own) - cell / 2, 0)
-        found.append(near[(gap**2).sum(axis=1) < reach**2])
-        if 8 * len(middle) * len(found[-1]) > budget:
-            return 8 * len(middle) * len(found[-1])
-    lists = np.full((len(middle), max(1, max(map(len, found)))), len(points), dtype=np.int64)
-    for row, near in zip(lists, found, strict=True):
+        results.append(near[(gap**2).sum(axis=1) < reach**2])
+        if 8 * len(middle) * len(results[-1]) > budget:
+            return 8 * len(middle) * len(results[-1])
+    lists = np.full((len(middle), max(1, max(map(len, results)))), len(points), dtype=np.int64)
+    for row, near in zip(lists, results, strict=True):
         row[: len(near)] = near
     return lists

@@ -293,12 +293,14 @@ class _Moments(Quantity):
         return MomentsPart(tuple(tables), tuple(_use(planning, use, tables, numbers) for use in uses))
 
     def gather(self, part: MomentsPart[Tensor], scene: Scene) -> tuple[SurfaceMoments, ...]:
-        found = []
+        results = []
         for use in part.uses:
             sources = [_source(part.tables[i], use, k, scene) for k, i in enumerate(use.tables)]
             pairs = pairs_for(scene, is_gated=False)
-            found.append(surface_moments(pairs if use.motion else pairs._replace(motion=None), vec(use.pos.unbind()), sources))
-        return tuple(found)
+            results.append(
+                surface_moments(pairs if use.motion else pairs._replace(motion=None), vec(use.pos.unbind()), sources)
+            )
+        return tuple(results)
 
     def reference(self, part: MomentsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceMoments:
         own, layout = part.uses[use], scene.layout
@@ -360,8 +362,8 @@ def _request(use: Use) -> MomentsRequest:
 def _way(use: Use) -> tuple[Any, ...]:
     """Return what tables have in common that serve several uses: how moments are found, whatever of and by whom."""
     own = _request(use)
-    found = own.backend, own.num_points, own.tolerance, own.gradient_tolerance, own.max_bytes, own.with_area
-    return *found, use.largest_shift
+    result = own.backend, own.num_points, own.tolerance, own.gradient_tolerance, own.max_bytes, own.with_area
+    return *result, use.largest_shift
 
 
 def _radii(planning: Planning, uses: Sequence[Use], use: Use, name: str) -> list[float]:

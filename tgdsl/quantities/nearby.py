@@ -105,16 +105,16 @@ def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> 
         pos: Where the probes are in their links' frames [m], planes (taxel,).
         sources: The objects.
     """
-    found: dict[str, Moments] = {}
+    result: dict[str, Moments] = {}
     motions: dict[str, Motion] = {}
     for source in sources:
         name, own = source.target.name, source.target.pairs
-        found[name] = FELT_MOMENTS(pairs, own, pos, source)
+        result[name] = FELT_MOMENTS(pairs, own, pos, source)
         if pairs.motion is not None:
             linear, angular, turn = (gathered(part, own, source.pair) for part in pairs.motion)
             motions[name] = Motion(linear, angular, turn)
     none = pairs.offset[0].new_zeros((pairs.offset[0].shape[0], pos[0].shape[0]))
-    return SurfaceMoments(pos, none, found, motions, {source.target.name: source.area for source in sources})
+    return SurfaceMoments(pos, none, result, motions, {source.target.name: source.area for source in sources})
 
 
 def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:

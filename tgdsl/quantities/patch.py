@@ -108,11 +108,11 @@ def slots_of(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Slot]
         touches.append(Touch(force, torque, normal, pos, is_used))
     forces = _normal_forces(planes.split(_of_pairs(contacts.whole, sides)), touches)
     origin = planes.split(contacts.body_pos[:, sides.bodies, None])
-    found = []
+    results = []
     for force, touch in zip(forces, touches, strict=True):
         away = planes.vec(torch.where(touch.is_used, part, 0.0).to(dtype) for part in planes.sub(touch.pos, origin))
-        found.append(Slot(force.to(dtype), away, planes.vec(part.to(dtype) for part in touch.normal)))
-    return found
+        results.append(Slot(force.to(dtype), away, planes.vec(part.to(dtype) for part in touch.normal)))
+    return results
 
 
 def _normal_forces(whole: Vec, touches: list[Touch]) -> list[Tensor]:
@@ -125,13 +125,13 @@ def _normal_forces(whole: Vec, touches: list[Touch]) -> list[Tensor]:
     total, count = sum(sizes[1:], start=sizes[0]), sum(used[1:], start=used[0])
     is_loaded = total > 0
     inverse = 1.0 / torch.where(is_loaded, total, count.clamp(min=1.0))
-    found = []
+    results = []
     for touch, size, one in zip(touches, sizes, used, strict=True):
         weight = torch.where(is_loaded, size, one) * inverse
         force = planes.dot(planes.add(touch.force, planes.scale(weight, lacking)), touch.normal).clamp(min=0)
         is_missing = touch.is_used & (planes.dot(touch.normal, touch.normal) == 0)
-        found.append(torch.where(is_missing, torch.nan, force))
-    return found
+        results.append(torch.where(is_missing, torch.nan, force))
+    return results
 
 
 def _of_pairs(field: Tensor, sides: Sides) -> Tensor:

@@ -48,14 +48,14 @@ def launch(
     fields = [part.contiguous() for part in contacts]
     num_envs, num_pairs, num_slots = fields[0].shape[:3]
     num_bodies, num_objects = pairs.shape
-    found = fields[0].new_empty((8, num_envs, num_bodies, num_objects))
+    result = fields[0].new_empty((8, num_envs, num_bodies, num_objects))
     num = num_envs * num_bodies * num_objects
     run[(triton.cdiv(num, BLOCK),)](
-        found, *fields, pairs.contiguous(), bodies, num, num_pairs, fields[5].shape[1], cancelled,
+        result, *fields, pairs.contiguous(), bodies, num, num_pairs, fields[5].shape[1], cancelled,
         BODIES=num_bodies, OBJECTS=num_objects, SLOTS=num_slots, SLOT=1 << (num_slots - 1).bit_length(),
         BLOCK=BLOCK, num_warps=WARPS,
     )  # fmt: skip
-    return found
+    return result
 
 
 @triton.jit

@@ -294,8 +294,8 @@ def tables(
         loss: b of the exposed faces across each axis [1]; default: they are insulated.
     """
     loss = np.zeros(count.shape) if loss is None else loss
-    found = {"count": count.astype(np.float64)}
-    found |= {"number": found["count"].prod(axis=1), "volume": (size / count).prod(axis=1)}
+    result = {"count": count.astype(np.float64)}
+    result |= {"number": result["count"].prod(axis=1), "volume": (size / count).prod(axis=1)}
     for axis, name in enumerate("xyz"):
         own = exposed_ends(count[:, axis], [face[0] for face in faces if face[1] == name])
         vectors, values = modes(count[:, axis], own * loss[:, axis, None])
@@ -304,9 +304,9 @@ def tables(
         sums = vectors.sum(axis=2)
         if not (own * loss[:, axis, None]).any():
             sums[:, 1:] = 0.0  # exactly: what insulated cells hold stays
-        found |= {f"ends_{name}": own, f"mode_{name}": vectors}
-        found |= {f"square_{name}": values, f"smooth_{name}": smooth, f"total_{name}": sums}
-    return found
+        result |= {f"ends_{name}": own, f"mode_{name}": vectors}
+        result |= {f"square_{name}": values, f"smooth_{name}": smooth, f"total_{name}": sums}
+    return result
 
 
 def is_cell(count: Int[np.ndarray, "row 3"]) -> Bool[np.ndarray, "row x y z"]:
@@ -652,23 +652,23 @@ class _Patches(Quantity):
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> PatchesPart[np.ndarray]:
         held: dict[str, str] = {}
-        found = []
+        results = []
         for use in uses:
             if _check(planning, use, held):
-                found.append(_use(planning, use))
-        return PatchesPart(tuple(found))
+                results.append(_use(planning, use))
+        return PatchesPart(tuple(results))
 
     def gather(self, part: PatchesPart[Tensor], scene: Scene) -> tuple[ContactPatch, ...]:
         return tuple(_patches(use, scene) for use in part.uses)
 
     def reference(self, part: PatchesPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferencePatches:
-        own, found = part.uses[use], {}
+        own, result = part.uses[use], {}
         for b, o in own.topology.met:
             patch = _reference_patch(scene, b, scene.contact_pairs[own.pairs[b, o]].object, int(own.pairs[b, o]), own.is_star)
             if patch is not None:
-                found[b, o] = patch
+                result[b, o] = patch
         objects = tuple(_reference_object(own, i, scene) for i in range(own.topology.num_objects))
-        return ReferencePatches(found, objects, own.topology, own.boxes)
+        return ReferencePatches(result, objects, own.topology, own.boxes)
 
     def fields(self, part: PatchesPart) -> set[str]:
         wanted = (

@@ -106,13 +106,13 @@ def point_tiles(taxels: Sequence[tuple[int, int]], num_taxels: int) -> list[tupl
         taxels: First of each link's taxels, and one beyond the last.
         num_taxels: Number of the query's taxels.
     """
-    size, found, end = tile_size(taxels), [], 0
+    size, result, end = tile_size(taxels), [], 0
     owners = sorted((first, last, link) for link, (first, last) in enumerate(taxels))
     for first, last, link in [*owners, (num_taxels, num_taxels, -1)]:
-        found += [(-1, start, min(start + size, first)) for start in range(end, first, size)]
-        found += [(link, start, min(start + size, last)) for start in range(first, last, size)]
+        result += [(-1, start, min(start + size, first)) for start in range(end, first, size)]
+        result += [(link, start, min(start + size, last)) for start in range(first, last, size)]
         end = last
-    return found
+    return result
 
 
 def tile_size(taxels: Sequence[tuple[int, int]]) -> int:
@@ -126,9 +126,9 @@ def _by_kernel(own: ObjectPoints) -> LinkPoints:
     from tgdsl.quantities.points_kernel import meet
 
     pairs, source = own
-    found = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]
-    distance, gradient = united([geom[1:] for geom in found], source.links.is_absent)
-    return LinkPoints(source.taxels, source.tiles, found[0][0], distance, gradient, source.area)
+    results = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]
+    distance, gradient = united([geom[1:] for geom in results], source.links.is_absent)
+    return LinkPoints(source.taxels, source.tiles, results[0][0], distance, gradient, source.area)
 
 
 def _inputs(own: ObjectPoints) -> list[Tensor]:
@@ -282,17 +282,17 @@ class _Points(Quantity):
         )
 
     def gather(self, part: PointsPart[Tensor], scene: Scene) -> tuple[dict[str, ObjectPoints], ...]:
-        found = []
+        results = []
         for use in part.uses:
             pairs = _with_lost(pairs_for(scene, use.is_gated))
             sources = [_source(part, met, scene) for met in use.objects]
-            found.append({source.object: ObjectPoints(pairs, source) for source in sources})
-        return tuple(found)
+            results.append({source.object: ObjectPoints(pairs, source) for source in sources})
+        return tuple(results)
 
     def reference(self, part: PointsPart[np.ndarray], use: int, scene: ReferenceScene) -> tuple[ReferencePoints, ...]:
         own, layout = part.uses[use], scene.layout
         numbers = {link.name: (i, link.body) for i, link in enumerate(layout.links)}
-        found = []
+        results = []
         for met in own.objects:
             cloud = part.clouds[met.cloud]
             target = scene.objects[cloud.object]
@@ -307,8 +307,8 @@ class _Points(Quantity):
                 phi, gradient = (np.array(one) for one in zip(*(distance_to(geoms, z) for z in pos), strict=True))
                 if own.is_gated and not scene.is_touching(name, target.name):
                     phi = np.full(len(pos), np.inf)
-                found.append(ReferencePoints(np.flatnonzero(layout.link_id == i), pos, phi, gradient, area))
-        return tuple(found)
+                results.append(ReferencePoints(np.flatnonzero(layout.link_id == i), pos, phi, gradient, area))
+        return tuple(results)
 
     def fields(self, part: PointsPart) -> set[str]:
         return {"contact_found"} if any(use.is_gated for use in part.uses) else set()
@@ -338,19 +338,19 @@ def _request(use: Use) -> Points:
 
 def _clouds(planning: Planning, uses: Sequence[Use]) -> dict[tuple[int, str], CloudPart[np.ndarray]]:
     """Return the points of all objects, by their number and the object."""
-    found: dict[tuple[int, str], CloudPart[np.ndarray]] = {}
+    result: dict[tuple[int, str], CloudPart[np.ndarray]] = {}
     for use in uses:
         num_points = _request(use).num_points
         for i, name in enumerate(use.request.objects):
             number = planning.object_id(name)
-            if (num_points, name) in found or number is None:
+            if (num_points, name) in result or number is None:
                 continue
             planning.progress(f"object {name}: points on its surface")
             try:
-                found[num_points, name] = cloud(planning.sensed[name], num_points, number)
+                result[num_points, name] = cloud(planning.sensed[name], num_points, number)
             except LowerError as error:
                 planning.report(("sensors", use.sensors[0], "feels", i), error.what, error.hint)
-    return found
+    return result
 
 
 def cloud(sensed: SensedObject, num_points: int, number: int) -> CloudPart[np.ndarray]:
@@ -379,20 +379,20 @@ def _links(planning: Planning, uses: Sequence[Use]) -> dict[str, list[Any]]:
     """Return how the distance to each link's own surface is found."""
     from tgdsl.quantities.bake import geom_distance
 
-    found: dict[str, list[Any]] = {}
+    result: dict[str, list[Any]] = {}
     for use in uses:
         for link in use.links:
-            if link.name in found:
+            if link.name in result:
                 continue
             planning.progress(f"link {link.name}: distances")
             try:
                 margin = _margin(planning, link, uses)
                 geoms = planning.geoms_of(link.name)
-                found[link.name] = [geom_distance(geom, LINKS, margin, f"link {link.name}") for geom in geoms]
+                result[link.name] = [geom_distance(geom, LINKS, margin, f"link {link.name}") for geom in geoms]
             except BakeError as error:
                 place = ("sensors", use.sensors[0], "links")
                 planning.report(place, f'link "{link.name}": {error}', "or use `anchors: taxels`")
-    return found
+    return result
 
 
 def _margin(planning: Planning, link: Link, uses: Sequence[Use]) -> float:
@@ -400,17 +400,17 @@ def _margin(planning: Planning, link: Link, uses: Sequence[Use]) -> float:
 
     Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
     """
-    found = []
+    results = []
     for use in uses:
         if link in use.links:
-            found += [_request(use).range, float(planning.layout.radius[use.taxels].max())]
-    return max(found)
+            results += [_request(use).range, float(planning.layout.radius[use.taxels].max())]
+    return max(results)
 
 
 def _use(planning: Planning, use: Use, clouds: dict[tuple[int, str], int], links: Sequence[str]) -> PointsUse[np.ndarray]:
     request, layout = _request(use), planning.layout.take(use.taxels)
     active = [i for i in range(len(layout.links)) if (layout.radius[layout.link_id == i] > 0).any()]
-    allowed, found = planning.allowed(request), []
+    allowed, result = planning.allowed(request), []
     for name in request.objects:
         own = [i for i in active if Pair(layout.links[i].body, name) in allowed and layout.links[i].name in links]
         number = clouds.get((request.num_points, name))
@@ -421,5 +421,5 @@ def _use(planning: Planning, use: Use, clouds: dict[tuple[int, str], int], links
         taxels = tuple((int(part[0]), int(part[-1]) + 1) for part in places)
         met = tuple(links.index(layout.links[i].name) for i in own)
         tiles = np.array(point_tiles(taxels, len(use.taxels)), dtype=np.int32).reshape(-1, 3)
-        found.append(MetObject(number, met, taxels, np.array(pair), np.array(met), tiles))
-    return PointsUse(request.is_gated, tuple(found))
+        result.append(MetObject(number, met, taxels, np.array(pair), np.array(met), tiles))
+    return PointsUse(request.is_gated, tuple(result))

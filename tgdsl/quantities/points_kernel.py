@@ -103,15 +103,15 @@ def launch(
         is_cubic: Whether it is interpolated by cubes.
     """
     num_envs, num_links, num_points = pose[0].shape[0], pair.shape[0], points.shape[2]
-    found = pose[0].new_empty((7, num_envs, num_links, num_points))
+    result = pose[0].new_empty((7, num_envs, num_links, num_points))
     points, gates = points.contiguous(), pose[0] if gate is None else gate
     run[(num_envs * num_links,)](
-        found, *pose, gates, pair, points, frames.contiguous(), counts.contiguous(), values,
+        result, *pose, gates, pair, points, frames.contiguous(), counts.contiguous(), values,
         num_links, num_points, *pose[0].stride(), *pose[9].stride(), *gates.stride(), points.stride(0),
         points.stride(1) if points.shape[1] != 1 else 0,
         IS_GATED=gate is not None, IS_CUBIC=is_cubic, BLOCK=BLOCK, num_warps=1,
     )  # fmt: skip
-    return found
+    return result
 
 
 @triton.jit

@@ -80,8 +80,8 @@ class ReferenceScene:
     def is_touching(self, link: str, target: str) -> bool:
         """Return whether the simulator has a link's body in contact with an object."""
         pairs = {(pair.link, pair.object): i for i, pair in enumerate(self.contact_pairs)}
-        found, i = self.fields.get("contact_found"), pairs.get((link, target))
-        return found is not None and i is not None and bool(found[i] > 0)
+        result, i = self.fields.get("contact_found"), pairs.get((link, target))
+        return result is not None and i is not None and bool(result[i] > 0)
 
     def variant(self, target: PairedObject) -> int:
         """Return which of its variants an object has."""

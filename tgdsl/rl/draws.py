@@ -108,9 +108,9 @@ class Draws:
         rows = None if chosen is None else few_ids(chosen)
         if rows is None:
             return torch.from_numpy(uniform_on_host(_hash_on_host(begun, purpose, index, counts)))
-        found, ids = np.zeros((len(counts), len(index)), dtype=np.float32), rows.numpy()
-        found[ids] = uniform_on_host(_hash_on_host(begun[ids], purpose, index, counts[ids]))
-        return torch.from_numpy(found)
+        result, ids = np.zeros((len(counts), len(index)), dtype=np.float32), rows.numpy()
+        result[ids] = uniform_on_host(_hash_on_host(begun[ids], purpose, index, counts[ids]))
+        return torch.from_numpy(result)
 
     def shares_ahead(self, what: str, counter: Int[Tensor, " env"], num: int, ahead: int) -> Float[Tensor, "env num"]:
         """Return `shares` for a purpose that is asked for again and again, its counter one higher each time.

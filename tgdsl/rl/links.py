@@ -29,10 +29,10 @@ def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray,
 
 def _joints_above(model: mujoco.MjModel, body: int) -> set[int]:
     """Return the hinges and slides that move a body."""
-    found: set[int] = set()
+    result: set[int] = set()
     while body:
         first = int(model.body_jntadr[body])
-        found |= set(range(first, first + int(model.body_jntnum[body])))
+        result |= set(range(first, first + int(model.body_jntnum[body])))
         body = int(model.body_parentid[body])
     kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    return {joint for joint in found if int(model.jnt_type[joint]) in kinds}
+    return {joint for joint in result if int(model.jnt_type[joint]) in kinds}

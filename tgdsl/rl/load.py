@@ -132,15 +132,15 @@ def _class_of(
         line = f"{raised_at(str((folder / module).resolve()), error)}: " if module.endswith(".py") else ""
         what = f'cannot import "{name}": {line}{type(error).__name__}: {error}'
         raise SpecError([source.problem(place, what)]) from error
-    found = getattr(own, class_, None)
-    if found is None:
+    result = getattr(own, class_, None)
+    if result is None:
         classes = [key for key, value in vars(own).items() if isinstance(value, type) and issubclass(value, base)]
         raise SpecError(
             [source.problem(place, f'{module} has no class "{class_}"', did_you_mean(class_, classes, f"{which} in it"))]
         )
-    if not (isinstance(found, type) and issubclass(found, base)):
+    if not (isinstance(result, type) and issubclass(result, base)):
         raise SpecError([source.problem(place, f'"{name}" is no subclass of {base.__module__}.{base.__name__}')])
-    return found
+    return result
 
 
 def _own_module(name: str, folder: Path) -> Any:

@@ -182,7 +182,7 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
     Raises:
         SpecError: If there are two profiles of noise beside `clean`.
     """
-    found: dict[str, Any] = {"observations": {}}
+    result: dict[str, Any] = {"observations": {}}
     for sensor in dict.fromkeys(felts.values()):
         own = [felt for felt, carrier in felts.items() if carrier == sensor]
         noises = list(dict.fromkeys(felt.noise for felt in own if felt.noise != CLEAN))
@@ -190,13 +190,13 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
             what = f"noise {listed(noises)} of one sensor in one simulation, expected one beside {CLEAN}"
             raise loaded.error(("noise",), what)
         is_both = bool(noises) and any(felt.noise == CLEAN for felt in own)
-        found[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in own))
-        found[f"sensors.{sensor}.noise"] = noises[0] if noises else CLEAN
-        found[f"sensors.{sensor}.readout"] = "both" if is_both else "measured"
+        result[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in own))
+        result[f"sensors.{sensor}.noise"] = noises[0] if noises else CLEAN
+        result[f"sensors.{sensor}.readout"] = "both" if is_both else "measured"
         for felt in own:
             reading = f"{sensor}/clean" if is_both and felt.noise == CLEAN else sensor
-            found["observations"][_observation(felt)] = [{"type": SENSED[felt.type][1], "of": reading}]
-    return found
+            result["observations"][_observation(felt)] = [{"type": SENSED[felt.type][1], "of": reading}]
+    return result
 
 
 def _observation(felt: Felt) -> str:

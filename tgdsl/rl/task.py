@@ -256,13 +256,13 @@ class Task(ABC, Generic[S]):
         Raises:
             SimulationError: If it is not: terms (env,), one at least.
         """
-        found = self.reward(now, is_over)
-        for name, value in found.items():
+        result = self.reward(now, is_over)
+        for name, value in result.items():
             if not isinstance(value, Tensor) or value.shape != is_over.shape:
                 raise self._wrong(f'the term "{name}" of `reward`', value, f"({len(is_over)},)")
-        if not found:
+        if not result:
             raise SimulationError(f"{type(self).__name__}: `reward` has no terms, expected one at least")
-        return found
+        return result
 
     def checked_observations(self, now: Now, taken: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return what `observe` returns, seen to be that.
@@ -270,20 +270,20 @@ class Task(ABC, Generic[S]):
         Raises:
             SimulationError: If it is not: groups (env, feature), of other names than those that are taken.
         """
-        found, num = self.observe(now), self.setup.num_envs
-        for name, value in found.items():
+        result, num = self.observe(now), self.setup.num_envs
+        for name, value in result.items():
             if not isinstance(value, Tensor) or value.ndim != 2 or len(value) != num:
                 raise self._wrong(f'the group "{name}" of `observe`', value, f"({num}, …)")
             if name in taken:
                 raise SimulationError(
                     f'{type(self).__name__}: `observe` has a group "{name}", as all tasks do; call it otherwise'
                 )
-        return found
+        return result
 
     def _wrong(self, what: str, value: object, expected: str) -> SimulationError:
         is_tensor = isinstance(value, Tensor)
-        found = f"of shape {tuple(value.shape)}" if is_tensor else f"a {type(value).__name__}"
-        return SimulationError(f"{type(self).__name__}: {what} is {found}, expected a tensor {expected}")
+        result = f"of shape {tuple(value.shape)}" if is_tensor else f"a {type(value).__name__}"
+        return SimulationError(f"{type(self).__name__}: {what} is {result}, expected a tensor {expected}")
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""

@@ -184,12 +184,12 @@ def silent_readings(
         touching: What touches: see `touching_bodies`.
     """
     weld, body = sim.model.body_weldid, sim.model.body
-    found = {}
+    result = {}
     for output in touch.outputs:
         own = [name for name in output.bodies if (int(weld[body(name).id]) or body(name).id) in touching]
         if output.rows == "taxel" and own and not readings[output.name][0].any():
-            found[output.name] = own
-    return found
+            result[output.name] = own
+    return result
 
 
 def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[str, str]:
@@ -202,7 +202,7 @@ def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[s
         touch: The module.
         readings: Its readings.
     """
-    found = {}
+    result = {}
     for output in touch.outputs:
         report = f"{output.name}/missed"
         missed = readings.get(report)
@@ -214,8 +214,8 @@ def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[s
         felt = float(np.linalg.norm(own, axis=1).sum())
         lost = float(missed[0].double().norm(dim=-1).sum())
         if lost > MISSED * (felt + lost):
-            found[report] = f'"{output.name}" misses {lost:.3g} of {felt + lost:.3g} N, which act where none of its taxels is'
-    return found
+            result[report] = f'"{output.name}" misses {lost:.3g} of {felt + lost:.3g} N, which act where none of its taxels is'
+    return result
 
 
 class Recorder:

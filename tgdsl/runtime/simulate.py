@@ -138,7 +138,7 @@ def simulator_for(device: str, name: str | None = None) -> SimulatorKind:
         if name == MUJOCO and type_ != "cpu":
             raise SimulationError(f'MuJoCo steps on the CPU, and the device is "{device}"; leave `simulator` out')
         return by_name[name]
-    found = [kind for kind in simulators if type_ in kind.devices]
-    if not found:
+    results = [kind for kind in simulators if type_ in kind.devices]
+    if not results:
         checked_device(device, sorted({type_ for kind in simulators for type_ in kind.devices}, reverse=True))
-    return found[0]
+    return results[0]

@@ -38,13 +38,13 @@ def differing_fields(loaded: mujoco.MjModel, kept: mujoco.MjModel, is_rounded: b
         kept: Another one.
         is_rounded: Whether the second was read from an MJCF text that MuJoCo wrote, with six digits; else every bit counts.
     """
-    found = []
+    results = []
     for name, one, other in _fields(loaded, kept, ""):
         if name in PATH_FIELDS or (is_rounded and name.startswith(ROUNDING_SENSITIVE)):
             continue
         if not _same(one, other, is_rounded):
-            found.append(name)
-    return found
+            results.append(name)
+    return results
 
 
 def _fields(one: Any, other: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:

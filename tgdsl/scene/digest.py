@@ -21,7 +21,7 @@ def scene_digest(scene: SceneFile) -> str:
             root.remove(sensors)
     texts = [ET.tostring(root, encoding="unicode"), *scene.parts.values(), repr(scene.objects)]
     texts += [repr(scene.colliders)] if scene.colliders else []
-    found = hashlib.sha256(b"tgdsl scene 1")
+    result = hashlib.sha256(b"tgdsl scene 1")
     for part in [*texts, *sorted(asset.sha256 for asset in scene.assets)]:
-        found.update(f"{len(part)} {part}".encode())
-    return found.hexdigest()
+        result.update(f"{len(part)} {part}".encode())
+    return result.hexdigest()

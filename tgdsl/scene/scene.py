@@ -289,10 +289,10 @@ class SceneModels:
 
     def models(self, choices: Sequence[Mapping[str, Choice]]) -> list[mujoco.MjModel]:
         """Return the model of each environment, and forget those that none has: sizes drawn anew would pile up."""
-        found = [self.model(own) for own in choices]
-        used = {id(model) for model in found}
+        results = [self.model(own) for own in choices]
+        used = {id(model) for model in results}
         self._models = {key: model for key, model in self._models.items() if id(model) in used}
-        return found
+        return results
 
     def size(self, name: str, choice: Choice) -> tuple[float, float, float]:
         """Return the size of an object whose size may be chosen, as MuJoCo defines it [m]."""

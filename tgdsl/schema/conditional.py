@@ -24,22 +24,22 @@ def conditional(schema: Any, definitions: Mapping[str, Schema]) -> Any:
     if not isinstance(schema, dict):
         return schema
     branches = _branches(schema)
-    found = {
+    result = {
         key: conditional(value, definitions) for key, value in schema.items() if not branches or key not in ("anyOf", "oneOf")
     }
     if not branches:
-        return found
+        return result
     by_type: dict[str, list[Schema]] = {"object": [], "array": [], "": []}
     for branch in branches:
         kind = str(_target(branch, definitions).get("type"))
         by_type[kind if kind in by_type else ""].append(branch)
     if len(by_type["array"]) > 1 or not (by_type["object"] or by_type["array"]):
-        return found | {"anyOf": [conditional(branch, definitions) for branch in branches]}
+        return result | {"anyOf": [conditional(branch, definitions) for branch in branches]}
     objects = _of_objects(by_type["object"], definitions, _discriminator(schema))
     chain: Schema = {"anyOf": [conditional(leaf, definitions) for leaf in by_type[""]]} if by_type[""] else {}
     if by_type["array"]:
         chain = _if({"type": "array"}, conditional(by_type["array"][0], definitions), chain or {"type": "object"})
-    return found | (_if({"type": "object"}, objects, chain) if chain and by_type["object"] else objects or chain)
+    return result | (_if({"type": "object"}, objects, chain) if chain and by_type["object"] else objects or chain)
 
 
 def _branches(schema: Schema) -> list[Schema]:
@@ -52,7 +52,7 @@ def _branches(schema: Schema) -> list[Schema]:
 def _discriminator(schema: Schema) -> Mapping[str, Any]:
     own = schema.get("anyOf") or schema.get("oneOf") or []
     inner = (_discriminator(part) for part in own if isinstance(part, dict))
-    return schema.get("discriminator") or next((found for found in inner if found), {})
+    return schema.get("discriminator") or next((result for result in inner if result), {})
 
 
 def _target(schema: Schema, definitions: Mapping[str, Schema]) -> Schema:

@@ -153,7 +153,7 @@ def load(
 
 def _with_upstream(written: Any, wanted: Collection[str], kinds: Sequence[Kind]) -> Collection[str]:
     """Return the names of sensors that are wanted and of all that they read, as the document has it, right or wrong."""
-    by_name, found, waiting = {kind.name: kind for kind in kinds}, dict.fromkeys(wanted), list(wanted)
+    by_name, result, waiting = {kind.name: kind for kind in kinds}, dict.fromkeys(wanted), list(wanted)
     own = written if isinstance(written, dict) else {}
     kind_of = {name: by_name.get(str(s.get("kind"))) if isinstance(s, dict) else None for name, s in own.items()}
     while waiting:
@@ -163,10 +163,10 @@ def _with_upstream(written: Any, wanted: Collection[str], kinds: Sequence[Kind])
             continue
         named = own[name].get(kind.reads)
         every = [other for other, k in kind_of.items() if k is not None and k.provides]
-        read = [other for other in (named if isinstance(named, list) else every) if other in own and other not in found]
-        found |= dict.fromkeys(read)
+        read = [other for other in (named if isinstance(named, list) else every) if other in own and other not in result]
+        result |= dict.fromkeys(read)
         waiting += read
-    return list(found)
+    return list(result)
 
 
 def load_layout(path: Path) -> LoadedLayout:

@@ -22,8 +22,8 @@ def reference_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]
 
 def _names(loaded: Loaded, key: str) -> list[str] | None:
     """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
-    found = loaded.source.value.get(key, {})
-    return list(found) if isinstance(found, dict) else None
+    result = loaded.source.value.get(key, {})
+    return list(result) if isinstance(result, dict) else None
 
 
 def _object_problems(loaded: Loaded, sensor: str, feels: tuple[str, ...]) -> list[Problem]:

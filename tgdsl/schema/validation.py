@@ -57,8 +57,8 @@ def _rest(value: dict, model: type[BaseModel], entries: set[Path], required: tup
 
 def _is_follow_up(error: ErrorDetails) -> bool:
     """Return whether an error only repeats another: of a value that is no YAML, or of items that have errors themselves."""
-    found, context = error["input"], error.get("ctx", {})
-    return found is yaml.Unreadable or (error["type"] == "too_short" and len(found) >= context["min_length"])
+    result, context = error["input"], error.get("ctx", {})
+    return result is yaml.Unreadable or (error["type"] == "too_short" and len(result) >= context["min_length"])
 
 
 def _raw_path(value: Any, error: ErrorDetails, known: Mapping[int, type[BaseModel]]) -> Path:

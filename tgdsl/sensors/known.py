@@ -182,6 +182,6 @@ def _wrong_call(kind: str, name: str, call: Any) -> str:
         fits = False
     if fits and not FORMER & set(list(signature.parameters)[: len(wanted)]):
         return ""
-    found = ", ".join(signature.parameters)
+    result = ", ".join(signature.parameters)
     hint = "the CHANGELOG says what was renamed when kinds began to make requests"
-    return f'kind "{kind}": found `{name}({found})`, expected `{name}({", ".join(wanted)})`; {hint}'
+    return f'kind "{kind}": found `{name}({result})`, expected `{name}({", ".join(wanted)})`; {hint}'

@@ -84,7 +84,7 @@ def crossings(corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 
 def _near_pairs(low: Float[np.ndarray, "f 3"], high: Float[np.ndarray, "f 3"]) -> Int[np.ndarray, "n 2"] | None:
     """Return the pairs of boxes that overlap, the lower index first; None if there are too many."""
     everything = np.arange(len(low))
-    found, waiting, count = [np.zeros((0, 2), np.int64)], [(everything, everything)], 0
+    result, waiting, count = [np.zeros((0, 2), np.int64)], [(everything, everything)], 0
     while waiting:
         own, near = waiting.pop()
         box_low, box_high = low[own].min(axis=0), high[own].max(axis=0)
@@ -98,11 +98,11 @@ def _near_pairs(low: Float[np.ndarray, "f 3"], high: Float[np.ndarray, "f 3"]) -
         for axis in range(3):
             meets &= (low[own, axis, None] <= high[near, axis]) & (high[own, axis, None] >= low[near, axis])
         a, b = np.nonzero(meets)
-        found.append(np.stack([own[a], near[b]], axis=1))
+        result.append(np.stack([own[a], near[b]], axis=1))
         count += len(a)
         if count > MAX_PAIRS:
             return None
-    return np.concatenate(found)
+    return np.concatenate(result)
 
 
 def _heights(base: np.ndarray, normal: np.ndarray, corners: np.ndarray, tolerance: float) -> Float[np.ndarray, "n 3"]:
@@ -119,8 +119,8 @@ def _sections(corners: Float[np.ndarray, "n 3 3"], height: Float[np.ndarray, "n 
     part = np.divide(height, height - after, out=np.zeros_like(height), where=crosses)
     ends = np.concatenate([corners, corners + part[:, :, None] * (onward - corners)], axis=1)
     is_end = np.concatenate([height == 0, crosses], axis=1)
-    found = np.flatnonzero(is_end.sum(axis=1) == 2)
-    return found, ends[found][is_end[found]].reshape(-1, 2, 3)
+    result = np.flatnonzero(is_end.sum(axis=1) == 2)
+    return result, ends[result][is_end[result]].reshape(-1, 2, 3)
 
 
 def cells(
@@ -172,8 +172,8 @@ def _clipped(
     way = segments[:, 1] - segments[:, 0]
     middle = depth[:, 0] + (0.5 * (begin + end))[:, None] * slope
     length = (end - begin) * np.sqrt((way**2).sum(axis=1))
-    found = np.flatnonzero((middle.min(axis=1) > tolerance) & (length > tolerance))
-    return found, segments[found, :1] + np.stack([begin, end], axis=1)[found, :, None] * way[found, None]
+    result = np.flatnonzero((middle.min(axis=1) > tolerance) & (length > tolerance))
+    return result, segments[result, :1] + np.stack([begin, end], axis=1)[result, :, None] * way[result, None]
 
 
 def _next(cell: np.ndarray) -> np.ndarray:
@@ -186,5 +186,5 @@ def _half(cell: Float[np.ndarray, "k 2"], side: Float[np.ndarray, " k"]) -> np.n
     crosses = side * after < 0
     part = np.divide(side, side - after, out=np.zeros_like(side), where=crosses)
     both = np.concatenate([cell, cell + part[:, None] * (onward - cell)], axis=1)
-    found = both.reshape(-1, 2)[np.column_stack([side >= 0, crosses]).reshape(-1)]
-    return found[(found != _next(found)).any(axis=1)]
+    result = both.reshape(-1, 2)[np.column_stack([side >= 0, crosses]).reshape(-1)]
+    return result[(result != _next(result)).any(axis=1)]

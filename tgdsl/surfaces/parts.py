@@ -127,17 +127,17 @@ def _angles(vertices: np.ndarray, edges: np.ndarray, opposite: np.ndarray, which
 
 def _wedges(sides: list[int], is_forward: np.ndarray) -> list[tuple[int, int]]:
     """Match the sides of one edge, in the order of their angle, as brackets: the solid is behind a face."""
-    found, begun = [], list[int]()
+    result, begun = [], list[int]()
     for side in sides:
         if not is_forward[side]:
             begun.append(side)
         elif begun:
-            found.append((begun.pop(), side))
-    ended = {side for _, side in found}
+            result.append((begun.pop(), side))
+    ended = {side for _, side in result}
     for side in sides:
         if begun and is_forward[side] and side not in ended:
-            found.append((begun.pop(), side))
-    return found
+            result.append((begun.pop(), side))
+    return result
 
 
 def _inside_out(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, num: int) -> Bool[np.ndarray, " p"]:

@@ -199,13 +199,13 @@ def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray,
 def _hidden(own: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, "4 f"]:
     """Return whether another geom hides the surface at the middle of triangles and just within their corners."""
     middle = corners.mean(axis=1)
-    found = []
+    results = []
     for k in range(4):
         pulled = corners if k == 0 else corners + 0.98 * (corners[:, k - 1] - middle)[:, None]
         pos, normal = own.on_surface(pulled)
         hidden = other.is_inside(pos + STEP * normal)
-        found.append(hidden | other.is_inside(pos - STEP * normal) if is_earlier else hidden)
-    return np.array(found)
+        results.append(hidden | other.is_inside(pos - STEP * normal) if is_earlier else hidden)
+    return np.array(results)
 
 
 def _bisected(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:

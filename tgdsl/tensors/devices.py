@@ -32,11 +32,11 @@ def dtype_of(dtype: torch.dtype | str) -> torch.dtype:
     Raises:
         TgdslError: If there is none of that name, or no module can be of it.
     """
-    found = getattr(torch, dtype.removeprefix("torch."), None) if isinstance(dtype, str) else dtype
-    if not isinstance(found, torch.dtype):
+    result = getattr(torch, dtype.removeprefix("torch."), None) if isinstance(dtype, str) else dtype
+    if not isinstance(result, torch.dtype):
         raise TgdslError(f"dtype is {dtype!r}, expected torch.float32 or torch.float64")
-    check_dtype(found)
-    return found
+    check_dtype(result)
+    return result
 
 
 def device_of(device: torch.device | str) -> torch.device:

@@ -52,8 +52,8 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
 
 def is_env_mask(env_ids: EnvIds, num_envs: int) -> bool:
     """Return whether environments are named by a mask; a tensor's numbers are not looked at."""
-    found = env_ids if isinstance(env_ids, Tensor) else torch.as_tensor(env_ids)
-    return found.dtype == torch.bool and found.shape == (num_envs,)
+    result = env_ids if isinstance(env_ids, Tensor) else torch.as_tensor(env_ids)
+    return result.dtype == torch.bool and result.shape == (num_envs,)
 
 
 def env_mask(
@@ -85,9 +85,9 @@ def env_mask(
             mask = torch.zeros(num_envs, dtype=torch.bool, device=env_ids.device)
             mask[env_ids.long()] = True
             return mask.to(device)
-    found = np.zeros(num_envs, dtype=bool)
-    found[env_indices(env_ids, num_envs, error)] = True
-    return torch.from_numpy(found).to(device)
+    result = np.zeros(num_envs, dtype=bool)
+    result[env_indices(env_ids, num_envs, error)] = True
+    return torch.from_numpy(result).to(device)
 
 
 def broadcast_over(mask: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "env ..."]:

@@ -27,8 +27,8 @@ def products(lines: Float[Tensor, "line row"], matrices: Matrices) -> Float[Tens
         matrices: Of each link, in the order of their rows, which together are all.
     """
     parts = lines.split([len(matrix) for matrix in matrices], dim=1)
-    found = [(own @ matrix.flatten(1)).unflatten(1, matrix.shape[1:]) for own, matrix in zip(parts, matrices, strict=True)]
-    return torch.cat(found, dim=-1).transpose(0, 1)
+    results = [(own @ matrix.flatten(1)).unflatten(1, matrix.shape[1:]) for own, matrix in zip(parts, matrices, strict=True)]
+    return torch.cat(results, dim=-1).transpose(0, 1)
 
 
 def _by_kernel(lines: Float[Tensor, "line row"], matrices: Matrices) -> Float[Tensor, "plane line row"]:

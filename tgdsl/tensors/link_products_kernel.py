@@ -59,7 +59,7 @@ def launch(
     assert lines.is_contiguous()
     num_lines, num_rows = lines.shape
     num_planes = matrices[0].shape[1]
-    found = lines.new_empty((num_planes, num_lines, num_rows))
+    result = lines.new_empty((num_planes, num_lines, num_rows))
     largest = max(len(matrix) for matrix in matrices)
     block, is_held = _block([len(matrix) for matrix in matrices]), largest <= 2 * BLOCK
     rest = _padded(largest - block) if is_held and largest > block else 0
@@ -69,10 +69,10 @@ def launch(
     stages = (2 if rest == BLOCK else 3) if is_held else 1  # more do not fit
     if lines.numel() > 0:
         run[(num_tiles * triton.cdiv(num_blocks, steps),)](
-            lines, flat, tiles, found, num_lines, num_rows, num_planes, num_tiles, steps,
+            lines, flat, tiles, result, num_lines, num_rows, num_planes, num_tiles, steps,
             LINES=LINES, SIZE=block, REST=rest, DEPTH=DEPTH, IS_HELD=is_held, num_warps=4, num_stages=stages,
         )  # fmt: skip
-    return found
+    return result
 
 
 def _padded(size: int) -> int:
@@ -91,13 +91,13 @@ def _block(sizes: Sequence[int]) -> int:
 
 def _tiles(sizes: Sequence[int], num_planes: int, tile: int) -> list[int]:
     """Return the table of tiles, row by row."""
-    found, row, place = [], 0, 0
+    result, row, place = [], 0, 0
     for size in sizes:
         for plane in range(num_planes):
             for first in range(0, size, tile):
-                found += [row, size, place + plane * size, first, plane]
+                result += [row, size, place + plane * size, first, plane]
         row, place = row + size, place + size * num_planes * size
-    return found
+    return result
 
 
 @torch.library.custom_op("tgdsl::joined", mutates_args=(), schema="(Tensor[] matrices, int tile) -> (Tensor, Tensor)")

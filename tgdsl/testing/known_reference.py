@@ -41,7 +41,7 @@ class KnownReference(ReferenceModule):
 
 def _digest(*values: Any) -> bytes:
     """Return a digest of states, dictionaries, sequences, tensors, arrays and plain values: of all that is in them."""
-    found = hashlib.sha256()
+    result = hashlib.sha256()
 
     def add(value: Any) -> None:
         if isinstance(value, SceneState):
@@ -49,14 +49,14 @@ def _digest(*values: Any) -> bytes:
         elif isinstance(value, Mapping):
             add([part for item in value.items() for part in item])
         elif isinstance(value, list | tuple):
-            found.update(f"{len(value)} parts:".encode())
+            result.update(f"{len(value)} parts:".encode())
             for part in value:
                 add(part)
         elif isinstance(value, Tensor | np.ndarray):
             array = np.ascontiguousarray(value)
-            found.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+            result.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
         else:
-            found.update(f"{value!r};".encode())
+            result.update(f"{value!r};".encode())
 
     add(values)
-    return found.digest()
+    return result.digest()

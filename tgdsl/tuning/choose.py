@@ -68,14 +68,14 @@ def account(trial: Trial, own: Outcome, shared: Shared) -> tuple[str, ...]:
 
 def _reasons(sensor: str, shared: Shared) -> dict[str, str]:
     """Return why objects are finer than a sensor by itself would have them."""
-    found = {}
+    result = {}
     for target, place in shared.alone[sensor].items():
         others = [name for name, own in shared.alone.items() if own.get(target) == shared.places[target]]
         if place < shared.places[target]:
-            found[target] = f"as fine as {listed(others)} needs"
+            result[target] = f"as fine as {listed(others)} needs"
         elif shared.floors.get(target) == place:
-            found[target] = "no coarser than written, as sensors without an accuracy feel it too"
-    return found
+            result[target] = "no coarser than written, as sensors without an accuracy feel it too"
+    return result
 
 
 def _cost(outcome: Outcome) -> tuple[int, int]:
@@ -196,8 +196,8 @@ def packed(choice: Choice) -> dict[str, np.ndarray]:
 
 def unpacked(arrays: Mapping[str, np.ndarray]) -> Choice:
     """Return the choice that `packed` packed."""
-    found = json.loads(arrays["choice"].tobytes())
-    return Choice(found["changes"], {name: tuple(lines) for name, lines in found["notes"].items()})
+    result = json.loads(arrays["choice"].tobytes())
+    return Choice(result["changes"], {name: tuple(lines) for name, lines in result["notes"].items()})
 
 
 class Found(NamedTuple):
@@ -221,21 +221,21 @@ def _chosen(task: Task) -> Choice:
         trial = Trial(sensor, task.wanted[name], recording, task.progress)
         return Found(trial, *cheapest(trial, trial.fields(), trial.levels(floors)))
 
-    found = _each(task, list(task.wanted), by_itself)
-    alone = {name: own.level.places for name, own in found.items()}
+    result = _each(task, list(task.wanted), by_itself)
+    alone = {name: own.level.places for name, own in result.items()}
     places: dict[str, int] = {}
     for own in alone.values():
         places |= {target: max(place, places.get(target, place)) for target, place in own.items()}
 
     def with_others(name: str) -> Found:
-        trial, level = found[name].trial, level_of({target: places[target] for target in alone[name]})
+        trial, level = result[name].trial, level_of({target: places[target] for target in alone[name]})
         return Found(trial, *cheapest(trial, trial.fields(), [level]))
 
     moved = [name for name, own in alone.items() if any(places[target] != place for target, place in own.items())]
-    found |= _each(task, moved, with_others)
-    changes = {key: value for own in found.values() for key, value in own.outcome.variant.changes.items()}
+    result |= _each(task, moved, with_others)
+    changes = {key: value for own in result.values() for key, value in own.outcome.variant.changes.items()}
     shared = Shared(places, alone, floors)
-    return Choice(changes, {name: account(own.trial, own.outcome, shared) for name, own in found.items()})
+    return Choice(changes, {name: account(own.trial, own.outcome, shared) for name, own in result.items()})
 
 
 def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dict[str, Found]:
@@ -244,26 +244,26 @@ def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dic
     Raises:
         SpecError: All that it refuses, where `accuracy` stands.
     """
-    found, problems = {}, []
+    result, problems = {}, []
     for name in names:
         try:
-            found[name] = work(name)
+            result[name] = work(name)
         except LowerError as error:
             problems.append(task.loaded.problem(("sensors", name, "accuracy"), error.what, error.hint))
     if problems:
         raise SpecError(problems)
-    return found
+    return result
 
 
 def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
     """Return of objects that sensors without an accuracy feel which way they have: no coarser one is taken."""
     felt = {target for name, spec in loaded.spec.sensors.items() if name not in wanted for target in spec.objects}
     alternatives = query_alternatives()
-    found = {}
+    result = {}
     for target in sorted(felt & loaded.spec.objects.keys()):
         own = [i for i, other in enumerate(alternatives) if is_taken(loaded.spec.objects[target], other)]
-        found |= {target: own[0]} if own else {}
-    return found
+        result |= {target: own[0]} if own else {}
+    return result
 
 
 def _states(task: Task) -> Recording:

@@ -86,8 +86,8 @@ def varied(
     time = np.linspace(0, 1, num_steps)[:, None, None]
     width = ranges[:, 1] - ranges[:, 0]
     sway = np.where(is_own, 0.0, SWAY * width * (np.sin(2 * np.pi * time / period + phase) - np.sin(phase)))
-    found = controls[0] + reach * (controls[:, None] - controls[0]) + sway
-    return np.where(width > 0, np.clip(found, ranges[:, 0], ranges[:, 1]), found)
+    result = controls[0] + reach * (controls[:, None] - controls[0]) + sway
+    return np.where(width > 0, np.clip(result, ranges[:, 0], ranges[:, 1]), result)
 
 
 def record(
@@ -123,17 +123,17 @@ def record(
     phases = 1 if script.keyframes is None and script.closing is None else 3
     seconds = steps / phases * max(own, substeps) * scene_model(touch.plan.scene).opt.timestep
     sim, controls = script.begin(touch, num_envs, own, seconds)
-    found = []
+    results = []
     model = sim.model
     ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
     for control in varied(controls, ranges, num_envs, seed):
-        progress(f"recording states: {len(found) + 1} of {len(controls)}")
+        progress(f"recording states: {len(results) + 1} of {len(controls)}")
         sim.step(control)
-        found.append(_copy(sim.state()))
+        results.append(_copy(sim.state()))
     sim.close()
     touch.free()
-    what = f"{len(found)} steps of {1e3 * sim.control_step:g} ms in {num_envs} environments, seed {seed}"
-    return Recording(tuple(found), touch.inputs.names, f"scripted run: {what}")
+    what = f"{len(results)} steps of {1e3 * sim.control_step:g} ms in {num_envs} environments, seed {seed}"
+    return Recording(tuple(results), touch.inputs.names, f"scripted run: {what}")
 
 
 def _copy(state: SceneState) -> SceneState:

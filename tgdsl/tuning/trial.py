@@ -92,13 +92,13 @@ class Trial:
         finest = known[-1] if known else None
         if finest is not None and not finest.is_exact:
             known = known[:-1]
-        found = [own for own in known if own.is_free]
+        results = [own for own in known if own.is_free]
         is_finest = finest is not None and finest.is_own and not finest.is_exact
-        if not any(own.is_own for own in found) and not is_finest:
-            found.insert(0, Variant("as written", is_own=True))
-        if not found:
+        if not any(own.is_own for own in results) and not is_finest:
+            results.insert(0, Variant("as written", is_own=True))
+        if not results:
             self._refuse_finest(self.sensor.variants.own.label)
-        return found
+        return results
 
     def levels(self, floors: Places) -> list[Level]:
         """Return the ways to find distances to meshes, from coarse to fine, that change nothing that is written.
@@ -118,11 +118,11 @@ class Trial:
             for name, spec in queried.items()
         }
         free = {name: own for name, own in free.items() if own}
-        found: dict[tuple[int, ...], Level] = {}
+        result: dict[tuple[int, ...], Level] = {}
         for i in known:
             places = {name: next((j for j in own if j >= i), own[-1]) for name, own in free.items()}
-            found.setdefault(tuple(places.values()), level_of(places))
-        return list(found.values())
+            result.setdefault(tuple(places.values()), level_of(places))
+        return list(result.values())
 
     def outcome(self, variant: Variant) -> Outcome | None:
         """Return a variant's errors; None if it cannot be had."""
@@ -244,10 +244,10 @@ def _pinned(trial: Trial) -> list[str]:
 def written_fields(trial: Trial) -> list[str]:
     """Return the fields that other choices would change if nobody had written them, by dotted path."""
     sensor = trial.sensor
-    found = [f"sensors.{sensor.name}.{key}" for key in written_of(sensor.spec, sensor.kind.alternatives(sensor.spec))]
+    results = [f"sensors.{sensor.name}.{key}" for key in written_of(sensor.spec, sensor.kind.alternatives(sensor.spec))]
     for name, spec in sensor.queried.items():
-        found += [f"objects.{name}.{key}" for key in written_of(spec, query_alternatives())]
-    return found
+        results += [f"objects.{name}.{key}" for key in written_of(spec, query_alternatives())]
+    return results
 
 
 def shown_errors(trial: Trial, outcome: Outcome) -> str:

@@ -175,10 +175,10 @@ def finest_of(sensor: Sensor, left_out: dict[str, str]) -> Variant:
         sensor: The sensor.
         left_out: Is told why finer ones cannot be had, by their labels.
     """
-    found = [own for axis in (sensor.variants.fields, sensor.variants.queries) if (own := _last(sensor, axis, left_out))]
-    if not found:
+    results = [own for axis in (sensor.variants.fields, sensor.variants.queries) if (own := _last(sensor, axis, left_out))]
+    if not results:
         return Variant(sensor.variants.own.label, is_own=True, is_exact=True)
-    return found[0] if len(found) == 1 else found[0].joined(found[1])
+    return results[0] if len(results) == 1 else results[0].joined(results[1])
 
 
 def _last(sensor: Sensor, axis: Sequence[Variant], left_out: dict[str, str]) -> Variant | None:

@@ -81,15 +81,15 @@ class Boxes:
         colour = WARMTH(self.norm(self.value[self.chosen]))[:, :3]
 
         def paint(points: Float[Array, "point 3"], body: Int[Array, " point"]) -> Float[Array, "point 3"]:
-            found = np.full(points.shape, np.nan)
+            result = np.full(points.shape, np.nan)
             for own, members in trees.items():
                 at = np.flatnonzero(body == own)
                 if len(at) and len(members):
                     local = Rotation.from_quat(pose.quat[own], scalar_first=True).inv().apply(points[at] - pose.pos[own])
                     sides = self.size[members[0]]  # the same for all boxes of a link: nearest in sides is the box itself
                     near = KDTree(self.layout.pos[members] / sides).query(local / sides)[1]
-                    found[at] = colour[members[near]]
-            return found
+                    result[at] = colour[members[near]]
+            return result
 
         return paint
 
@@ -132,15 +132,15 @@ def boxes_of(
 
 def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Float[Array, "box 3"]) -> Float[Array, "box 2 3"]:
     """Return the area of each box's faces, lower and upper across x, y and z, that is on the box of its link [m²]."""
-    found = np.zeros((len(pos), 2, 3))
+    result = np.zeros((len(pos), 2, 3))
     area = size.prod(axis=1, keepdims=True) / size
     for link in np.unique(link_id):
         own = link_id == link
         low, high = pos[own] - 0.5 * size[own], pos[own] + 0.5 * size[own]
         slack = 0.1 * size[own]
-        found[own, 0] = area[own] * (low < low.min(axis=0) + slack)
-        found[own, 1] = area[own] * (high > high.max(axis=0) - slack)
-    return found
+        result[own, 0] = area[own] * (low < low.min(axis=0) + slack)
+        result[own, 1] = area[own] * (high > high.max(axis=0) - slack)
+    return result
 
 
 def draw_boxes(axes: Axes, sim: Simulator, seen: Seen, boxes: Boxes, env: int) -> None:

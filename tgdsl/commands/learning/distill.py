@@ -295,21 +295,21 @@ class _Part:
         from tgdsl.rl.train.run import end_if_stopped
 
         command, keys, is_evaluated = self._command, distiller.keys, self._command.episodes > 0 and run.stopped_by is None
-        found, text = [], shlex.join(["tgdsl", *sys.argv[1:]])
+        result, text = [], shlex.join(["tgdsl", *sys.argv[1:]])
         with StatusLine() as progress:
             if is_evaluated:
                 acting = distiller.acting()
-                found = evaluate_each(distiller.env, acting, len(keys), command.episodes, progress=progress)
+                result = evaluate_each(distiller.env, acting, len(keys), command.episodes, progress=progress)
             students = self._folder.path / "students"
-            write_students(distiller, self._loaded, origin, run.seconds, text, found, students, progress)
+            write_students(distiller, self._loaded, origin, run.seconds, text, result, students, progress)
         resume = ("--device", command.device, "--resume", str(self._folder.path.parent))
         end_if_stopped(run, shlex.join(["tgdsl", "distill", str(command.task), *resume]))
-        if not found:
+        if not result:
             self._folder.evaluation.unlink(missing_ok=True)  # of what they were before
             return []
-        plain = {key.name: own.plain() for key, own in zip(keys, found, strict=True)}
+        plain = {key.name: own.plain() for key, own in zip(keys, result, strict=True)}
         _write(self._folder.evaluation, plain)
-        return rows_of(keys, found, self.resolution, distiller.samples // len(keys), round(run.seconds / 60.0, 2))
+        return rows_of(keys, result, self.resolution, distiller.samples // len(keys), round(run.seconds / 60.0, 2))
 
 
 def _warn_unlike(rows: list[Row]) -> None:
@@ -361,12 +361,12 @@ def _read(folder: Path) -> dict[str, Any]:
     """Return what a run was asked for, its teacher as it is named in the working folder."""
     file = folder / "distill.json"
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        result = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise TgdslError(f"{file}: there is no run of tgdsl distill to go on with: {error}") from error
     names = ("teacher", "types", "placements", "noise", "seeds", "resolutions", "envs", "seed", "overrides")
-    if missing := [name for name in names if not isinstance(found, dict) or name not in found]:
+    if missing := [name for name in names if not isinstance(result, dict) or name not in result]:
         raise TgdslError(f"{file}: it has no {missing[0]}: this is not what tgdsl distill writes")
-    own = (folder.resolve() / found.get("teacher_from_here", "")).resolve()
-    is_elsewhere = own.is_file() and own != Path(found["teacher"]).resolve()
-    return found | {"teacher": os.path.relpath(own)} if is_elsewhere else found
+    own = (folder.resolve() / result.get("teacher_from_here", "")).resolve()
+    is_elsewhere = own.is_file() and own != Path(result["teacher"]).resolve()
+    return result | {"teacher": os.path.relpath(own)} if is_elsewhere else result

@@ -91,12 +91,12 @@ def non_default(table: AttributeTable, own: Any, usual: Any) -> dict[str, Any]:
         own: By the array's name, an element's value: any callable.
         usual: The same of an element with MuJoCo's defaults.
     """
-    found = {}
+    result = {}
     for attribute, array in table.items():
         value = np.asarray(own(array))
         if not np.array_equal(value, usual(array)):
-            found[attribute] = KEYWORDS[attribute][int(value)] if attribute in KEYWORDS else value.tolist()
-    return found
+            result[attribute] = KEYWORDS[attribute][int(value)] if attribute in KEYWORDS else value.tolist()
+    return result
 
 
 def flag_names(key: str) -> dict[str, int]:
@@ -107,11 +107,11 @@ def flag_names(key: str) -> dict[str, int]:
 
 def non_default_flags(model: mujoco.MjModel) -> dict[str, list[str]]:
     """Return the flags of a model that are set and that USD has no attribute for, by `disable` and `enable`."""
-    found = {}
+    result = {}
     for key in FLAGS:
         value = int(getattr(model.opt, f"{key}flags"))
-        found[key] = [name for name, bit in flag_names(key).items() if value & bit and name not in KNOWN_FLAGS]
-    return {key: names for key, names in found.items() if names}
+        result[key] = [name for name, bit in flag_names(key).items() if value & bit and name not in KNOWN_FLAGS]
+    return {key: names for key, names in result.items() if names}
 
 
 def read_custom(stage: Stage, prim: Prim, key: str) -> Any:
@@ -121,8 +121,8 @@ def read_custom(stage: Stage, prim: Prim, key: str) -> Any:
 
 def read_mjcf_attributes(stage: Stage, prim: Prim, attributes: Iterable[str]) -> dict[str, str]:
     """Return a prim's custom attributes as attributes of an MJCF element."""
-    found = {attribute: read_custom(stage, prim, attribute) for attribute in attributes}
-    return {attribute: text_of(value) for attribute, value in found.items() if value is not None}
+    result = {attribute: read_custom(stage, prim, attribute) for attribute in attributes}
+    return {attribute: text_of(value) for attribute, value in result.items() if value is not None}
 
 
 def read_option_flags(stage: Stage, scene: Prim) -> dict[str, str]:

@@ -166,16 +166,16 @@ def own_drives(stage: Stage, joints: Iterable[Joint], actuators: Iterable[Actuat
         joints: All joints of the tree.
         actuators: Those that are prims.
     """
-    found, driven = [], {actuator.joint: actuator for actuator in actuators if actuator.joint}
+    result, driven = [], {actuator.joint: actuator for actuator in actuators if actuator.joint}
     for joint in joints:
         if joint.drive is None:
             continue
         other = driven.get(joint.path)
         if other is None or not math.isinf(joint.drive.order):
-            found.append(joint)
+            result.append(joint)
         elif not _is_same_servo(joint.drive, other):
             stage.drop("drives were dropped, which contradict the actuator prims of their joints", joint.prim)
-    return found
+    return result
 
 
 def _is_same_servo(drive: Drive, actuator: Actuator) -> bool:

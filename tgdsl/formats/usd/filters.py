@@ -47,18 +47,18 @@ def exclusions(
             colliders.setdefault(geom.body, []).append(geom.path)
             prims[geom.path] = geom.prim
     filters = _Filters(stage, colliders, prims, joints)
-    found: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
+    result: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
     filtered = filters.of_colliders()
     owners = [owner for owner, own in colliders.items() if own]
     for first, second in combinations(owners, 2) if filtered else ():
         pairs = [frozenset((a, b)) for a in colliders[first] for b in colliders[second]]
         hits = [pair for pair in pairs if pair in filtered]
         if len(hits) == len(pairs):
-            found.add(frozenset((first, second)))
-        elif hits and frozenset((first, second)) not in found:
+            result.add(frozenset((first, second)))
+        elif hits and frozenset((first, second)) not in result:
             for pair in hits:
                 stage.drop("collision filters were dropped that hold for some colliders of a body only", filtered[pair])
-    return sorted(found, key=lambda pair: sorted(path or "" for path in pair))
+    return sorted(result, key=lambda pair: sorted(path or "" for path in pair))
 
 
 class _Filters:
@@ -78,24 +78,24 @@ class _Filters:
 
     def of_joints(self) -> set[Pair]:
         """Return pairs of bodies that a joint keeps apart."""
-        found = set()
+        result = set()
         for joint in self.joints:
             if joint.is_filtering and None not in joint.bodies:
-                found.add(frozenset(joint.bodies))
+                result.add(frozenset(joint.bodies))
             elif joint.is_filtering and any(target and self._static(target) for target in joint.targets):
                 self.stage.drop(
                     "joints do not keep their bodies from colliding with the static prims that they are attached to", joint.prim
                 )
-        return found
+        return result
 
     def of_articulations(self) -> set[Pair]:
         """Return pairs of bodies of articulations without self-collision."""
-        found = set()
+        result = set()
         for prim in self.stage.prims:
             is_root = self.stage.has(prim, "PhysicsArticulationRootAPI")
             if is_root and read_attributes(self.stage, prim, SELF_COLLISION).get("self") == "false":
-                found |= {frozenset(pair) for pair in combinations(self._articulation(str(prim.GetPath())), 2)}
-        return found
+                result |= {frozenset(pair) for pair in combinations(self._articulation(str(prim.GetPath())), 2)}
+        return result
 
     def of_colliders(self) -> dict[frozenset[str], Prim]:
         """Return pairs of colliders that must not collide, and the prim that says so."""
@@ -132,12 +132,12 @@ class _Filters:
 
     def _articulation(self, root: str) -> list[str]:
         """Return the bodies of an articulation: those at and below its root, and all that joints connect with them."""
-        found = {body for body in self.colliders if body is not None and (body == root or body.startswith(f"{root}/"))}
+        result = {body for body in self.colliders if body is not None and (body == root or body.startswith(f"{root}/"))}
         links = [joint.bodies for joint in self.joints if not joint.is_excluded and None not in joint.bodies]
-        found |= {body for joint in self.joints if joint.path == root for body in joint.bodies if body is not None}
-        while new := {body for pair in links if found & set(pair) for body in pair if body is not None} - found:
-            found |= new
-        return [body for body in self.colliders if body in found and body is not None]
+        result |= {body for joint in self.joints if joint.path == root for body in joint.bodies if body is not None}
+        while new := {body for pair in links if result & set(pair) for body in pair if body is not None} - result:
+            result |= new
+        return [body for body in self.colliders if body in result and body is not None]
 
     def _static(self, path: str) -> bool:
         return any(own == path or own.startswith(f"{path}/") for own in self.colliders.get(None, ()))

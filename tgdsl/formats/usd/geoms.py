@@ -100,10 +100,10 @@ def _is_site(stage: Stage, prim: Prim) -> bool:
 def _drawn_site(stage: Stage, prim: Prim, pose: Matrix) -> tuple[Matrix, dict[str, str]]:
     """Return the frame [m] of a site that is a gprim, and how it is drawn."""
     shape, color = shape_of(stage, prim, stage.pose(prim)), _color(stage, prim)
-    found = {} if color is None else {"rgba": text_of(color.tolist())}
+    result = {} if color is None else {"rgba": text_of(color.tolist())}
     if shape.kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box"):
-        return shape.pose, found | {"type": shape.kind, "size": text_of(shape.size)}
-    return pose, found
+        return shape.pose, result | {"type": shape.kind, "size": text_of(shape.size)}
+    return pose, result
 
 
 def read_gprims(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Gprim]:
@@ -167,15 +167,15 @@ def _geoms(
         collision_shape(stage, prim, shape, place) if shape.kind == "mesh" and prim.GetTypeName() == "Mesh" else (shape, True)
     )
     is_same = collided is shape
-    found = [
+    results = [
         Gprim(
             *(path, prim, body, collided, True, is_visible and is_same, is_hull),
             *(friction, density, color, model if is_same else "", attributes, mesh),
         )
     ]
     if is_visible and not is_same:
-        found.append(Gprim(path, prim, body, shape, False, True, False, nothing, 0.0, color, "", {}, mesh))
-    return found
+        results.append(Gprim(path, prim, body, shape, False, True, False, nothing, 0.0, color, "", {}, mesh))
+    return results
 
 
 def _mass_model(stage: Stage, prim: Prim, mesh: Mapping[str, str]) -> str:

@@ -47,13 +47,13 @@ def read_mesh(stage: Stage, prim: Prim) -> tuple[Vertices, Faces]:
 
 def _triangles(vertices: Vertices, sizes: Int[np.ndarray, " polygon"], corners: Int[np.ndarray, " corner"]) -> Faces:
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    found = [corners[starts[sizes == 3, None] + np.arange(3)]]
+    results = [corners[starts[sizes == 3, None] + np.arange(3)]]
     order = [np.flatnonzero(sizes == 3)]
     for polygon in np.flatnonzero(sizes > 3):
         ring = corners[starts[polygon] : starts[polygon] + sizes[polygon]]
-        found.append(ring[_ear_clipping(vertices[ring])])
+        results.append(ring[_ear_clipping(vertices[ring])])
         order.append(np.full(len(ring) - 2, polygon))
-    return np.concatenate(found)[np.argsort(np.concatenate(order), kind="stable")]
+    return np.concatenate(results)[np.argsort(np.concatenate(order), kind="stable")]
 
 
 def _ear_clipping(ring: Vertices) -> Faces:

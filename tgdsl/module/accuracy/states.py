@@ -57,13 +57,13 @@ def narrowed(state: SceneState, have: Mapping[str, Sequence[str]], inputs: Input
 def readings_of(touch: TactileModule, states: Sequence[SceneState], name: str) -> Float[np.ndarray, "step env row channel"]:
     """Return what a module reads of states that follow each other, from a reset on; samples of blocks are rows."""
     touch.free()
-    found = []
+    results = []
     with torch.no_grad():
         for state in states:
             reading = touch(state.to(touch.device))[name].double().cpu()
-            found.append(reading.flatten(1, -2))
+            results.append(reading.flatten(1, -2))
     touch.free()
-    return torch.stack(found).numpy()
+    return torch.stack(results).numpy()
 
 
 class Common(NamedTuple):
@@ -130,9 +130,9 @@ def _rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np
     columns = here.dtype.names or ()
     if not {"link", "pos"} <= set(columns):
         raise StateError(f'readings of "{name}" differ in their rows, which have no places: {", ".join(columns)}')
-    found = []
+    results = []
     for link, pos in zip(here["link"], here["pos"], strict=True):
         at = np.flatnonzero(there["link"] == link)
         distance = np.linalg.norm(there["pos"][at] - pos, axis=1)
-        found.append(at[distance <= distance.min() + TOGETHER])
-    return found
+        results.append(at[distance <= distance.min() + TOGETHER])
+    return results

@@ -77,12 +77,12 @@ def variants_of(
 
 
 def _variants(paths: Sequence[str], specs: Sequence[Any], alternatives: Sequence[Alternative]) -> tuple[Variant, ...]:
-    found = []
+    results = []
     for own in alternatives:
         is_own = all(is_taken(spec, own) for spec in specs)
         changes = {f"{path}.{key}": value for path in paths for key, value in own.changes.items()}
-        found.append(Variant(own.label, changes, is_own, all(is_free(spec, own) for spec in specs), own.is_exact))
-    return tuple(found)
+        results.append(Variant(own.label, changes, is_own, all(is_free(spec, own) for spec in specs), own.is_exact))
+    return tuple(results)
 
 
 def is_taken(spec: Any, alternative: Alternative) -> bool:
@@ -111,10 +111,10 @@ def _is_same(own: Any, value: Any) -> bool:
 
 def queried_objects(plan: Plan) -> tuple[str, ...]:
     """Return the objects of a plan that have surfaces other than primitives, whose distances a grid or triangles give."""
-    found = []
+    results = []
     for part in plan.quantities.values():
         tables: Sequence[Any] = getattr(part, "geoms", ())
         for target, table in zip(plan.objects, tables, strict=False):
             if isinstance(table, GeomTable) and any(surface is not None for surface in table.surfaces):
-                found.append(target.name)
-    return tuple(dict.fromkeys(found))
+                results.append(target.name)
+    return tuple(dict.fromkeys(results))

@@ -30,15 +30,15 @@ def chosen_rows(
         updated: New state of all of them.
         memory: State of all of them before, and what was handed out.
     """
-    updated, found = chosen_only(memory, updated, mask), dict(readings)
+    updated, result = chosen_only(memory, updated, mask), dict(readings)
     for name, reading in readings.items():
         if f"{KEPT}{name}" in memory:
-            found[name] = torch.where(
+            result[name] = torch.where(
                 broadcast_over(mask, reading), reading.transpose(-2, -1), memory[f"{KEPT}{name}"]
             ).transpose(-2, -1)
         elif f"{WINDOW}{name}" in memory:
-            found[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
-    return found, updated
+            result[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
+    return result, updated
 
 
 def few_rows(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:

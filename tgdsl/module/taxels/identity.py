@@ -152,9 +152,9 @@ def _rollout_tables(path: Path) -> dict[str, dict[str, np.ndarray]]:
         with np.load(path, allow_pickle=False) as archive:
             places = [key.rpartition(":")[0] for key in archive.files if key.endswith(":pos") and f"{key[:-4]}:link" in archive]
             keys = {name: [key for key in archive.files if key.rpartition(":")[0] == name] for name in places}
-            found = {name.partition("/")[0]: {k.rpartition(":")[2]: archive[k] for k in own} for name, own in keys.items()}
+            result = {name.partition("/")[0]: {k.rpartition(":")[2]: archive[k] for k in own} for name, own in keys.items()}
     except (OSError, EOFError, ValueError, BadZipFile) as error:
         raise TgdslError(f"{path}: expected the .npz file of a rollout: {error}") from error
-    if not found:
+    if not result:
         raise TgdslError(f"{path}: this .npz file holds no table of taxels")
-    return {name: _columns(table, f"{path}: {name}") for name, table in found.items()}
+    return {name: _columns(table, f"{path}: {name}") for name, table in result.items()}

@@ -47,19 +47,19 @@ def taxel_table(layout: Layout) -> TaxelTable:
 
 def row_tables(plan: Plan) -> dict[str, TaxelTable]:
     """Return what the rows of each reading of a sensor are: of taxels `taxel_table`, else what its kind declares."""
-    found = {}
+    result = {}
     for sensor in plan.sensors:
         for reading, axis in zip(sensor.readings, sensor.axes, strict=True):
             if axis.name == "taxel":
-                found[reading.name] = taxel_table(plan.layout_of(sensor))
+                result[reading.name] = taxel_table(plan.layout_of(sensor))
                 continue
             columns = [(name, np.array(texts)) for name, texts in axis.texts.items()] + list(axis.numbers.items())
             dtype: list[Any] = [(name, column.dtype, column.shape[1:]) for name, column in columns]
             table = np.empty(axis.size, dtype=dtype or [("row", np.int64)])
             for name, column in columns or [("row", np.arange(axis.size))]:
                 table[name] = column
-            found[reading.name] = table.view(TaxelTable)
-    return found
+            result[reading.name] = table.view(TaxelTable)
+    return result
 
 
 def images_of(
@@ -88,7 +88,7 @@ def image_indices(layout: Layout) -> Mapping[str, Int[np.ndarray, "row column"]]
     Raises:
         TgdslError: If no link's taxels are on a grid.
     """
-    found: dict[str, np.ndarray] = {}
+    result: dict[str, np.ndarray] = {}
     for i, link in enumerate(layout.links):
         own = np.flatnonzero(layout.link_id == i)
         rows, columns = layout.cell[own].T
@@ -96,8 +96,8 @@ def image_indices(layout: Layout) -> Mapping[str, Int[np.ndarray, "row column"]]
             continue
         image = np.full((rows.max() + 1, columns.max() + 1), -1, dtype=np.int64)
         image[rows, columns] = np.where(layout.radius[own] > 0, own, -1)
-        found[link.name] = image
-    if not found:
+        result[link.name] = image
+    if not result:
         names = ", ".join(link.name for link in layout.links)
         raise TgdslError(f"no image without a grid: the taxels of {names} are not laid out with `method: grid`")
-    return found
+    return result

@@ -161,13 +161,13 @@ class Closing:
 
     def _cosines(self, one: int, two: int) -> list[float]:
         """Return the cosines between the axes of hinges of one finger that two joints turn."""
-        found = []
+        results = []
         for i, axis in self.turned[one].items():
             for j, other in self.turned[two].items():
                 paths = (self.tree.path(self.segment(i)), self.tree.path(self.segment(j)))
                 if i != j and (paths[0][0] in paths[1] or paths[1][0] in paths[0]):
-                    found.append(float(axis @ other))
-        return found
+                    results.append(float(axis @ other))
+        return results
 
     def _bending(self, candidates: list[int]) -> list[int]:
         """Return the joints of which to find the closed end: those that spread fingers are not among them."""
@@ -176,15 +176,15 @@ class Closing:
         hinges = {joint for joint in candidates if int(self.tree.model.jnt_type[joint]) == _HINGE}
         free = hinges - self.sense.keys() - one_way
         spreading = self._spreading(free, one_way)
-        found = []
+        results = []
         for joint in candidates:
             segment = self.segment(joint)
             own = [other for other in candidates if self.segment(other) == segment]
             rivals = [other for other in own if other in self.sense] or [other for other in own if other in one_way] or own
             spreads = joint in spreading or (joint in free and self.chain[segment] in curled)
             if rivals == [joint] and not spreads:
-                found.append(joint)
-        return found
+                results.append(joint)
+        return results
 
     def _spreading(self, free: Set[int], one_way: Set[int]) -> set[int]:
         """Return the joints that spread two fingers or more: about parallel axes, across those of hinges that bend one way.

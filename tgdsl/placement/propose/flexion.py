@@ -150,12 +150,12 @@ class Flexion:
 
     def _nearest(self, segment: int) -> list[int]:
         """Return the joints that move a segment, the one that moves it nearest to itself first."""
-        path, found = self.tree.path(segment), {}
+        path, result = self.tree.path(segment), {}
         for joint, pose in self.steps.items():
             depths = [path.index(s) for s in map(self.closing.segment, self._moved(pose)) if s in path]
             if depths:
-                found[joint] = min(depths)
-        return sorted(found, key=lambda joint: (found[joint], joint))
+                result[joint] = min(depths)
+        return sorted(result, key=lambda joint: (result[joint], joint))
 
     def _carried(self, body: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
         """Return the joint that carries a body, and where to in the world in the open pose."""

@@ -71,10 +71,10 @@ class KinematicTree:
     @cached_property
     def bodies(self) -> dict[int, list[int]]:
         """The bodies with surface of each segment."""
-        found: dict[int, list[int]] = {segment: [] for segment in self.parent}
+        result: dict[int, list[int]] = {segment: [] for segment in self.parent}
         for body in sorted(self.area):
-            found[self.segment[body]].append(body)
-        return found
+            result[self.segment[body]].append(body)
+        return result
 
     @cached_property
     def carries(self) -> set[int]:
@@ -83,11 +83,11 @@ class KinematicTree:
 
     def path(self, segment: int) -> list[int]:
         """Return a segment and all above it, upward."""
-        found = []
+        results = []
         while segment:
-            found.append(segment)
+            results.append(segment)
             segment = self.parent[segment]
-        return found
+        return results
 
     def children(self, segment: int) -> list[int]:
         """Return the children of a segment that have surface."""
@@ -105,12 +105,12 @@ class KinematicTree:
     @cached_property
     def loops(self) -> set[tuple[int, int]]:
         """Pairs of segments of one tree that an active equality holds together."""
-        found = set()
+        result = set()
         for i in np.flatnonzero(np.isin(self.model.eq_type, _LOOPS) & (self.model.eq_active0 != 0)):
             one, two = (self.segment[body] for body in self.bound_bodies(int(i)))
             if one and two and one != two and self.path(one)[-1] == self.path(two)[-1]:
-                found.add((one, two))
-        return found
+                result.add((one, two))
+        return result
 
     def bound_bodies(self, equality: int) -> tuple[int, int]:
         """Return the bodies that a connect or weld holds together."""
@@ -205,22 +205,22 @@ def hands(tree: KinematicTree) -> list[Hand]:
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
     bases = {root: _bases(tree, [root, *tree.below(root)]) for root in roots}
     straight = [root for root in roots if _is_driven(tree, root) and not bases[root]]
-    found = [_hand(tree, base) for root in roots if root not in straight for base in bases[root] or [root]]
+    results = [_hand(tree, base) for root in roots if root not in straight for base in bases[root] or [root]]
     if straight:
-        found.append(_hand(tree, 0, [s for root in straight for s in (root, *tree.below(root))]))
-    return found
+        results.append(_hand(tree, 0, [s for root in straight for s in (root, *tree.below(root))]))
+    return results
 
 
 def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
     """Return the segments at which hands begin, the deepest first."""
     parting = [s for s in segments if len(_chains(tree, s, tree.below(s))) > 1]
     parting = parting or [s for s in segments if len(tree.children(s)) > 1][:1]  # a rod that moves all fingers binds them
-    found: list[int] = []
+    results: list[int] = []
     for s in sorted(parting, key=lambda s: len(tree.path(s)), reverse=True):
-        below = [base for base in found if s in tree.path(base)]
+        below = [base for base in results if s in tree.path(base)]
         if all(_parts_within(tree, s, base) for base in below):
-            found = [s, *(base for base in found if base not in below)]
-    return found
+            results = [s, *(base for base in results if base not in below)]
+    return results
 
 
 def _parts_within(tree: KinematicTree, base: int, other: int) -> bool:
@@ -277,11 +277,11 @@ def _mounts(tree: KinematicTree, base: int) -> list[int]:
 
 def _within(tree: KinematicTree, segment: int, body: int) -> list[int]:
     """Return a body of a segment and those above it in the same segment, upward."""
-    found = []
+    results = []
     while body and tree.segment[body] == segment:
-        found.append(body)
+        results.append(body)
         body = int(tree.model.body_parentid[body])
-    return found
+    return results
 
 
 def _last(tree: KinematicTree, segment: int) -> list[int]:
@@ -299,8 +299,8 @@ def _chains(tree: KinematicTree, base: int, beyond: Sequence[int]) -> list[list[
     edges = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     shape = (len(beyond), len(beyond))
     count, chain = connected_components(coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape), directed=False)
-    found = [[s for s in beyond if chain[place[s]] == number] for number in range(count)]
-    return [segments for segments in found if tree.carries.intersection(segments)]
+    results = [[s for s in beyond if chain[place[s]] == number] for number in range(count)]
+    return [segments for segments in results if tree.carries.intersection(segments)]
 
 
 def _ends(tree: KinematicTree, chain: Sequence[int], middle: Float[np.ndarray, " 3"]) -> list[int]:

@@ -18,8 +18,8 @@ def with_jaws(tree: KinematicTree, hand: Hand) -> list[Hand]:
     """Return the grippers of one jaw in a hand of one chain, or whose chains are arms; if there are none, the hand."""
     if len(hand.chains) > 1 and hand.length <= MAX_FINGER:
         return [hand]
-    found = [gripper for chain in hand.chains for s in chain if (gripper := gripper_of(tree, s)) is not None]
-    return [gripper for gripper in found if gripper.length <= MAX_FINGER] or [hand]
+    results = [gripper for chain in hand.chains for s in chain if (gripper := gripper_of(tree, s)) is not None]
+    return [gripper for gripper in results if gripper.length <= MAX_FINGER] or [hand]
 
 
 def gripper_of(tree: KinematicTree, segment: int) -> Hand | None:

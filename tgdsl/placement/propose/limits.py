@@ -55,7 +55,7 @@ def as_meant(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def _servo_limits(model: mujoco.MjModel) -> dict[int, tuple[float, float]]:
     """Return between which values position servos set hinges and slides [rad, of slides m]."""
-    found: dict[int, tuple[float, float]] = {}
+    result: dict[int, tuple[float, float]] = {}
     for i in range(model.nu):
         joint, gear, bias = int(model.actuator_trnid[i, 0]), float(model.actuator_gear[i, 0]), model.actuator_biasprm[i]
         is_servo = int(model.actuator_biastype[i]) == _SERVO_BIAS and int(model.actuator_gaintype[i]) == _FIXED_GAIN
@@ -64,5 +64,5 @@ def _servo_limits(model: mujoco.MjModel) -> dict[int, tuple[float, float]]:
             # The servo rests where gain · control + bias₀ + bias₁ · gear · position vanishes.
             force = model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i] + bias[0]
             low, high = sorted((-force / (bias[1] * gear)).tolist())
-            found[joint] = low, high
-    return found
+            result[joint] = low, high
+    return result

@@ -103,7 +103,7 @@ class Poses:
         _, sizes, rows = np.linalg.svd(self._jacobian()[:, self.dofs], full_matrices=False)
         basis = list(rows[sizes > INDEPENDENT * max(float(sizes.max(initial=0.0)), 1e-9)])
         place = {int(dof): i for i, dof in enumerate(self.dofs)}
-        driven, found = _driven(self.model), []
+        driven, result = _driven(self.model), []
         for joint in sorted(self.joints, key=lambda j: (not self.model.jnt_limited[j], j not in driven, self._depth(j), j)):
             row = np.zeros(len(self.dofs))
             row[place[int(self.model.jnt_dofadr[joint])]] = 1.0
@@ -111,15 +111,15 @@ class Poses:
                 row -= (row @ other) * other
             if (size := float(np.linalg.norm(row))) > INDEPENDENT:
                 basis.append(row / size)
-                found.append(joint)
-        return sorted(found)
+                result.append(joint)
+        return sorted(result)
 
     def _depth(self, joint: int) -> int:
         return len(self.tree.path(self.tree.segment[int(self.model.jnt_bodyid[joint])]))
 
     def _equalities(self, segments: set[int], joints: set[int]) -> list[int]:
         """Return the active equalities that bind joints of the hand to one another."""
-        model, found = self.model, []
+        model, result = self.model, []
         for i in np.flatnonzero(model.eq_active0).tolist():
             kind, ids = int(model.eq_type[i]), (int(model.eq_obj1id[i]), int(model.eq_obj2id[i]))
             if kind == _JOINT:
@@ -130,8 +130,8 @@ class Poses:
                 bound = {self.tree.segment[b] for b in self.tree.bound_bodies(i)} if kind in _BODIES else set()
                 is_within = len(bound) == 2 and bound <= segments
             if is_within:
-                found.append(i)
-        return found
+                result.append(i)
+        return result
 
     def _bound(self, qpos: Float[np.ndarray, " qpos"], dofs: Sequence[int] | np.ndarray) -> np.ndarray | None:
         """Return a pose near another at which the equalities hold, by motion of some degrees of freedom."""
@@ -164,13 +164,13 @@ def _with_equalities_alone(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def _driven(model: mujoco.MjModel) -> set[int]:
     """Return the joints on which an actuator acts, directly or by a fixed tendon."""
-    found: set[int] = set()
+    result: set[int] = set()
     for kind, target in zip(model.actuator_trntype.tolist(), model.actuator_trnid[:, 0].tolist(), strict=True):
         if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
-            found.add(target)
+            result.add(target)
         elif kind == int(mujoco.mjtTrn.mjTRN_TENDON):
-            found |= _of_tendon(model, target)
-    return found
+            result |= _of_tendon(model, target)
+    return result
 
 
 def _of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:

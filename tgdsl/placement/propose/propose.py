@@ -84,11 +84,11 @@ class Proposal:
 
     def placement(self, link: LinkProposal, resolution: str) -> dict[str, Any]:
         """Return how a link is sampled, as the grammar has it."""
-        found: dict[str, Any] = {"method": "poisson", "count": link.counts[resolution]}
-        found |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
+        result: dict[str, Any] = {"method": "poisson", "count": link.counts[resolution]}
+        result |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
         if link.facing is not None:
-            found["region"] = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
-        return found
+            result["region"] = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
+        return result
 
     def mapping(self) -> dict[str, Any]:
         """Return the layout as the grammar has it."""
@@ -156,8 +156,8 @@ def _sampled_hands(
     while True:
         asked = included(include, tuple(sampler.meshes), dict(sampler.left_out))
         tree = kinematic_tree(sampler.robot, sampler.meshes)
-        found = chosen_hands(tree)
-        outer = {sampler.robot.compiled.body(body).name: why for body, why in outside(tree, found).items()}
+        result = chosen_hands(tree)
+        outer = {sampler.robot.compiled.body(body).name: why for body, why in outside(tree, result).items()}
         wanted = [name for name in sampler.meshes if name not in outer or name in asked]
         fresh: dict[str, LinkSurface | str] = {}
         for i, name in enumerate(wanted):
@@ -170,7 +170,7 @@ def _sampled_hands(
             sampler.drop(name, why)
         if not dropped:
             sampler.left_out += [(name, why) for name, why in outer.items() if name not in asked]
-            return found, {name: surfaces[name] for name in wanted}
+            return result, {name: surfaces[name] for name in wanted}
 
 
 def _link(name: str, surface: LinkSurface, side: InnerSide, density: float) -> LinkProposal:

@@ -17,8 +17,8 @@ SCENERY = "stands or floats by itself: taken for scenery or an object; --include
 
 def chosen_hands(tree: KinematicTree) -> list[Flexion]:
     """Return the hands of a robot: those of which two chains or a jaw are known to close, or else all that may be one."""
-    found = [Flexion(tree, own) for hand in hands(tree) for own in with_jaws(tree, hand)]
-    return [flexion for flexion in found if flexion.num_closing > (flexion.hand.jaw is None)] or found
+    results = [Flexion(tree, own) for hand in hands(tree) for own in with_jaws(tree, hand)]
+    return [flexion for flexion in results if flexion.num_closing > (flexion.hand.jaw is None)] or results
 
 
 def outside(tree: KinematicTree, found: Sequence[Flexion]) -> dict[int, str]:
@@ -41,7 +41,7 @@ def included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[st
     Raises:
         TgdslError: If a pattern matches no link that can have taxels.
     """
-    found: set[str] = set()
+    result: set[str] = set()
     for pattern in patterns:
         own = {pattern} & {*names} or {*matching(pattern, names)}
         if not own:
@@ -49,5 +49,5 @@ def included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[st
             why = [f'"{name}" can have no taxels: {left_out[name]}' for name in barred]
             what = "; ".join(why) or f'no link matches "{pattern}"; {did_you_mean(pattern, names, "links")}'
             raise TgdslError(f"--include: {what}")
-        found |= own
-    return found
+        result |= own
+    return result

@@ -125,8 +125,8 @@ def layout_text(proposal: Proposal, robot: str) -> str:
 
 def _chosen(proposal: Proposal) -> list[tuple[str, str, list[LinkProposal]]]:
     """Return each option that some links need, as the grammar has it, and the links."""
-    found = [(key, [link for link in proposal.links if key in link.options]) for key in _OPTIONS]
-    return [(key, f"{key}: {_flow(links[0].options[key])}", links) for key, links in found if links]
+    results = [(key, [link for link in proposal.links if key in link.options]) for key in _OPTIONS]
+    return [(key, f"{key}: {_flow(links[0].options[key])}", links) for key, links in results if links]
 
 
 def _left_out(proposal: Proposal) -> list[str]:

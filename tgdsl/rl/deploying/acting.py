@@ -110,11 +110,11 @@ class HandActor:
             control_step=prepared.control_step,
             goal=goal,
         )
-        found = {"proprio": groups.proprio(now)} | prepared.loaded.task.observe_hand(spec, now)
+        result = {"proprio": groups.proprio(now)} | prepared.loaded.task.observe_hand(spec, now)
         if prepared.felt is not None:
             source = prepared.sensed.groups[prepared.felt.group]
-            found[GROUP] = observed[source.observation].cpu()
-        return {name: found[name].float() for name in prepared.groups}
+            result[GROUP] = observed[source.observation].cpu()
+        return {name: result[name].float() for name in prepared.groups}
 
     def act(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env actuator"]:
         """Return the set-points of all actuators for what is observed [rad]; joints that the policy does not move are held.

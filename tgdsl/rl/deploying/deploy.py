@@ -244,9 +244,9 @@ class Deployment:
             if scene is not None:
                 opened.callback(scene.close)
             own = self.prepared
-            found = connect(own.sensed.touch, self.source, control_step=own.control_step, scene=scene, **self._options)
+            result = connect(own.sensed.touch, self.source, control_step=own.control_step, scene=scene, **self._options)
             opened.pop_all()
-        return found
+        return result
 
     def _approach(self, connection: Connection, actor: HandActor) -> None:
         """Begin where a hand is, or go to a keyframe's controls first, if it may move."""
@@ -311,11 +311,11 @@ def deploy(
     Raises:
         TgdslError: As from `Deployment` and `Deployment.steps`.
     """
-    found = Deployment(task, policy, source, **options)
-    for moment in found.steps(episodes, seconds):
+    result = Deployment(task, policy, source, **options)
+    for moment in result.steps(episodes, seconds):
         if watch is not None:
             watch(moment)
-    return found.report()
+    return result.report()
 
 
 def emulated_limits(prepared: Prepared) -> MotionLimits:

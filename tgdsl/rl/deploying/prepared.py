@@ -156,9 +156,9 @@ def prepare(
         raise loaded.error(("joints",), str(error)) from error
     sizes = {name: _size(name, card, sensed, felt, len(moved), asked) for name in names}
     actuator_id = _actuators(model, joints)
-    found = Prepared(saved, loaded, sensed, felt, sizes, asked, model, joints, actuator_id, actuators, changes)
-    found.policy()
-    return found
+    result = Prepared(saved, loaded, sensed, felt, sizes, asked, model, joints, actuator_id, actuators, changes)
+    result.policy()
+    return result
 
 
 def _with(loaded: LoadedTask, values: Mapping[str, Any]) -> LoadedTask:

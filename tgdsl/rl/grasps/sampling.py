@@ -209,8 +209,8 @@ class _Trials:
             self._steps(0.5 * self.spec.hold / PUSHES)
 
     def _object(self) -> tuple[Float[Tensor, "env 3"], Float[Tensor, "env 4"]]:
-        found = self.sim.watched().body(self._body)
-        return found.pos.clone(), found.quat.clone()
+        result = self.sim.watched().body(self._body)
+        return result.pos.clone(), result.quat.clone()
 
     def _strayed(
         self, begin_pos: Float[Tensor, "env 3"], begin_quat: Float[Tensor, "env 4"]

@@ -59,5 +59,5 @@ class GraspSpec(SpecModel):
 
 def grasp_spec(spec: TaskSpec) -> GraspSpec | None:
     """Return how a task's grasps are sampled; None if its episodes do not begin with grasps."""
-    found = getattr(spec, "grasps", None)
-    return found if isinstance(found, GraspSpec) else None
+    result = getattr(spec, "grasps", None)
+    return result if isinstance(result, GraspSpec) else None

@@ -106,7 +106,7 @@ class GraspTable:
         rank, num = np.zeros_like(variants), np.zeros_like(variants)
         for v in np.unique(variants):
             rank[variants == v], num[variants == v] = np.arange((variants == v).sum()), (variants == v).sum()
-        found: dict[str, Tensor] = {}
+        result: dict[str, Tensor] = {}
         device = self.qpos.device
         step, place = torch.from_numpy(num).to(device), torch.from_numpy(rank).to(device)
         for i in range(int((self.count / step).ceil().max())):
@@ -116,8 +116,8 @@ class GraspTable:
             each = {name: getattr(state, name) for name in FIELDS} | {"pos": motion.pos, "quat": motion.quat}
             for name, value in each.items():
                 if value is not None:
-                    own = found.setdefault(
+                    own = result.setdefault(
                         name, torch.zeros((len(self.qpos), *value.shape[1:]), dtype=value.dtype, device=device)
                     )
                     own[index] = value.to(device)
-        return found
+        return result

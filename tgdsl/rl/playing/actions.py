@@ -141,10 +141,10 @@ def _script_of(actions: str) -> tuple[ScriptFunction, str, str]:
     if not Path(file).is_file():
         raise ScriptError(f"{file}: there is no such file")
     try:
-        found = runpy.run_path(file, run_name=Path(file).stem)
+        result = runpy.run_path(file, run_name=Path(file).stem)
     except Exception as error:  # whatever a user's code raises
         raise ScriptError(f"{raised_at(file, error)}: {type(error).__name__}: {error}") from error
-    functions = [key for key, value in found.items() if callable(value) and not key.startswith("_")]
-    if not callable(found.get(name)):
+    functions = [key for key, value in result.items() if callable(value) and not key.startswith("_")]
+    if not callable(result.get(name)):
         raise ScriptError(f'{file}: there is no function "{name}"; {did_you_mean(name, functions, "functions")}')
-    return found[name], file, name
+    return result[name], file, name

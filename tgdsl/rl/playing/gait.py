@@ -209,11 +209,11 @@ class GaitMeter:
         sums = {name: value.view(self._blocks, size).sum(dim=1).tolist() for name, value in self._sums.items()}
         saturated = self._saturated.view(self._blocks, size, -1).sum(dim=1).tolist()
         most, counts = self._most.view(self._blocks, size, 2).amax(dim=1).tolist(), self._counts.cpu()
-        found = []
+        results = []
         for block in range(self._blocks):
             own = {name: value[block] for name, value in sums.items()}
-            found.append(self._gait(own, saturated[block], most[block], counts[block]))
-        return found
+            results.append(self._gait(own, saturated[block], most[block], counts[block]))
+        return results
 
     def _gait(self, sums: dict[str, float], saturated: list[float], most: list[float], counts: Tensor) -> Gait:
         """Return the gait of one block, by its sums."""
@@ -263,5 +263,5 @@ def percentile(counts: Tensor, share: float = PERCENTILE) -> float | None:
 
 def _percentiles(names: Sequence[str], counts: Tensor) -> dict[str, float]:
     """Return the percentile of each row that has values, by its name."""
-    found = {name: percentile(row) for name, row in zip(names, counts, strict=True)}
-    return {name: value for name, value in found.items() if value is not None}
+    result = {name: percentile(row) for name, row in zip(names, counts, strict=True)}
+    return {name: value for name, value in result.items() if value is not None}

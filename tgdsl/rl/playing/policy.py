@@ -255,8 +255,8 @@ def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
     """Whether groups are those of a card, in its order; that of touch may be named by what is felt, as `Felt.group`."""
     pairs = zip(card.items(), groups.items(), strict=False)
     return len(card) == len(groups) and all(
-        size == found and (name == other or (name == GROUP and other.startswith(f"{GROUP}/")))
-        for (name, size), (other, found) in pairs
+        size == result and (name == other or (name == GROUP and other.startswith(f"{GROUP}/")))
+        for (name, size), (other, result) in pairs
     )
 
 

@@ -62,8 +62,8 @@ def changes_around(card: Mapping[str, Any], loaded: LoadedTask, model: mujoco.Mj
         return []
     now, scene = provenance(loaded, model), card["scene"]
     lines = differences(card["sensors"], _known(card["sensors"], now["sensors"]))
-    found = [f"{loaded.spec.document}: {line}" for line in lines]
-    return found + [f"the scene's {part}" for part, digest in now["scene"].items() if scene.get(part, digest) != digest]
+    results = [f"{loaded.spec.document}: {line}" for line in lines]
+    return results + [f"the scene's {part}" for part, digest in now["scene"].items() if scene.get(part, digest) != digest]
 
 
 def _known(before: Any, now: Any) -> Any:
@@ -75,12 +75,12 @@ def _known(before: Any, now: Any) -> Any:
 
 def _digest(model: mujoco.MjModel, names: tuple[str, ...]) -> str:
     """Return a hash of arrays to five digits, within which machines and versions of MuJoCo agree."""
-    found = hashlib.sha256()
+    result = hashlib.sha256()
     for name in names:
         array: Any = model
         for part in name.split("."):
             array = getattr(array, part)
         values = np.asarray(array, dtype=np.float64)
         rounded = np.where(np.abs(values) < LEAST, 0.0, values) + 0.0
-        found.update(f"{name} {values.shape} {' '.join(f'{value:.4e}' for value in rounded.flat)}\n".encode())
-    return found.hexdigest()[:16]
+        result.update(f"{name} {values.shape} {' '.join(f'{value:.4e}' for value in rounded.flat)}\n".encode())
+    return result.hexdigest()[:16]

@@ -130,8 +130,8 @@ class Images(Embedding):
         """Return images, 0 where there is no taxel."""
         by_channel = x.unflatten(1, (self.grid.channels, self.grid.num_taxels))
         cells: Tensor = self.cells  # pyright: ignore[reportAssignmentType]
-        found = by_channel[:, :, cells.flatten()].unflatten(2, self.grid.shape)
-        return found.transpose(1, 2) * self.masks()
+        result = by_channel[:, :, cells.flatten()].unflatten(2, self.grid.shape)
+        return result.transpose(1, 2) * self.masks()
 
     def masks(self) -> Tensor:
         """Return 1 where there is a taxel, else 0."""

@@ -173,8 +173,8 @@ def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping
     wrong = (~state.isfinite()).reshape(-1, state.shape[-1] if state.ndim else 1).any(dim=0).tolist()
     own = [name for name in networks if f"{name}_state_dict" in path] or list(networks)  # one of rsl_rl's, or students
     columns = [[group for group in networks[name] for _ in range(sizes.get(group, 0))] for name in own]
-    found = (group for each in columns if len(each) == len(wrong) for group, is_it in zip(each, wrong, strict=True) if is_it)
-    return f"{path}, which observes {listed([*dict.fromkeys(found)])},"
+    result = (group for each in columns if len(each) == len(wrong) for group, is_it in zip(each, wrong, strict=True) if is_it)
+    return f"{path}, which observes {listed([*dict.fromkeys(result)])},"
 
 
 def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:

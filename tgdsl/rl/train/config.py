@@ -29,10 +29,10 @@ def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[st
     train = loaded.spec.train
     known = [name for name in groups if name not in (PROPRIO, GROUP)]
     actor = _given(loaded, groups, ("actor",)) or [name for name in known if name != PROPS]
-    found = {"actor": actor, "critic": _given(loaded, groups, ("critic",)) or known}
+    result = {"actor": actor, "critic": _given(loaded, groups, ("critic",)) or known}
     if train.rnd != "off":
-        found["rnd_state"] = _given(loaded, groups, ("rnd", "groups")) or ([STATE] if STATE in groups else actor)
-    return found
+        result["rnd_state"] = _given(loaded, groups, ("rnd", "groups")) or ([STATE] if STATE in groups else actor)
+    return result
 
 
 def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str, int] | None = None) -> dict[str, Any]:
@@ -122,13 +122,13 @@ def _given(loaded: LoadedTask, groups: Mapping[str, int], place: tuple[str, ...]
     Raises:
         SpecError: If there is no such group.
     """
-    found: Any = loaded.spec.train
+    result: Any = loaded.spec.train
     for key in place:
-        found = getattr(found, key)
-    for i, name in enumerate(found or ()):
+        result = getattr(result, key)
+    for i, name in enumerate(result or ()):
         if name not in groups:
             what = f'there is no group of observations "{name}"'
             raise loaded.error(("train", *place, i), what, did_you_mean(name, groups, "groups"))
         if groups[name] == 0:
             raise loaded.error(("train", *place, i), f'the group of observations "{name}" is empty')
-    return list(found or ())
+    return list(result or ())

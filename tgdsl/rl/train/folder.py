@@ -225,15 +225,15 @@ class RunFolder:
 
     def _read(self) -> dict[str, Any]:
         try:
-            found = json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {"starts": []}
+            result = json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {"starts": []}
         except (OSError, ValueError) as error:
             raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
-        starts = found.get("starts") if isinstance(found, dict) else None
+        starts = result.get("starts") if isinstance(result, dict) else None
         if not isinstance(starts, list) or not all(isinstance(own, dict) and own.keys() >= ASKED for own in starts):
             raise TgdslError(
                 f"{self.run}: expected what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ASKED))}"
             )
-        return found
+        return result
 
     def _clean(self) -> None:
         """Remove temporary files that a run which was killed has left."""
@@ -292,13 +292,13 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskS
 
 def versions() -> dict[str, str]:
     """Return the versions of what a run depends on, of those packages that there are."""
-    found = {"python": platform.python_version()}
+    result = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
-            found[package] = version(package)
+            result[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return result
 
 
 def taxel_csv(touch: TactileModule) -> str:

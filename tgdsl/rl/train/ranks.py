@@ -42,14 +42,14 @@ class Ranks:
             RankError: If its variables make no sense.
         """
         try:
-            found = Ranks(
+            result = Ranks(
                 *(int(environ.get(name, least)) for name, least in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
             )
         except ValueError as error:
             raise RankError(f"RANK, WORLD_SIZE and LOCAL_RANK are set by torchrun, and are whole numbers: {error}") from error
-        if not 0 <= found.rank < found.size or found.local < 0:
-            raise RankError(f"RANK is {found.rank} and WORLD_SIZE {found.size}: expected a rank from 0 below the size")
-        return found
+        if not 0 <= result.rank < result.size or result.local < 0:
+            raise RankError(f"RANK is {result.rank} and WORLD_SIZE {result.size}: expected a rank from 0 below the size")
+        return result
 
     @property
     def is_first(self) -> bool:

@@ -182,8 +182,8 @@ def _least_margin(model: mujoco.MjModel, sensor: int) -> float | None:
         for i, (one, two) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
         if (one in first and two in second) or (two in first and one in second)
     ]
-    found = [*of_masks, *of_pairs]
-    return float(min(margin for margin, _ in found)) if any(gap > 0 for _, gap in found) else None
+    results = [*of_masks, *of_pairs]
+    return float(min(margin for margin, _ in results)) if any(gap > 0 for _, gap in results) else None
 
 
 def _geoms(model: mujoco.MjModel, kind: int, index: int) -> Int[np.ndarray, " geom"]:

@@ -45,13 +45,13 @@ class Movement:
     @cached_property
     def hand(self) -> frozenset[int]:
         """Bodies of the smallest subtrees, one of each tree, that hold all that closes; an arm is none of them."""
-        found: set[int] = set()
+        result: set[int] = set()
         for tree in {self._root(joint) for joint in self.closing}:
             paths = [self.path(int(self.model.jnt_bodyid[joint])) for joint in self.closing if self._root(joint) == tree]
             common = set.intersection(*map(set, paths))
             above = max(common - {int(self.model.jnt_bodyid[joint]) for joint in self.closing}, default=tree)
-            found |= {body for body in range(1, self.model.nbody) if above in self.path(body)}
-        return frozenset(found)
+            result |= {body for body in range(1, self.model.nbody) if above in self.path(body)}
+        return frozenset(result)
 
     @cached_property
     def num_joints(self) -> int:
@@ -81,22 +81,22 @@ class Movement:
 
     def pose(self, share: float) -> Float[np.ndarray, " qpos"]:
         """Return where the joints are when the hand has closed by a share; all else is at its start."""
-        found = self.model.qpos0.copy()
+        result = self.model.qpos0.copy()
         for joint, (opened, closed) in self.ends.items():
-            found[self.model.jnt_qposadr[joint]] = (1.0 - share) * opened + share * closed
+            result[self.model.jnt_qposadr[joint]] = (1.0 - share) * opened + share * closed
         for joint in self.closing[len(self.ends) :]:
             leader, coefficients = self.follows[joint]
-            moved = found[self.model.jnt_qposadr[leader]] - self.model.qpos0[self.model.jnt_qposadr[leader]]
-            found[self.model.jnt_qposadr[joint]] += np.polynomial.polynomial.polyval(moved, coefficients)
-        return found
+            moved = result[self.model.jnt_qposadr[leader]] - self.model.qpos0[self.model.jnt_qposadr[leader]]
+            result[self.model.jnt_qposadr[joint]] += np.polynomial.polynomial.polyval(moved, coefficients)
+        return result
 
     def path(self, body: int) -> list[int]:
         """Return a body and all above it but the world, upward."""
-        found = []
+        results = []
         while body:
-            found.append(body)
+            results.append(body)
             body = int(self.model.body_parentid[body])
-        return found
+        return results
 
     def is_scalar(self, joint: int) -> bool:
         """Return whether a joint is a hinge or a slide."""
@@ -107,23 +107,23 @@ class Movement:
 
     def _looped(self) -> set[int]:
         """Return the bodies between two that an equality holds together, and where their paths upward meet."""
-        model, found = self.model, set[int]()
+        model, result = self.model, set[int]()
         for i in np.flatnonzero(np.isin(model.eq_type, _LOOPS) & model.eq_active0.astype(bool)):
             ids = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
             if int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE):
                 ids = int(model.site_bodyid[ids[0]]), int(model.site_bodyid[ids[1]])
             one, two = (set(self.path(max(body, 0))) for body in ids)
-            found |= (one ^ two) if one and two else set()
-        return found
+            result |= (one ^ two) if one and two else set()
+        return result
 
 
 def leaders(joint: int, follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]]]) -> list[int]:
     """Return the joint that one follows, the one that this follows, and so on; `follows` as in `Movement`."""
-    found: list[int] = []
-    while joint in follows and follows[joint][0] not in found:
+    results: list[int] = []
+    while joint in follows and follows[joint][0] not in results:
         joint = follows[joint][0]
-        found.append(joint)
-    return found
+        results.append(joint)
+    return results
 
 
 def movement(scene: Model, bodies: frozenset[str]) -> Movement:

@@ -72,7 +72,7 @@ class Sweep:
         First between all fingertips; if it cannot be held there, such as what is smaller than the gaps, between one fingertip
         and the palm, or two.
         """
-        best, found = (False, 0, -np.inf), None
+        best, result = (False, 0, -np.inf), None
         tips = self.movement.tips
         for among in ([tips], [*((tip,) for tip in tips), *combinations(tips, 2)]):
             for candidate in self._candidates(among):
@@ -80,10 +80,10 @@ class Sweep:
                 grip = self.grip(origin)
                 value = grip.is_opposed, len(grip.links), -grip.imbalance
                 if grip.overlap <= 0 and grip.links and value > best:
-                    best, found = value, origin
+                    best, result = value, origin
             if best[0]:
                 break
-        return found
+        return result
 
     def grip(self, origin: Float[np.ndarray, " 3"] | None = None) -> Grip:
         """Return what the hand meets as it closes.
@@ -111,15 +111,15 @@ class Sweep:
 
     def _candidates(self, among: Sequence[Sequence[int]]) -> list[Float[np.ndarray, " 3"]]:
         """Return places between fingertips, and from there toward the palm, while the hand closes."""
-        found = []
+        results = []
         base = [b for b in sorted(self.movement.hand) if self._touchable(b)]
         for share in SHARES:
             self._posed(float(share))
             for bodies in among:
                 tips = np.mean([self._middle_of(body) for body in bodies], axis=0)
                 palm = self._middle_of(base[0]) if base[0] not in self.movement.tips else tips
-                found += [(1.0 - toward) * tips + toward * palm for toward in TOWARD_PALM]
-        return found
+                results += [(1.0 - toward) * tips + toward * palm for toward in TOWARD_PALM]
+        return results
 
     def _middle_of(self, body: int) -> Float[np.ndarray, " 3"]:
         geoms = self._touchable(body)

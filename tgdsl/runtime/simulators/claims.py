@@ -17,8 +17,8 @@ _READERS: weakref.WeakKeyDictionary[TactileModule, weakref.ref[Source]] = weakre
 
 
 def _reader(touch: TactileModule) -> Source | None:
-    found = _READERS.get(touch)
-    return None if found is None else found()
+    result = _READERS.get(touch)
+    return None if result is None else result()
 
 
 def refuse_unfit(

@@ -21,11 +21,11 @@ def checked_device(device: str, supported: Sequence[str]) -> torch.device:
         SimulationError: If there is no such device, or its type is not among these.
     """
     try:
-        found = torch.empty(0, device=device).device
+        result = torch.empty(0, device=device).device
     except (RuntimeError, AssertionError) as error:
         hint = why_there_is_none(device, error, supported)
         raise SimulationError(f'there is no device "{device}" to run physics on{hint}') from error
-    if found.type not in supported:
+    if result.type not in supported:
         expected = " or ".join(f'"{name}"' for name in supported)
         raise SimulationError(f'physics on "{device}" is not supported, expected {expected}')
-    return found
+    return result

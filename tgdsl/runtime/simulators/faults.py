@@ -110,12 +110,12 @@ class EnvFaults:
         Args:
             diverged: What else to say of environments that diverged.
         """
-        found = []
+        results = []
         for text, where in zip(_MESSAGES, self._held.cpu(), strict=True):
             if where.any():
                 envs = listed([str(env) for env in torch.nonzero(where).flatten().tolist()])
-                found.append(text.format(envs=envs, diverged=diverged) + "; reset them to go on")
-        return found
+                results.append(text.format(envs=envs, diverged=diverged) + "; reset them to go on")
+        return results
 
     def warn_once(self, totals: list[int] | None = None) -> None:
         """Warn of the first environments that were started anew.

@@ -43,11 +43,11 @@ def saved_state(
 ) -> dict[str, Tensor]:
     """Return copies of a simulation's state by name."""
     is_placed, values = start.placed
-    found = {f"state/{name}": arrays[name] for name in INTEGRATED} | dict(heat)
-    found |= {f"properties/{name}": value for name, value in properties.fields().items()}
+    result = {f"state/{name}": arrays[name] for name in INTEGRATED} | dict(heat)
+    result |= {f"properties/{name}": value for name, value in properties.fields().items()}
     if is_placed is not None:
-        found |= {"start/is_placed": is_placed} | {f"start/{name}": value for name, value in values.items()}
-    return {name: value.clone() for name, value in (found | {"faults/counts": faults.counts}).items()}
+        result |= {"start/is_placed": is_placed} | {f"start/{name}": value for name, value in values.items()}
+    return {name: value.clone() for name, value in (result | {"faults/counts": faults.counts}).items()}
 
 
 def load_state(

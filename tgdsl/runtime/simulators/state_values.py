@@ -118,22 +118,22 @@ class StateTable:
         if name not in self._arrays:
             raise SimulationError(f'the state has no array "{name}"; {did_you_mean(name, self._arrays, "arrays")}')
         try:
-            found = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
+            result = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
         except (TypeError, ValueError) as error:
             raise SimulationError(f"{name} is no array of numbers: {error}") from error
         own = tuple(self._arrays[name].shape[1:])
         num_rows = self._num_envs if ids is None else len(ids)
-        if tuple(found.shape) not in ((num_rows, *own), own):
+        if tuple(result.shape) not in ((num_rows, *own), own):
             what = "a row per environment" if ids is None else "a row for each index"
             raise SimulationError(
-                f"{name} has shape {tuple(found.shape)}, expected {(num_rows, *own)}, {what}, or {own} for all"
+                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *own)}, {what}, or {own} for all"
             )
-        if ids is not None and found.ndim > len(own) and len(np.unique(ids)) < len(ids):
+        if ids is not None and result.ndim > len(own) and len(np.unique(ids)) < len(ids):
             twice = sorted({str(env) for env in ids.tolist() if (ids == env).sum() > 1})
             raise SimulationError(
                 f"env_ids: environments {listed(twice)} are named more than once, and {name} has a row for each"
             )
-        return found
+        return result
 
     def _judged(self, name: str, value: Float[Tensor, "env ..."]) -> tuple[Float[Tensor, "env ..."], Bool[Tensor, "2 env"]]:
         """Return a value with quaternions of unit length, and where it is not finite and where a quaternion is zero."""

@@ -105,12 +105,12 @@ class WorldObjects:
 
     def _choices(self, env: int) -> tuple[Choice, ...]:
         """Return what each object is like in one environment."""
-        found = []
+        results = []
         for i, name in enumerate(self._names):
             x, y, z = self._chosen.object_size[env, i].tolist()
             size = (x, y, z) if self._scenes.objects[name].is_sized else None
-            found.append(Choice(int(self._chosen.variant[env, i]), size))
-        return tuple(found)
+            results.append(Choice(int(self._chosen.variant[env, i]), size))
+        return tuple(results)
 
     def _row(self, choices: tuple[Choice, ...]) -> Row:
         """Return the fields that environments with some choices have of their own."""

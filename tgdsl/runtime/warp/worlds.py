@@ -109,12 +109,12 @@ class Faults(EnvFaults):
         Args:
             sizes: Values for the pools' messages.
         """
-        found, overflow = self.messages(), self._arrays["overflow"].cpu()
+        result, overflow = self.messages(), self._arrays["overflow"].cpu()
         for bit, text in POOLS.items():
             envs = torch.nonzero((overflow >> bit) & 1).flatten().tolist()
             if envs:
-                found.append("MuJoCo Warp: " + text.format(envs=listed([str(env) for env in envs]), **sizes))
-        return "; ".join(found)
+                result.append("MuJoCo Warp: " + text.format(envs=listed([str(env) for env in envs]), **sizes))
+        return "; ".join(result)
 
 
 _VELOCITIES = ("cvel", "cdof_dot")

@@ -62,16 +62,16 @@ def hand_terms(plan: Plan, contact_threshold: float | None, is_log: bool = False
     Raises:
         ObservationError: If a hand cannot give some: all of them, each with its reason, and what it can give.
     """
-    found, problems = [], []
+    result, problems = [], []
     for planned in plan.observations:
         try:
             is_joint = planned.type in PROPRIOCEPTION
-            found.append(_joint_term(plan, planned, is_log) if is_joint else _hand_term(plan, planned, contact_threshold))
+            result.append(_joint_term(plan, planned, is_log) if is_joint else _hand_term(plan, planned, contact_threshold))
         except ObservationError as error:
             problems.append(f"  {_label(planned)}: {error}")
     if problems:
         raise ObservationError("\n".join(["an XHand1 cannot give these observations:", *problems, _GIVES]))
-    return tuple(found)
+    return tuple(result)
 
 
 def warn_of_noise(plan: Plan) -> None:
@@ -130,10 +130,10 @@ def _joint_term(plan: Plan, planned: PlannedObservation, is_log: bool) -> HandTe
 
 def _joint_of(name: str) -> int:
     """Return which of the hand's joints one of the robot file is."""
-    found = [i for i, joint in enumerate(JOINTS) if name == joint or name.endswith(f"_hand_{joint}")]
-    if not found:
+    results = [i for i, joint in enumerate(JOINTS) if name == joint or name.endswith(f"_hand_{joint}")]
+    if not results:
         raise ObservationError(f'it has no joint "{name}"')
-    return found[0]
+    return results[0]
 
 
 def _fingers(plan: Plan, sensor: PlannedSensor) -> tuple[int, ...]:

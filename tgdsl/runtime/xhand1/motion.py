@@ -104,11 +104,11 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
         MotionError: If the robot lacks a joint, or one has no range.
     """
     names = [model.joint(i).name for i in range(model.njnt)]
-    found = [[i for i, name in enumerate(names) if name == own or name.endswith(f"_hand_{own}")] for own in JOINTS]
-    if lacking := [own for own, ids in zip(JOINTS, found, strict=True) if len(ids) != 1 or not model.jnt_limited[ids[0]]]:
+    results = [[i for i, name in enumerate(names) if name == own or name.endswith(f"_hand_{own}")] for own in JOINTS]
+    if lacking := [own for own, ids in zip(JOINTS, results, strict=True) if len(ids) != 1 or not model.jnt_limited[ids[0]]]:
         what = f"an XHand1, real or emulated, is a whole hand: expected one joint with a range for each of {listed(lacking)}"
         raise MotionError(f"{what}; the robot has {listed(names) or 'none'}")
-    return np.array(found)[:, 0]
+    return np.array(results)[:, 0]
 
 
 def joint_ranges(model: mujoco.MjModel) -> Float[np.ndarray, "joint 2"]:

@@ -102,7 +102,7 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
     kept = math.exp(-step / float(constants["settling"]))
     turn = factors(np.array(step))
     added = np.concatenate([struck(np.array([step])), begun[..., None] * factors(step - grains)], axis=2).transpose(2, 0, 1)
-    found = {
+    result = {
         "kept": np.asarray(kept),
         "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
@@ -110,15 +110,15 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         **{name: _by_parts(name, part) for name, part in _rounded("turn", np.stack([np.real(turn), np.imag(turn)])).items()},
     }
     if scrape > 0:
-        found["noise"] = np.asarray(math.sqrt(scrape * step / len(grains)))
+        result["noise"] = np.asarray(math.sqrt(scrape * step / len(grains)))
     if "band" in constants:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
-        return found | {"energy": np.concatenate([energy, energy], axis=1)}
+        return result | {"energy": np.concatenate([energy, energy], axis=1)}
     of_grains = begun[..., None, None] * factors(times - grains[:, None])
     free, drives = seen[..., None] * factors(times), np.concatenate([struck(times)[:, :, None], of_grains], axis=2)
     heard = np.real(seen[..., None, None] * drives)
     by_mode = heard.swapaxes(1, 2).reshape(len(heard), -1, samples)  # drive by drive
-    return found | {
+    return result | {
         "heard": np.concatenate(
             [np.real(free), -np.imag(free), by_mode if "shape_value" in constants else heard.sum(axis=1)], axis=1
         )
@@ -151,5 +151,5 @@ def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "2 
     low, high, share = (constants[f"turn_{name}"] for name in ("low", "high", "share"))
     if low.dtype == torch.float64:
         return low + share * (high - low)
-    found = torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
-    return found if found.is_cuda else materialised(found)  # on a CPU it is else chosen anew for each environment
+    result = torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
+    return result if result.is_cuda else materialised(result)  # on a CPU it is else chosen anew for each environment

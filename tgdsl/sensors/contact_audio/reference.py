@@ -84,12 +84,12 @@ def _shares(spec: ContactAudioSpec, modes: Ringing, loads: ReferenceLoads) -> Fl
     """Return by how much more or less than by its gain each load strikes each mode of what it acts on."""
     if spec.gains == "mean":
         return np.ones((*loads.force.shape, 1))
-    found = np.zeros((*loads.force.shape, modes.frequency.shape[1]))
+    result = np.zeros((*loads.force.shape, modes.frequency.shape[1]))
     for b, o in np.ndindex(loads.force.shape):
         shapes = modes.shapes[b if spec.of == "link" else o]
         own = shapes.share(loads.center[b, o][None], loads.along[b, o][None])[0]
-        found[b, o, : len(own)] = own
-    return found
+        result[b, o, : len(own)] = own
+    return result
 
 
 def _no_surface(name: str) -> Surface:
@@ -113,12 +113,12 @@ def _driven(
     rate: complex, phasor: complex, rise: float, strikes: Strikes, samples: int, step: float
 ) -> tuple[Float[np.ndarray, " sample"], complex]:
     """Return the velocity of a mode of gain 1 in a step whose force rises evenly [N], and its phasor at the end."""
-    found = []
+    results = []
     for k in range(1, samples + 1):
         time = k * step / samples
         noise = sum(u * np.exp(rate * (time - s)) for s, u in strikes if s <= time + 1e-12 * step)
-        found.append(np.exp(rate * time) * phasor + rise / step * np.expm1(rate * time) / rate**2 + noise)
-    return np.array([z.real + rate.real / rate.imag * z.imag for z in found]), complex(found[-1])
+        results.append(np.exp(rate * time) * phasor + rise / step * np.expm1(rate * time) / rate**2 + noise)
+    return np.array([z.real + rate.real / rate.imag * z.imag for z in results]), complex(results[-1])
 
 
 def _ring(
@@ -128,11 +128,11 @@ def _ring(
     if is_paper:
         return _two_pole(rate, phasor, strikes, samples, step)
     times = np.arange(1, samples + 1) * step / samples
-    found = [
+    results = [
         (np.exp(rate * t) * phasor).imag + sum((u * np.exp(rate * (t - s))).imag for s, u in strikes if s <= t + 1e-12 * step)
         for t in times
     ]
-    return np.array(found), complex(np.exp(rate * step) * phasor + sum(u * np.exp(rate * (step - s)) for s, u in strikes))
+    return np.array(results), complex(np.exp(rate * step) * phasor + sum(u * np.exp(rate * (step - s)) for s, u in strikes))
 
 
 def _two_pole(
@@ -142,21 +142,21 @@ def _two_pole(
     pole = np.exp(rate * step / samples)
     first, second = 2 * pole.real, abs(pole) ** 2
     last, before = phasor.imag, (phasor / pole).imag
-    found = []
+    results = []
     for k in range(samples):
         struck = sum(u for time, u in strikes if abs(time - (k + 1) * step / samples) < 1e-9 * step)
         last, before = first * last - second * before + struck, last
-        found.append(last)
+        results.append(last)
     # y = Im z and y[k−1] = Im(z/p): two equations for Re z, with 1/p = p*/|p|².
     real = (last * pole.real - before * second) / pole.imag
-    return np.array(found), complex(real, last)
+    return np.array(results), complex(real, last)
 
 
 def _bands(spec: ContactAudioSpec, modes: Ringing, amplitude: np.ndarray) -> np.ndarray:
     """Return ½ Σ (g |z|)² of the modes in each third octave (row, band) [m²/s²], or its level [dB]."""
-    found = np.zeros((len(modes.frequency), len(modes.bands)))
+    result = np.zeros((len(modes.frequency), len(modes.bands)))
     for place, own in np.ndenumerate(modes.frequency):
         for b, number in enumerate(modes.bands):
             if middle(number) * 10**-0.05 <= own < middle(number) * 10**0.05:
-                found[place[0], b] += 0.5 * amplitude[place] ** 2
-    return 10 * np.log10(1 + found / quiet()) if spec.scale == "decibel" else found
+                result[place[0], b] += 0.5 * amplitude[place] ** 2
+    return 10 * np.log10(1 + result / quiet()) if spec.scale == "decibel" else result

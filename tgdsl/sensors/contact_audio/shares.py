@@ -47,7 +47,7 @@ def tables(shapes: Sequence[ModeShapes], num_modes: int) -> dict[str, np.ndarray
             blocks.append(value.reshape(len(value), -1))
         first[row] = kept[key]
         owner[row, np.arange(len(own.owner)), own.owner] = 1.0
-    found = {
+    result = {
         "shape_value": np.concatenate(blocks),
         "shape_first": first,
         "shape_num": np.stack([own.num for own in shapes]),
@@ -56,7 +56,7 @@ def tables(shapes: Sequence[ModeShapes], num_modes: int) -> dict[str, np.ndarray
         "shape_rate": np.stack([1.0 / own.step for own in shapes]),
     }
     # Without any that are one, field i is mode i.
-    return found if (owner.sum(axis=1) <= 1).all() else found | {"shape_owner": owner}
+    return result if (owner.sum(axis=1) <= 1).all() else result | {"shape_owner": owner}
 
 
 def indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> Mapping[str, int]:

@@ -92,27 +92,27 @@ def launch(
         state: The planes that `point_anchors.PLANES` names, changed in place.
         first: Where the object's points begin in them, link after link.
     """
-    found, num_active = _empty(pose, pair, points)
-    _, num_envs, num_links, num_points = found.shape
+    result, num_active = _empty(pose, pair, points)
+    _, num_envs, num_links, num_points = result.shape
     assert num_points < MOST
     points, gates = points.contiguous(), pose[0] if gate is None else gate
     standoff, enter, exit, *slip = stick_slip
     run[(num_envs * num_links,)](
-        found, num_active, *state, standoff, enter, exit, slip[0] if slip else standoff, *pose, gates, pair, points,
+        result, num_active, *state, standoff, enter, exit, slip[0] if slip else standoff, *pose, gates, pair, points,
         frames.contiguous(), counts.contiguous(), values, first, state[0].stride(0),
         num_links, num_points, *pose[0].stride(), *pose[9].stride(), *gates.stride(), points.stride(0),
         points.stride(1) if points.shape[1] != 1 else 0,
         SLIDES=len(slip) > 0, IS_GATED=gate is not None, IS_CUBIC=is_cubic, LANES=LANES,
         CHUNK=min(max(triton.next_power_of_2(num_points), LANES), CHUNK), num_warps=1, maxnreg=REGISTERS,
     )  # fmt: skip
-    return found, num_active
+    return result, num_active
 
 
 def _empty(pose: list[Tensor], pair: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Return memory for what the kernel finds."""
     num_envs, num_links, num_points = pose[0].shape[0], pair.shape[0], points.shape[2]
-    found = pose[0].new_empty((6, num_envs, num_links, num_points))
-    return found, pose[0].new_empty((num_envs, num_links), dtype=torch.int32)
+    result = pose[0].new_empty((6, num_envs, num_links, num_points))
+    return result, pose[0].new_empty((num_envs, num_links), dtype=torch.int32)
 
 
 @triton.jit

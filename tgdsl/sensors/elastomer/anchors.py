@@ -88,7 +88,7 @@ def advance_reference(
     touch: ReferencePenetration, pos: np.ndarray, normal: np.ndarray, stick_slip: StickSlip, state: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return t (taxel, 3) [m] and the new anchors of one environment, taxel by taxel."""
-    found = np.zeros((len(pos), 3))
+    result = np.zeros((len(pos), 3))
     after = {name: np.zeros(len(pos)) for name in PLANES}
     for i, (x, n) in enumerate(zip(pos, normal, strict=True)):
         phi, rotation, offset = touch.distance[i], touch.rotation[i], touch.offset[i]
@@ -96,17 +96,17 @@ def advance_reference(
         e = np.array([state[name][i] for name in PLANES[:3]])
         if k >= 0 and not phi[k] > stick_slip.standoff + stick_slip.exit:
             s = rotation[k].T @ (e - offset[k]) - x
-            t = found[i] = s - (s @ n) * n
+            t = result[i] = s - (s @ n) * n
             length = float(np.linalg.norm(t))
             if stick_slip.slip is not None and length > stick_slip.slip * touch.depth[i] and length**2 > planes.tiny():
-                found[i] = t * (stick_slip.slip * touch.depth[i] / length)
-                e = e + rotation[k] @ (found[i] - t)
+                result[i] = t * (stick_slip.slip * touch.depth[i] / length)
+                e = e + rotation[k] @ (result[i] - t)
         else:
             k = _deepest(stick_slip.standoff - phi, float(stick_slip.enter))
             e = rotation[k] @ x + offset[k] if k >= 0 else np.zeros(3)
         for name, value in zip(PLANES, (*e, k + 1), strict=True):
             after[name][i] = value
-    return found, after
+    return result, after
 
 
 def _deepest(depth: np.ndarray, enter: float) -> int:

@@ -115,26 +115,26 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
         else:
             shear, after = anchors.advance(felt, felt.pos, normal, stick_slip, state)
     move = _elastic if "normal_stiffness" in constants else _gaussian
-    found = move(felt.depth, shear, normal, constants)
+    result = move(felt.depth, shear, normal, constants)
     if loads is not None:
         flat = frozenset(int(name.removeprefix(FLAT)) for name in constants if name.startswith(FLAT))
         markers = Markers(felt.pos, normal, constants["shear_falloff"], constants.get("reference_area"), flat)
         dragged = point_anchors.drag(loads, markers, felt.depth.shape[0])
-        found = planes.add(found, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
-    return {channel.name: plane for channel, plane in zip(CHANNELS, found, strict=True)}, after
+        result = planes.add(result, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
+    return {channel.name: plane for channel, plane in zip(CHANNELS, result, strict=True)}, after
 
 
 def _gaussian(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants) -> Vec:
     strength = constants["dilation_strength"]
     in_plane = planes.vec(operators.apply(constants, "spread", [strength * depth]))
     (bulge,) = operators.apply(constants, "bulge", [strength * planes.power(depth, constants["depth_exponent"])])
-    found = planes.add(in_plane, planes.scale(bulge, normal))
+    result = planes.add(in_plane, planes.scale(bulge, normal))
     if shear is None:
-        return found
+        return result
     pulled = torch.stack(planes.scale(constants["shear_strength"] * depth, shear))
     (dragged,) = operators.apply(constants, "drag", [pulled])
     along = planes.vec(dragged)
-    return planes.add(found, planes.sub(along, planes.scale(planes.dot(along, normal), normal)))
+    return planes.add(result, planes.sub(along, planes.scale(planes.dot(along, normal), normal)))
 
 
 def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants) -> Vec:

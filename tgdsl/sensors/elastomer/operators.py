@@ -112,8 +112,8 @@ def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Ten
     """
     if (matrices := _matrices(constants, name)) and LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
         lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
-        found = reduce(torch.add, [LINK_PRODUCTS(own, each) for own, each in zip(lines, matrices, strict=True)])
-        return tuple(found.unflatten(1, planes[0].shape[:-1]).unbind())
+        result = reduce(torch.add, [LINK_PRODUCTS(own, each) for own, each in zip(lines, matrices, strict=True)])
+        return tuple(result.unflatten(1, planes[0].shape[:-1]).unbind())
     parts: list[tuple[Tensor, ...]] = []
     start = 0
     while (form := _form(constants, f"{name}/{len(parts)}")) is not None:
@@ -125,12 +125,12 @@ def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Ten
 
 def _matrices(constants: Mapping[str, Tensor], name: str) -> list[list[Float[Tensor, "_source out _target"]]]:
     """Return the matrices of all links, for each plane that goes in; nothing if there are other forms."""
-    found: list[Tensor] = []
-    while (form := _form(constants, f"{name}/{len(found)}")) is not None:
+    results: list[Tensor] = []
+    while (form := _form(constants, f"{name}/{len(results)}")) is not None:
         if "matrix" not in form[0]:
             return []
-        found.append(form[0]["matrix"])
-    return [[matrix[i] for matrix in found] for i in range(len(found[0]))] if found else []
+        results.append(form[0]["matrix"])
+    return [[matrix[i] for matrix in results] for i in range(len(results[0]))] if results else []
 
 
 Block = Mapping[str, Tensor]
@@ -168,12 +168,12 @@ def _use_spectrum(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
     size = spectrum.shape[2], 2 * (spectrum.shape[3] - 1)
     order = cells.reshape(-1)
     waves = [torch.fft.rfft2(plane[..., order].unflatten(-1, (rows, columns)), s=size) for plane in planes]
-    found = []
+    results = []
     for response in spectrum:
         total = sum((wave * factor for wave, factor in zip(waves, response, strict=True)), start=torch.zeros_like(waves[0]))
         plane = torch.fft.irfft2(total, s=size)[..., :rows, :columns]
-        found.append(plane.flatten(-2)[..., block["places"]])
-    return tuple(found)
+        results.append(plane.flatten(-2)[..., block["places"]])
+    return tuple(results)
 
 
 def indices(constants: Mapping[str, np.ndarray]) -> dict[str, int]:

@@ -292,8 +292,8 @@ def _point_sum_by_kernel(load: ShearLoad, markers: Markers) -> Vec:
     from tgdsl.sensors.elastomer import point_sum_kernel
 
     where = list(load.pos), list(load.strength), load.count, load.tiles, tile_size(load.taxels)
-    found = point_sum_kernel.point_sum(*where, list(markers.pos), list(markers.normal), markers.falloff)
-    return planes.vec(found.unbind())
+    result = point_sum_kernel.point_sum(*where, list(markers.pos), list(markers.normal), markers.falloff)
+    return planes.vec(result.unbind())
 
 
 def _point_sum_inputs(load: ShearLoad, markers: Markers) -> list[Tensor]:
@@ -331,8 +331,8 @@ def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 
 def _along(tangent: Vec, point: Vec) -> Tensor:
     """Return points along tangents, (env, taxel or 1, point): of one tangent it is kept, not formed anew for each marker."""
-    found = planes.dot(tangent, point)
-    return materialised(found) if tangent[0].shape[0] == 1 else found
+    result = planes.dot(tangent, point)
+    return materialised(result) if tangent[0].shape[0] == 1 else result
 
 
 def _tangents(normal: Vec) -> tuple[Vec, Vec]:
@@ -357,7 +357,7 @@ def reference_drag(
     state: Mapping[str, np.ndarray],
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return u_j / s_s (taxel, 3) [m²] and the new anchors of one environment, point by point."""
-    found, row = np.zeros((len(pos), 3)), 0
+    result, row = np.zeros((len(pos), 3)), 0
     after = {name: np.zeros_like(state[name]) for name in PLANES}
     for points in met:
         weight = 1.0 if reference_area is None else points.area / reference_area
@@ -371,11 +371,11 @@ def reference_drag(
                     e = e + t * (1.0 - stick_slip.slip * h / length)
                 for j in points.taxels:
                     r, s = (v - (v @ normal[j]) * normal[j] for v in (pos[j] - z, z - e))
-                    found[j] += weight * h * s * np.exp(-falloff * (r @ r))
+                    result[j] += weight * h * s * np.exp(-falloff * (r @ r))
             else:
                 holds = stick_slip.standoff - phi > stick_slip.enter
                 e = z if holds else np.zeros(3)
             for name, value in zip(PLANES, (*e, float(holds)), strict=True):
                 after[name][row] = value
             row += 1
-    return found, after
+    return result, after

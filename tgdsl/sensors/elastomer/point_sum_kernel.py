@@ -70,15 +70,15 @@ def launch(
         falloff: λ [1/m²].
     """
     num_envs, num_links, num_points = pos[0].shape
-    found = pos[0].new_empty((3, num_envs, marker[0].shape[0]))
+    result = pos[0].new_empty((3, num_envs, marker[0].shape[0]))
     of_program = 1 if count is None else TILES
     planes = (*pos, *strength, *(part.contiguous() for part in (*marker, *normal)))
     run[(num_envs, triton.cdiv(tiles.shape[0], of_program))](
-        *planes, falloff, found, tiles if count is None else count, tiles,
+        *planes, falloff, result, tiles if count is None else count, tiles,
         tiles.shape[0], num_links, num_points, pos[0].stride(0), pos[0].stride(1), marker[0].shape[0],
         HAS_COUNT=count is not None, TILES=of_program, BLOCK=block, num_warps=1,
     )  # fmt: skip
-    return found
+    return result
 
 
 @triton.jit

@@ -35,7 +35,7 @@ def reference(
     if spec.boundary is not None:
         raise NotImplementedError("the reference has no clamped boundary")
     touch = gathered[ContactDepth]
-    shear, found, after = np.zeros((layout.num_taxels, 3)), np.zeros((layout.num_taxels, 3)), {}
+    shear, result, after = np.zeros((layout.num_taxels, 3)), np.zeros((layout.num_taxels, 3)), {}
     stick_slip = StickSlip(spec.standoff, spec.enter, spec.exit, spec.slip)
     if spec.anchored == "taxels":
         shear, after = advance_reference(touch, layout.pos, layout.normal, stick_slip, state)
@@ -43,14 +43,14 @@ def reference(
         area = None if spec.model == "paper" else spec.reference_area
         args = layout.pos, layout.normal, stick_slip, spec.shear_falloff, area, state
         drag, after = reference_drag(gathered[Points], *args)
-        found = np.where(layout.radius[:, None] > 0, spec.shear_strength * drag, 0.0)
+        result = np.where(layout.radius[:, None] > 0, spec.shear_strength * drag, 0.0)
     for link in range(len(layout.links)):
         own = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
         for j in own:
             sources = _Sources(layout.pos[own], layout.normal[own], layout.area[own], touch.depth[own], shear[own])
             move = _gaussian if spec.kernel == "gaussian" else _elastic
-            found[j] += move(spec, layout.pos[j], layout.normal[j], sources)
-    return found, after
+            result[j] += move(spec, layout.pos[j], layout.normal[j], sources)
+    return result, after
 
 
 class _Sources(NamedTuple):

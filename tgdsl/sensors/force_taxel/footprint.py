@@ -198,8 +198,8 @@ def shared_forces(
         levenberg,
     )
     padded = [(share * part[..., None]).sum(dim=2) for part in force]
-    found = torch.stack([part.flatten(1).index_select(1, bodies.row) for part in padded], dim=1)
-    return Shared(found, torch.stack([part.sum(dim=2) for part in padded], dim=1), torch.stack(residual, dim=1))
+    result = torch.stack([part.flatten(1).index_select(1, bodies.row) for part in padded], dim=1)
+    return Shared(result, torch.stack([part.sum(dim=2) for part in padded], dim=1), torch.stack(residual, dim=1))
 
 
 def _shared_by_kernel(

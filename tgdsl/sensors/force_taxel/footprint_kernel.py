@@ -292,10 +292,10 @@ def _moments(pos, weights, num_own, box, point, normal, force, slope, inverse, I
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
     away, is_beside = _away(box, point, force, inverse)
     if is_beside:
-        found = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, True)
+        result = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, True)
     else:
-        found = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, False)
-    return found
+        result = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, False)
+    return result
 
 
 @triton.jit

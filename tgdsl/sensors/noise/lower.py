@@ -151,8 +151,8 @@ def _parameters(knobs: Knobs, channels: Sequence[str]) -> dict[str, Float[np.nda
         "dead_low": knobs.dead_range[0],
         "dead_high": knobs.dead_range[1],
     }
-    found = {name: np.repeat(np.array(value)[:, None], len(channels), axis=1) for name, value in plain.items()}
-    return found | {name: _by_channel(name, value, channels) for name, value in amplitudes.items()}
+    result = {name: np.repeat(np.array(value)[:, None], len(channels), axis=1) for name, value in plain.items()}
+    return result | {name: _by_channel(name, value, channels) for name, value in amplitudes.items()}
 
 
 def quantity(channel: str) -> str:
@@ -181,7 +181,7 @@ def _compact(value: Float[np.ndarray, "end channel row"]) -> np.ndarray:
 
 def _kernels(values: Mapping[str, np.ndarray], layout: Layout) -> dict[str, np.ndarray]:
     """Return each link's operator W, (σ, from, to); G alone where χ or σ is a range: the lower end's, then the rest."""
-    found: dict[str, np.ndarray] = {}
+    result: dict[str, np.ndarray] = {}
     strength, (low, high) = values["crosstalk_strength"][:, 0], values["crosstalk_sigma"][:, 0]
     is_wider = bool((low != high).any())
     for i in range(len(layout.links)):
@@ -193,10 +193,10 @@ def _kernels(values: Mapping[str, np.ndarray], layout: Layout) -> dict[str, np.n
             kernels = [kernel]
         else:
             kernels = [np.diag(1 - strength[0, own]) + strength[0, own] * kernel]
-        found[f"{KERNEL}{i:04d}"] = np.stack(kernels).transpose(0, 2, 1)
+        result[f"{KERNEL}{i:04d}"] = np.stack(kernels).transpose(0, 2, 1)
     if is_wider:
-        found["crosstalk_mixture"] = np.array([0.0, 1.0])[:, None, None]
-    return found
+        result["crosstalk_mixture"] = np.array([0.0, 1.0])[:, None, None]
+    return result
 
 
 def crosstalk_kernel(layout: Layout, sigma: Float[np.ndarray, " taxel"]) -> Float[np.ndarray, "taxel taxel"]:

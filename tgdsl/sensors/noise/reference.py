@@ -150,10 +150,10 @@ class ReferenceNoise:
     def _delayed(self) -> Signal:
         """Return the signal as it was: between two calls it is linear, before the first one it is constant."""
         late = self._knob("read_delay") + self._uniform(random.JITTER)[0, 0] * self._knob("jitter")
-        past, found = np.array(self._signals), np.empty(self._shape)
+        past, result = np.array(self._signals), np.empty(self._shape)
         for place in np.ndindex(self._shape):
-            found[place] = np.interp(self._times[-1] - late[place], self._times, past[:, *place])
-        return found
+            result[place] = np.interp(self._times[-1] - late[place], self._times, past[:, *place])
+        return result
 
     def _random_offset(self) -> Signal:
         noise, step = normal_pair(self._words(random.READING, self._shape[1]))
@@ -186,13 +186,13 @@ def _range(knobs: Knobs, name: str, channel: str) -> Range:
     """Return the range of a number that `PARAMETERS` names; that of a stage that is off is neutral."""
     match name.split("_"):
         case ["gain" | "dead", "low" | "high" as end]:
-            found = getattr(knobs, "gain" if name.startswith("gain") else "dead_range")[("low", "high").index(end)]
+            result = getattr(knobs, "gain" if name.startswith("gain") else "dead_range")[("low", "high").index(end)]
         case ["hysteresis" | "crosstalk" as stage, part]:
             own = getattr(knobs, stage)
             field = "time_constant" if part == "time" else part
-            found = getattr(own, field) if own else ZERO if part == "strength" else (1.0, 1.0)
+            result = getattr(own, field) if own else ZERO if part == "strength" else (1.0, 1.0)
         case _:
-            found = getattr(knobs, name)
-    if isinstance(found, tuple):
-        return found
-    return found.get(quantity(channel), found.get(ALL, ZERO))
+            result = getattr(knobs, name)
+    if isinstance(result, tuple):
+        return result
+    return result.get(quantity(channel), result.get(ALL, ZERO))

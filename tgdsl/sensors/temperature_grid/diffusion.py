@@ -164,16 +164,16 @@ def by_modes(cells: Cells, factor: Tensor, modes: tuple[Modes, ...]) -> Spread:
 
     What of the sum came through the faces is what these modes have of it.
     """
-    found = cells
+    result = cells
     for axis, own in enumerate(modes):
-        found = along(own.vectors, found, axis)
-    found, totals = found * factor, outer([own.totals for own in modes], torch.mul)
-    entered = (found * totals).sum(dim=(-3, -2, -1))
+        result = along(own.vectors, result, axis)
+    result, totals = result * factor, outer([own.totals for own in modes], torch.mul)
+    entered = (result * totals).sum(dim=(-3, -2, -1))
     for axis, own in enumerate(modes):
-        found = along(own.vectors.transpose(-2, -1), found, axis)
+        result = along(own.vectors.transpose(-2, -1), result, axis)
     there = outer([(own.vectors[:, 0] > 0).to(cells.dtype) for own in modes], torch.mul)
-    excess = found.sum(dim=(-3, -2, -1)) - entered
-    return Spread(found - there * (excess / there.sum(dim=(-3, -2, -1)))[..., None, None, None], entered)
+    excess = result.sum(dim=(-3, -2, -1)) - entered
+    return Spread(result - there * (excess / there.sum(dim=(-3, -2, -1)))[..., None, None, None], entered)
 
 
 def exponents(rates: Float[Tensor, "env row 3"], modes: tuple[Modes, ...]) -> Cells:

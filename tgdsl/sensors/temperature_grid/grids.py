@@ -28,15 +28,15 @@ def boxes(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> F
         raise LowerError(
             "two of its links are one body", field="links", hint="name the body, or choose a part of it by `region`"
         )
-    found = []
+    results = []
     for link in layout.links:
         surface = surface_of(link.name, spec.region)
         used = surface.vertices[np.unique(surface.faces)]
         low, high = used.min(axis=0), used.max(axis=0)
         if not (high - low > 1e-9).all():
             raise LowerError(f'the box of link "{link.name}" has no volume', field="links", hint="a link needs a solid")
-        found.append((low, high))
-    return np.array(found)
+        results.append((low, high))
+    return np.array(results)
 
 
 def counts(spec: TemperatureGridSpec, corners: Float[np.ndarray, "row 2 3"]) -> Int[np.ndarray, "row 3"]:
@@ -46,17 +46,17 @@ def counts(spec: TemperatureGridSpec, corners: Float[np.ndarray, "row 2 3"]) -> 
         LowerError: If there are more than `MOST`.
     """
     if spec.cells is not None:
-        found = np.tile(np.array(spec.cells, dtype=np.int64), (len(corners), 1))
+        result = np.tile(np.array(spec.cells, dtype=np.int64), (len(corners), 1))
     else:
         assert spec.spacing is not None
-        found = np.maximum(1, np.ceil((corners[:, 1] - corners[:, 0]) / spec.spacing - 1e-9).astype(np.int64))
+        result = np.maximum(1, np.ceil((corners[:, 1] - corners[:, 0]) / spec.spacing - 1e-9).astype(np.int64))
     # Rows are padded to the longest along each axis.
-    if (total := len(found) * float(np.prod(found.max(axis=0, initial=1), dtype=np.float64))) > MOST:
+    if (total := len(result) * float(np.prod(result.max(axis=0, initial=1), dtype=np.float64))) > MOST:
         field = "cells" if spec.spacing is None else "spacing"
         raise LowerError(
             f"its links have {total:.3g} cells, expected at most {MOST:,}", field=field, hint="use fewer, larger cells"
         )
-    return found
+    return result
 
 
 def centres(count: Int[np.ndarray, "row 3"], corners: Float[np.ndarray, "row 2 3"]) -> Float[np.ndarray, "cell 3"]:

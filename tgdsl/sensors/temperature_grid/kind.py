@@ -163,17 +163,17 @@ def _contact(spec: TemperatureGridSpec, made_of: list[Material], size: np.ndarra
     """Return what areas and conductances of patches follow from."""
     if not spec.feels:
         return {}
-    found = {}
+    result = {}
     if spec.contact_area == "manifold":
         moduli = [(own.youngs_modulus, own.poissons_ratio or 0.0) for own in made_of]
-        found["compliance"] = np.array([0.0 if e is None else (1.0 - nu * nu) / e for e, nu in moduli])
+        result["compliance"] = np.array([0.0 if e is None else (1.0 - nu * nu) / e for e, nu in moduli])
         radius = 0.5 * size.min(axis=1) if spec.curvature_radius is None else np.full(len(size), spec.curvature_radius)
-        found["curvature"] = 1.0 / radius
+        result["curvature"] = 1.0 / radius
     else:
-        found["contact_area"] = scalar(spec.contact_area)
+        result["contact_area"] = scalar(spec.contact_area)
     if spec.contact_conductance is not None:
-        found["contact_conductance"] = scalar(spec.contact_conductance)
-    return found
+        result["contact_conductance"] = scalar(spec.contact_conductance)
+    return result
 
 
 def _source(spec: TemperatureGridSpec, count: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:

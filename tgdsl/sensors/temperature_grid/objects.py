@@ -38,11 +38,11 @@ def gained(objects: Tensor, where: Topology, nodes: Tensor, grids: Tensor) -> Te
 
 def is_cell(objects: Tensor, where: Topology) -> Tensor:
     """Return 1 for the cells that each object has (object, x, y, z)."""
-    found = torch.zeros(objects.shape[1:], dtype=objects.dtype, device=objects.device)
+    result = torch.zeros(objects.shape[1:], dtype=objects.dtype, device=objects.device)
     for i, (x, y, z) in enumerate(where.cells):
         if where.links[i] < 0:
-            found[i, :x, :y, :z].fill_(1.0)
-    return found
+            result[i, :x, :y, :z].fill_(1.0)
+    return result
 
 
 def account(

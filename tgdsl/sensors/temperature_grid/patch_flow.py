@@ -50,13 +50,13 @@ def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants, x: Tenso
         normal = planes.where(is_object, planes.vec(_of_sides(patches, part) for part in patches.object_normal), normal)
     of_sides = _of_sides(patches, area)
     parts = squares(of_sides, pos, normal, rows.boxes, num_cells(rows))
-    found = of_squares(of_sides, normal, rows.conductivity, rows.boxes, parts)
+    result = of_squares(of_sides, normal, rows.conductivity, rows.boxes, parts)
     responds = response(parts, of_sides > 0, x, rows.modes, "is_semi_implicit" in constants)
     series = resistance(area, patches, patches.topology.lumped, constants)
     if series is None:
-        return found, responds
-    whole = found.sum(dim=(-3, -2, -1))
-    return found / (1.0 + whole * _of_sides(patches, series))[..., None, None, None], responds
+        return result, responds
+    whole = result.sum(dim=(-3, -2, -1))
+    return result / (1.0 + whole * _of_sides(patches, series))[..., None, None, None], responds
 
 
 def _of_sides(patches: ContactPatch, plane: Tensor) -> Tensor:

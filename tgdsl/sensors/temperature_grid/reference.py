@@ -41,7 +41,7 @@ class Block:
     def operators(self, film: np.ndarray | None = None) -> list[np.ndarray]:
         """Return −α∇² along each axis (cell, cell), with what exposed ends lose through a film by axis [W/(m²·K)], [1/s]."""
         assert self.count is not None
-        alpha, found = self.conductivity * self.step.prod() / self.capacity, []
+        alpha, result = self.conductivity * self.step.prod() / self.capacity, []
         for axis, n in enumerate(self.count):
             matrix, rate = np.zeros((n, n)), alpha / self.step[axis] ** 2
             for i in range(n - 1):
@@ -49,8 +49,8 @@ class Block:
             if film is not None:
                 for end in self.ends(axis):
                     matrix[end, end] += film[axis] * self.step.prod() / self.step[axis] / self.capacity
-            found.append(matrix)
-        return found
+            result.append(matrix)
+        return result
 
     def ends(self, axis: int) -> list[int]:
         """Return the first or the last cell along an axis, or both, as its faces are exposed."""
@@ -66,16 +66,16 @@ def reference(
     spec: TemperatureGridSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the temperatures read [°C] (row, 1), and what is remembered."""
-    found: ReferencePatches = gathered[ContactPatches]
+    result: ReferencePatches = gathered[ContactPatches]
     links, objects = (
-        _links(spec, layout, found),
-        [_object(spec, own, found.topology.cells[i], i in found.topology.grids) for i, own in enumerate(found.objects)],
+        _links(spec, layout, result),
+        [_object(spec, own, result.topology.cells[i], i in result.topology.grids) for i, own in enumerate(result.objects)],
     )
     before = {name: np.array(value, dtype=np.float64) for name, value in state.items()}
-    _load(links, objects, found, before, spec, context)
+    _load(links, objects, result, before, spec, context)
     if not context.is_first:
-        (_advance if spec.model == "physical" else _advance_as_printed)(spec, found, links, objects, context.dt)
-    after = _store(links, objects, found, before)
+        (_advance if spec.model == "physical" else _advance_as_printed)(spec, result, links, objects, context.dt)
+    after = _store(links, objects, result, before)
     seen = after["cells"]
     if spec.lag is not None:
         ratio = context.dt / spec.lag
@@ -83,7 +83,7 @@ def reference(
         lagged = seen + (before["measured"] - before["cells"]) * kept - (seen - before["cells"]) * (1 - kept) / ratio
         lagged = lagged if spec.model == "physical" else before["measured"] + ratio * (seen - before["measured"])
         seen = after["measured"] = seen.copy() if context.is_first else lagged
-    return _output(spec, seen, counts(spec, found.boxes)) + spec.ambient, after
+    return _output(spec, seen, counts(spec, result.boxes)) + spec.ambient, after
 
 
 def _links(spec: TemperatureGridSpec, layout: Layout, found: ReferencePatches) -> list[Block]:

@@ -417,10 +417,10 @@ def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, ther
     cover = tl.where(is_any, 2.0 * own * fit / depth, 0.0)
     spot = tl.where(is_any, 2.0 * own * radius / (1.0 + 0.5 * rho) * fitted, 0.0)
     of_x, of_y, of_z = (spot * x[4])[None, :, :, :], (spot * y[4])[None, :, :, :], (spot * z[4])[None, :, :, :]
-    found = x[0] * (y[0] * (cover[None, :, :, :] * z[0] + of_z * z[1]) + of_y * y[1] * z[0]) + of_x * x[1] * y[0] * z[0]
+    result = x[0] * (y[0] * (cover[None, :, :, :] * z[0] + of_z * z[1]) + of_y * y[1] * z[0]) + of_x * x[1] * y[0] * z[0]
     is_there = there[:, None, :, None]
     shares = tl.where(is_there, x[0] * y[0] * z[0], 0.0)
-    return tl.where(is_there, found, 0.0), shares, x[2] * y[2] * z[2]
+    return tl.where(is_there, result, 0.0), shares, x[2] * y[2] * z[2]
 
 
 @triton.jit

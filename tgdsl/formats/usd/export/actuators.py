@@ -112,11 +112,11 @@ def add_tendons(writer: StageWriter, scope: str, joints: dict[int, Any]) -> dict
         scope: Path of the scope that holds them.
         joints: The schema of each joint that can move, by MuJoCo's index.
     """
-    model, found = writer.model, {}
+    model, result = writer.model, {}
     for tendon in range(model.ntendon):
         name = model.tendon(tendon).name
         prim = writer.stage.DefinePrim(writer.path(scope, name or "tendon"), "MjcTendon")
-        found[tendon] = str(prim.GetPath())
+        result[tendon] = str(prim.GetPath())
         set_custom(prim, "name", name)
         for attribute, array in TENDON.items():
             value = getattr(model, f"tendon_{array}")[tendon].tolist()
@@ -131,7 +131,7 @@ def add_tendons(writer: StageWriter, scope: str, joints: dict[int, Any]) -> dict
             if is_limited:
                 _set_range(prim, own.replace("limited", "range"), getattr(model, f"tendon_{values}")[tendon])
         _path(writer, tendon, prim, joints)
-    return found
+    return result
 
 
 def _path(writer: StageWriter, tendon: int, prim: Any, joints: dict[int, Any]) -> None:

@@ -120,11 +120,11 @@ def shifted(coefficients: Float[np.ndarray, " 5"], follower: float, leader: floa
         follower: Where the follower's displacement is zero [rad or m].
         leader: The same of the leader.
     """
-    found = np.zeros(5)
+    result = np.zeros(5)
     moved = Polynomial(coefficients)(Polynomial([-leader, 1.0])).coef if leader else coefficients
-    found[: len(moved)] = moved
-    found[0] += follower
-    return found
+    result[: len(moved)] = moved
+    result[0] += follower
+    return result
 
 
 def _add_polynomial(writer: StageWriter, equality: int, scope: str, paths: dict[int, str]) -> Any:

@@ -123,13 +123,13 @@ def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "verte
     """
     first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     moved = model.mesh_vert[first : first + count].astype(np.float64)
-    found = Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).apply(moved) + model.mesh_pos[mesh]
-    bit = np.finfo(np.float32).eps * max(np.abs(found).max(), np.abs(moved).max())
+    result = Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).apply(moved) + model.mesh_pos[mesh]
+    bit = np.finfo(np.float32).eps * max(np.abs(result).max(), np.abs(moved).max())
     for decimals in range(8):
-        if np.abs(np.round(found, decimals) - found).max() <= bit:
-            found = np.round(found, decimals)
+        if np.abs(np.round(result, decimals) - result).max() <= bit:
+            result = np.round(result, decimals)
             break
-    return np.ascontiguousarray(found + 0.0, dtype=np.float32)
+    return np.ascontiguousarray(result + 0.0, dtype=np.float32)
 
 
 def _colour(writer: StageWriter, geom: int, shape: Any) -> None:

@@ -53,12 +53,12 @@ class StageWriter:
     def path(self, parent: str, name: str) -> str:
         """Return a path below a prim that is valid, like the name, and not yet taken; and take it."""
         plain = f"{parent}/{usd_modules().Tf.MakeValidIdentifier(name)}"
-        found, number = plain, 0
-        while found in self._taken:
+        result, number = plain, 0
+        while result in self._taken:
             number += 1
-            found = f"{plain}_{number}"
-        self._taken.add(found)
-        return found
+            result = f"{plain}_{number}"
+        self._taken.add(result)
+        return result
 
     def body_name(self, body: int) -> str:
         """Return a body's name, or what a message and a prim call one that has none."""

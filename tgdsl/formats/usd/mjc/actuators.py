@@ -71,17 +71,17 @@ def read_actuators(stage: Stage, named: Named) -> list[Actuator]:
     """
     prims = [prim for prim in stage.prims if prim.GetTypeName() in (MJC_ACTUATOR, NEWTON_ACTUATOR)]
     names = unique_names(stage, prims)
-    found: list[Actuator] = []
+    results: list[Actuator] = []
     for prim in sorted(prims, key=lambda prim: prim.GetTypeName() != MJC_ACTUATOR):
         read = _mjc_actuator if prim.GetTypeName() == MJC_ACTUATOR else _newton_actuator
         actuator = read(stage, prim, named, names[str(prim.GetPath())])
         if actuator is None:
             continue
-        if read is _newton_actuator and actuator.joint in [other.joint for other in found]:
+        if read is _newton_actuator and actuator.joint in [other.joint for other in results]:
             stage.drop("NewtonActuators were dropped whose joint has an MjcActuator", prim)
             continue
-        found.append(actuator)
-    return found
+        results.append(actuator)
+    return results
 
 
 def _mjc_actuator(stage: Stage, prim: Prim, named: Named, name: str) -> Actuator | None:

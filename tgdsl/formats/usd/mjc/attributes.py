@@ -151,7 +151,7 @@ def read_attributes(stage: Stage, prim: Prim, table: SourceTable, is_angular: bo
         table: Which attributes, and where their values are.
         is_angular: Whether the element turns, which decides on units.
     """
-    found = {}
+    result = {}
     for attribute, sources in table.items():
         own = read_custom(stage, prim, attribute)
         values = [] if own is None else [(f"tgdsl:{attribute}", own, Source(""))]
@@ -160,8 +160,8 @@ def read_attributes(stage: Stage, prim: Prim, table: SourceTable, is_angular: bo
             if not _agree(values[0][1], value, source):
                 stage.drop(f"{name} was dropped, which contradicts {values[0][0]}", prim)
         if values:
-            found[attribute] = text_of(TOKENS.get(values[0][1], values[0][1]) if _is_token(values[0]) else values[0][1])
-    return found
+            result[attribute] = text_of(TOKENS.get(values[0][1], values[0][1]) if _is_token(values[0]) else values[0][1])
+    return result
 
 
 def with_limits(stage: Stage, attributes: dict[str, str], pairs: Iterable[str]) -> dict[str, str]:

@@ -82,11 +82,11 @@ def _of_displacements(coefficients: Float[np.ndarray, " 5"], follower: float, le
         follower: Position of the follower at `qpos0` [rad or m].
         leader: The same of the leader.
     """
-    found = np.zeros(5)
+    result = np.zeros(5)
     moved = Polynomial(coefficients)(Polynomial([leader, 1.0])).coef if leader else coefficients
-    found[: len(moved)] = moved
-    found[0] -= follower
-    return found
+    result[: len(moved)] = moved
+    result[0] -= follower
+    return result
 
 
 def add_polynomials(stage: Stage, equality: ET.Element, names: Mapping[str, Mapping[str, str]]) -> None:

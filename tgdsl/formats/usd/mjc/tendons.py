@@ -29,14 +29,14 @@ def add_tendons(stage: Stage, tendon: ET.Element, named: Named) -> dict[str, str
     """
     prims = [prim for prim in stage.prims if prim.GetTypeName() == "MjcTendon"]
     names = unique_names(stage, prims)
-    found = {}
+    result = {}
     for prim in prims:
         element = _tendon(stage, prim, named)
         if element is not None:
-            found[str(prim.GetPath())] = names[str(prim.GetPath())]
+            result[str(prim.GetPath())] = names[str(prim.GetPath())]
             element.set("name", names[str(prim.GetPath())])
             tendon.append(element)
-    return found
+    return result
 
 
 def _tendon(stage: Stage, prim: Prim, named: Named) -> ET.Element | None:

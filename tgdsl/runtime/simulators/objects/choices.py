@@ -99,7 +99,7 @@ class EnvObjects:
         self._known(name)
         if not self._scenes.objects[name].is_sized:
             raise SimulationError(f"the size of object {name} is fixed; the document frees it with `size: per_env`")
-        found = np.atleast_1d(np.asarray(value, dtype=np.float64))
-        if found.shape[:-1] not in ((), (count,)) or not np.isfinite(found).all():
-            raise SimulationError(f"sizes of object {name}: found shape {found.shape}, expected ({count}, 1 to 3), finite")
-        return np.broadcast_to(found, (count, found.shape[-1]))
+        result = np.atleast_1d(np.asarray(value, dtype=np.float64))
+        if result.shape[:-1] not in ((), (count,)) or not np.isfinite(result).all():
+            raise SimulationError(f"sizes of object {name}: found shape {result.shape}, expected ({count}, 1 to 3), finite")
+        return np.broadcast_to(result, (count, result.shape[-1]))

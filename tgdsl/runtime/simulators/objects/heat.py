@@ -66,8 +66,8 @@ class EnvHeat:
         Raises:
             SimulationError: If there is no such object, or a value does not fit.
         """
-        found = {("temperature", self._column(name)): self._degrees(name, v, len(ids)) for name, v in temperatures.items()}
-        return found | {("material", self._column(name)): self._numbers(name, v, len(ids)) for name, v in materials.items()}
+        result = {("temperature", self._column(name)): self._degrees(name, v, len(ids)) for name, v in temperatures.items()}
+        return result | {("material", self._column(name)): self._numbers(name, v, len(ids)) for name, v in materials.items()}
 
     def write(self, ids: Int[np.ndarray, " n"], chosen: Mapping[tuple[str, int], np.ndarray]) -> None:
         """Write what was chosen for some environments, in place."""

@@ -71,7 +71,7 @@ class SimulatedTips:
 
     def forces(self, readings: Mapping[str, Tensor]) -> Float[np.ndarray, "finger 3"]:
         """Return the force on each fingertip, along its link's axes [unit of `agg_force`]; 0 where none is observed."""
-        found = np.zeros((len(FINGERS), 3))
+        result = np.zeros((len(FINGERS), 3))
         features: dict[PlannedObservation, Tensor] = {}
         for finger, place in self._places.items():
             planned = place.term.planned
@@ -79,8 +79,8 @@ class SimulatedTips:
                 constants = self._touch.constants.tree["observations"][planned.key]
                 reading = last_step(readings[str(planned.reading)])
                 features[planned] = observations.observe(planned.type, reading, planned.channels, constants)[0]
-            found[finger] = place.force(features[planned])
-        return found
+            result[finger] = place.force(features[planned])
+        return result
 
     def _take(self, finger: int, place: _Place) -> None:
         known = self._places.setdefault(finger, place)

@@ -259,8 +259,10 @@ class SerialClient:
         self.counters.num_timeouts += 1
         if waiting.foreign is not None and self._addresses is not None:
             expected = "from {:#04x} to {:#04x}".format(*self._addresses.reply)
-            found = f"from {waiting.foreign.source:#04x} to {waiting.foreign.destination:#04x}"
-            return HandAddressError(f"a reply came {found}, expected {expected}; if it is this hand's, set its reply addresses")
+            result = f"from {waiting.foreign.source:#04x} to {waiting.foreign.destination:#04x}"
+            return HandAddressError(
+                f"a reply came {result}, expected {expected}; if it is this hand's, set its reply addresses"
+            )
         if waiting.is_early:
             took = f"sooner than {self.timing.baud} baud allow"
             return HandTimeoutError(f"a reply to {what} came {took}: an earlier one's, or set checks_wire_time=False")

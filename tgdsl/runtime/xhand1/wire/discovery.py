@@ -48,14 +48,14 @@ def find_hands(
     """
     timing = timing or SerialTiming()
     client = SerialClient(open_port(device, timing.baud), None, timing)
-    found = []
+    results = []
     try:
         for hand_id in hand_ids:
             try:
                 reply = client.exchange(Command.VERSION, hand_id=hand_id)
             except (HandTimeoutError, HandChecksumError):
                 continue
-            found.append(FoundHand(device, Addresses(hand_id, reply.source, reply.destination), reply.payload))
+            results.append(FoundHand(device, Addresses(hand_id, reply.source, reply.destination), reply.payload))
     finally:
         client.close()
-    return tuple(found)
+    return tuple(results)

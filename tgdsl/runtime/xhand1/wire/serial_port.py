@@ -57,9 +57,9 @@ def list_ports() -> tuple[PortInfo, ...]:
     Raises:
         HandError: If pyserial is not installed.
     """
-    found = _pyserial().tools.list_ports.comports()
+    result = _pyserial().tools.list_ports.comports()
     return tuple(
-        sorted((PortInfo(p.device, p.description or "", p.serial_number or "") for p in found), key=lambda p: p.device)
+        sorted((PortInfo(p.device, p.description or "", p.serial_number or "") for p in result), key=lambda p: p.device)
     )
 
 
