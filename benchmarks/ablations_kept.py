@@ -84,7 +84,7 @@ class Ablation:
         taught: The students, in the order of the table.
         curves: Their curves by resolution.
         teacher: The evaluation of their teacher; None: not kept.
-        rest: That of joints at rest; likewise.
+        rest: That of joints at rest; the same.
     """
 
     name: str

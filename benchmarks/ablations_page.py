@@ -33,7 +33,7 @@ class Judged(NamedTuple):
         taught: The students.
         trend: How the mean of their scores changes over the last third; None: too few points.
         is_flat: Whether that has flattened; None where that cannot be told.
-        holds: Whether they do not get worse, flat or not; likewise.
+        holds: Whether they do not get worse, flat or not; the same.
     """
 
     taught: Taught
@@ -48,7 +48,7 @@ class Judged(NamedTuple):
 
     @property
     def can_be_better(self) -> bool:
-        """Whether others can be called worse than they; likewise."""
+        """Whether others can be called worse than they; the same."""
         return bool(self.holds) and self.taught.row.seeds > 1
 
 

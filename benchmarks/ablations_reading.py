@@ -5,7 +5,7 @@ estimates the sum F of the normal forces of the object's contacts, MuJoCo's own 
 
     F̂ = mean F + (x − mean x)/σ · w,   w = argmin Σ (F̂ − F)² + λ n |w|²          sums and means over the n instants of the fit
     R² = 1 − Σ (F̂ − F)²/Σ (F − mean F)²                                          over the episodes of the test
-    relative error = √ mean ((F̂ − F)/F)²                                         likewise
+    relative error = √ mean ((F̂ − F)/F)²                                         the same
 
 σ is the standard deviation of a channel, over all its taxels: with one of its own a taxel that is hardly ever touched would get
 a weight that a touch in the test blows up. λ is the one of `RIDGES` with the least error in four-fold cross-validation over the

@@ -4,7 +4,7 @@
     python benchmarks/envs.py --device cuda --envs 8192 --seconds 100 --out out/envs
     python benchmarks/envs.py examples/tasks/in_palm_rotate.yaml --cones pyramidal --set randomise.drive={}
 
-Actions are random, episodes begin anew as they end. Of each task and friction cone:
+Actions are random, episodes begin again as they end. Of each task and friction cone:
 
 - `ratio`: `TouchEnv.step` over the same physics and the same module alone (on a GPU `sim.step_and_read`, else `sim.step` and
   the module), from the same states and with the same targets of the same drives; `ratio_ideal`: without drives, with the
@@ -189,7 +189,7 @@ def share_of(label: str) -> str:
 
 @contextmanager
 def stamped(env: TouchEnv) -> Iterator[Stamps]:
-    """Have a step note its parts; what was captured is captured anew."""
+    """Have a step note its parts; what was captured is captured again."""
     stamps, sim, episodes = Stamps(env.device), env.sim, env._episodes
     advance, read, began = env._advance, sim.read, env._begin
     patches: list[tuple[Any, str, Any]] = []

@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--every", type=float, default=0.075, help="from one to the next [s]")
     parser.add_argument("--distance", type=float, default=0.3, help="of the camera from the object [m]")
     parser.add_argument("--azimuth", type=float, default=150.0, help="of where it looks [deg]")
-    parser.add_argument("--elevation", type=float, default=-40.0, help="likewise [deg]")
+    parser.add_argument("--elevation", type=float, default=-40.0, help="the same [deg]")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="of the task's document")
     parser.add_argument("--out", type=Path, required=True)

@@ -390,7 +390,7 @@ def write(path: Path, row: Row, versions: dict[str, Any]) -> None:
 
 
 def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Return the command line, and in `arguments` what begins it anew."""
+    """Return the command line, and in `arguments` what begins it again."""
     arguments = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)

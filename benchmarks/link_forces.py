@@ -3,7 +3,7 @@
     python benchmarks/link_forces.py examples/tasks/screwdriver.yaml policies/screwdriver.pt --envs 24
 
 Prints how many forces there were, their median, 99th percentile and largest [N], over one episode of each environment; and
-likewise how deep in the object the deepest probe of the task's `surface_distance` was [mm], where one was: contacts are soft.
+the same how deep in the object the deepest probe of the task's `surface_distance` was [mm], where one was: contacts are soft.
 """
 
 from __future__ import annotations

@@ -356,7 +356,7 @@ def plot(options: argparse.Namespace) -> None:
 
 
 def parsed() -> argparse.Namespace:
-    """Return the command line, and in `arguments` what begins it anew."""
+    """Return the command line, and in `arguments` what begins it again."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     making = commands.add_parser("artefacts", help="compile all modules")

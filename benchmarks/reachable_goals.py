@@ -26,7 +26,7 @@ from tgdsl.rl.env import TouchEnv
 
 TASK = Path(__file__).parents[1] / "examples" / "tasks" / "in_hand_repose.yaml"
 SAMPLES, KNOTS, EACH = 48, 6, 5
-"""Sequences of targets; their parts, and control steps of each, after which the plan is made anew."""
+"""Sequences of targets; their parts, and control steps of each, after which the plan is made again."""
 KEPT = 6
 """Sequences that the next plan is a mean of."""
 SPREADS = (0.2, 0.5, 1.0)

@@ -1,4 +1,4 @@
-"""Resets on a GPU: do they wait for nothing, can a CUDA graph capture them, and do environments with faults start anew there?
+"""Resets on a GPU: do they wait for nothing, can a CUDA graph capture them, and do environments with faults restart there?
 
     tgdsl compile examples/noisy_hand.yaml -o out/noisy_hand.safetensors          # where documents can be compiled
     python benchmarks/reset_check.py out/noisy_hand.safetensors [--num-envs 64]
@@ -9,7 +9,7 @@
   same reset does without a graph (what is integrated bit for bit, what follows from it to roundings), and changes nothing of
   other environments.
 - `loop`: a step, a reading and a masked reset in one CUDA graph, to 1 % of what the same calls do without.
-- `faults`: environments that diverge, or are given controls or a state that is not finite, start anew; the others are those of
+- `faults`: environments that diverge, or are given controls or a state that is not finite, restart; the others are those of
   a simulation without any, to 1 % after six control steps: two runs on a GPU are not alike bit for bit.
 - `times`: what a masked reset, and the state after it, take.
 """
@@ -195,7 +195,7 @@ def check_faults(options: argparse.Namespace) -> None:
             if step == 2:
                 assert (sim.arrays["time"][:3] == 0).all() and torch.isfinite(sim.qpos).all()
     assert sim.fault_counts.tolist() == [1, 1, 1] + [0] * (sim.num_envs - 3), sim.fault_counts
-    found = [str(entry.message) for entry in said if "started anew" in str(entry.message)]
+    found = [str(entry.message) for entry in said if "restarted" in str(entry.message)]
     assert len(found) == 1 and "1 diverged, 1 had controls" in found[0], found
     for _ in range(4):
         readings = sim.step_and_read(control)
@@ -210,7 +210,7 @@ def check_faults(options: argparse.Namespace) -> None:
     except SimulationError as error:
         said_of_state = str(error)
     assert said_of_state.startswith("values given for the state of environments 0, 1, 2 are not finite"), said_of_state
-    print("  three environments started anew, the others are those of a simulation without faults")
+    print("  three environments restarted, the others are those of a simulation without faults")
 
 
 def check_times(options: argparse.Namespace) -> None:

@@ -10,7 +10,7 @@ Three parts, each with the same number of environments and control steps:
     types    the paper's eight types with encoders of their own, three students each
 
 and of each rollout (physics, touch, teacher and students acting) and update, medians of `--iterations` iterations after warm
-ones in which kernels are loaded and graphs captured; as ratios to `one`. Each part has new students, and begins episodes anew.
+ones in which kernels are loaded and graphs captured; as ratios to `one`. Each part has new students, and begins episodes again.
 
 Environments are made as `tgdsl distill` makes them, twice: with the sensor of `force_torque` alone for `one` and `seeds`, with
 the sensors of all types for `types`. In environments made once, with all sensors, a single student would pay for seven types

@@ -250,7 +250,7 @@ def check_graph(options: argparse.Namespace) -> None:
 
 
 def check_masked(options: argparse.Namespace) -> None:
-    """Read all, then some anew, in one graph: captured after three calls, and replayed."""
+    """Read all, then some again, in one graph: captured after three calls, and replayed."""
     touch, other = module(options, options.device), module(options, options.device)
     if not options.eager:
         touch.compile()
@@ -297,7 +297,7 @@ def copied(state: SceneState, into: SceneState | None = None) -> SceneState:
 
 
 def check_reset(options: argparse.Namespace) -> None:
-    """Start every other environment anew, five times, so that what is captured is replayed."""
+    """Start every other environment again, five times, so that what is captured is replayed."""
     touch = module(options, options.device)
     sim = simulation(touch, options, substeps=SUBSTEPS)
     start = {name: sim.arrays[name].clone() for name in HANDED_OVER}

@@ -33,7 +33,7 @@ def test_num_and_seed_and_a_file(here, document):
     assert len(env.task.grasps.qpos) == 4
     with np.load(document.parent / "kept" / "my grasps.npz") as found:
         assert found["variant"].tolist() == [0, 0, 1, 1]
-    # A document that names a file is sampled anew all the same.
+    # A document that names a file is sampled again all the same.
     code, out, _ = here(document.parent, "grasps", "task.yaml", "--num", "2", "--set", "grasps.file=nowhere.npz")
     assert code == 0 and out.splitlines()[0].startswith("2 grasps")
     assert "--set, has the same" in out.splitlines()[1]

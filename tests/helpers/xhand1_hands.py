@@ -103,7 +103,7 @@ def read_again(hand: XHand1) -> Reading:
 
 
 def drive_until(hand: XHand1, target: np.ndarray, is_so: Callable[[], bool]) -> None:
-    """Command until something is so; what was stopped, as the machine stood still, is begun anew."""
+    """Command until something is so; what was stopped, as the machine stood still, is begun again."""
 
     def commanded() -> bool:
         try:

@@ -45,7 +45,7 @@ def test_frequencies_scale_exactly():
 
 
 def test_one_analysis_per_shape_and_poissons_ratio(monkeypatch):
-    """Of three materials with one ratio; another ratio, or another shape, is computed anew; the cache has what was computed."""
+    """Of three materials with one ratio; another ratio, or another shape, is recomputed; the cache has what was computed."""
     computed = []
     own = spectra._computed
     monkeypatch.setattr(spectra, "_computed", lambda *given: computed.append(given[2]) or own(*given))

@@ -1,4 +1,4 @@
-"""Artefacts that were edited by hand and hashed anew: indices of what is not there are refused by name when they are loaded."""
+"""Artefacts that were edited by hand and rehashed: indices of what is not there are refused by name when they are loaded."""
 
 import dataclasses
 import re

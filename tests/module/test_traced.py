@@ -16,7 +16,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def test_no_number_of_the_code_or_the_plan_is_an_input(name):
     """A float that is read is one for `torch.compile(dynamic=True)`.
 
-    It costs microseconds a call, and double precision on a GPU; or all is traced anew, and compiling takes twice as long.
+    It costs microseconds a call, and double precision on a GPU; or all is traced again, and compiling takes twice as long.
     """
     touch = tgdsl.compile(EXAMPLES / f"{name}.yaml")
     numbers, traced = [], []

@@ -53,7 +53,7 @@ def closed_state(touch, num_envs=5, dtype=torch.float64):
 
 
 def bits(touch, state):
-    """Return all readings, bit for bit, of a module that begins anew."""
+    """Return all readings, bit for bit, of a module that begins again."""
     touch.free()
     with torch.no_grad():
         return {name: (value.shape, value.contiguous().numpy().tobytes()) for name, value in touch(state).items()}

@@ -211,7 +211,7 @@ def test_relative_actions_add_up_within_the_range_and_are_smoothed(tmp_path):
 
 @BOTH
 def test_offsets_are_from_the_target_that_an_episode_began_with(tmp_path, simulator):
-    """Two environments start at 0.3 and −1.8 rad: a ⟼ start + 0.5 a, within ±2; the second begins anew where its joint is then."""
+    """Two environments start at 0.3 and −1.8 rad: a ⟼ start + 0.5 a, within ±2; the second begins again where its joint is then."""
     sim, actuation = hinge(tmp_path, simulator, num_envs=2, action=ActionSpec(mode="offset", scale=0.5))
     sim.qpos[:, 0] = torch.tensor([0.3, -1.8])
     actuation.reset(torch.tensor([True, True]), torch.tensor([1, 1]))

@@ -101,7 +101,7 @@ def test_words_are_mixed_alike_by_torch_and_by_numpy():
 
 @pytest.mark.parametrize("is_compiled", [False, True])
 def test_numbers_made_ahead_are_those_asked_for_one_by_one(is_compiled):
-    """While counters go on by one, after some environments begin anew, counters go back or stay, and with another seed."""
+    """While counters go on by one, after some environments begin again, counters go back or stay, and with another seed."""
     draws, plain, counts = Draws(2, 4), Draws(2, 4), torch.arange(4) + (3 << 32)
     draws._is_on_host = not is_compiled
     for call in range(24):

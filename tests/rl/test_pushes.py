@@ -1,4 +1,4 @@
-"""Pushes: a free ball gains F Δt / m, intervals and forces are those drawn, and only chosen environments begin anew."""
+"""Pushes: a free ball gains F Δt / m, intervals and forces are those drawn, and only chosen environments begin again."""
 
 import numpy as np
 import pytest

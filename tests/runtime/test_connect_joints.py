@@ -56,7 +56,7 @@ def test_a_sample_is_observed_in_the_order_of_the_actuators(tmp_path):
 
 
 def test_emulator_and_simulation_agree(tmp_path):
-    """Angles as far as the wire's floats can say them, controls to the bit; both start anew with a reset."""
+    """Angles as far as the wire's floats can say them, controls to the bit; both restart with a reset."""
     terms = [{"type": "joint_pos"}, {"type": "last_action"}]
     touch = compiled(tmp_path, terms)
     squeeze = np.linspace(0.05, 0.2, 12).astype(np.float32)

@@ -1,4 +1,4 @@
-"""When calls are captured anew, and that what is remembered is left as it was; what is captured needs a GPU."""
+"""When calls are captured again, and that what is remembered is left as it was; what is captured needs a GPU."""
 
 import pytest
 import torch

@@ -173,7 +173,7 @@ def test_the_origin_is_the_document_as_written(tmp_path):
 
 @pytest.mark.slow
 def test_a_choice_follows_from_what_the_document_says(tmp_path):
-    """Another mass changes the motion, not what is computed of it; still it is looked at anew."""
+    """Another mass changes the motion, not what is computed of it; still it is looked at again."""
     made = chosen_document(tmp_path, depth_at("1 %"))
     keys = set()
     for text in (made.read_text(), made.read_text().replace("1 %", "2 %"), made.read_text().replace("radius: 4", "radius: 3")):

@@ -10,7 +10,7 @@ class Cache:
     """Show where baked distances, moments and modes are kept, how many and how large they are; or remove them all."""
 
     clear: bool = False
-    """Remove all of it; it is computed anew when it is wanted."""
+    """Remove all of it; it is recomputed when it is wanted."""
 
     def run(self) -> None:
         """Say what there is, or what was removed."""

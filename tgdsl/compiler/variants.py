@@ -51,7 +51,7 @@ class NewBody:
         is_free: Whether it moves freely, or is fixed to the world.
         group: Of its geoms: one that weighs, where the scene's compiler takes all inertias from geoms.
         contype: MuJoCo's bits of its geoms.
-        conaffinity: Likewise.
+        conaffinity: The same.
     """
 
     name: str

@@ -3,7 +3,7 @@
 A file's scene becomes one mesh, each node's under its transform; materials and textures are left out. Numbers are kept as the
 file has them, in its frame: glTF's are metres with Y up by its specification, and are not turned to have Z up. So do yourdfpy
 and trimesh, three.js' urdf-loader and SAPIEN, for which the glTF files of hands are mostly made (those of dex-urdf lie in the
-frames of their links); RViz 2 since 2025 and Drake do turn them. COLLADA's `up_axis` is left alone likewise, as RViz does,
+frames of their links); RViz 2 since 2025 and Drake do turn them. COLLADA's `up_axis` is left alone too, as RViz does,
 and its unit, which most URDF loaders apply, is applied.
 """
 

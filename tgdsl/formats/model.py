@@ -54,7 +54,7 @@ class Model:
     rewritten: Mapping[str, Path] = field(default_factory=dict)
 
     def changed(self, change: Callable[[mujoco.MjSpec], object]) -> Model:
-        """Return the model with a change of its spec, compiled anew.
+        """Return the model with a change of its spec, recompiled.
 
         Raises:
             RobotError: If MuJoCo cannot compile it, or what the change raises.

@@ -44,7 +44,7 @@ SEARCH_ERROR = 2e-6
 class TriangleMesh:
     """Triangles to ask distances of, with one hierarchy per device, built when a point on that device first asks.
 
-    Copies and pickles hold the triangles and build anew. The mesh must outlive whatever was compiled with it.
+    Copies and pickles hold the triangles and build again. The mesh must outlive whatever was compiled with it.
 
     Attributes:
         vertices: Positions in the mesh's frame [m].

@@ -55,7 +55,7 @@ class Calls:
         return self.compiled.get(name, step)
 
     def forget_graphs(self) -> None:
-        """Capture anew at the next calls: constants lie elsewhere."""
+        """Capture again at the next calls: constants lie elsewhere."""
         for graphed in self.graphed.values():
             graphed.forget()
 

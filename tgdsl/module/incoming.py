@@ -125,7 +125,7 @@ class Incoming:
 
     @property
     def held_dt(self) -> object:
-        """Stands for the time that calls are apart, as a tensor: another object after it was written anew."""
+        """Stands for the time that calls are apart, as a tensor: another object after it was written again."""
         return self._dt
 
     def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
@@ -214,7 +214,7 @@ class Incoming:
         return self._dt[1]
 
     def _retime(self, dt: float) -> None:
-        """Make constants anew that are made for another time between the calls of a kind, and warn of it the first time."""
+        """Make constants again that are made for another time between the calls of a kind, and warn of it the first time."""
         for sensor in (sensor for sensor in self._plan.sensors if sensor.name in self._timesteps):
             own, retimed = dt / max(sensor.substeps, 1), self._kinds[sensor.name].retimed
             if math.isclose(own, self._timesteps[sensor.name], rel_tol=SAME_TIME):

@@ -295,7 +295,7 @@ class TactileModule(HookedModule):
         """Begin a new episode in some environments (default: all); the others are left untouched.
 
         State is at rest again, filters start from the next reading's true value, and gains, dead taxels and what else is drawn
-        per episode are drawn anew.
+        per episode are redrawn.
 
         Args:
             env_ids: Indices, or a boolean mask over environments. Indices that lie on a GPU are not looked at, as that would

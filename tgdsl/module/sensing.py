@@ -64,7 +64,7 @@ def read(
     """Return a sensor's readings by name (env, row, channel), its new memory, and what its kind's `forward` returned.
 
     Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
-    fuses then has the equation write all channels side by side, and would else form them anew for each number of the noise.
+    fuses then has the equation write all channels side by side, and would else form them again for each number of the noise.
 
     Args:
         sensor: The sensor.

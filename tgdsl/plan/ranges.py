@@ -1,6 +1,6 @@
 """Whether the indices that a Plan holds are of things that are there: looked at once, when an artefact is loaded.
 
-A hash only says that a file is whole. One that was edited by hand, and hashed anew, may hold any number.
+A hash only says that a file is whole. One that was edited by hand, and rehashed, may hold any number.
 """
 
 from __future__ import annotations

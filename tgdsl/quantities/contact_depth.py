@@ -53,7 +53,7 @@ class SearchPart(Generic[Array]):
     Attributes:
         pair: Index of each probe's pair with each object among all pairs, (object, taxel).
         spheres: Bounds of the objects, (1, object, 2); None where they differ between environments.
-        geoms: Their geoms, (1, geom, row); None likewise.
+        geoms: Their geoms, (1, geom, row); None in the same case.
     """
 
     pair: Array = field(metadata=indices(lambda search, part, plan: len(plan.pairs.link)))

@@ -77,7 +77,7 @@ def launch(
         reach: As `deepest` has it.
         gate: 0 where a pair may be felt, −∞ where it may not.
         spheres: The objects, see `Tables`.
-        geoms: Their geoms, likewise.
+        geoms: Their geoms, in the same way.
     """
     num_envs, (num_objects, num_taxels) = pose[0].shape[0], pair.shape
     depth = pose[0].new_empty((num_envs, num_taxels))

@@ -132,7 +132,7 @@ def relate(
     parts = on_host(_related, *(own.index_select(1, bodies) for bodies in (link, target) for own in fields))
     is_moving = len(parts) > 12
     parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
-    # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
+    # Stacked, they are stored once per pair; a compiler that fuses would else form them again for every taxel.
     parts = torch.stack(parts, dim=1).to(dtype).unbind(1)
     motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18]), planes.vec(parts[18:21])) if is_moving else None
     return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, None if gate is None else parts[-1])

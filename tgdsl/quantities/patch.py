@@ -30,9 +30,9 @@ class Contacts(NamedTuple):
 
     Attributes:
         force: Of each contact (env, pair, slot, 3) [N].
-        torque: Likewise [N·m].
-        normal: Likewise.
-        pos: Likewise [m].
+        torque: The same [N·m].
+        normal: The same.
+        pos: The same [m].
         whole: Force of all contacts of a pair (env, pair, 3) [N].
         body_pos: Origins of bodies (env, body, 3) [m].
         body_quat: Their orientations (env, body, 4).

@@ -269,7 +269,7 @@ class Actuation:
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
-        """Draw the drives of some environments anew, which hold the positions that their joints now have.
+        """Draw the drives of some environments again, which hold the positions that their joints now have.
 
         Args:
             chosen: The environments.

@@ -1,7 +1,7 @@
 """Environments in which touch can be learned: a task, its module and a simulation as one step.
 
 One control step, in this order: the action becomes targets; forces that push begin or end; physics steps, each with its drive;
-readings of one instant; is it over; rewards; and then the environments that have ended begin anew: what is random is drawn,
+readings of one instant; is it over; rewards; and then the environments that have ended begin again: what is random is drawn,
 they are placed, and they alone are read again, without a move of anyone else's delay, noise or history. On a GPU all of it is
 one CUDA graph, and the host never waits.
 
@@ -110,7 +110,7 @@ class TouchEnv:
         self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
         is_cuda = self.touch.device.type == "cuda"
         is_compiled = is_cuda if compiled is None else compiled
-        self.touch.memory.keeps_last = True  # of environments that do not begin anew while others do
+        self.touch.memory.keeps_last = True  # of environments that do not begin again while others do
         if is_compiled:
             self.touch.compile(dynamic=not is_cuda)  # a GPU reads all environments each time, a CPU any number of them
         self._joints = moved_joints(loaded, sensed)
@@ -245,7 +245,7 @@ class TouchEnv:
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
 
-        Actions count as zeros. Episodes that end do not begin anew: call `reset`.
+        Actions count as zeros. Episodes that end do not begin again: call `reset`.
 
         Args:
             control: Set-points of all actuators, as their joints' positions [rad; slides: m].

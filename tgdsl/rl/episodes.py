@@ -193,7 +193,7 @@ class Episodes:
             properties.set(chosen, mass={name: self.mass})
 
     def _restart(self, chosen: Bool[Tensor, " env"], at_controls: bool) -> None:
-        """Draw drives and pushes anew, and begin to add up."""
+        """Draw drives and pushes again, and begin to add up."""
         self._actuation.reset(chosen, self.number, at_controls)
         self._pushes.reset(chosen, self.number)
         for counted in (self.steps, self.total, self.sums):

@@ -58,8 +58,8 @@ class Setup:
         first_half_height: That of its first variant, which stands where the keyframe has it [m].
         variant: Which of its variants each environment's object is, from 0.
         num_variants: How many there are; 1 if the object has none.
-        friction: Coefficient of sliding friction of each object: a live tensor, drawn anew before `reset`.
-        mass: Mass of each object [kg], likewise.
+        friction: Coefficient of sliding friction of each object: a live tensor, redrawn before `reset`.
+        mass: Mass of each object [kg], in the same way.
         draws: Random numbers.
         rows: By kind of sensor that the task looks at: its reading's name in `Now.readings`, and a table of that one's rows.
         grasps: Grasps that episodes begin from; None if the task's document has none.

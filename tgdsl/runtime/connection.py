@@ -97,7 +97,7 @@ class Connection(ABC):
         return dict(self._groups)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Start some environments anew (default: all): a simulation from its keyframe, a hand where it is, passive.
+        """Restart some environments (default: all): a simulation from its keyframe, a hand where it is, passive.
 
         Raises:
             HandError: If a hand gives no new reading.

@@ -95,7 +95,7 @@ def simulate(
             MuJoCo's model by name. On the CPU environments may always have these.
         watch: Names of bodies, sites, joints, actuators and pairs that `sim.watched()` returns, of the instant of readings.
         on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
-            until they are reset, "reset" starts them anew, in the simulator and in the module, "note" leaves that to whoever
+            until they are reset, "reset" restarts them, in the simulator and in the module, "note" leaves that to whoever
             looks at `faults` and resets them. All are counted, and the last two warn once.
         nconmax: On a GPU, capacity for contacts per environment, in a pool that all share: see `WarpSimulation`.
         njmax: On a GPU, capacity for rows of constraints in each environment.

@@ -288,7 +288,7 @@ class SceneModels:
         return self._models[key]
 
     def models(self, choices: Sequence[Mapping[str, Choice]]) -> list[mujoco.MjModel]:
-        """Return the model of each environment, and forget those that none has: sizes drawn anew would pile up."""
+        """Return the model of each environment, and forget those that none has: sizes redrawn would pile up."""
         results = [self.model(own) for own in choices]
         used = {id(model) for model in results}
         self._models = {key: model for key, model in self._models.items() if id(model) in used}

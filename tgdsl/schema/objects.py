@@ -143,7 +143,7 @@ class ObjectSpec(SpecModel):
     """MuJoCo's bits of the geoms of a body of its own; default: 1, and what makes it collide with all geoms of the scene that
     collide."""
     conaffinity: Bits | None = None
-    """Likewise."""
+    """The same."""
     surface: str = "collision"
     """What is felt of it: `collision`, the geoms that collide, meshes by their convex hulls as MuJoCo collides them; `visual`,
     the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is. The

@@ -174,7 +174,7 @@ def parse(text: str, file: str) -> Source:
     yaml.Composer = _BoundedComposer
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ReusedAnchorWarning)  # an anchor may be set anew
+            warnings.simplefilter("ignore", ReusedAnchorWarning)  # an anchor may be set again
             node = yaml.compose(text)
         if node is None:
             source.problems.append(Problem(file, 1, 1, "", "the document is empty"))

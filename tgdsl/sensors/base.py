@@ -343,7 +343,7 @@ class Kind:
         is_timed: Whether it wants to know when it is called: a clock is kept, and the state's `dt` is wanted.
         is_random: Whether it draws random numbers of its own, from `Context.stream`.
         retimed: `(constants, dt) → constants`: those of its constants that depend on the time between calls of `forward` [s],
-            anew. The module calls it whenever that time is another one than `Lowered.timestep`, or was at the last call.
+            again. The module calls it whenever that time is another one than `Lowered.timestep`, or was at the last call.
         quantities: Quantities of its own that it asks for, which no installed package brings.
         indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
         alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are

@@ -35,7 +35,7 @@ def captured(call: Callable[[], Tensors]) -> tuple[Replay, Tensors]:
 class Graphed:
     """A function of inputs and of memory that it changes in place, captured as a graph at the first call and replayed after it.
 
-    It is captured anew when shapes or dtypes of the inputs change, or memory lies elsewhere. What it returns is in the same
+    It is captured again when shapes or dtypes of the inputs change, or memory lies elsewhere. What it returns is in the same
     tensors at each call.
     """
 
@@ -63,7 +63,7 @@ class Graphed:
         return dict(self._made)
 
     def forget(self) -> None:
-        """Capture anew at the next call: constants lie elsewhere."""
+        """Capture again at the next call: constants lie elsewhere."""
         self._key = None
 
     def _start(self, tensors: Tensors, memory: Tensors) -> None:

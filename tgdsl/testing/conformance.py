@@ -325,7 +325,7 @@ class KindConformance:
                 assert gradient is None or torch.isfinite(gradient).all()
 
     def test_reset_of_one_environment(self, scene: Path) -> None:
-        """Reset starts one environment anew, by index and by mask, and leaves the others untouched."""
+        """Reset restarts one environment, by index and by mask, and leaves the others untouched."""
         module, _ = self.build(self.document(scene), torch.float64)
         other, _ = self.build(self.document(scene), torch.float64)
         first, second, *_ = self.states(module, num_envs=4)

@@ -75,7 +75,7 @@ def seen(
         markers: The taxels.
         env: Which environment.
         width: Columns, before `SUPERSAMPLING` of them become one pixel.
-        height: Rows, likewise.
+        height: Rows, in the same way.
         view: From where; default: see `cameras.best_camera`.
         layouts: What else carries sensors; the first gives views their names where the module has no taxels.
     """

@@ -95,7 +95,7 @@ def test_from_a_teacher_to_students_that_play(base, here):
 
 
 def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeypatch):
-    """The number of environments is kept, not made anew; what students feel cannot be changed; old scores do not stay."""
+    """The number of environments is kept, not made again; what students feel cannot be changed; old scores do not stay."""
     few = (
         *TEACHER,
         "--types",
@@ -193,7 +193,7 @@ def test_what_of_the_task_is_otherwise_than_for_the_teacher_is_told_once(base, h
 
 
 def test_what_is_refused_leaves_a_run_as_it_was(base, here):
-    """An override that does not fit is not kept; a folder that holds a run takes no other; one killed early begins anew."""
+    """An override that does not fit is not kept; a folder that holds a run takes no other; one killed early begins again."""
     few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)
     code, _, error = here(base, "distill", "task.yaml", *few, "--set", "distill.decoders={size: {}}", "-o", "run")
     assert code == 2 and 'no privileged number "size"' in error and not (base / "run").exists()

@@ -222,7 +222,7 @@ def test_a_clip_bounds_from_where_a_pass_begins(make, kind):
 
 @pytest.mark.parametrize("kind", ["mlp", "convrnn"])
 def test_to_stop_and_go_on_is_to_go_on(make, tmp_path, kind):
-    """To the bit, where the environments are put where they were; otherwise a checkpoint begins episodes anew.
+    """To the bit, where the environments are put where they were; otherwise a checkpoint begins episodes again.
 
     A step is made before: a loaded state has no instant, of which decoders tell.
     """

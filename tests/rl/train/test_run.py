@@ -186,7 +186,7 @@ def test_other_groups_networks_and_files_are_refused_by_name(tmp_path):
     with pytest.raises(CheckpointError, match=r"its networks are of other sizes: .*mlp"):
         restore(other, state, file)
     more, _ = small_learner(tmp_path, num_envs=5)
-    restore(more, state, file)  # of another number of environments: these begin anew
+    restore(more, state, file)  # of another number of environments: these begin again
     assert int(more.env.steps.sum()) == 0
 
 
@@ -204,7 +204,7 @@ def test_what_is_no_checkpoint_is_named(tmp_path):
         before, after = f"{other}: found ", ", expected a checkpoint of `tgdsl train` or `tgdsl distill`; "
         assert str(raised.value).startswith(before)
         said, hint = str(raised.value).removeprefix(before).split(after)
-        assert hint == "put back a copy of one, or begin anew with another --out"
+        assert hint == "put back a copy of one, or begin again with another --out"
         return said
 
     for part in (b"", b"no checkpoint", content[:1000], content[: len(content) // 2], content[:-1]):

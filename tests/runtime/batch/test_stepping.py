@@ -144,7 +144,7 @@ def test_a_diverging_environment_is_reported(tmp_path, monkeypatch):
     sim.batch.qvel[1, 0] = np.nan
     with pytest.raises(SimulationError) as caught:
         sim.step()
-    assert str(caught.value) == "environments 1 diverged, and MuJoCo has started them anew; reset them to go on"
+    assert str(caught.value) == "environments 1 diverged, and MuJoCo has restarted them; reset them to go on"
     sim.reset([1])
     sim.step()
     np.testing.assert_allclose(sim.batch.time, [0.004, 0.002, 0.004])

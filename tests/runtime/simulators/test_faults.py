@@ -1,4 +1,4 @@
-"""Environments that diverge or are given what is not finite: named, started anew by choice, and of no concern to the others."""
+"""Environments that diverge or are given what is not finite: named, restarted by choice, and of no concern to the others."""
 
 import warnings
 
@@ -16,7 +16,7 @@ from tgdsl.runtime.simulators.state_values import Rows
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 CONTROLS = np.random.default_rng(3).normal(size=(6, 2))
 PRESSED = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
-SAID = r"^environments had faults and were started anew: {}; this is said once, `fault_counts` counts on$"
+SAID = r"^environments had faults and were restarted: {}; this is said once, `fault_counts` counts on$"
 
 
 @pytest.fixture(autouse=True)
@@ -134,7 +134,7 @@ def test_a_divergence_in_one_of_many_physics_steps_counts(tmp_path, simulator):
 
 @BOTH
 def test_in_substates_a_module_begins_one_episode_per_fault(tmp_path, simulator):
-    """Not another one at each physics step that follows: gains would be drawn anew, and delays never fill."""
+    """Not another one at each physics step that follows: gains would be redrawn, and delays never fill."""
     touch = module(tmp_path, noise={"gain": [0.5, 2.0], "read_delay": "4 ms"})
     sim = simulator(touch, 3, keyframe="home", substeps=4, on_fault="reset")
     control = torch.zeros(3, 2, dtype=torch.float64)
@@ -142,7 +142,7 @@ def test_in_substates_a_module_begins_one_episode_per_fault(tmp_path, simulator)
         touch(state)
     control[1] = torch.nan
     states = sim.substates(control)
-    with pytest.warns(UserWarning, match="were started anew"):
+    with pytest.warns(UserWarning, match="were restarted"):
         touch(next(states))
     for state in states:
         touch(state)

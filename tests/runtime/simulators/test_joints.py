@@ -201,7 +201,7 @@ def test_tables_and_pictures_are_of_links_alone(touch, tmp_path):
 
 @pytest.mark.parametrize("kind", [BatchSimulation, WarpSimulation])
 def test_where_objects_differ_the_robots_joints_are_the_same(tmp_path, kind):
-    """Environments with another object start anew, at the keyframe's joints; the others stay where they were."""
+    """Environments with another object restart, at the keyframe's joints; the others stay where they were."""
     document = joint_document(tmp_path, TERMS)
     still = (tmp_path / "robot.xml").read_text().replace("</worldbody>", f"{OBJECT}</worldbody>")
     (tmp_path / "scene.xml").write_text(re.sub('<joint name="spin"[^>]*>', "", still))

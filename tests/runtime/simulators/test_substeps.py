@@ -135,9 +135,7 @@ def test_a_divergence_is_reported_where_it_happens(tmp_path, monkeypatch):
     states = sim.substates()
     next(states)
     sim.batch.qvel[2, 0] = np.nan
-    with pytest.raises(
-        SimulationError, match=r"^environments 2 diverged, and MuJoCo has started them anew; reset them to go on$"
-    ):
+    with pytest.raises(SimulationError, match=r"^environments 2 diverged, and MuJoCo has restarted them; reset them to go on$"):
         next(states)
     assert next(states, None) is None
     sim.reset([2])

@@ -118,7 +118,7 @@ class TestPaper(TestSamples):
 
 @pytest.mark.parametrize("other", [1e-3, 3.1e-3])
 def test_another_time_step_is_the_references_too(tmp_path, other):
-    """Matrices are made anew when calls come faster or slower than was compiled for, and again when they do as before."""
+    """Matrices are made again when calls come faster or slower than was compiled for, and again when they do as before."""
     (tmp_path / "scene.xml").write_text(SCENE)
     suite = TestWithoutNoise()
     module, reference = suite.build(suite.document(tmp_path / "scene.xml"), torch.float64)

@@ -34,7 +34,7 @@ def test_amplitude_grows_with_impulse():
 
 @pytest.mark.slow
 def test_a_collision_sounds_the_same_at_any_time_step(dropped):
-    """Contacts of one stiffness that take some 4 to 14 steps: amplitudes within 10 %, impulses likewise."""
+    """Contacts of one stiffness that take some 4 to 14 steps: amplitudes within 10 %, impulses the same."""
     found = []
     for step in (0.0005, 0.001, 0.002):
         sim, touch = dropped(heights=HEIGHTS[3:], step=step, stiffness="-2e5 -4", samples=round(step * 16000))

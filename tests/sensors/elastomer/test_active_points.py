@@ -106,7 +106,7 @@ def test_not_a_number_comes_out_of_its_own_environment():
 @pytest.mark.slow
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_one_graph_serves_all_numbers_of_active_points(num_threads):
-    """Compiled without a break, and not anew when other points are active."""
+    """Compiled without a break, and not again when other points are active."""
     torch.compiler.reset()
     compiled = torch.compile(summed, fullgraph=True, dynamic=True)
     load, markers = given("few", torch.float32)

@@ -1,4 +1,4 @@
-"""Noise that goes on where it stopped, and that starts anew at a reset."""
+"""Noise that goes on where it stopped, and that restarts at a reset."""
 
 import pytest
 import torch

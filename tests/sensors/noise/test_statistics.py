@@ -30,7 +30,7 @@ def test_white_noise_is_white():
 
 
 def test_drift_is_a_random_walk():
-    """Its steps are independent of one another, and of the white noise; a reset starts some anew."""
+    """Its steps are independent of one another, and of the white noise; a reset starts some again."""
     sigma = 1e-3
     noise, white = million({"drift": sigma}), million({"white_noise": 1.0})
     walk, steps, noises = np.zeros((SIDE, SIDE)), [], []

@@ -60,7 +60,7 @@ class Tare:
 
 
 def _tare(hand: driver.XHand1, num_frames: int) -> driver.Tare:
-    """Tare a hand, anew if a reply is lost or damaged on the way; after a few times that is an error."""
+    """Tare a hand, again if a reply is lost or damaged on the way; after a few times that is an error."""
     from tgdsl.runtime.xhand1.wire.errors import HandChecksumError, HandTimeoutError, StaleReadingError
 
     for _ in range(_TRIES - 1):

@@ -224,7 +224,7 @@ class Memory(HookedModule):
         self.clock.free()
 
     def reset(self, chosen: Tensor) -> None:
-        """Begin a new episode in the environments of a mask; what noise and history remember starts anew by its age."""
+        """Begin a new episode in the environments of a mask; what noise and history remember restarts by its age."""
         for path, planned in self._planned.items():
             if "/" not in path.partition(":")[2] and not path.startswith(WINDOW):
                 buffer = self.get_buffer(path)

@@ -96,7 +96,7 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         if isinstance(seed, Sequence):
             raise TgdslError(f"seed is {seed!r}: expected one whole number for all environments, which makes those of each")
         if options:
-            raise TgdslError(f"reset has no options, found {', '.join(map(repr, options))}: all environments begin anew")
+            raise TgdslError(f"reset has no options, found {', '.join(map(repr, options))}: all environments begin again")
         chosen = None if seed is None else index(seed)
         super().reset(seed=chosen)
         return self._obs(self.touch_env.reset(chosen)), {}

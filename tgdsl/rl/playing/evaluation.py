@@ -91,7 +91,7 @@ def evaluate_each(
     Each environment's first episodes count, as many of each, so that short ones do not count more often than long ones.
 
     Args:
-        env: The environments; they begin anew.
+        env: The environments; they begin again.
         actor: Who acts.
         blocks: How many blocks they are: as many environments each, one block after the other.
         episodes: How many episodes count of each block.

@@ -122,7 +122,7 @@ class Distiller:
         self._clock.split()
 
     def learn(self) -> None:
-        """Learn from the rollout; likewise."""
+        """Learn from the rollout; the same."""
         self._losses.zero_()
         if self._spec.aggregate > 1:
             self._gathered.append([value.clone() for value in self._of_rollout()])
@@ -147,7 +147,7 @@ class Distiller:
         """Go on from what was saved.
 
         Raises:
-            RuntimeError: If networks are of other sizes; likewise ValueError and KeyError.
+            RuntimeError: If networks are of other sizes; also ValueError and KeyError.
         """
         for own, saved in zip(self.rollouts, state["stacks"], strict=True):
             own.stack.load_state_dict(saved)

@@ -56,7 +56,7 @@ class StudentNetworksSpec(SpecModel):
     touch_kind: Literal["mlp", "lstm", "cnn", "convrnn"] = "mlp"
     """Kind of the network that embeds touch; of types that have no images, `mlp` in place of `cnn`, `lstm` of `convrnn`."""
     touch_encoder: TouchEncoderSpec = TouchEncoderSpec()
-    """Its widths, likewise."""
+    """Its widths, in the same way."""
     convolution: ConvolutionSpec = ConvolutionSpec()
     """The networks of images."""
     hidden: Widths = WIDTHS
@@ -81,7 +81,7 @@ class DistillSpec(SpecModel):
     aggregate: Whole = 1
     """Rollouts that updates learn from, the latest and those before it: a first pass goes through the latest one, each other
     one through one of them at random, as DAgger's set is of all that was seen; 1: the latest alone. A run that goes on begins
-    to gather them anew."""
+    to gather them again."""
     learning_rate: Positive = 1e-4
     """Learning rate, at the start where it falls."""
     final_learning_rate: Positive | None = None

@@ -31,7 +31,7 @@ class Stack:
         size: How many there are.
         memory: How many numbers each remembers of an episode.
         parameters: Their weights by name, (student, …).
-        buffers: Means and variances by which they normalise what they see, likewise: copies of `moments`.
+        buffers: Means and variances by which they normalise what they see, in the same way: copies of `moments`.
         moments: Means and variances of what they have seen, (student, feature), in float64: after many rows a change is lost in
             float32.
         seen: How many rows each has seen.

@@ -53,7 +53,7 @@ class Teacher:
             raise PolicyError(f"{file}: this teacher feels with other taxels: resolution {found}, here {wanted}")
         if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
             what = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
-            raise PolicyError(f"{file}: {what}; learn it anew, or take distill.loss=mse")
+            raise PolicyError(f"{file}: {what}; learn it again, or take distill.loss=mse")
         self.changes = changes_since(card, loaded.spec, OF_TOUCH)
         self._loaded = loaded
 

@@ -128,7 +128,7 @@ class InPalmRotateSpec(TaskSpec):
     free_speed: Annotated[float, Quantity("speed", gt=0.0)] = 0.2
     """v_free: a slower object costs nothing [m/s]."""
     free_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
-    """ω_free: likewise of its angular velocity, about whatever axis [rad/s]."""
+    """ω_free: the same of its angular velocity, about whatever axis [rad/s]."""
 
 
 def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:

@@ -111,7 +111,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
 
 def _no_checkpoint(file: Path, found: str) -> CheckpointError:
     """Return the error of a file from which no run can go on."""
-    hint = "put back a copy of one, or begin anew with another --out"
+    hint = "put back a copy of one, or begin again with another --out"
     return CheckpointError(f"{file}: found {found}, expected a checkpoint of `tgdsl train` or `tgdsl distill`; {hint}")
 
 

@@ -35,7 +35,7 @@ class Captured(Generic[T]):
         self.forget()
 
     def forget(self) -> None:
-        """Capture anew: tensors lie elsewhere."""
+        """Capture again: tensors lie elsewhere."""
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._made: T | None = None

@@ -44,7 +44,7 @@ class EpisodeTally:
         self._sums += kept
 
     def taken(self) -> Tensor:
-        """Return the sums over all processes, the number of episodes first, and begin anew; the host does not wait."""
+        """Return the sums over all processes, the number of episodes first, and begin again; the host does not wait."""
         assert self._sums is not None
         made = self._sums.clone()
         summed(made)

@@ -91,7 +91,7 @@ class Learner:
         self._clock.split()
 
     def learn(self) -> None:
-        """Learn from the rollout; likewise."""
+        """Learn from the rollout; the same."""
         self.algorithm.compute_returns(self._obs)
         self.algorithm.update()
         self.iteration += 1
@@ -114,10 +114,10 @@ class Learner:
         return {"algorithm": algorithm.save(), "rnd_steps": algorithm.rnd.update_counter if algorithm.rnd else 0}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved; it may hold more than `state_dict` returned. RND that was off until then begins anew.
+        """Go on from what was saved; it may hold more than `state_dict` returned. RND that was off until then begins again.
 
         Raises:
-            RuntimeError: If networks are of other sizes; likewise ValueError and KeyError.
+            RuntimeError: If networks are of other sizes; also ValueError and KeyError.
         """
         saved, has_rnd = dict(state["algorithm"]), "rnd_state_dict" in state["algorithm"]
         self.algorithm.load(saved, dict.fromkeys(("actor", "critic", "optimizer", "iteration"), True) | {"rnd": has_rnd}, True)

@@ -177,7 +177,7 @@ class CapturedPPO(PPO):
         return {name: self.losses[i] for i, name in enumerate(LOSSES) if name != "rnd" or self.rnd is not None}
 
     def load(self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool) -> bool:
-        """Take over what was saved: see rsl_rl; what was captured is captured anew."""
+        """Take over what was saved: see rsl_rl; what was captured is captured again."""
         is_loaded = super().load(loaded_dict, load_cfg, strict)
         own = [self.optimizer, *([self.rnd.optimizer] if self.rnd else [])]
         for group in (group for optimizer in own for group in optimizer.param_groups):

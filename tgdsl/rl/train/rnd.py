@@ -27,7 +27,7 @@ class Distillation(RandomNetworkDistillation):
         Args:
             num_envs: Number of environments.
             eps: Of the states' normalisation: see `Normalisation`.
-            clip: Likewise.
+            clip: The same.
             options: Those of rsl_rl.
         """
         super().__init__(**options)

@@ -99,7 +99,7 @@ class Run:
 
         Raises:
             DivergedError: If something of it is no finite number; the checkpoint that is there stays.
-            FileError: If it cannot be written; likewise.
+            FileError: If it cannot be written; the same.
         """
         learner = self._learner
         state = state_of(learner, self.seconds)
@@ -125,7 +125,7 @@ class Run:
 
         Raises:
             DivergedError: If losses or state are no numbers any more; the last checkpoint is from before.
-            FileError: If something cannot be written; likewise.
+            FileError: If something cannot be written; the same.
         """
         try:
             with StopRequest() as request:

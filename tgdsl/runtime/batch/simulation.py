@@ -278,10 +278,10 @@ class BatchSimulation(Simulation):
                 artefact's scene. Its objects are the same in all environments.
             options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
             watch: What `watched` returns.
-            on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
-                them anew, in the simulator and in the module, counts them in `fault_counts` and warns once; "note" leaves it to
-                whoever looks at `faults` and resets them. So do environments with controls that are not finite, which "raise"
-                refuses.
+            on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset. "reset" restarts
+                them, in the simulator and in the module, counts them in `fault_counts` and warns once. "note" leaves it to
+                whoever looks at `faults` and resets them. The same holds for environments with controls that are not finite,
+                which "raise" refuses.
             prepare: Changes the artefact's scene before it is compiled; bodies and contact sensors must stay.
 
         Raises:
@@ -414,7 +414,7 @@ class BatchSimulation(Simulation):
         if not is_faulty.any():
             return
         if self._faults.on_fault == "raise":
-            raise SimulationError("; ".join(self._faults.messages(diverged=", and MuJoCo has started them anew")))
+            raise SimulationError("; ".join(self._faults.messages(diverged=", and MuJoCo has restarted them")))
         if self._faults.on_fault == "reset":
             self._begin_episodes(is_faulty, Rows({}))
             self._faults.note_restarted(is_faulty)

@@ -1,4 +1,4 @@
-"""What goes wrong in single environments, and what is done about it: they wait for a reset, or are started anew.
+"""What goes wrong in single environments, and what is done about it: they wait for a reset, or are restarted.
 
 Shapes: `env` environments, `kind` kinds of faults.
 """
@@ -15,7 +15,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean, listed
 
 OnFault = Literal["raise", "reset", "note"]
-"""What becomes of environments with a fault: "raise" has a step raise until they are reset, "reset" starts them anew, "note"
+"""What becomes of environments with a fault: "raise" has a step raise until they are reset, "reset" restarts them, "note"
 leaves that to whoever looks at `mask`."""
 DIVERGED, BAD_CONTROL, BAD_VALUES, NO_ROOM = range(4)
 _MESSAGES = (
@@ -33,7 +33,7 @@ _COUNTS = (
 
 
 class EnvFaults:
-    """The faults of each environment, on the device, from when they are noted until the environment is started anew.
+    """The faults of each environment, on the device, from when they are noted until the environment is restarted.
 
     Attributes:
         on_fault: What becomes of environments with a fault.
@@ -69,12 +69,12 @@ class EnvFaults:
 
     @property
     def restarted(self) -> Bool[Tensor, " env"]:
-        """Environments that the last step has started anew."""
+        """Environments that the last step has restarted."""
         return self._restarted
 
     @property
     def mask(self) -> Bool[Tensor, " env"]:
-        """Environments that wait for a reset, or that the last step started anew."""
+        """Environments that wait for a reset, or that the last step restarted."""
         return self._held.any(dim=0) | self._restarted
 
     def note(self, kind: int, where: Bool[Tensor, " env"] | Bool[Tensor, ""]) -> None:
@@ -82,7 +82,7 @@ class EnvFaults:
         self._held[kind] |= where
 
     def begin_step(self) -> None:
-        """Forget which environments the last step has started anew."""
+        """Forget which environments the last step has restarted."""
         if self.on_fault == "reset":
             self._restarted.zero_()
 
@@ -95,13 +95,13 @@ class EnvFaults:
         return self._held.any(dim=0)
 
     def clear(self, where: Bool[Tensor, " env"]) -> None:
-        """Forget the faults of environments that are started anew."""
+        """Forget the faults of environments that are restarted."""
         self._held &= ~where
         self._is_counted &= ~where
         self._restarted &= ~where
 
     def note_restarted(self, where: Bool[Tensor, " env"]) -> None:
-        """Note environments that a step has started anew."""
+        """Note environments that a step has restarted."""
         self._restarted |= where
 
     def messages(self, diverged: str = "") -> list[str]:
@@ -118,7 +118,7 @@ class EnvFaults:
         return results
 
     def warn_once(self, totals: list[int] | None = None) -> None:
-        """Warn of the first environments that were started anew.
+        """Warn of the first environments that were restarted.
 
         Args:
             totals: Number of faults of each kind; default: those counted, for which a GPU is waited for.
@@ -128,5 +128,5 @@ class EnvFaults:
             return
         self._has_warned = True
         kinds = ", ".join(text.format(num=num) for text, num in zip(_COUNTS, found, strict=True) if num)
-        what = "had faults" if self.on_fault == "note" else "had faults and were started anew"
+        what = "had faults" if self.on_fault == "note" else "had faults and were restarted"
         warnings.warn(f"environments {what}: {kinds}; this is said once, `fault_counts` counts on", stacklevel=4)

@@ -124,7 +124,7 @@ class SubstepStates:
             self._restarted = chosen.clone() if self._restarted is None else self._restarted | chosen
 
     def stepped(self, restarted: Bool[Tensor, " env"]) -> None:
-        """Note that a captured step has written the states anew, and which environments it has started anew.
+        """Note that a captured step has written the states again, and which environments it has restarted.
 
         A replayed graph runs no Python: neither `begin` nor `restart`.
         """
@@ -258,7 +258,7 @@ class Simulation(ABC):
     def faults(self) -> Bool[Tensor, " env"]:
         """Environments that have diverged, or whose controls or given state were not finite.
 
-        With `on_fault="reset"` those that the last step has started anew; else those that wait for a reset.
+        With `on_fault="reset"` those that the last step has restarted; else those that wait for a reset.
         """
         return self._faults.mask
 
@@ -304,7 +304,7 @@ class Simulation(ABC):
 
         For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
         simulator is where `step` would have left it once all are taken; who stops earlier has made fewer physics steps. With
-        `on_fault="reset"` environments start anew after the physics step of their fault, and make the others from there.
+        `on_fault="reset"` environments restart after the physics step of their fault, and make the others from there.
 
         Args:
             control: Actuator controls, as for `step`; they are set when the first state is asked for.
@@ -441,7 +441,7 @@ class Simulation(ABC):
         temperatures: Mapping[str, Values] | None = None,
         materials: Mapping[str, Values] | None = None,
     ) -> None:
-        """Say what objects are like in some environments (default: all), and start these anew; resets leave it as it is.
+        """Say what objects are like in some environments (default: all), and restart these; resets leave it as it is.
 
         At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
         the XHand1's palm, 10 ms; on the CPU each is kept and takes 3 MB.

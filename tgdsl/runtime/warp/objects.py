@@ -79,7 +79,7 @@ class WorldObjects:
         self._chosen.choose(ids, variants, sizes)
 
     def write_to(self, worlds: Worlds) -> None:
-        """Write the fields of environments whose objects were chosen anew, in place; the others keep their masses.
+        """Write the fields of environments whose objects were chosen again, in place; the others keep their masses.
 
         Raises:
             SimulationError: If a field that all environments share would differ.

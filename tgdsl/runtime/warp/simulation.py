@@ -203,7 +203,7 @@ class WarpSimulation(Simulation):
         arrays: Live tensors (env, …) of MuJoCo's arrays, such as `arrays["qpos"]`. In `arrays["sensordata"]` the contact
             sensors that `tgdsl.instrument` adds are zero: their contacts are read elsewhere.
         parameters: Live tensors (env, …) of the model's fields that environments have of their own; what MuJoCo derives from
-            them, such as `body_subtreemass`, is not derived anew.
+            them, such as `body_subtreemass`, is not derived again.
         warp_model: MuJoCo Warp's model.
         warp_data: MuJoCo Warp's data.
     """
@@ -247,7 +247,7 @@ class WarpSimulation(Simulation):
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
             on_fault: What becomes of environments that diverge, are given controls that are not finite, or whose search for
                 contacts of convex shapes runs out of room: "raise" has `step` raise until they are reset; "reset" starts them
-                anew, in the simulator and in the module, counts them in `fault_counts` and warns once; "note" leaves it to
+                again, in the simulator and in the module, counts them in `fault_counts` and warns once; "note" leaves it to
                 whoever looks at `faults` and resets them. On a GPU "reset" is done there, without waiting, and each `state`
                 then evaluates all environments once more. Pools that are too small raise either way.
 
@@ -336,7 +336,7 @@ class WarpSimulation(Simulation):
 
         It is `step(control)` and then `touch(state())`, without gradients, and for the price of one launch. As with any CUDA
         graph, the next call overwrites the readings; `clone` what is to be kept. The first two calls run eagerly, the third
-        captures; the graph is captured anew when the module holds other tensors than before: when it was moved, compiled,
+        captures; the graph is captured again when the module holds other tensors than before: when it was moved, compiled,
         freed, or given another dt.
 
         Args:
@@ -402,7 +402,7 @@ class WarpSimulation(Simulation):
             raise SimulationError(message)
 
     def recapture(self) -> None:
-        """Capture the CUDA graphs anew: when an array of `warp_model` or `warp_data` was replaced."""
+        """Capture the CUDA graphs again: when an array of `warp_model` or `warp_data` was replaced."""
         for call in (self._step, self._substep, self._step_and_read):
             call.forget()
         self._worlds.forget_graphs()

@@ -157,7 +157,7 @@ class GraphedCall(Generic[T]):
         self.forget()
 
     def forget(self) -> None:
-        """Forget what was captured: it is captured anew."""
+        """Forget what was captured: it is captured again."""
         self._eager_calls = 0
         self._captured: tuple[torch.cuda.CUDAGraph, T] | None = None
 

@@ -136,7 +136,7 @@ class Worlds:
         kept: Those of `qpos`, `qvel` and `ctrl` that the module wants, at the instant of poses and contacts.
         contacts: The contacts that the module wants.
         faults: What has gone wrong.
-        restarted: Environments that the last `step` has started anew.
+        restarted: Environments that the last `step` has restarted.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class Worlds:
         self._move = GraphedCall(stream, self._evaluate_poses)
 
     def step(self, num_steps: int, drive: Callable[[], None] | None = None) -> None:
-        """Advance all environments by some physics steps, and start those anew that shall not wait: for a `GraphedCall`.
+        """Advance all environments by some physics steps, and restart those that shall not wait: for a `GraphedCall`.
 
         Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
         some of them remember earlier steps.
@@ -246,7 +246,7 @@ class Worlds:
         """Take note, on the host, that all environments have been stepped.
 
         Args:
-            is_evaluated: Whether those that were started anew have been evaluated; which these are, only the device knows.
+            is_evaluated: Whether those that were restarted have been evaluated; which these are, only the device knows.
         """
         if not self._stream.is_capturing:
             self._has_stale = False
@@ -254,7 +254,7 @@ class Worlds:
             self._note_stale()
 
     def reset(self, mask: Bool[Tensor, " env"], rows: Rows, finds_contacts: bool = True) -> None:
-        """Start some environments anew, with values.
+        """Restart some environments, with values.
 
         Their poses and contacts are evaluated when they are next asked for; without a look for contacts, their poses at once.
         """
@@ -345,7 +345,7 @@ class Worlds:
             put_rows(kept, is_new, self.arrays[name])
 
     def forget_graphs(self) -> None:
-        """Capture anew at the next calls."""
+        """Capture again at the next calls."""
         for call in (self._reset, self._refresh, self._move):
             call.forget()
 

@@ -184,7 +184,7 @@ class XHand1:
 
     @property
     def num_reconnects(self) -> int:
-        """How often the port went away and was opened anew."""
+        """How often the port went away and was reopened."""
         return self._reader.num_connects
 
     def tare(self, num_frames: int = 20) -> Tare:

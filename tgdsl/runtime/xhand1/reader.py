@@ -62,7 +62,7 @@ class HandReader(threading.Thread):
         ended: Why no more readings will come; None while they may.
         motion: What may move, or None.
         counters: What happened on the line.
-        num_connects: How often the port was opened anew.
+        num_connects: How often the port was reopened.
         left_driven: Why the hand did not confirm, at the end, that it is passive; None if it did or never moved.
     """
 

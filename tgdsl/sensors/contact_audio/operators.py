@@ -152,4 +152,4 @@ def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "2 
     if low.dtype == torch.float64:
         return low + share * (high - low)
     result = torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
-    return result if result.is_cuda else materialised(result)  # on a CPU it is else chosen anew for each environment
+    return result if result.is_cuda else materialised(result)  # on a CPU it is else chosen again for each environment

@@ -54,7 +54,7 @@ def active_points(pos: Vec, strength: Vec) -> Iterator[Row]:
 
     Args:
         pos: z_p, planes (env, link, point) in each link's frame [m].
-        strength: s_p, likewise [m²]. Points of strength 0 may be left out, unless their place is not finite.
+        strength: s_p, in the same way [m²]. Points of strength 0 may be left out, unless their place is not finite.
 
     Yields:
         An empty slot has the strength 0.
@@ -154,7 +154,7 @@ class Markers(NamedTuple):
 
     Attributes:
         pos: Positions [m], planes (taxel,).
-        normal: Normals, likewise.
+        normal: Normals, in the same way.
         falloff: λ_s [1/m²].
         reference_area: A_ref [m²], or None: points count once.
         flat: First taxels of the links whose markers have one normal.
@@ -330,7 +330,7 @@ def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 
 
 def _along(tangent: Vec, point: Vec) -> Tensor:
-    """Return points along tangents, (env, taxel or 1, point): of one tangent it is kept, not formed anew for each marker."""
+    """Return points along tangents, (env, taxel or 1, point): of one tangent it is kept, not formed again for each marker."""
     result = planes.dot(tangent, point)
     return materialised(result) if tangent[0].shape[0] == 1 else result
 

@@ -61,12 +61,12 @@ def launch(
     Args:
         run: The kernel.
         pos: z_p, three planes in each link's frame [m].
-        strength: s_p, likewise [m²]; all six lie in memory alike.
+        strength: s_p, in the same way [m²]; all six lie in memory alike.
         count: Number of active points of each link; they come first. None: inactive ones have strength 0.
         tiles: What `points.point_tiles` returns; markers of no link read 0.
         block: `points.tile_size`.
         marker: x_j, three planes [m].
-        normal: Unit normals n_j, likewise.
+        normal: Unit normals n_j, in the same way.
         falloff: λ [1/m²].
     """
     num_envs, num_links, num_points = pos[0].shape

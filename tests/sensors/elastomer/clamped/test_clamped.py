@@ -1,7 +1,7 @@
 """A clamped pad from the document to the reading, against two solutions of the membrane's equation by other ways.
 
 The one takes the pad's own mesh: energies of its elements by quadrature, one dense matrix, the rows of the edge removed, and
-solved anew for each displacement of the edge; so readings agree to rounding. The other knows no mesh: on a rectangle it sets
+solved again for each displacement of the edge; so readings agree to rounding. The other knows no mesh: on a rectangle it sets
 the equation itself at Chebyshev points (Trefethen, *Spectral Methods in MATLAB*, 2000, chapter 7), and readings agree within
 the error that `boundary.element_size` allows, 1e-3 of the largest displacement of the edge.
 """

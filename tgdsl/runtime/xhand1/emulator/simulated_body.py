@@ -103,7 +103,7 @@ class SimulatedBody:
             self._feel()
 
     def reset(self) -> None:
-        """Start the scene anew."""
+        """Restart the scene."""
         with self._lock:
             self._scene.reset()
             self._time = 0.0

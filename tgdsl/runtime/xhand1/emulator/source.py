@@ -92,7 +92,7 @@ class EmulatedSource(XHand1Source):
             warnings.warn(f"{what}; see the calibration's scale and rotation", stacklevel=2)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Make the hand passive, then start the scene anew.
+        """Make the hand passive, then restart the scene.
 
         Raises:
             SimulationError: If the simulation ended, as it diverged.

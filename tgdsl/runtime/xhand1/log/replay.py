@@ -35,8 +35,8 @@ class ReplaySource:
     """A log that steps like `XHand1Source`, as one environment.
 
     With a control step, a step delivers what the live source would have had: the newest reading that had arrived when the step
-    was over, or the first one within 80 ms after; else the failure of that time is raised anew. Without one, each step delivers
-    the next reading or failure of the log, so that a log made of a source's own readings gives the very samples again.
+    was over, or the first one within 80 ms after; else the failure of that time is raised again. Without one, each step
+    delivers the next reading or failure of the log, so that a log made of a source's own readings gives the very samples again.
 
     Attributes:
         log: The log.
@@ -142,7 +142,7 @@ class ReplaySource:
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Forget the speeds, count steps from now, and deliver the first reading that was asked for from then on.
 
-        As with the live hand, time goes on; `rewind` starts the log anew.
+        As with the live hand, time goes on; `rewind` restarts the log.
 
         Args:
             env_ids: Indices, or a boolean mask over environments, of which there is one; default: it.
@@ -163,7 +163,7 @@ class ReplaySource:
         self._await(coming, max(now, float(self.log.received_at[coming - 1])) + READ_TIMEOUT_S)
 
     def rewind(self) -> None:
-        """Start anew with the log's first reading."""
+        """Restart with the log's first reading."""
         self._velocity.reset()
         self.num_late_steps = 0
         self._readings: Iterator[Reading] = self.log.readings()

@@ -106,7 +106,7 @@ class SerialClient:
             port: The port.
             addresses: The hand's; None accepts replies from and to any address but those of the host's own requests.
             timing: Times of the line.
-            counters: Where to count; default: anew.
+            counters: Where to count; default: new counters.
             clock: Seconds that only go forward.
         """
         self.port = port

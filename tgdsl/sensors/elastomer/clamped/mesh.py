@@ -1,4 +1,4 @@
-"""Meshing a region of the plane anew: triangles that are fine along the edge, where a clamped field varies, and coarser inside.
+"""Remeshing a region of the plane: triangles that are fine along the edge, where a clamped field varies, and coarser inside.
 
 The edge is thinned to the vertices that give it its shape and cut into pieces no longer than the element size; inside stand the
 points of nested triangular lattices, of which those with spacing 2^k sizes are used where the edge is at least 2^k / `GRADE`

@@ -1,6 +1,6 @@
 """An elastomer pad laid flat: where its edge is, where its taxels are, and triangles between them.
 
-The surface that was declared as the pad is unrolled to the plane and meshed anew with quadratic triangles. Fields on the plane
+The surface that was declared as the pad is unrolled to the plane and remeshed with quadratic triangles. Fields on the plane
 are along two axes, whose directions at each taxel and at each point of the edge tie them to the body frame: parallel on a flat
 pad, along and across the arc on a cylinder.
 
