@@ -25,7 +25,7 @@ def meet(pairs, pair, points, links, g):
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_kernels_way_is_the_definition(monkeypatch, case):
-    monkeypatch.setitem(sys.modules, "tgdsl.quantities.points_kernel", SimpleNamespace(meet=meet))
+    monkeypatch.setitem(sys.modules, "tgdsl.quantities.depth_kernel", SimpleNamespace(meet=meet))
     own = made(case, torch.float64)
     found, expected = LINK_POINTS.kernel(own), link_points(own)
     for name in ("pos", "distance", "gradient", "area"):

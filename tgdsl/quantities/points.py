@@ -123,7 +123,7 @@ def tile_size(taxels: Sequence[tuple[int, int]]) -> int:
 
 def _by_kernel(own: ObjectPoints) -> LinkPoints:
     """One geom of the links after the other."""
-    from tgdsl.quantities.points_kernel import meet
+    from tgdsl.quantities.depth_kernel import meet
 
     pairs, source = own
     results = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracles.setups.sounds import MODES, STEP, amplitudes, half_sine, plate, pressed, sound
 from scipy.signal import lsim
 
 import tgdsl
-from tgdsl.report.oracles.setups.sounds import MODES, STEP, amplitudes, half_sine, plate, pressed, sound
 from tgdsl.runtime.batch.simulation import BatchSimulation
 
 FORCE = {"model": "force", "scrape": 0}

@@ -55,7 +55,7 @@ def nothing_held(meeting):
 
 def by_kernel(meeting, stick_slip, state):
     """Return the active points, and change the state in place, as `shear_loads` has the kernel do on a GPU."""
-    from tgdsl.quantities.points_kernel import grid_tables
+    from tgdsl.quantities.depth_kernel import grid_tables
     from tgdsl.sensors.elastomer.anchor_kernel import anchor_kernel, launch
 
     (rotation, offset, _, gate), source = meeting

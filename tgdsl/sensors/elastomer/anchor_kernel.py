@@ -23,7 +23,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.shapes_kernel import chosen, dot
-from tgdsl.quantities.points_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
+from tgdsl.quantities.depth_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
 LANES, CHUNK = 32, 512
 """Threads of a program, which is one warp, and most points of a chunk."""

@@ -197,7 +197,7 @@ def shear_loads(
 def _shear_loads_by_kernel(
     objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
 ) -> tuple[list[ShearLoad], dict[str, Tensor]]:
-    from tgdsl.quantities.points_kernel import grid_tables
+    from tgdsl.quantities.depth_kernel import grid_tables
     from tgdsl.sensors.elastomer.anchor_kernel import advance_anchors
 
     loads, first = [], 0
