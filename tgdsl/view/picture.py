@@ -178,7 +178,7 @@ def _draw_maps(
         axes.set_title(f"{names[link]}\n{markers.summary(chosen)}", fontsize=size, color=INK, linespacing=1.35, pad=17)
         axes.annotate(mark, (0.5, 1.0), (0, 3), "axes fraction", "offset points", fontsize=size - 1, color=FAINT, ha="center")
     if markers.is_read.any():
-        draw_colour_bar(figure.add_axes((0.645, 0.06, 0.295, 0.016)), norm, HEAT, markers.colour_label, 10)
+        draw_colour_bar(figure.add_axes((0.645, 0.06, 0.295, 0.016)), norm, HEAT, markers.colour_label, 10.0)
     else:
         figure.text(0.7925, 0.083, f"{markers.quantity}: nothing is touched", size=10.5, color=FAINT, ha="center", va="center")
 
