@@ -50,7 +50,10 @@ class Setup:
         control_step: Duration of a control step Δt [s].
         model: The compiled scene.
         joints: Where each joint stands in `qpos` and `qvel`.
-        actuators: The joints that the policy moves, with their limits [rad].
+        actuators: The joints that the policy moves.
+        low: Lower ends of these joints' ranges [rad].
+        high: Upper ends [rad].
+        max_torque: Largest torques of their drives [N·m]; infinite where there is no limit.
         object: Body of the task's object.
         links: Bodies of the rows of `Now.link_force`.
         qpos: Where episodes start, before anything is random: the keyframe.
@@ -72,6 +75,9 @@ class Setup:
     model: mujoco.MjModel
     joints: Joints
     actuators: Actuators
+    low: Float[Tensor, " joint"]
+    high: Float[Tensor, " joint"]
+    max_torque: Float[Tensor, " joint"]
     object: str
     links: tuple[str, ...]
     qpos: Float[Tensor, " nq"]

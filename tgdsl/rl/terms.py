@@ -45,9 +45,9 @@ def action_rate(now: Now) -> Float[Tensor, " env"]:
     return (now.action - now.last_action).square().sum(dim=1)
 
 
-def joint_limit(now: Now, low: Float[Tensor, " joint"], high: Float[Tensor, " joint"]) -> Float[Tensor, " env"]:
+def joint_limit(now: Now, setup: Setup) -> Float[Tensor, " env"]:
     """Return how far joints are beyond the middle `FREE_SHARE` of their ranges, summed [rad]."""
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    middle, half = 0.5 * (setup.low + setup.high), 0.5 * (setup.high - setup.low)
     return ((now.joint_pos - middle).abs() - FREE_SHARE * half).clamp(min=0.0).sum(dim=1)
 
 
@@ -66,9 +66,9 @@ def near(now: Now, width: float) -> Float[Tensor, " env"]:
     return torch.exp(-now.distance.clamp(min=0.0) / width).mean(dim=1)
 
 
-def effort(now: Now, limit: Float[Tensor, " joint"]) -> Float[Tensor, " env"]:
+def effort(now: Now, setup: Setup) -> Float[Tensor, " env"]:
     """Return the squares of the torques as shares of the largest ones, summed; a drive without a limit makes none."""
-    return (now.torque / limit).square().sum(dim=1)
+    return (now.torque / setup.max_torque).square().sum(dim=1)
 
 
 def object_speed(now: Now, free_speed: float, free_spin: float) -> Float[Tensor, " env"]:
@@ -134,8 +134,7 @@ class JointLimit(RewardTerm):
     """How far joints are beyond the middle 95 % of their ranges, summed [rad]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        own = setup.actuators
-        return joint_limit(now, *(torch.from_numpy(end).to(now.joint_pos) for end in (own.low, own.high)))
+        return joint_limit(now, setup)
 
 
 class Work(RewardTerm):
@@ -149,7 +148,7 @@ class Effort(RewardTerm):
     """Squares of the torques as shares of the largest ones, summed [1/s]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return effort(now, torch.from_numpy(setup.actuators.limit).to(now.joint_pos))
+        return effort(now, setup)
 
 
 class ContactForce(RewardTerm):

@@ -110,7 +110,7 @@ def test_the_document_as_it_is_equals_the_reference():
 def test_a_joint_at_the_end_of_its_range_costs(env):
     """0.05 rad beyond the middle 95 % of a range."""
     env.reset(0)
-    now, (low, high) = env.now, (env.task.low, env.task.high)
+    now, (low, high) = env.now, (env.task.setup.low, env.task.setup.high)
     pos = now.joint_pos.clone()
     pos[:, 3] = 0.5 * (low[3] + high[3]) + 0.95 * 0.5 * (high[3] - low[3]) + 0.05
     terms = env.task.reward(replace(now, joint_pos=pos), torch.zeros(NUM, dtype=torch.bool))

@@ -67,7 +67,8 @@ def test_torques_and_speeds_cost():
             linvel=torch.tensor([[0.0, 0.4, 0.0], [0.1, 0, 0]]), angvel=torch.tensor([[0, 0, 3.0], [1, 0, 0]])
         ),
     )
-    assert terms.effort(now, torch.tensor([1.0, 0.4, torch.inf])).tolist() == pytest.approx([1.25])
+    setup = SimpleNamespace(max_torque=torch.tensor([1.0, 0.4, torch.inf]))
+    assert terms.effort(now, setup).tolist() == pytest.approx([1.25])
     assert terms.object_speed(now, 0.2, 2.0).tolist() == pytest.approx([1.5, 0.0])
 
 

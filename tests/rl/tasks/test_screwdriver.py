@@ -208,7 +208,7 @@ def test_a_joint_at_the_end_of_its_range_and_a_hand_elsewhere_cost(env):
     env.reset(0)
     now, task = env.now, env.task
     pos = now.joint_pos.clone()
-    pos[:, 0] = task.low[0] + 0.5 * (task.high[0] - task.low[0]) * 1.95 + 0.02
+    pos[:, 0] = task.setup.low[0] + 0.5 * (task.setup.high[0] - task.setup.low[0]) * 1.95 + 0.02
     terms = task.reward(replace(now, joint_pos=pos), torch.zeros(4, dtype=torch.bool))
     assert terms["joint_limit"].tolist() == pytest.approx([-40 * 0.02] * 4)
     away = (pos[:, 0] - now.joint_pos[:, 0]).square()

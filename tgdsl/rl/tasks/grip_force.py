@@ -194,8 +194,6 @@ class GripForce(Task[GripForceSpec]):
             LowerError: If there is no such keyframe, or not one for each variant, or commands change within a control step.
         """
         super().__init__(spec, setup)
-        limits = (setup.actuators.low, setup.actuators.high)
-        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
         self.qpos, self.ctrl = (_keyframes(spec, setup, name)[setup.variant] for name in ("qpos", "ctrl"))
         self.item, own = object_qpos(setup), setup.actuators
         self.moved = torch.from_numpy(own.actuator).to(setup.device, torch.int64)
@@ -253,7 +251,7 @@ class GripForce(Task[GripForceSpec]):
             "drop": weights.drop * self._is_dropped(now),
             "crush": weights.crush * self._is_crushed(now),
             "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
             "work": weights.work * terms.work(now),
         }
 

@@ -224,8 +224,6 @@ class InHandRepose(Task[InHandReposeSpec]):
         super().__init__(spec, setup)
         self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.step = torch.full((setup.num_envs,), spec.goal_step, dtype=setup.dtype, device=setup.device)
-        limits = (setup.actuators.low, setup.actuators.high)
-        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
         self.most_steps = round(spec.goal_timeout / setup.control_step)
         self.start_pos, self.goal = self.keep("start_pos", 3), self.keep("goal", 4)
         self.error, self.rate = self.keep("error"), self.keep("rate")  # φ of the last step's goal, and how fast it got smaller
@@ -280,7 +278,7 @@ class InHandRepose(Task[InHandReposeSpec]):
             "drop": weights.drop * self._is_dropped(now),
             "goal_timeout": weights.goal_timeout * self.is_late,
             "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
             "work": weights.work * terms.work(now),
         }
 

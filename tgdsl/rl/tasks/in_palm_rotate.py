@@ -201,10 +201,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         """Begin with all objects where the keyframe has them."""
         super().__init__(spec, setup)
         self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
-        self.holding, own = Holding(spec.hold, setup), setup.actuators
-        self.low, self.high, self.limit = (
-            torch.from_numpy(end).to(setup.device, setup.dtype) for end in (own.low, own.high, own.limit)
-        )
+        self.holding = Holding(spec.hold, setup)
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
         self.quat = self.keep("quat", 4)
         self.angle, self.rate, self.tilt = self.keep("angle"), self.keep("rate"), self.keep("tilt")
@@ -260,9 +257,9 @@ class InPalmRotate(Task[InPalmRotateSpec]):
             "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
             "drop": weights.drop * (distance > spec.drop_distance),
             "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
             "work": weights.work * terms.work(now),
-            "effort": weights.effort * terms.effort(now, self.limit),
+            "effort": weights.effort * terms.effort(now, self.setup),
             "object_speed": weights.object_speed * terms.object_speed(now, spec.free_speed, spec.free_spin),
         }
 

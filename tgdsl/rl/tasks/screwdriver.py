@@ -231,10 +231,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
             raise SimulationError("this task begins with grasps, and there are none")
         self.grasps = setup.grasps
         self.axis = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
-        self.holding, own = Holding(spec.hold, setup), setup.actuators
-        self.low, self.high, self.limit = (
-            torch.from_numpy(end).to(setup.device, setup.dtype) for end in (own.low, own.high, own.limit)
-        )
+        self.holding = Holding(spec.hold, setup)
         self.joints = torch.from_numpy(setup.actuators.qpos).to(setup.device, torch.int64)
         self.upright_pos, self.upright_tip = (own.to(setup.device, setup.dtype) for own in _upright(setup, spec.tip))
         self.quat, self.start_joints = self.keep("quat", 4), self.keep("start_joints", len(setup.actuators.names))
@@ -279,10 +276,10 @@ class Screwdriver(Task[ScrewdriverSpec]):
             "hand_pose": weights.hand_pose * (now.joint_pos - self.start_joints).square().sum(dim=1),
             "drop": weights.drop * is_over,
             "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
             "work": weights.work * terms.work(now),
             "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
-            "effort": weights.effort * terms.effort(now, self.limit),
+            "effort": weights.effort * terms.effort(now, self.setup),
         }
 
     def step_progress(self) -> Float[Tensor, " env"]:
