@@ -126,6 +126,7 @@ def test_terms_bring_the_sensors_that_they_look_at(folder):
         ("{a: {term: 'own.py:Hight', weight: 1}}", 8, "terms.a.term", 'did you mean "Height"?'),
         ("{a: {term: 'nowhere.py:A', weight: 1}}", 8, "terms.a.term", "there is no such file"),
         ("{a: {term: 'pathlib:Path'}}", 8, "terms.a.term", "no subclass of tgdsl.rl.terms.Term"),
+        ("{proprio: {term: object_state}}", 8, "terms.proprio", "give the term another name"),
         ("{a: 3}", 8, "terms.a", "expected a mapping"),
     ],
 )
@@ -145,3 +146,10 @@ def test_values_are_set_by_dotted_path(folder):
 def test_a_term_of_the_wrong_shape_is_named(folder):
     with pytest.raises(SimulationError, match=r'the term "odd" returns shape \(4, 2\), expected a tensor \(4,\)'):
         tiny_env(folder, more='terms: {odd: {term: "own.py:Wrong", weight: 1}}\n').step(torch.zeros(4, 2))
+
+
+def test_a_term_does_not_replace_one_of_the_tasks_own(folder):
+    with pytest.raises(SimulationError, match='has a term "nothing" already'):
+        tiny_env(folder, task="own.py:Idle", more="terms: {nothing: {term: work, weight: 1}}\n").step(torch.zeros(4, 2))
+    with pytest.raises(SimulationError, match='group "goal"'):
+        tiny_env(folder, more="terms: {goal: {term: object_state}}\n")

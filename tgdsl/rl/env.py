@@ -376,6 +376,10 @@ class TouchEnv:
         rates = self.task.rates(now, terminated)
         for name, term in self.loaded.terms.items():
             if isinstance(term, RewardTerm):
+                if name in rates:
+                    raise SimulationError(
+                        f"the task's `reward` has a term \"{name}\" already: give the document's another name"
+                    )
                 rates[name] = self._checked(name, term.weight * term.rate(now, self.task.setup), terminated)
             elif isinstance(term, TerminationTerm):
                 terminated = terminated | self._checked(name, term.is_over(now, self.task.setup), terminated)

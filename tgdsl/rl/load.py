@@ -15,13 +15,15 @@ from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
-from tgdsl.rl.terms import TERMS, RewardTerm, Term
+from tgdsl.rl.terms import TERMS, ObservationTerm, RewardTerm, Term
 from tgdsl.schema.load import read_source
 from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Path as Place
 from tgdsl.schema.yaml import Source, from_mapping
 
 C = TypeVar("C")
+SHARED_GROUPS = ("proprio", "tactile_sensors", "priv_proprio")
+"""Groups of observations that all tasks have."""
 REQUIRED = ("tgdsl", "task", "document", "object", "joints")
 
 
@@ -99,6 +101,10 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
         term = validate(source, place, class_, problems, ())
         if isinstance(term, RewardTerm) and hasattr(getattr(spec, "rewards", None), name):
             problems.append(source.problem(place, f'the task has a term "{name}"', f"set `rewards.{name}`", on_key=True))
+        elif isinstance(term, ObservationTerm) and name in SHARED_GROUPS:
+            problems.append(
+                source.problem(place, f'all tasks have a group "{name}"', "give the term another name", on_key=True)
+            )
         elif isinstance(term, Term):
             terms[name] = term
     return terms
