@@ -7,8 +7,8 @@
 A change is a sign, an operator, a comparison, a number, an index, a swapped name or a dropped statement. Each runs in a fork of
 a process that has the libraries imported, with the changed module in place of the real one; the files stay as they are. The
 tests that reach the changed line are known from one run of `make test` under coverage, which is kept in `build/mutate` and
-made again with `--refresh`. A change is killed when a test fails or hangs. What survives `--limit` seconds of tests, near and
-short ones first, is given ten times as many.
+made again with `--refresh`; tests that fail then are left out. A change is killed when a test fails or hangs. What survives
+`--limit` seconds of tests, near and short ones first, is given ten times as many.
 
 A survivor means one of three things: a test is missing, the code has no effect and can go, or the change is equivalent.
 """
@@ -28,7 +28,7 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.abc import MetaPathFinder
@@ -223,22 +223,24 @@ class Reached:
 
         self._data = CoverageData(str(RECORDS / "coverage"))
         self._data.read()
-        self._seconds = {
-            (case.get("classname"), case.get("name")): float(case.get("time") or 0)
+        cases = [
+            ((case.get("classname"), case.get("name")), case)
             for case in ElementTree.parse(RECORDS / "times.xml").iter("testcase")
-        }
+        ]
+        self._seconds = {key: float(case.get("time") or 0) for key, case in cases}
+        self._failed = {key for key, case in cases if case.find("failure") is not None or case.find("error") is not None}
         self._lines: dict[Path, dict[int, list[str]]] = {}
-        self._tests = {context.rsplit("|", 1)[0] for context in self._data.measured_contexts() if context}
+        self._tests = self._passing(self._data.measured_contexts())
 
     def tests(self, mutant: Mutant, limit: float) -> list[str]:
         """Return the tests that reach a change, near ones first, then short ones, as many as fit into a time [s]."""
         if mutant.file not in self._lines:
             self._lines[mutant.file] = self._data.contexts_by_lineno(str(mutant.file))
         lines = self._lines[mutant.file]
-        tests = {context.rsplit("|", 1)[0] for context in lines.get(mutant.line, []) if context}
+        tests = self._passing(lines.get(mutant.line, []))
         near = str("tests" / mutant.file.relative_to(REPOSITORY / "tgdsl").parent)
         if not tests:  # a statement of the module, run at import: tests of the folder may only read a table
-            tests = {context.rsplit("|", 1)[0] for contexts in lines.values() for context in contexts if context}
+            tests = self._passing(context for contexts in lines.values() for context in contexts)
             tests |= {test for test in self._tests if test.startswith(f"{near}/")}
         ordered = sorted(tests, key=lambda test: (not test.startswith(near), self._time(test)))
         total, kept = 0.0, []
@@ -249,11 +251,19 @@ class Reached:
             kept.append(test)
         return kept
 
+    def _passing(self, contexts: Iterable[str]) -> set[str]:
+        """Return the tests of coverage's contexts but those that failed without any change."""
+        tests = {context.rsplit("|", 1)[0] for context in contexts if context}
+        return {test for test in tests if _key(test) not in self._failed}
+
     def _time(self, test: str) -> float:
-        path, *names = test.split("::")
-        stem, bracket, parameters = names[-1].partition("[")
-        where = ".".join([path.removesuffix(".py").replace("/", "."), *names[:-1]])
-        return self._seconds.get((where, stem + bracket + parameters), 1.0)
+        return self._seconds.get(_key(test), 1.0)
+
+
+def _key(test: str) -> tuple[str, str]:
+    """Return the class name and name under which pytest's report has a test."""
+    path, *names = test.split("::")
+    return ".".join([path.removesuffix(".py").replace("/", "."), *names[:-1]]), names[-1]
 
 
 # Runs ------------------------------------------------------------------------------------------------------------------------
