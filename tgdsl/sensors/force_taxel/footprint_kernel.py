@@ -36,7 +36,7 @@ TILE = 4
 """Taxels whose forces are written together."""
 FEW_STEPS = 12
 """Steps up to which no exponent β · g can overflow float32, as each makes β longer by √10 at most."""
-UNROLL = tl.constexpr(8)
+UNROLL = tl.constexpr(4)
 """Taxels of a pass that are worked on at a time."""
 BESIDE = tl.constexpr(0.25)
 """How far a contact stands beside the box of the taxels where moments are about that [footprints]."""
