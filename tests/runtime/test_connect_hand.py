@@ -14,7 +14,7 @@ from xhand1_models import JOINTS, document, hand_xml
 import tgdsl
 from tgdsl.errors import HandError, ObservationError
 from tgdsl.module.module import TactileModule
-from tgdsl.runtime.xhand1 import connect as connecting
+from tgdsl.runtime import connect as connecting
 from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator

@@ -19,7 +19,7 @@ from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.geometry.rotations import product, rotated
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.model_ids import site_id
+from tgdsl.runtime.simulators.model_ids import element_id
 
 _BODY_FIELDS = ("body_pos", "body_quat", "body_linvel", "body_angvel")
 _JOINT_FIELDS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
@@ -115,7 +115,7 @@ class WatchReader:
             SimulationError: If the model has no such site, or its body no name, or the module does not read a pair.
         """
         self._watch = watch
-        sites = np.array([site_id(model, name) for name in watch.sites], dtype=np.int64)
+        sites = np.array([element_id(model, "site", name) for name in watch.sites], dtype=np.int64)
         of_sites = [_carrier(model, int(site)) for site in sites]
         bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
         self.inputs = _inputs(watch, bodies)

@@ -17,9 +17,9 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, listed
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.bodies import STATE_ARRAYS
-from tgdsl.runtime.simulators.claims import refuse_two_instants
 from tgdsl.runtime.simulators.faults import BAD_VALUES, DIVERGED, NO_ROOM, EnvFaults
 from tgdsl.runtime.simulators.joint_fields import FORCES, JointColumns
+from tgdsl.runtime.simulators.simulation import refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
@@ -260,18 +260,14 @@ class Worlds:
         """
         self._is_reset.copy_(mask)
         self._reset()
-        self._write(mask, rows)
+        self.put(mask, rows)
         if finds_contacts:
             self.make_stale(mask)
         else:
             self._move()
 
     def put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
-        """Put values into the state of some environments; those that cannot be used are left out and noted."""
-        self._write(mask, rows)
-        self.make_stale(mask)
-
-    def _write(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+        """Write values into the state of some environments; those that cannot be used are left out and noted."""
         with torch.no_grad():
             is_put = mask
             if rows.is_bad is not None:

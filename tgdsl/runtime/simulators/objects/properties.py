@@ -64,6 +64,7 @@ class ObjectProperties(ABC):
         """
         self._model, self._bodies_of, self._num_envs, self._device = model, bodies_of, num_envs, device
         self._objects: dict[str, RigidObject] = {}
+        self._indices: dict[tuple[str, str], Tensor] = {}
 
     def set(
         self,
@@ -98,11 +99,11 @@ class ObjectProperties(ABC):
 
     def mass(self, name: str) -> Float[Tensor, " env"]:
         """Return the mass of an object in each environment [kg]."""
-        return self._mass(self._object(name))
+        return self._values("body_mass")[:, self._index(self._object(name), "bodies")].sum(dim=1)
 
     def friction(self, name: str) -> Float[Tensor, " env"]:
         """Return the coefficient of sliding friction of an object in each environment, the largest of its geoms'."""
-        return self._friction(self._object(name))
+        return self._values("geom_friction")[:, self._index(self._object(name), "geoms"), 0].amax(dim=1)
 
     @abstractmethod
     def fields(self) -> dict[str, Tensor]:
@@ -123,10 +124,15 @@ class ObjectProperties(ABC):
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None: ...
 
     @abstractmethod
-    def _mass(self, target: RigidObject) -> Float[Tensor, " env"]: ...
+    def _values(self, field: str) -> Float[Tensor, "env ..."]:
+        """Return a field of MuJoCo's model in each environment, also where all share it."""
 
-    @abstractmethod
-    def _friction(self, target: RigidObject) -> Float[Tensor, " env"]: ...
+    def _index(self, target: RigidObject, name: str) -> Int[Tensor, " element"]:
+        """Return an object's `bodies`, `geoms`, `dofs` or `above` on the device."""
+        key = (target.name, name)
+        if key not in self._indices:
+            self._indices[key] = torch.from_numpy(getattr(target, name)).to(self._device)
+        return self._indices[key]
 
     def _object(self, name: str) -> RigidObject:
         if name not in self._objects:

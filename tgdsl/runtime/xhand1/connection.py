@@ -1,35 +1,23 @@
-"""The XHand1 as a source: "xhand1" or "xhand1:PORT"; and what connections to a hand, an emulated one and a log share."""
+"""Connections to an XHand1, to an emulated one, and to the log of one."""
 
 from __future__ import annotations
 
 import warnings
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.errors import HandError, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.source import Control, Source
-from tgdsl.runtime.source_kind import SourceKind
-from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.source import HandSample, XHand1Source, is_chosen, refuse_beyond_watchdog
-from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.replies import Addresses
-from tgdsl.runtime.xhand1.wire.serial_port import list_ports
+from tgdsl.runtime.xhand1.source import HandSample, is_chosen
 from tgdsl.scene.scene import scene_model
 from tgdsl.tensors.env_ids import EnvIds
-
-_USB_PORTS = ("/dev/ttyUSB", "/dev/ttyACM", "/dev/cu.usb", "COM")
 
 
 @runtime_checkable
@@ -137,69 +125,3 @@ class JointTargets:
                 warnings.warn(f"{what}; to move it, connect with motion=MotionLimits(...)", stacklevel=4)
             return None
         return self._joints.targets(control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control))
-
-
-def given_calibration(calibration: Calibration | str | Path | None) -> Calibration | None:
-    """Return a calibration, read from its file if that is given.
-
-    Raises:
-        SpecError: If the file has mistakes.
-    """
-    return load_calibration(Path(calibration)) if isinstance(calibration, (str, Path)) else calibration
-
-
-def refuse_unfit_steps(control_step: float, motion: MotionLimits | None, timing: SerialTiming | None) -> None:
-    """Refuse control steps that are shorter than an exchange on the line, or longer than the watchdog waits.
-
-    Raises:
-        HandError: If they are shorter.
-        MotionError: If they are longer.
-    """
-    shortest = (timing or SerialTiming()).exchange_s
-    if 0 < control_step < shortest:
-        what = f"control steps of {1e3 * control_step:g} ms ({1 / control_step:.0f} per second)"
-        raise HandError(f"{what}, and an exchange takes {1e3 * shortest:.2f} ms: at most {1 / shortest:.0f} per second")
-    refuse_beyond_watchdog(control_step, None if motion is None else motion.watchdog_s)
-
-
-def _open(
-    touch: TactileModule,
-    source: str,
-    *,
-    control_step: float,
-    calibration: Calibration | str | Path | None,
-    motion: MotionLimits | None,
-    addresses: Addresses | None,
-    timing: SerialTiming | None,
-    lockstep: bool,
-) -> Connection:
-    known = given_calibration(calibration) or Calibration.none()
-    if lockstep:
-        raise HandError("a real hand moves in its own time: lockstep is for emulators and logs")
-    port = source.partition(":")[2]
-    observer = HandObserver(touch, known, control_step)
-    targets = JointTargets(touch, motion, "the hand")
-    refuse_unfit_steps(control_step, motion, timing)
-    warn_of_noise(touch.plan)
-    with ExitStack() as opened:
-        hand = opened.enter_context(XHand1.open(port or _only_port(), addresses, motion=motion, timing=timing))
-        stepped = XHand1Source(hand, control_step=control_step, calibration=known)
-        opened.pop_all()
-    return HandConnection(stepped, observer, targets)
-
-
-def _only_port() -> str:
-    """Return the only USB serial port.
-
-    Raises:
-        HandError: If there are none or several.
-    """
-    ports = [port.device for port in list_ports() if port.device.startswith(_USB_PORTS)]
-    if len(ports) != 1:
-        found = listed(ports) or "none"
-        raise HandError(f'expected one USB serial port, found {found}; name the hand\'s: source="xhand1:/dev/ttyUSB0"')
-    return ports[0]
-
-
-XHAND1 = SourceKind("xhand1", '"xhand1", "xhand1:PORT"', _open)
-"""The hand on a serial port."""
