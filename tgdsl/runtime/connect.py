@@ -28,9 +28,7 @@ from tgdsl.runtime.warp.simulation import WarpSimulation
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.connection import HandConnection, JointTargets
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.simulated_body import SimulatedBody
-from tgdsl.runtime.xhand1.emulator.simulated_tips import SimulatedTips
-from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
+from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource, SimulatedBody, SimulatedTips
 from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.log.replay import ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids

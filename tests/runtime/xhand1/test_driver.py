@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_lines import Faults, FaultyEmulator
 from xhand1_hands import PATIENT, Stamps, WrittenBytes, open_again, read_again, wait_until
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.wire import payloads, serial_port
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
@@ -36,7 +35,7 @@ BRISK = SerialTiming(reply_timeout_s=0.2, silence_s=0.1)
 def test_every_reading_is_new_and_knows_its_age():
     stamps = Stamps()
     with (
-        Emulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, max_age_s=20.0) as hand,
     ):
         readings = [hand.read(20.0) for _ in range(60)]
@@ -47,7 +46,7 @@ def test_every_reading_is_new_and_knows_its_age():
 def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
     """Every byte, over failures of all kinds, a pulled cable and the end."""
     written, stamps = WrittenBytes(), Stamps()
-    with Emulator(EmulatedHand(forces=stamps), faults=Faults.each(0.1)) as emulator:
+    with FaultyEmulator(EmulatedHand(forces=stamps), faults=Faults.each(0.1)) as emulator:
         with open_again(emulator.device, timing=BRISK, open_port=written.open) as hand:
             while len(written.writes) < 100:
                 with contextlib.suppress(HandError):
@@ -71,7 +70,7 @@ def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
 def test_registers_version_and_tare_write_no_set_point_either():
     written = WrittenBytes()
     with (
-        Emulator(EmulatedHand(forces=Stamps())) as emulator,
+        FaultyEmulator(EmulatedHand(forces=Stamps())) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, open_port=written.open) as hand,
     ):
         assert hand.version() == b"tgdsl emulator"
@@ -93,7 +92,7 @@ def test_a_saturated_fingertip_cannot_be_tared():
         return TipForces(np.full((5, 3), 300.0), np.zeros((5, 120, 3)))
 
     with (
-        Emulator(EmulatedHand(forces=pressed)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=pressed)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, max_age_s=20.0) as hand,
     ):
         assert hand.read().state.total_force.tolist() == [[127, 127, 255]] * 5
@@ -113,7 +112,7 @@ def failure_of(hand: XHand1) -> HandError | None:
 def test_all_faults_at_once():
     """What comes is new and whole, and what does not come has a name."""
     stamps, readings, errors = Stamps(), [], []
-    with Emulator(EmulatedHand(forces=stamps), seed=5) as emulator, open_again(emulator.device, timing=CALM) as hand:
+    with FaultyEmulator(EmulatedHand(forces=stamps), seed=5) as emulator, open_again(emulator.device, timing=CALM) as hand:
         emulator.set_faults(Faults.each(0.05))
 
         def is_read() -> bool:
@@ -131,7 +130,7 @@ def test_all_faults_at_once():
 
 def test_a_silent_device_is_named():
     stamps = Stamps()
-    with Emulator(EmulatedHand(forces=stamps)) as emulator:
+    with FaultyEmulator(EmulatedHand(forces=stamps)) as emulator:
         with open_again(emulator.device, timing=CALM) as hand:
             emulator.set_faults(Faults(silence=1.0))
             assert wait_until(lambda: isinstance(failure_of(hand), HandTimeoutError))
@@ -152,13 +151,13 @@ def refusal(device: str) -> str:
 
 def test_a_line_that_damages_everything():
     timing = SerialTiming(reply_timeout_s=1.0, silence_s=0.1)
-    with Emulator(faults=Faults(corrupt=1.0)) as emulator, pytest.raises(HandChecksumError, match="came damaged"):
+    with FaultyEmulator(faults=Faults(corrupt=1.0)) as emulator, pytest.raises(HandChecksumError, match="came damaged"):
         XHand1.open(emulator.device, timing=timing)
 
 
 def test_unplug_and_replug():
     stamps = Stamps()
-    with Emulator(EmulatedHand(forces=stamps)) as emulator, open_again(emulator.device, timing=CALM) as hand:
+    with FaultyEmulator(EmulatedHand(forces=stamps)) as emulator, open_again(emulator.device, timing=CALM) as hand:
         for _ in range(3):
             emulator.unplug()
             assert wait_until(lambda: isinstance(failure_of(hand), HandDisconnectedError))
@@ -170,7 +169,7 @@ def test_unplug_and_replug():
 
 
 def test_the_wrong_hand():
-    with Emulator(EmulatedHand(3)) as emulator:
+    with FaultyEmulator(EmulatedHand(3)) as emulator:
         with pytest.raises(HandTimeoutError):
             XHand1.open(emulator.device)
         with XHand1.open(emulator.device, Addresses(3), timing=PATIENT) as hand:
@@ -180,7 +179,7 @@ def test_the_wrong_hand():
 
 
 def test_a_closed_hand_says_so():
-    with Emulator() as emulator:
+    with FaultyEmulator() as emulator:
         hand = XHand1.open(emulator.device, timing=PATIENT)
         hand.close()
         hand.close()
@@ -193,7 +192,7 @@ def test_a_port_that_is_not_there_or_taken():
     with pytest.raises(HandDisconnectedError, match="/dev/no-such-port cannot be opened at 3000000 baud"):
         XHand1.open("/dev/no-such-port")
     taken = pytest.raises(HandDisconnectedError, match="cannot be opened")
-    with Emulator() as emulator, XHand1.open(emulator.device, timing=PATIENT), taken:
+    with FaultyEmulator() as emulator, XHand1.open(emulator.device, timing=PATIENT), taken:
         XHand1.open(emulator.device)
 
 

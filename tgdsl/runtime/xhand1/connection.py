@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -11,43 +10,17 @@ from torch import Tensor
 
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.connection import Connection
-from tgdsl.runtime.source import Control, Source
+from tgdsl.runtime.source import Control
 from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.source import HandSample, is_chosen
+from tgdsl.runtime.xhand1.source import HandSource, is_chosen
 from tgdsl.scene.scene import scene_model
 from tgdsl.tensors.env_ids import EnvIds
 
 
-@runtime_checkable
-class HandSource(Source, Protocol):
-    """A source that is an XHand1, or the log of one."""
-
-    @property
-    def is_over(self) -> bool:
-        """Whether there is nothing more to read."""
-        ...
-
-    def sample(self) -> HandSample:
-        """Return what the hand said at the end of the last step."""
-        ...
-
-    @property
-    def age_s(self) -> float | None:
-        """How old that is at most, now [s]; None where nothing runs in real time."""
-        ...
-
-    def resume(self) -> None:
-        """Allow a hand that was made passive by an error to move again."""
-        ...
-
-
 class HandConnection(Connection):
-    """A connection to an XHand1, or to the log of one.
-
-    Shapes: `env` one, `feature` numbers of an observation.
-    """
+    """A connection to an XHand1, or to the log of one."""
 
     def __init__(self, source: HandSource, observer: HandObserver, targets: JointTargets | None = None):
         """Connect a hand.

@@ -4,11 +4,11 @@ import contextlib
 
 import numpy as np
 import pytest
+from faulty_lines import Faults
 from virtual_hands import VirtualPort, VirtualTime, virtual_hand
 from xhand1_hands import Stamps
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
@@ -88,7 +88,7 @@ def test_one_reply_in_twenty_is_faulty(fault, monkeypatch):
         hand.read()
         port.set_faults(Faults(**{fault: 0.05}))
         readings, _ = read_for(hand, time, stamps, 600)
-        assert port.wire.line.counts[fault] > 10
+        assert port.line.counts[fault] > 10
     assert len(readings) > 500
 
 

@@ -8,13 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from faulty_lines import Faults, FaultyEmulator
 from hand_logs import assert_same_reading, random_readings, write_log
 from xhand1_hands import Stamps
 
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.identity import HandIdentity
 from tgdsl.runtime.xhand1.log.log import CHUNK, RECORD, STATE, Fault, LogError, open_log
@@ -287,7 +286,7 @@ def test_a_huge_array_is_not_believed(tmp_path):
 def test_recording_an_emulated_hand_through_failures(tmp_path):
     stamps = Stamps()
     with (
-        Emulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
         XHand1.open(emulator.device) as hand,
         LogWriter(tmp_path / "a.npz") as log,
     ):
@@ -311,7 +310,7 @@ def test_recording_an_emulated_hand_through_failures(tmp_path):
 
 
 def test_a_closed_hand_ends_a_recording():
-    with Emulator() as emulator:
+    with FaultyEmulator() as emulator:
         hand = XHand1.open(emulator.device)
         coming = events(hand, 60.0)
         next(coming)
