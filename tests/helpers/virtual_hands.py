@@ -17,9 +17,8 @@ from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
 from tgdsl.runtime.xhand1.reader import HandReader
-from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialCounters, SerialTiming
+from tgdsl.runtime.xhand1.wire.client import Addresses, SerialClient, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError
-from tgdsl.runtime.xhand1.wire.replies import Addresses
 from tgdsl.runtime.xhand1.wire.serial_port import POLL_S
 
 

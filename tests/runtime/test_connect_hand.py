@@ -16,17 +16,15 @@ import tgdsl
 from tgdsl.errors import HandError, ObservationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime import connect as connecting
-from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
-from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
+from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
     HandDisconnectedError,
     HandTimeoutError,
     MotionError,
-    StaleReadingError,
 )
 from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, encode_command
 from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
@@ -108,7 +106,7 @@ def test_after_a_failed_step_nothing_old_is_observed(touch):
         with pytest.raises(ObservationError, match="the last step or reset failed, so there is nothing new to observe"):
             env.observe()
         assert isinstance(env.source, XHand1Source)
-        with pytest.raises(StaleReadingError, match="the last step or reset gave no reading"):
+        with pytest.raises(HandTimeoutError, match="the last step or reset gave no reading"):
             env.source.sample()
         with pytest.raises(HandTimeoutError):
             env.reset()

@@ -34,8 +34,7 @@ from tgdsl.runtime.xhand1.log.replay import ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.observe import HandObserver
 from tgdsl.runtime.xhand1.source import XHand1Source, refuse_beyond_watchdog
-from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.replies import Addresses
+from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
 from tgdsl.runtime.xhand1.wire.serial_port import list_ports
 from tgdsl.scene.scene import scene_model
 

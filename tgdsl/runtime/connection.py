@@ -137,7 +137,6 @@ class SimulationConnection(Connection):
     """A connection to a simulator of the module's scene, or to a scene that reads the module's sensors itself."""
 
     def __init__(self, touch: TactileModule, source: Simulator | SteppedScene):
-        """Connect a module to the simulator that it reads."""
         super().__init__(source)
         self._touch, self._scene = touch, source
 

@@ -34,10 +34,6 @@ class SteppedScene:
     def __init__(self, touch: TactileModule, sim: Any):
         """Take a simulation that is at its start.
 
-        Args:
-            touch: The module that reads it; nobody else may call it.
-            sim: The simulation.
-
         Raises:
             SimulationError: If it has more than one environment.
         """

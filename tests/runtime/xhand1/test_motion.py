@@ -15,7 +15,7 @@ from tgdsl.files.find import robot_names
 from tgdsl.runtime.xhand1 import reader
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
-from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ranges
+from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, MotionError, WatchdogError
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS, PASSIVE, Mode, encode_command
@@ -47,20 +47,20 @@ def positions(motion: Motion, now: float) -> np.ndarray:
 @pytest.mark.parametrize("name", ["xhand1_right", "xhand1_left"])
 def test_ranges_come_from_the_robot_file(name):
     model = mujoco.MjModel.from_xml_path(str(robot_names()[name]))
-    assert np.abs(joint_ranges(model)) == pytest.approx(np.abs(np.array(RANGES)), abs=1e-9)
+    assert np.abs(model.jnt_range[joint_ids(model)]) == pytest.approx(np.abs(np.array(RANGES)), abs=1e-9)
     found = MotionLimits.of_robot(model, speed=0.5, current_limit=200, kp=80)
-    assert [found.lower, found.upper] == [tuple(joint_ranges(model)[:, i]) for i in (0, 1)]
+    assert [found.lower, found.upper] == [tuple(model.jnt_range[joint_ids(model)][:, i]) for i in (0, 1)]
     assert (found.speed, found.current_limit, found.watchdog_s) == ((0.5,) * 12, (200,) * 12, 0.1)
 
 
 def test_another_robot_has_no_such_joints():
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with pytest.raises(MotionError, match="is a whole hand: expected one joint with a range for each of thumb_bend_joint, "):
-        joint_ranges(model)
+        model.jnt_range[joint_ids(model)]
     finger = "".join(f'<body><joint name="{name}" range="0 90"/><geom size=".1"/></body>' for name in JOINTS[1:])
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{finger}</worldbody></mujoco>")
     with pytest.raises(MotionError, match=f"for each of {JOINTS[0]}; the robot has {JOINTS[1]}, "):
-        joint_ranges(model)
+        model.jnt_range[joint_ids(model)]
 
 
 def test_a_set_point_starts_where_the_joint_is_and_moves_at_its_speed():
@@ -268,7 +268,7 @@ def test_a_reader_that_fails_for_a_reason_of_its_own_leaves_the_hand_passive(mon
         monkeypatch.setattr(reader, "decode_state", broken)
         assert becomes_passive(emulator)
         hand._reader.join()
-        for call in (lambda: hand.command(REST), hand.read, hand.version):
+        for call in (lambda: hand.command(REST), hand.read):
             with pytest.raises(HandClosedError, match=r"the reader ended: ValueError\('a mistake of ours'\)"):
                 call()
 

@@ -40,15 +40,6 @@ class OwnFields(ObjectProperties):
         variants: Sequence[mujoco.MjModel],
         is_open: bool,
     ):
-        """Begin: all environments have the batch's model.
-
-        Args:
-            batch: The environments.
-            model: The batch's model.
-            bodies_of: Body of each of the document's objects.
-            variants: The model of each variant that an object may have.
-            is_open: Whether models that are not among these may come.
-        """
         super().__init__(model, bodies_of, batch.nsim, torch.device("cpu"))
         self._batch = batch
         self._fields: dict[str, Array] = {}

@@ -57,10 +57,6 @@ class ContactSensors:
     def __init__(self, model: mujoco.MjModel, inputs: Inputs):
         """Look up where everything is.
 
-        Args:
-            model: The model.
-            inputs: What the module wants.
-
         Raises:
             SimulationError: If the model lacks a sensor, one does not show what is wanted, or sensors are disabled.
         """
@@ -103,7 +99,6 @@ class _PointSensor:
     """A sensor of single contacts."""
 
     def __init__(self, model: mujoco.MjModel, name: str, num_slots: int):
-        """Look up what it shows."""
         self._place = _place(model, name)
         sensor = int(model.sensor(name).id)
         bits, _, self._num = model.sensor_intprm[sensor, :3].tolist()

@@ -49,12 +49,7 @@ class Sweep:
     """A hand that closes on an object, pose by pose."""
 
     def __init__(self, movement: Movement, body: int):
-        """Look at what can touch: geoms that collide, or of a body without such all.
-
-        Args:
-            movement: How the hand moves.
-            body: The object.
-        """
+        """Look at what can touch: geoms that collide, or of a body without such all."""
         self.movement, self.model, self.body = movement, movement.model, body
         self.data = mujoco.MjData(self.model)
         self.is_free = int(self.model.body_dofnum[body]) == 6 and int(self.model.body_jntnum[body]) == 1

@@ -105,12 +105,6 @@ class WatchReader:
     def __init__(self, watch: Watch, inputs: Inputs, model: mujoco.MjModel, device: torch.device):
         """Look up sites and pairs.
 
-        Args:
-            watch: What is looked at.
-            inputs: What the module wants.
-            model: The scene.
-            device: Where the tensors are.
-
         Raises:
             SimulationError: If the model has no such site, or its body no name, or the module does not read a pair.
         """

@@ -88,12 +88,6 @@ class PairContacts:
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, num_envs: int, device: torch.device):
         """Allocate memory for what is wanted.
 
-        Args:
-            inputs: What the module wants.
-            model: The scene.
-            num_envs: Number of environments.
-            device: Where physics runs.
-
         Raises:
             SimulationError: If the model lacks a body or geom.
         """

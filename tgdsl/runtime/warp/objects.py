@@ -57,7 +57,6 @@ class WorldObjects:
     """
 
     def __init__(self, chosen: EnvObjects, inputs: Inputs):
-        """Take the choices of all environments; `write_to` writes them."""
         self._scenes, self._names, self._chosen = chosen.scenes, inputs.objects, chosen
         self._rows: dict[tuple[Choice, ...], Row] = {}
         self._written: list[tuple[Choice, ...]] = []

@@ -49,13 +49,6 @@ class StateReader:
     ):
         """Look up where everything is.
 
-        Args:
-            inputs: What the module wants.
-            model: The scene.
-            sources: The arrays that `STATE_ARRAYS` names and those of `joint_fields.FORCES`, (env, …).
-            kept: The arrays of joints and actuators at the state's instant, (env, …).
-            contacts: The contacts that are wanted; default: none.
-
         Raises:
             SimulationError: If the model lacks a body, a joint or an actuator.
         """
@@ -92,15 +85,6 @@ class WorldProperties(ObjectProperties):
         num_envs: int,
         device: torch.device,
     ):
-        """Begin: all environments are as the scene has them.
-
-        Args:
-            parameters: The fields that environments have of their own, (env, …).
-            model: The scene.
-            bodies_of: Body of each of the document's objects.
-            num_envs: Number of environments.
-            device: Where physics runs.
-        """
         super().__init__(model, bodies_of, num_envs, device)
         self._fields = parameters
         self._plain: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}

@@ -11,8 +11,7 @@ from torch import Tensor
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.source import Control
-from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
-from tgdsl.runtime.xhand1.motion import MotionLimits
+from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, check_ranges
 from tgdsl.runtime.xhand1.observe import HandObserver
 from tgdsl.runtime.xhand1.source import HandSource, is_chosen
 from tgdsl.scene.scene import scene_model
@@ -23,13 +22,7 @@ class HandConnection(Connection):
     """A connection to an XHand1, or to the log of one."""
 
     def __init__(self, source: HandSource, observer: HandObserver, targets: JointTargets | None = None):
-        """Connect a hand.
-
-        Args:
-            source: The hand.
-            observer: Observes it for the module.
-            targets: Where controls send its joints; default: nowhere, and nothing is said of it.
-        """
+        """Connect a hand."""
         super().__init__(source)
         self._hand, self._observer, self._targets = source, observer, targets
 

@@ -10,7 +10,7 @@ from tgdsl.observations.observations import HAND_ONLY
 from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedObservation, PlannedSensor
-from tgdsl.runtime.xhand1.controls import JointControls
+from tgdsl.runtime.xhand1.motion import JointControls
 from tgdsl.runtime.xhand1.wire.errors import MotionError
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, JOINTS
 from tgdsl.scene.scene import scene_model

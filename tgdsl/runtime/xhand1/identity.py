@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialTiming
-from tgdsl.runtime.xhand1.wire.discovery import FoundHand
-from tgdsl.runtime.xhand1.wire.errors import HandChecksumError, HandRefusedError, HandTimeoutError
+from tgdsl.runtime.xhand1.wire.errors import HandRefusedError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.payloads import encode_register_request
+from tgdsl.runtime.xhand1.wire.ports import FoundHand
 from tgdsl.runtime.xhand1.wire.protocol import Command, Register
 from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
 
@@ -76,5 +76,5 @@ def _register(client: SerialClient, number: int) -> bytes | None:
     """Return what a register holds; None if the hand refuses to tell, or does not answer."""
     try:
         return client.exchange(Command.READ_REGISTER, encode_register_request(number)).payload
-    except (HandRefusedError, HandTimeoutError, HandChecksumError):
+    except (HandRefusedError, HandTimeoutError):
         return None

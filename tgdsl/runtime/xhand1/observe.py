@@ -21,8 +21,8 @@ from torch import Tensor
 
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.fingertips import HandTerm, hand_terms
+from tgdsl.runtime.xhand1.motion import JointControls
 from tgdsl.runtime.xhand1.source import HandSample
 from tgdsl.scene.scene import scene_model
 
@@ -36,12 +36,6 @@ class HandObserver:
 
     def __init__(self, touch: TactileModule, calibration: Calibration, control_step: float, *, is_log: bool = False):
         """Look whether a hand can give what the module observes.
-
-        Args:
-            touch: The module.
-            calibration: The hand's; of it the contact threshold is used.
-            control_step: Time from one call of `observe` to the next [s].
-            is_log: Whether the hand is a recorded one.
 
         Raises:
             ObservationError: If a hand cannot give an observation; all of them are named.

@@ -23,7 +23,7 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
-from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, StaleReadingError
+from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError
 from tgdsl.tensors.env_ids import EnvIds
 
 
@@ -231,10 +231,10 @@ class XHand1Source(HandSource):
         """Return what the hand said at the end of the last step, or after a reset.
 
         Raises:
-            StaleReadingError: If that step or reset failed: what was said before is not returned as if it were new.
+            HandTimeoutError: If that step or reset failed: what was said before is not returned as if it were new.
         """
         if self._sample is None:
-            raise StaleReadingError("the last step or reset gave no reading; step or reset again")
+            raise HandTimeoutError("the last step or reset gave no reading; step or reset again")
         return self._sample
 
     @property

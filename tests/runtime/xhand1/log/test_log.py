@@ -74,7 +74,7 @@ def test_whose_and_what_and_what_went_wrong(tmp_path):
     calibration = Calibration(
         "N", rng.uniform(0.1, 1, (5, 3)), rotation, rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), "it's"
     )
-    faults = (Fault.of(HandTimeoutError("no reply — 30 ms"), 1.05), Fault.of(errors.StaleReadingError("old"), 1.13))
+    faults = (Fault.of(HandTimeoutError("no reply — 30 ms"), 1.05), Fault.of(errors.HandDisconnectedError("gone"), 1.13))
     path = write_log(
         tmp_path / "a.npz", random_readings(np.array([1.0, 1.2])), faults, identity=IDENTITY, calibration=calibration
     )
@@ -85,7 +85,7 @@ def test_whose_and_what_and_what_went_wrong(tmp_path):
     assert (log.calibration.units, log.calibration.hand) == ("N", "it's")
     for name in ("scale", "rotation", "bias", "tare"):
         assert (getattr(log.calibration, name) == getattr(calibration, name)).all()
-    assert [type(fault.error()) for fault in log.faults] == [HandTimeoutError, errors.StaleReadingError]
+    assert [type(fault.error()) for fault in log.faults] == [HandTimeoutError, errors.HandDisconnectedError]
     assert str(log.faults[0].error()) == "no reply — 30 ms"
 
 
@@ -305,7 +305,7 @@ def test_recording_an_emulated_hand_through_failures(tmp_path):
     assert len(found) > 20  # a busy machine may have lost one before the thirtieth
     assert all(one < other for one, other in pairwise(found))
     assert log.faults
-    assert all(isinstance(fault.error(), (HandTimeoutError, errors.StaleReadingError)) for fault in log.faults)
+    assert all(isinstance(fault.error(), HandTimeoutError) for fault in log.faults)
     assert log.received_at[0] < log.faults[0].time < log.received_at[-1]
 
 

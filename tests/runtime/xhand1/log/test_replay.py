@@ -22,7 +22,7 @@ from tgdsl.runtime.xhand1.log.replay import ReplayOverError, ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.source import HandSample, XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandTimeoutError, StaleReadingError
+from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.payloads import saturated
 
 RNG = np.random.default_rng(5)
@@ -171,7 +171,7 @@ def test_a_gap_without_a_failure_is_a_stale_reading(tmp_path):
     path = write_log(tmp_path / "a.npz", random_readings(np.array([1.0, 1.01, 2.0])))
     source = ReplaySource(path, control_step=0.02, speed=math.inf)
     source.step()
-    with pytest.raises(StaleReadingError, match=r"no new reading came in time; the newest is 118 ms old"):
+    with pytest.raises(HandTimeoutError, match=r"no new reading came in time; the newest is 118 ms old"):
         source.step()  # due at 1.04, given up at 1.12; asked for at 1.002
 
 
@@ -193,7 +193,7 @@ def expected_steps(times, faults, control_step: float) -> list[int | str]:
             now = due + 0.08
             last = max(t for t in times if t <= now)
             after = [fault for fault in faults if last < fault.time <= now]
-            out.append(after[-1].kind if after else "StaleReadingError")
+            out.append(after[-1].kind if after else "HandTimeoutError")
     return out
 
 

@@ -38,7 +38,6 @@ class EnvHeat:
     material: Int[Tensor, "env heated"]
 
     def __init__(self, inputs: Inputs, num_envs: int, device: torch.device, dtype: torch.dtype):
-        """Begin with what the document says."""
         self.names = inputs.heated
         self._starts, self._num_materials = inputs.start_temperatures, inputs.num_materials
         with torch.inference_mode(False):

@@ -54,14 +54,6 @@ class ObjectProperties(ABC):
     """Masses and frictions of a simulation's objects, by the name of an object or body, with all that is welded to it."""
 
     def __init__(self, model: mujoco.MjModel, bodies_of: Mapping[str, str], num_envs: int, device: torch.device):
-        """Begin: all environments are as the scene has them.
-
-        Args:
-            model: The scene.
-            bodies_of: Body of each of the document's objects.
-            num_envs: Number of environments.
-            device: Where physics runs.
-        """
         self._model, self._bodies_of, self._num_envs, self._device = model, bodies_of, num_envs, device
         self._objects: dict[str, RigidObject] = {}
         self._indices: dict[tuple[str, str], Tensor] = {}

@@ -16,8 +16,7 @@ from types import TracebackType
 
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.parser import FrameParser
-from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD, Frame, encode_frame
+from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD, Frame, FrameParser, encode_frame
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD
 
 _IDLE_S = 0.05
@@ -217,7 +216,9 @@ class Emulator:
         with self._lock:
             ends, next_due = self._ends, self.line.next_due()
         wait = _IDLE_S if next_due is None else max(next_due - time.monotonic(), 0.0)
-        ready = select.select([self._wake_read, *(ends or ())[:1]], [], [], min(wait, _IDLE_S))[0]
+        ready: list[int] = []
+        with contextlib.suppress(OSError):  # the cable was pulled meanwhile
+            ready = select.select([self._wake_read, *(ends or ())[:1]], [], [], min(wait, _IDLE_S))[0]
         with self._lock:
             if self._wake_read in ready:
                 os.read(self._wake_read, 1)

@@ -77,7 +77,6 @@ class FirstOrderBody:
     """
 
     def __init__(self, forces: ForceField, time_constant_s: float):
-        """Start with all joints at zero."""
         self.position = np.zeros(NUM_JOINTS)
         self._forces = forces
         self._time_constant_s = time_constant_s
@@ -111,7 +110,6 @@ class EmulatedHand:
         address: Its address.
         commands: The last commands of its joints.
         position: Joint angles that it last sent [rad].
-        num_states: How many states it has sent.
     """
 
     def __init__(
@@ -134,7 +132,6 @@ class EmulatedHand:
                 fingertips that feel `forces`.
         """
         self.commands: tuple[JointCommand, ...] = PASSIVE
-        self.num_states = 0
         self.address = hand_address(hand_id)
         self.position: Float[np.ndarray, " joint"] = np.zeros(NUM_JOINTS)
         self._body: Body = FirstOrderBody(forces, time_constant_s) if body is None else body
@@ -162,7 +159,6 @@ class EmulatedHand:
             self._body.command(now, commands)
             self.position, forces = self._body.felt(now)
             self.commands = commands
-            self.num_states += 1
             return frame.command, encode_state(self._state(forces))
         if frame.command == Command.VERSION:
             return frame.command, VERSION

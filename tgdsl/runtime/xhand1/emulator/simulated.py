@@ -30,12 +30,11 @@ from tgdsl.plan.sensors import PlannedObservation
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces, is_driven
 from tgdsl.runtime.xhand1.fingertips import HandTerm
-from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
+from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
@@ -73,10 +72,6 @@ class SimulatedTips:
 
     def __init__(self, touch: TactileModule, terms: Sequence[HandTerm]):
         """Find the observation of each fingertip's force.
-
-        Args:
-            touch: The module.
-            terms: Its observations, as a hand gives them.
 
         Raises:
             ObservationError: If the emulator cannot give some, as no observation has the force on their fingertips.
@@ -120,7 +115,6 @@ class SimulatedBody:
 
     Attributes:
         time: Time of the simulation, since its start or reset [s].
-        num_late_s: Time that physics could not keep up with [s].
         clipped: Fingertips that felt more than their bytes can hold.
         failure: The error that ended `run`, or None.
     """
@@ -128,15 +122,10 @@ class SimulatedBody:
     def __init__(self, scene: SteppedScene, tips: SimulatedTips, calibration: Calibration):
         """Take a scene.
 
-        Args:
-            scene: The scene, which watches the hand's joints; nobody else may step it.
-            tips: What the fingertips feel.
-            calibration: How forces become counts.
-
         Raises:
             MotionError: If the scene's actuators are not those of a hand.
         """
-        self.time = self.num_late_s = 0.0
+        self.time = 0.0
         self.clipped: set[str] = set()
         self.failure: Exception | None = None
         self._scene, self._tips, self._calibration = scene, tips, calibration
@@ -208,7 +197,6 @@ class SimulatedBody:
                 due += self._scene.control_step
                 late = time.monotonic() - due
                 if late > _LATE_S:
-                    self.num_late_s += late
                     due += late
         except Exception as error:  # raised by whoever steps the source
             self.failure = error

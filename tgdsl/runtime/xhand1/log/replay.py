@@ -21,7 +21,7 @@ from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S
 from tgdsl.runtime.xhand1.log.log import Fault, LogError, open_log
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.source import HandSample, HandSource
-from tgdsl.runtime.xhand1.wire.errors import StaleReadingError
+from tgdsl.runtime.xhand1.wire.errors import HandTimeoutError
 
 
 class ReplayOverError(TgdslError):
@@ -198,7 +198,7 @@ class ReplaySource(HandSource):
         if last >= 0 and self._fault_times[last] > self.log.received_at[newest]:
             return Fault(now, self.log.faults[last].kind, self.log.faults[last].message)
         age = 1e3 * (now - float(self.log.requested_at[newest]))
-        return Fault.of(StaleReadingError(f"no new reading came in time; the newest is {age:.0f} ms old"), now)
+        return Fault.of(HandTimeoutError(f"no new reading came in time; the newest is {age:.0f} ms old"), now)
 
     def _fail(self, fault: Fault) -> NoReturn:
         self._wait_until(fault.time)

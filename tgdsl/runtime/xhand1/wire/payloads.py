@@ -22,8 +22,6 @@ from tgdsl.runtime.xhand1.wire.errors import ProtocolError
 NUM_JOINTS = 12
 NUM_TAXELS = 120
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
-TIP_JOINTS = (2, 5, 7, 9, 11)
-"""Id of the joint that moves each fingertip."""
 JOINTS = (
     "thumb_bend_joint",
     "thumb_rota_joint1",
@@ -226,12 +224,6 @@ def encode_state(state: HandState) -> bytes:
             tip[name][axis] = force[..., i]
     tip["temperature"], tip["total_temperature"] = state.taxel_temperature, state.total_temperature
     return record.tobytes()
-
-
-def unverified_taxel_cells() -> Int[np.ndarray, "taxel 2"]:
-    """Return row (of 12) and column (of 10) of each taxel as one display program draws them; no source says where they are."""
-    index = np.arange(NUM_TAXELS)
-    return np.stack([11 - index % 12, index // 12], axis=-1)
 
 
 def encode_register_request(number: int) -> bytes:
