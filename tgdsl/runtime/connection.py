@@ -32,7 +32,6 @@ class Connection(ABC):
     """
 
     def __init__(self, source: Source):
-        """Connect a source; users call `tgdsl.connect`."""
         self.source = source
         self._groups: dict[str, Tensor] | None = None
         self._is_read = True

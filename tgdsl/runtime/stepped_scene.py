@@ -32,11 +32,6 @@ class SteppedScene:
     """
 
     def __init__(self, touch: TactileModule, sim: Any):
-        """Take a simulation that is at its start.
-
-        Raises:
-            SimulationError: If it has more than one environment.
-        """
         if sim.num_envs != 1:
             raise SimulationError(f"an emulated hand has one environment, found {sim.num_envs}")
         self.sim: Simulation = sim

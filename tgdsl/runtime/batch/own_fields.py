@@ -48,11 +48,7 @@ class OwnFields(ObjectProperties):
         self._is_derived = False
 
     def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
-        """Give environments other models than they had; those that keep theirs keep their masses and frictions too.
-
-        Args:
-            models: The model of each environment.
-        """
+        """Give environments other models; those that keep theirs keep their masses and frictions too."""
         changed = [env for env, model in enumerate(models) if model is not self._chosen[env]]
         self._chosen = list(models)
         if self._own is not None:

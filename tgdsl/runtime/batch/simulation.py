@@ -55,11 +55,6 @@ class ContactSensors:
     """
 
     def __init__(self, model: mujoco.MjModel, inputs: Inputs):
-        """Look up where everything is.
-
-        Raises:
-            SimulationError: If the model lacks a sensor, one does not show what is wanted, or sensors are disabled.
-        """
         if inputs.pairs and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
             what = "the scene has sensors disabled, and contacts are read of sensors: they would read 0"
             raise SimulationError(f'{what}; take <flag sensor="disable"/> out of its <option>')
@@ -202,11 +197,6 @@ class BatchReader:
     """
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, batch: mujoco.batch.Batch):
-        """Look up where everything is, in a batch that was not stepped yet.
-
-        Raises:
-            SimulationError: If the model lacks a body, a joint, an actuator or a contact sensor.
-        """
         self._batch = batch
         self._bodies = BodyFields(inputs, model, index=np.asarray, take=_rows, cross=_cross)
         self._contacts = ContactSensors(model, inputs)

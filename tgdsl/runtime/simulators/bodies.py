@@ -52,9 +52,6 @@ class BodyFields:
             index: Makes indices of the arrays that are read: NumPy's, or tensors on their device.
             take: Returns the rows of an array (env, row, …) that such indices name.
             cross: Their cross product along the last axis.
-
-        Raises:
-            SimulationError: If the model lacks a body.
         """
         ids = np.array([element_id(model, "body", name) for name in inputs.bodies], dtype=np.int64)
         self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))

@@ -43,20 +43,12 @@ def element_id(model: mujoco.MjModel, kind: str, name: str) -> int:
 
 
 def keyframe_id(model: mujoco.MjModel, name: str | None) -> int:
-    """Return the index of a keyframe; without a name −1, the model's own initial state.
-
-    Raises:
-        SimulationError: If there is none of that name.
-    """
+    """Return the index of a keyframe; without a name −1, the model's own initial state."""
     return -1 if name is None else element_id(model, "key", name)
 
 
 def part_geoms(model: mujoco.MjModel, part: ContactPart) -> Int[np.ndarray, " geom"]:
-    """Return the indices of the geoms of a part of an object or link.
-
-    Raises:
-        SimulationError: If there is no body or geom of that name.
-    """
+    """Return the indices of the geoms of a part of an object or link."""
     if part.kind == "geom":
         return np.array([element_id(model, "geom", part.name)])
     return geoms_of(model, element_id(model, "body", part.name), part.kind == "subtree")

@@ -658,12 +658,7 @@ def _refuse_unfit(touch: TactileModule, num_envs: int, options: SimOptions) -> N
 
 
 def refuse_two_instants(model: mujoco.MjModel, sleep: str) -> None:
-    """Raise an error for a model whose state would not be of one instant.
-
-    Args:
-        model: The scene.
-        sleep: The message if its bodies may sleep.
-    """
+    """Raise an error for a model whose state would not be of one instant; `sleep` is the message if its bodies may sleep."""
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:

@@ -48,12 +48,7 @@ class StartContacts:
             self.is_placed = self.is_placed & ~chosen
 
     def place(self, chosen: Bool[Tensor, " env"], contacts: Contacts) -> None:
-        """Note environments that were placed, and their contacts.
-
-        Args:
-            chosen: The environments.
-            contacts: "none", or fields of a state by name, one row for all environments alike or (env, …); those left out are
-                zero.
+        """Note environments that were placed, and their contacts: "none", or fields of a state by name, the others zero.
 
         Raises:
             SimulationError: If there is no such word or field, or a shape does not fit.
@@ -70,12 +65,9 @@ class StartContacts:
     def applied_to(
         self, state: SceneState, is_stored: bool = True, rows: Int[Tensor, " n"] | slice = slice(None)
     ) -> SceneState:
-        """Return a state in which placed environments have the contacts of their start.
+        """Return a state, of all or some rows, in which placed environments have the contacts of their start.
 
-        Args:
-            state: What the simulator has.
-            is_stored: Whether those that were stored are of this state's pairs and joints; if not, all are zero.
-            rows: The environments that the state is of; default: all.
+        Unless `is_stored`, the stored ones are not of this state's pairs and joints, and all are zero.
         """
         if self.is_placed is None:
             return state

@@ -47,11 +47,6 @@ class StateReader:
         kept: Mapping[str, Tensor],
         contacts: PairContacts | None = None,
     ):
-        """Look up where everything is.
-
-        Raises:
-            SimulationError: If the model lacks a body, a joint or an actuator.
-        """
         self._sources, self._contacts = sources, contacts
         device = sources["xpos"].device
         self._bodies = BodyFields(

@@ -22,7 +22,6 @@ class HandConnection(Connection):
     """A connection to an XHand1, or to the log of one."""
 
     def __init__(self, source: HandSource, observer: HandObserver, targets: JointTargets | None = None):
-        """Connect a hand."""
         super().__init__(source)
         self._hand, self._observer, self._targets = source, observer, targets
 
@@ -63,11 +62,6 @@ class JointTargets:
     """From a model's controls to joint angles; without leave to move, to none, which is said once."""
 
     def __init__(self, touch: TactileModule, motion: MotionLimits | None, name: str):
-        """Look whether the scene's actuators are the hand's, and the limits within the robot file's.
-
-        Raises:
-            MotionError: If they are not.
-        """
         self._name = name
         self._joints: JointControls | None = None
         self._is_told = False

@@ -53,7 +53,6 @@ class XHand1:
     """
 
     def __init__(self, reader: HandReader, timing: SerialTiming, max_age_s: float | None = None):
-        """Take over a reader that runs; use `open`."""
         self._reader = reader
         two_replies_s = 2 * timing.reply_timeout_s
         self._max_age_s = max(MAX_AGE_S, two_replies_s) if max_age_s is None else max_age_s

@@ -128,8 +128,7 @@ class JointControls:
         """Return those of a model.
 
         Raises:
-            MotionError: If the model lacks a joint of the hand, a joint has not just one actuator that takes its angle in rad,
-                or there are other actuators.
+            MotionError: If a joint has not just one actuator that takes its angle in rad, or there are others.
         """
         joints = joint_ids(model)
         actuators = [_actuator(model, name, int(joint)) for name, joint in zip(JOINTS, joints, strict=True)]
@@ -139,22 +138,14 @@ class JointControls:
         return cls(np.array(actuators), model.jnt_qposadr[joints].astype(np.int64))
 
     def targets(self, control: np.ndarray) -> Float[np.ndarray, " joint"]:
-        """Return joint angles by joint id [rad] from controls by actuator, (actuator,) or (1, actuator).
-
-        Raises:
-            MotionError: If there are not as many.
-        """
+        """Return joint angles by joint id [rad] from controls by actuator, (actuator,) or (1, actuator)."""
         if control.shape not in ((NUM_JOINTS,), (1, NUM_JOINTS)):
             raise MotionError(f"control has shape {control.shape}, expected (1, {NUM_JOINTS}) or ({NUM_JOINTS},)")
         return control.reshape(-1)[self.actuator_id].astype(np.float64)
 
 
 def check_ranges(model: mujoco.MjModel, limits: MotionLimits) -> None:
-    """Look whether motion limits stay within the robot file's.
-
-    Raises:
-        MotionError: If one does not.
-    """
+    """Raise an error unless motion limits stay within the robot file's."""
     ranges = model.jnt_range[joint_ids(model)]
     for name, lower, upper, (least, largest) in zip(JOINTS, limits.lower, limits.upper, ranges, strict=True):
         if lower < least - ROUNDING or upper > largest + ROUNDING:

@@ -35,11 +35,6 @@ class HandObserver:
     """
 
     def __init__(self, touch: TactileModule, calibration: Calibration, control_step: float, *, is_log: bool = False):
-        """Look whether a hand can give what the module observes.
-
-        Raises:
-            ObservationError: If a hand cannot give an observation; all of them are named.
-        """
         self.terms = hand_terms(touch.plan, calibration.contact_threshold, is_log)
         self._like = torch.empty(0, dtype=touch.dtype, device=touch.device)
         self._threshold = calibration.contact_threshold
@@ -49,11 +44,7 @@ class HandObserver:
         self._action: Tensor | None = None
 
     def note(self, control: Tensor | np.ndarray | None) -> None:
-        """Take note of controls that were given, by actuator, (actuator,) or (1, actuator) [rad]; None: the last still hold.
-
-        Raises:
-            MotionError: If there are not as many as the hand has joints.
-        """
+        """Take note of controls that were given, by actuator, (actuator,) or (1, actuator) [rad]; None: the last still hold."""
         if control is not None and self._controls is not None:
             values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
             self._action = torch.from_numpy(self._controls.targets(values)).unsqueeze(0)

@@ -63,7 +63,6 @@ class HandReader(threading.Thread):
     """
 
     def __init__(self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion | None):
-        """Take over a client."""
         super().__init__(name="xhand1", daemon=True)
         self.changed = threading.Condition()
         self.reading: Reading | None = None
@@ -164,11 +163,7 @@ class HandReader(threading.Thread):
 
 
 def _plausible(state: HandState) -> HandState:
-    """Return a state whose numbers can be those of a hand.
-
-    Raises:
-        ProtocolError: If the joints are not numbered 0 to 11, or an angle is not finite.
-    """
+    """Return a state, or raise an error if its numbers cannot be those of a hand."""
     if state.joint_id.tolist() != list(range(len(JOINTS))):
         raise ProtocolError(f"the joints of a reply are numbered {state.joint_id.tolist()}, expected 0 to 11")
     if not np.isfinite(state.position).all():

@@ -59,14 +59,7 @@ class HandSample:
 
     @classmethod
     def of(cls, reading: Reading, calibration: Calibration, velocity: VelocityFilter, time_s: float) -> HandSample:
-        """Return what a reading says.
-
-        Args:
-            reading: The reading.
-            calibration: What its counts mean.
-            velocity: The filter of joint speeds, which takes note of it.
-            time_s: When the joints were where it says [s].
-        """
+        """Return what a reading says; the filter takes note of it, at the time when the joints were there [s]."""
         state = reading.state
         speeds = velocity.update(time_s, state.position.astype(np.float64))
         return cls(
@@ -285,11 +278,7 @@ class XHand1Source(HandSource):
 
 
 def refuse_beyond_watchdog(control_step: float, watchdog_s: float | None) -> None:
-    """See that commands, one per control step, come before a watchdog bites.
-
-    Raises:
-        MotionError: If they do not.
-    """
+    """Raise an error unless commands, one per control step, come before a watchdog bites."""
     if watchdog_s is not None and control_step >= watchdog_s:
         what = f"a control step of {1e3 * control_step:g} ms, and the watchdog bites after {1e3 * watchdog_s:g} ms"
         raise MotionError(f"{what}; expected a shorter step")

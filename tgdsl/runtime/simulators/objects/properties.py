@@ -133,11 +133,7 @@ class ObjectProperties(ABC):
 
 
 def refuse_other_fields(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Refuse fields that environments do not have, or of another shape.
-
-    Raises:
-        SimulationError: If there are any.
-    """
+    """Raise an error for fields that environments do not have, or of another shape."""
     for name, value in given.items():
         if name not in own or tuple(own[name].shape) != tuple(value.shape):
             raise SimulationError(f'environments cannot have a "{name}" of shape {tuple(value.shape)} of their own')
@@ -145,11 +141,6 @@ def refuse_other_fields(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) 
 
 def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str]) -> RigidObject:
     """Return an object by its name in the document, or by its body's in the scene.
-
-    Args:
-        model: The scene.
-        name: The name.
-        bodies_of: Body of each of the document's objects.
 
     Raises:
         SimulationError: If there is no such object or body, or it has no mass.
@@ -182,18 +173,7 @@ def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str])
 def property_rows(
     what: str, given: Numbers, num_envs: int, device: torch.device, is_positive: bool = False
 ) -> Float[Tensor, " env"]:
-    """Return a property's value for each environment; numbers on the host are looked at.
-
-    Args:
-        what: How errors call it.
-        given: One value for all, or (env,).
-        num_envs: Number of environments.
-        device: Where it is wanted.
-        is_positive: Whether it cannot be 0.
-
-    Raises:
-        SimulationError: If a shape does not fit, or a number on the host is out of range.
-    """
+    """Return a property's value for each environment; those on the host must be finite and at least 0, or more than 0."""
     values = given if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given, dtype=np.float64))
     if tuple(values.shape) not in ((), (1,), (num_envs,)):
         raise SimulationError(f"{what} has shape {tuple(values.shape)}, expected one number or ({num_envs},)")

@@ -120,11 +120,6 @@ class SimulatedBody:
     """
 
     def __init__(self, scene: SteppedScene, tips: SimulatedTips, calibration: Calibration):
-        """Take a scene.
-
-        Raises:
-            MotionError: If the scene's actuators are not those of a hand.
-        """
         self.time = 0.0
         self.clipped: set[str] = set()
         self.failure: Exception | None = None

@@ -18,7 +18,7 @@ from tgdsl.errors import TgdslError
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S
-from tgdsl.runtime.xhand1.log.log import Fault, LogError, open_log
+from tgdsl.runtime.xhand1.log.log import Fault, open_log
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.source import HandSample, HandSource
 from tgdsl.runtime.xhand1.wire.errors import HandTimeoutError
@@ -217,10 +217,7 @@ class ReplaySource(HandSource):
 
     def _take(self, index: int) -> None:
         """Deliver a reading; those before it that were not delivered are skipped, as a slow reader would."""
-        try:
-            while self._next_reading <= index:
-                reading = next(self._readings)
-                self._next_reading += 1
-        except StopIteration as error:
-            raise LogError(f"{self.log.path}: this log was changed while it was replayed") from error
+        while self._next_reading <= index:
+            reading = next(self._readings)
+            self._next_reading += 1
         self._sample = HandSample.of(reading, self.calibration, self._velocity, reading.requested_at)

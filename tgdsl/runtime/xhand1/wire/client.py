@@ -243,11 +243,7 @@ class SerialClient:
         return waiting.reply
 
     def _synchronise(self) -> None:
-        """Ask for the version, so that what is still on its way comes before the answer; learn at first whether there is one.
-
-        Raises:
-            HandError: If there was one before, and is none now.
-        """
+        """Ask for the version: earlier replies come before the answer. Learn at first whether there is one."""
         for left in range(1 if self._tells_version else _VERSION_TRIES, 0, -1):
             try:
                 self._ask(Command.VERSION, b"", None, 0)
@@ -269,11 +265,7 @@ class SerialClient:
         return _CLOCK_TOLERANCE * 10 * num_bytes / self.timing.baud
 
     def _await_silence(self) -> None:
-        """Wait until the line is silent, if it may not be.
-
-        Raises:
-            HandTimeoutError: If it does not fall silent.
-        """
+        """Wait until the line is silent, if it may not be; raise an error if it does not fall silent."""
         if not self._is_suspect and not self.port.pending():
             return
         self._is_suspect = True

@@ -75,11 +75,7 @@ class Frame:
 
 
 def hand_address(hand_id: int) -> int:
-    """Return the address of a hand.
-
-    Raises:
-        ProtocolError: If the id does not fit seven bits.
-    """
+    """Return the address of a hand, whose id is 0 to 127."""
     if not 0 <= hand_id < 0x80:
         raise ProtocolError(f"hand id {hand_id}: expected 0 to 127")
     return HAND_ADDRESS | hand_id
