@@ -10,17 +10,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from faulty_lines import Faults, FaultyLine
+
 from tgdsl.runtime.xhand1 import driver, reader, source
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
-from tgdsl.runtime.xhand1.emulator.wire import EmulatedWire
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
 from tgdsl.runtime.xhand1.reader import HandReader
-from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialCounters, SerialTiming
+from tgdsl.runtime.xhand1.wire.client import Addresses, SerialClient, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError
-from tgdsl.runtime.xhand1.wire.replies import Addresses
-from tgdsl.runtime.xhand1.wire.serial_port import BAUD, POLL_S
+from tgdsl.runtime.xhand1.wire.serial_port import POLL_S
 
 
 class VirtualTime:
@@ -79,21 +78,21 @@ class VirtualPort:
         writes: Time and bytes of all that was written.
     """
 
-    def __init__(self, wire: EmulatedWire, time: VirtualTime):
-        self.wire, self.time, self.is_there = wire, time, True
+    def __init__(self, line: FaultyLine, time: VirtualTime):
+        self.line, self.time, self.is_there = line, time, True
         self.writes: list[tuple[float, bytes]] = []
         self._here = b""
 
     def write(self, data: bytes) -> None:
         self._check()
         self.writes.append((self.time.now, bytes(data)))
-        self.wire.hear(data, self.time.now)
+        self.line.hear(data, self.time.now)
 
     def read(self) -> bytes:
         self._check()
         if not self.pending():
             later = self.time.now + POLL_S
-            self.time.pass_until(min(self.wire.next_due() or later, later))
+            self.time.pass_until(min(self.line.next_due() or later, later))
             self._check()
             self.pending()
         here, self._here = self._here, b""
@@ -101,18 +100,18 @@ class VirtualPort:
 
     def pending(self) -> int:
         self._check()
-        self._here += self.wire.due(self.time.now)
+        self._here += self.line.due(self.time.now)
         return len(self._here)
 
     def close(self) -> None:
         self._here = b""
 
     def set_faults(self, faults: Faults) -> None:
-        self.wire.line.faults = faults
+        self.line.faults = faults
 
     def unplug(self) -> None:
         self.is_there = False
-        self.wire.cut()
+        self.line.cut()
 
     def replug(self) -> None:
         self.is_there = True
@@ -184,7 +183,7 @@ def virtual_hand(
     time, timing = VirtualTime(), timing or SerialTiming()
     for module in (driver, reader, source):
         monkeypatch.setattr(module, "time", time)
-    port = VirtualPort(EmulatedWire(hand or EmulatedHand(), Faults(), BAUD, turnaround_s, seed), time)
+    port = VirtualPort(FaultyLine(hand, seed=seed, turnaround_s=turnaround_s), time)
 
     def connect(counters: SerialCounters) -> SerialClient:
         port._check()

@@ -10,8 +10,8 @@ from tiny_tasks import NOISY, RADIUS, RANDOM, actions, same, taxel_world, tiny_e
 
 from tgdsl.errors import SimulationError
 from tgdsl.runtime import simulate
-from tgdsl.runtime.batch.connect import SIMULATION
 from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.connect import SOURCES
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 
 STEPS = 12
@@ -378,8 +378,8 @@ def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
                 threads=1,
             )
 
-    mine = dataclasses.replace(SIMULATION, name="mine", simulate=Mine, recognise=None)
-    monkeypatch.setattr(simulate, "known_sources", lambda: (SIMULATION, mine))
+    mine = dataclasses.replace(SOURCES[0], name="mine", simulate=Mine, recognise=None)
+    monkeypatch.setattr(simulate, "known_sources", lambda: (SOURCES[0], mine))
     env, other = make(3, simulator="mine"), make(3, simulator="mujoco")
     assert isinstance(env.sim, Mine)
     for _ in range(3):

@@ -13,7 +13,7 @@ from tgdsl.errors import HandError, ObservationError, SimulationError, TgdslErro
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.connect import Connection
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
+from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.wire.errors import (
     HandDisconnectedError,

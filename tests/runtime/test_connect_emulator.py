@@ -14,7 +14,7 @@ import tgdsl
 from tgdsl.errors import HandError, ObservationError, SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
+from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.payloads import FORCE_MAX

@@ -11,16 +11,14 @@ from warp_cases import SCENE, module
 
 import tgdsl
 from tgdsl.errors import ObservationError, SimulationError, TgdslError
-from tgdsl.runtime.known import SOURCES, known_sources
+from tgdsl.runtime.connect import SOURCES, known_sources
 from tgdsl.runtime.source import Simulator, Source
 
 MODULE = '''
 import torch
 
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.connection import Connection
-from tgdsl.runtime.simulators.connect import SimulationConnection
-from tgdsl.runtime.source_kind import SimulatorKind, SourceKind
+from tgdsl.runtime.connection import Connection, SimulationConnection, SimulatorKind, SourceKind
 
 
 class Fingertip:

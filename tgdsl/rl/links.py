@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool
 
-from tgdsl.runtime.simulators.model_ids import body_id
+from tgdsl.runtime.simulators.model_ids import element_id
 
 
 def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray, " link"]:
@@ -21,7 +21,7 @@ def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray,
         model: The scene.
         links: Bodies.
     """
-    joints = [_joints_above(model, body_id(model, link)) for link in links]
+    joints = [_joints_above(model, element_id(model, "body", link)) for link in links]
     of_all = set.intersection(*joints) if joints else set()
     slides = {joint for joint in of_all if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)}
     return np.array([bool(own - slides) for own in joints], dtype=bool)

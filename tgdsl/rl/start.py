@@ -17,11 +17,11 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed
 from tgdsl.rl.task import Setup
+from tgdsl.runtime.connection import keyword_options
 from tgdsl.runtime.simulate import simulator_for
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.watch import Watch
-from tgdsl.runtime.source_kind import keyword_options
 from tgdsl.scene.scene import SceneModels, is_absent
 from tgdsl.schema.select import is_plain, matching
 

@@ -30,7 +30,7 @@ from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.table import GraspTable
 from tgdsl.rl.spec import TaskSpec
-from tgdsl.runtime.simulators.joints import Joints
+from tgdsl.runtime.simulators.model_ids import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched

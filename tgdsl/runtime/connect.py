@@ -1,23 +1,45 @@
-"""One way to step and observe, whatever is behind it: a simulation, a real hand, an emulated one, or a recorded log."""
+"""One way to step and observe, whatever is behind it: a simulation, a real hand, an emulated one, or a recorded log.
+
+The kinds of sources that can be connected to are tgdsl's own and those of installed packages. A package brings one by an entry
+point, in its pyproject.toml:
+
+    [project.entry-points."tgdsl.sources"]
+    my_hand = "my_package.my_hand:MY_HAND"
+"""
 
 from __future__ import annotations
 
+import math
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.errors import HandError, SimulationError, TgdslError, did_you_mean, listed
+from tgdsl.files.plugins import known
 from tgdsl.module.module import TactileModule
 from tgdsl.module.taxels.identity import Taxels, check_taxels
-from tgdsl.runtime.connection import Connection as Connection
-from tgdsl.runtime.known import known_sources
-from tgdsl.runtime.source_kind import SourceKind
+from tgdsl.observations.observations import HAND_ONLY, hand_only_error
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.connection import Connection, SimulationConnection, SimulatorKind, SourceKind
+from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.stepped_scene import SteppedScene
-from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.replies import Addresses
+from tgdsl.runtime.warp.simulation import WarpSimulation
+from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
+from tgdsl.runtime.xhand1.connection import HandConnection, JointTargets
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource, SimulatedBody, SimulatedTips
+from tgdsl.runtime.xhand1.fingertips import warn_of_noise
+from tgdsl.runtime.xhand1.log.replay import ReplaySource
+from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
+from tgdsl.runtime.xhand1.observe import HandObserver
+from tgdsl.runtime.xhand1.source import XHand1Source, refuse_beyond_watchdog
+from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
+from tgdsl.runtime.xhand1.wire.serial_port import list_ports
+from tgdsl.scene.scene import scene_model
 
 CONTROL_STEP = 0.02
+_USB_PORTS = ("/dev/ttyUSB", "/dev/ttyACM", "/dev/cu.usb", "COM")
 
 
 def connect(
@@ -43,7 +65,7 @@ def connect(
         source: `simulation`: its own scene, in MuJoCo. `emulator`: the same behind the serial protocol of an XHand1.
             `xhand1`: the hand on the only USB serial port; `xhand1:/dev/ttyUSB0`: on this one. A path that ends in `.npz`: a
             recorded log. `warp`: its own scene in MuJoCo Warp on a GPU; `warp:cuda:1`: on this one. Installed packages may
-            bring others, see `tgdsl.runtime.known`.
+            bring others, see `known_sources`.
         num_envs: Number of environments; more than 1 only for a simulation.
         control_step: Duration of one control step [s]; in a scene, a whole number of physics steps.
         keyframe: Keyframe that a scene starts from; default: the model's own initial state.
@@ -82,6 +104,139 @@ def connect(
     return kind.open(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **own)
 
 
+def _open_simulation(
+    touch: TactileModule,
+    source: str,
+    *,
+    num_envs: int,
+    control_step: float,
+    keyframe: str | None,
+    scene: SteppedScene | None = None,
+) -> Connection:
+    _refuse_hand_only(touch)
+    if scene is None:
+        return SimulationConnection(touch, _simulated(touch, num_envs, control_step, keyframe))
+    return SimulationConnection(touch, _stepping(scene, control_step))
+
+
+def _open_warp(
+    touch: TactileModule,
+    source: str,
+    *,
+    num_envs: int,
+    control_step: float,
+    keyframe: str | None,
+    scene: SteppedScene | None = None,
+    nconmax: int | None = None,
+    njmax: int | None = None,
+) -> Connection:
+    _refuse_hand_only(touch)
+    if scene is not None:
+        return SimulationConnection(touch, _stepping(scene, control_step))
+    device = source.partition(":")[2] or "cuda"
+    sim = WarpSimulation(touch, num_envs, device=device, keyframe=keyframe, nconmax=nconmax, njmax=njmax)
+    _set_control_step(sim, control_step)
+    return SimulationConnection(touch, sim)
+
+
+def _open_emulator(
+    touch: TactileModule,
+    source: str,
+    *,
+    control_step: float,
+    keyframe: str | None,
+    calibration: Calibration | str | Path | None,
+    motion: MotionLimits | None,
+    timing: SerialTiming | None,
+    lockstep: bool,
+    scene: SteppedScene | None = None,
+) -> Connection:
+    read_calibration = _read(calibration) or Calibration.none()
+    observer = HandObserver(touch, read_calibration, control_step)
+    tips = SimulatedTips(touch, observer.terms)
+    if scene is None:
+        model = scene_model(touch.plan.scene)
+        joints = tuple(model.joint(int(i)).name for i in joint_ids(model))
+        scene = SteppedScene(touch, _simulated(touch, 1, control_step, keyframe, Watch(joints=joints)))
+    _stepping(scene, control_step)
+    if not lockstep:
+        _refuse_unfit_steps(control_step, motion, timing)
+    targets = JointTargets(touch, motion, "the emulated hand")
+    body = SimulatedBody(scene, tips, read_calibration)
+    hand = EmulatedSource(
+        body, control_step=control_step, calibration=read_calibration, motion=motion, timing=timing, lockstep=lockstep
+    )
+    return HandConnection(hand, observer, targets)
+
+
+def _open_hand(
+    touch: TactileModule,
+    source: str,
+    *,
+    control_step: float,
+    calibration: Calibration | str | Path | None,
+    motion: MotionLimits | None,
+    addresses: Addresses | None,
+    timing: SerialTiming | None,
+    lockstep: bool,
+) -> Connection:
+    read_calibration = _read(calibration) or Calibration.none()
+    if lockstep:
+        raise HandError("a real hand moves in its own time: lockstep is for emulators and logs")
+    observer = HandObserver(touch, read_calibration, control_step)
+    targets = JointTargets(touch, motion, "the hand")
+    _refuse_unfit_steps(control_step, motion, timing)
+    warn_of_noise(touch.plan)
+    port = source.partition(":")[2] or _only_port()
+    with ExitStack() as opened:
+        hand = opened.enter_context(XHand1.open(port, addresses, motion=motion, timing=timing))
+        stepped = XHand1Source(hand, control_step=control_step, calibration=read_calibration)
+        opened.pop_all()
+    return HandConnection(stepped, observer, targets)
+
+
+def _open_log(
+    touch: TactileModule, source: str, *, control_step: float, calibration: Calibration | str | Path | None, lockstep: bool
+) -> Connection:
+    speed = math.inf if lockstep else 1.0
+    replay = ReplaySource(Path(source), control_step=control_step, speed=speed, calibration=_read(calibration))
+    observer = HandObserver(touch, replay.calibration, control_step, is_log=True)
+    warn_of_noise(touch.plan)
+    return HandConnection(replay, observer)
+
+
+SOURCES: tuple[SourceKind, ...] = (
+    SimulatorKind(
+        "simulation",
+        '"simulation"',
+        _open_simulation,
+        recognise=lambda source: source == "simulation",
+        devices=("cpu",),
+        simulate=BatchSimulation,
+    ),
+    SourceKind("emulator", '"emulator"', _open_emulator, recognise=lambda source: source == "emulator"),
+    SourceKind("xhand1", '"xhand1", "xhand1:PORT"', _open_hand),
+    SimulatorKind("warp", '"warp", "warp:DEVICE"', _open_warp, devices=("cuda",), simulate=WarpSimulation),
+    SourceKind("log", 'the path of a log, "….npz"', _open_log, recognise=lambda source: source.endswith(".npz")),
+)
+"""The kinds of tgdsl."""
+
+
+def known_sources() -> tuple[SourceKind, ...]:
+    """Return all kinds of sources: those of tgdsl, then those of installed packages by package and name.
+
+    An installed kind that cannot be had is left out, with a warning, the first time.
+
+    Raises:
+        TgdslError: If two kinds have one name.
+    """
+    return known("tgdsl.sources", "source", "kinds of sources", SOURCES, (), _wrong)
+
+
+def _wrong(kind: object) -> str:
+    return "" if isinstance(kind, SourceKind) else f"found {type(kind).__name__}, expected a {SourceKind.__name__}"
+
+
 def kind_of(source: str) -> SourceKind:
     """Return the kind of the source that a user named.
 
@@ -94,3 +249,53 @@ def kind_of(source: str) -> SourceKind:
             return kind
     *most, last = (kind.expected for kind in kinds)
     raise TgdslError(f'unknown source "{source}"; expected {", ".join(most)} or {last}')
+
+
+def _simulated(
+    touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None, watch: Watch | None = None
+) -> BatchSimulation:
+    sim = BatchSimulation(touch, num_envs, keyframe=keyframe, threads=0 if num_envs > 1 else 1, watch=watch)
+    _set_control_step(sim, control_step)
+    return sim
+
+
+def _set_control_step(sim: Simulation, control_step: float) -> None:
+    timestep = float(sim.model.opt.timestep)
+    sim.substeps = round(control_step / timestep)
+    if sim.substeps < 1 or abs(sim.control_step - control_step) > 1e-6 * timestep:
+        what = f"a control step of {control_step:g} s"
+        raise SimulationError(f"{what}, expected a whole number of the scene's physics steps of {timestep:g} s")
+
+
+def _stepping(scene: SteppedScene, control_step: float) -> SteppedScene:
+    """Return a scene, after a look at the duration of its control steps."""
+    if abs(scene.control_step - control_step) > 1e-9:
+        raise SimulationError(f"control steps of {control_step:g} s, and the scene's are {scene.control_step:g} s")
+    return scene
+
+
+def _refuse_hand_only(touch: TactileModule) -> None:
+    for term in touch.plan.observations:
+        if term.type in HAND_ONLY:
+            raise hand_only_error(term.group, term.index, term.type)
+
+
+def _refuse_unfit_steps(control_step: float, motion: MotionLimits | None, timing: SerialTiming | None) -> None:
+    """Raise an error for control steps that are shorter than an exchange on the line, or longer than the watchdog waits."""
+    shortest = (timing or SerialTiming()).exchange_s
+    if 0 < control_step < shortest:
+        what = f"control steps of {1e3 * control_step:g} ms ({1 / control_step:.0f} per second)"
+        raise HandError(f"{what}, and an exchange takes {1e3 * shortest:.2f} ms: at most {1 / shortest:.0f} per second")
+    refuse_beyond_watchdog(control_step, None if motion is None else motion.watchdog_s)
+
+
+def _read(calibration: Calibration | str | Path | None) -> Calibration | None:
+    return load_calibration(Path(calibration)) if isinstance(calibration, (str, Path)) else calibration
+
+
+def _only_port() -> str:
+    ports = [port.device for port in list_ports() if port.device.startswith(_USB_PORTS)]
+    if len(ports) != 1:
+        found = listed(ports) or "none"
+        raise HandError(f'expected one USB serial port, found {found}; name the hand\'s: source="xhand1:/dev/ttyUSB0"')
+    return ports[0]

@@ -1,18 +1,24 @@
-"""A source as a policy sees it: stepped, observed and reset, whatever is behind it.
+"""A source as a policy sees it: stepped, observed and reset, whatever is behind it; and the kinds of sources that register.
 
 Shapes: `env` environments, `feature` numbers of an observation.
 """
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 from types import TracebackType
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import ObservationError
-from tgdsl.runtime.source import Control, Source
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.source import Control, Simulator, Source
+from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.tensors.env_ids import EnvIds
 
 
@@ -26,7 +32,6 @@ class Connection(ABC):
     """
 
     def __init__(self, source: Source):
-        """Connect a source; users call `tgdsl.connect`."""
         self.source = source
         self._groups: dict[str, Tensor] | None = None
         self._is_read = True
@@ -125,3 +130,64 @@ class Connection(ABC):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+class SimulationConnection(Connection):
+    """A connection to a simulator of the module's scene, or to a scene that reads the module's sensors itself."""
+
+    def __init__(self, touch: TactileModule, source: Simulator | SteppedScene):
+        super().__init__(source)
+        self._touch, self._scene = touch, source
+
+    def read(self) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the observation groups of the state."""
+        scene = self._scene
+        return self._touch.observe(scene.readings if isinstance(scene, SteppedScene) else self._touch(scene.state()))
+
+
+@dataclass(frozen=True)
+class SourceKind:
+    """A kind of source that `tgdsl.connect` can open.
+
+    Attributes:
+        name: Its name, by which it is also recognised: alone, or with an address, "name:ADDRESS".
+        expected: How users name a source of this kind, as errors list it: '"name" or "name:ADDRESS"'.
+        open: Opens a source: `open(touch, source, *, option, …)`, given the module and the source as the user named it. The
+            options that it knows are its keyword-only parameters: those of `connect` that it needs, and any of its own.
+        recognise: Whether a source that a user named is of this kind; default: if its name is the kind's.
+    """
+
+    name: str
+    expected: str
+    open: Callable[..., Connection]
+    recognise: Callable[[str], bool] | None = None
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of the options that it knows."""
+        return keyword_options(self.open)
+
+    def recognises(self, source: str) -> bool:
+        """Return whether a source that a user named is of this kind."""
+        return source.partition(":")[0] == self.name if self.recognise is None else self.recognise(source)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorKind(SourceKind):
+    """A kind of source that `tgdsl.simulate` can make too.
+
+    Attributes:
+        devices: Types of torch devices whose physics it is taken for: "cpu", "cuda".
+        simulate: Makes a simulation: `simulate(touch, num_envs, *, device, option, …)`.
+    """
+
+    devices: tuple[str, ...]
+    simulate: Callable[..., Any]
+
+
+def keyword_options(call: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the names of a function's keyword-only parameters; of a `Simulation` that takes any, its `OPTIONS` too."""
+    parameters = inspect.signature(call).parameters.values()
+    names = tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    return (*getattr(call, "OPTIONS", ()), *names) if takes_any else names

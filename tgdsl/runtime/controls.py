@@ -17,16 +17,7 @@ FAR_BEYOND = 10.0
 
 
 def control_tensor(control: Tensor | np.ndarray, num_envs: int, num_actuators: int) -> Float[Tensor, "*env actuator"]:
-    """Return controls as a tensor without gradients where they are; an array becomes float64.
-
-    Args:
-        control: Controls, (env, actuator), or (actuator,) for all environments alike.
-        num_envs: Number of environments.
-        num_actuators: Number of actuators of the model.
-
-    Raises:
-        SimulationError: If their shape is another one.
-    """
+    """Return controls, (actuator,) or (env, actuator), as a tensor without gradients; an array becomes float64."""
     values = control.detach() if isinstance(control, Tensor) else torch.from_numpy(np.array(control, dtype=np.float64))
     if tuple(values.shape) not in ((num_actuators,), (num_envs, num_actuators)):
         expected = f"({num_envs}, {num_actuators}) or ({num_actuators},)"
@@ -39,13 +30,7 @@ def write_controls(
 ) -> Bool[Tensor, "*env"]:
     """Write controls in place where they are finite; return the environments where they are not, or for all whether they are.
 
-    Args:
-        control: Controls, as for `control_tensor`.
-        ctrl: A simulator's controls.
-        refuses_unfinite: Whether the host's own are refused if they are not finite. Those on a GPU are looked at there.
-
-    Raises:
-        SimulationError: If they do not fit, or are the host's and not finite.
+    Those on a GPU are looked at there; those of the host are refused if they are not finite and `refuses_unfinite`.
     """
     values = control_tensor(control, *ctrl.shape)
     is_read_here = not (values.is_cuda and ctrl.is_cuda)
@@ -80,11 +65,7 @@ def is_unfinite(values: Float[Tensor, "*env actuator"]) -> Bool[Tensor, "*env"]:
 
 
 def refuse_unfinite(values: Float[Tensor, "*env actuator"]) -> None:
-    """Look at controls on the host.
-
-    Raises:
-        SimulationError: If any is not finite.
-    """
+    """Raise an error if any control on the host is not finite."""
     rows = torch.nonzero(is_unfinite(values).reshape(-1)).flatten().tolist()
     if rows:
         raise SimulationError(f"control is not finite in environments {listed([str(row) for row in rows])}")

@@ -17,12 +17,13 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.errors import SimulationError
 from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.simulators.memory import refuse_beyond_memory
+from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.source import Simulator
 
 PLACES = ("link", "body", "pos", "normal", "area")
@@ -42,13 +43,7 @@ class Step:
 
 
 def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds: float, control_step: float) -> Controls:
-    """Return controls that hold each keyframe's for a while and move evenly to the next one's in as long.
-
-    Args:
-        model: The scene.
-        keyframes: Names of the keyframes, of which only `ctrl` counts.
-        seconds: Duration of each hold and of each move [s].
-        control_step: Duration of a control step [s].
+    """Return controls that hold the `ctrl` of each keyframe for some seconds and move evenly to the next one's in as long.
 
     Raises:
         SimulationError: If the scene has no such keyframe, none is given, or the duration is not positive, or takes more steps
@@ -56,25 +51,20 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
     """
     if not keyframes or not 0 < seconds < np.inf:
         raise SimulationError(f"{len(keyframes)} keyframes held for {seconds:g} s: expected at least one, and more than 0 s")
-    known = [model.key(i).name for i in range(model.nkey)]
-    for name in keyframes:
-        if name not in known:
-            raise SimulationError(f'the scene has no keyframe "{name}"; {did_you_mean(name, known, "keyframes")}')
-    return controls_between([model.key_ctrl[model.key(name).id] for name in keyframes], seconds, control_step)
+    targets = [model.key_ctrl[element_id(model, "key", name)] for name in keyframes]
+    return controls_between(targets, seconds, control_step)
 
 
 def controls_between(targets: Sequence[Float[np.ndarray, " actuator"]], seconds: float, control_step: float) -> Controls:
-    """Return controls that hold each of some for a while and move evenly to the next in as long.
-
-    Args:
-        targets: The controls.
-        seconds: Duration of each hold and of each move [s].
-        control_step: Duration of a control step [s].
+    """Return controls that hold each of some targets for some seconds and move evenly to the next in as long.
 
     Raises:
         SimulationError: If the duration is not positive, or takes more steps than there is memory for.
     """
-    steps = _num_steps(len(targets[0]), seconds, control_step, 2 * len(targets) - 1)
+    if not 0 < seconds < np.inf:
+        raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
+    steps, times = max(round(seconds / control_step), 1), 2 * len(targets) - 1
+    refuse_beyond_memory(f"controls of {times * steps} steps", 8 * times * steps * len(targets[0]))
     parts = [np.tile(targets[0], (steps, 1))]
     for start, end in pairwise(targets):
         ramp = np.linspace(0.0, 1.0, steps)[:, None]
@@ -89,26 +79,8 @@ def default_keyframes(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def held_controls(model: mujoco.MjModel, seconds: float, control_step: float) -> Controls:
-    """Return controls that stay those of the initial state, zero.
-
-    Args:
-        model: The scene.
-        seconds: For how long [s].
-        control_step: Duration of a control step [s].
-
-    Raises:
-        SimulationError: If the duration is not positive, or takes more steps than there is memory for.
-    """
-    return np.zeros((_num_steps(model.nu, seconds, control_step), model.nu))
-
-
-def _num_steps(num_actuators: int, seconds: float, control_step: float, times: int = 1) -> int:
-    """Return how many control steps a duration has, at least one; controls of so many, `times` over, fit into memory."""
-    if not 0 < seconds < np.inf:
-        raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
-    steps = max(round(seconds / control_step), 1)
-    refuse_beyond_memory(f"controls of {times * steps} steps", 8 * times * steps * num_actuators)
-    return steps
+    """Return controls that stay zero, as in the initial state, for some time: see `controls_between`."""
+    return controls_between([np.zeros(model.nu)], seconds, control_step)
 
 
 def recorded_controls(path: Path) -> Controls:
@@ -177,11 +149,7 @@ def silent_readings(
 ) -> dict[str, list[str]]:
     """Return the readings of taxels that are 0 although bodies with these taxels touch an object, and these bodies.
 
-    Args:
-        touch: The module.
-        sim: The simulation.
-        readings: Its readings.
-        touching: What touches: see `touching_bodies`.
+    `touching` is what `touching_bodies` returns.
     """
     weld, body = sim.model.body_weldid, sim.model.body
     result = {}
@@ -197,10 +165,6 @@ def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[s
 
     Loads are the sizes of forces by body, in the first environment: of what a body's taxels feel together, and of what it
     misses. Readings with a history are left out.
-
-    Args:
-        touch: The module.
-        readings: Its readings.
     """
     result = {}
     for output in touch.outputs:
@@ -228,11 +192,6 @@ class Recorder:
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
-        """Allocate memory for a rollout.
-
-        Raises:
-            SimulationError: If this computer has too little memory.
-        """
         self._outputs, self._taxels, self._rows = touch.outputs, touch.taxels, touch.rows
         size = 4 * num_steps * num_envs * sum(math.prod(output.shape) for output in self._outputs)
         refuse_beyond_memory(f"readings of {num_envs} environments at {num_steps} steps", size)

@@ -36,14 +36,7 @@ class Script:
     note: str = ""
 
     def begin(self, touch: TactileModule, num_envs: int, substeps: int, seconds: float, options: Options | None = None) -> Run:
-        """Start the scene.
-
-        Args:
-            touch: The module that reads it.
-            num_envs: Environments.
-            substeps: Physics steps per control step.
-            seconds: Duration of each hold and of each move [s].
-            options: MuJoCo's options that are to differ from the scene's.
+        """Start the scene; each hold and each move takes some seconds.
 
         Raises:
             SimulationError: If the scene has no such keyframe, or cannot be simulated.
@@ -63,23 +56,14 @@ class Script:
 
 
 def substeps_of(touch: TactileModule, others: int) -> int:
-    """Return how many physics steps a control step has: as many as sensors that read blocks want.
-
-    Args:
-        touch: The module.
-        others: How many there are where no sensor wants any.
-    """
+    """Return the physics steps of a control step: as many as sensors that read blocks want, else `others`."""
     return max((sensor.substeps for sensor in touch.plan.sensors), default=0) or others
 
 
 def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, progress: Progress = silent) -> Script:
-    """Return how a scene is run.
+    """Return how a scene is run: between keyframes, by default `rest` and `squeeze` if the scene has them.
 
-    Args:
-        touch: The module that reads it.
-        keyframes: Keyframes whose controls are held and moved between; default: `rest` and `squeeze` if the scene has them,
-            else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
-        progress: Is told what is done.
+    Else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
     """
     own = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
     if own or keyframes is not None:

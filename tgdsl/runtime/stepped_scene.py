@@ -15,7 +15,6 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
-from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.source import Control
@@ -33,15 +32,6 @@ class SteppedScene:
     """
 
     def __init__(self, touch: TactileModule, sim: Any):
-        """Take a simulation that is at its start.
-
-        Args:
-            touch: The module that reads it; nobody else may call it.
-            sim: The simulation.
-
-        Raises:
-            SimulationError: If it has more than one environment.
-        """
         if sim.num_envs != 1:
             raise SimulationError(f"an emulated hand has one environment, found {sim.num_envs}")
         self.sim: Simulation = sim
@@ -104,29 +94,3 @@ class SteppedScene:
     def close(self) -> None:
         """Release the module; the scene can no longer be used."""
         self.sim.close()
-
-
-class SceneConnection(Connection):
-    """A connection to a scene that reads the module's sensors itself.
-
-    Shapes: `env` one, `feature` numbers of an observation.
-    """
-
-    def __init__(self, touch: TactileModule, scene: SteppedScene):
-        """Connect a module to the scene that it reads."""
-        super().__init__(scene)
-        self._touch, self._scene = touch, scene
-
-    def read(self) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the observation groups of the scene's last readings."""
-        return self._touch.observe(self._scene.readings)
-
-
-def refuse_other_steps(scene: SteppedScene, control_step: float) -> None:
-    """See that a scene makes control steps of some duration [s].
-
-    Raises:
-        SimulationError: If not.
-    """
-    if abs(scene.control_step - control_step) > 1e-9:
-        raise SimulationError(f"control steps of {control_step:g} s, and the scene's are {scene.control_step:g} s")

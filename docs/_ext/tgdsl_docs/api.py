@@ -14,6 +14,7 @@ MORE = {
     "SceneState": (),
     "BatchSimulation": (
         "tgdsl.runtime.simulators.simulation.Simulation",
+        "tgdsl.runtime.simulators.simulation.SimOptions",
         "tgdsl.runtime.source.Source",
         "tgdsl.runtime.source.Simulator",
     ),
@@ -27,7 +28,7 @@ WRITING = {
         ("AnySensorSpec", "SensorSpec", "OnJointsSpec", "LinkSpec", "ProbeSpec", "ContactProbeSpec"),
     ),
     "Quantities": ("tgdsl.quantities.base", ("Quantity", "Request", "Planning", "Scene", "Gathered", "Use")),
-    "Sources": ("tgdsl.runtime.source_kind", ("SourceKind",)),
+    "Sources": ("tgdsl.runtime.connection", ("Connection", "SourceKind", "SimulatorKind")),
 }
 """What authors of kinds, quantities and sources use."""
 HEADS = "=-"

@@ -1,10 +1,10 @@
 """An emulated hand that no command may have moved, and serial ports that this computer seems to have."""
 
 import pytest
+from faulty_lines import FaultyEmulator
 from resting_hands import resting
 
 from tgdsl.runtime.xhand1 import driver
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.wire import ports
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
@@ -19,7 +19,7 @@ ALLOWED = {Command.VERSION, Command.READ_REGISTER, Command.EXCHANGE}
 def emulator():
     """A hand at rest; at the end, no request may have held a set-point that moves a joint."""
     registers = {Register.SERIAL_NUMBER: b"X1-0042" + bytes(25), Register.NAME: b"\xff\x00", Register.SIDE: b"\x01"}
-    with Emulator(EmulatedHand(forces=resting, registers=registers)) as emulator:
+    with FaultyEmulator(EmulatedHand(forces=resting, registers=registers)) as emulator:
         yield emulator
         assert {frame.command for _, frame in emulator.requests} <= ALLOWED
         assert {frame.payload for _, frame in emulator.requests if frame.command == Command.EXCHANGE} <= {

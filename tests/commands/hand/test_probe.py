@@ -2,8 +2,8 @@
 
 import os
 
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
+from faulty_lines import Faults, FaultyEmulator
+
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.wire.protocol import Command
 
@@ -49,7 +49,7 @@ def test_a_computer_without_ports(plugged, here, tmp_path):
 
 
 def test_no_hand_or_several_are_an_error_that_lists_them(emulator, plugged, here, tmp_path):
-    with Emulator(EmulatedHand(3)) as second:
+    with FaultyEmulator(EmulatedHand(3)) as second:
         plugged(emulator.device, second.device)
         code, _, error = here(tmp_path, "hand", "monitor", "--seconds", "0.1")
         assert code == 2

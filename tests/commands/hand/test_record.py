@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 
 import pytest
+from faulty_lines import Faults
 from resting_hands import TARE
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.log import record
 from tgdsl.runtime.xhand1.log.log import open_log
 from tgdsl.runtime.xhand1.wire.protocol import Command

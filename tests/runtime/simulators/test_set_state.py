@@ -271,7 +271,7 @@ def test_joints_that_share_a_body_need_names():
         f"<mujoco><worldbody>{text.format(joints)}<body name='b'><joint name='a'/><geom size='.1'/></body>"
         "<body name='c'><joint type='ball'/><geom size='.1'/></body></worldbody></mujoco>"
     )
-    from tgdsl.runtime.simulators.joints import Joint, Joints
+    from tgdsl.runtime.simulators.model_ids import Joint, Joints
 
     assert Joints(model) == {"a": Joint(slice(5, 6), slice(4, 5)), "c": Joint(slice(6, 10), slice(5, 8))}
 

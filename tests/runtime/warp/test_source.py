@@ -33,8 +33,8 @@ def test_a_gpu_is_asked_for_by_its_device_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(WarpSimulation, "__init__", functools.wraps(WarpSimulation.__init__)(started))
     sim = tgdsl.simulate(touch, 7, device="cuda:1", substeps=5, keyframe="home", nconmax=20, njmax=90)
     assert isinstance(sim, WarpSimulation)
-    keys = {"substeps": 5, "keyframe": "home", "nconmax": 20, "njmax": 90, "on_fault": "raise"}
-    assert asked == {"num_envs": 7, "device": "cuda:1", "options": None, "watch": None, "per_env": (), **keys}
+    keys = {"substeps": 5, "keyframe": "home", "nconmax": 20, "njmax": 90}
+    assert asked == {"num_envs": 7, "device": "cuda:1", **keys}
     assert isinstance(tgdsl.simulate(touch, 1, device="cpu"), BatchSimulation)
 
 

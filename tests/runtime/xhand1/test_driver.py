@@ -6,26 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_lines import Faults, FaultyEmulator
 from xhand1_hands import PATIENT, Stamps, WrittenBytes, open_again, read_again, wait_until
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
+from tgdsl.runtime.xhand1.identity import identify
 from tgdsl.runtime.xhand1.wire import payloads, serial_port
-from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.discovery import find_hands
+from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
-    HandChecksumError,
     HandClosedError,
     HandDisconnectedError,
     HandError,
-    HandRefusedError,
     HandTimeoutError,
     MotionError,
 )
-from tgdsl.runtime.xhand1.wire.protocol import Frame, Register, encode_frame
-from tgdsl.runtime.xhand1.wire.replies import Addresses
+from tgdsl.runtime.xhand1.wire.ports import find_hands
+from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
 
 READ = encode_frame(Frame(0xFE, 0x80, 2, payloads.encode_command(payloads.PASSIVE)))
 VERSION = bytes.fromhex("55aafe80130000efc3")
@@ -36,7 +33,7 @@ BRISK = SerialTiming(reply_timeout_s=0.2, silence_s=0.1)
 def test_every_reading_is_new_and_knows_its_age():
     stamps = Stamps()
     with (
-        Emulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, max_age_s=20.0) as hand,
     ):
         readings = [hand.read(20.0) for _ in range(60)]
@@ -47,7 +44,7 @@ def test_every_reading_is_new_and_knows_its_age():
 def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
     """Every byte, over failures of all kinds, a pulled cable and the end."""
     written, stamps = WrittenBytes(), Stamps()
-    with Emulator(EmulatedHand(forces=stamps), faults=Faults.each(0.1)) as emulator:
+    with FaultyEmulator(EmulatedHand(forces=stamps), faults=Faults.each(0.1)) as emulator:
         with open_again(emulator.device, timing=BRISK, open_port=written.open) as hand:
             while len(written.writes) < 100:
                 with contextlib.suppress(HandError):
@@ -68,22 +65,20 @@ def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
         assert (joint.mode, joint.kp, joint.ki, joint.kd, joint.current_limit) == (0, 0, 0, 0, 0)
 
 
-def test_registers_version_and_tare_write_no_set_point_either():
+def test_identity_and_tare_write_no_set_point_either():
     written = WrittenBytes()
-    with (
-        Emulator(EmulatedHand(forces=Stamps())) as emulator,
-        XHand1.open(emulator.device, timing=PATIENT, open_port=written.open) as hand,
-    ):
-        assert hand.version() == b"tgdsl emulator"
-        assert hand.read_register(Register.NAME) == b"emulated"
-        with pytest.raises(HandRefusedError, match="the hand refused command 0x15"):
-            hand.read_register(999)
+    with FaultyEmulator(EmulatedHand(forces=Stamps())) as emulator:
+        (found,) = find_hands(emulator.device, (0,), timing=PATIENT, open_port=written.open)
+        identity = identify(found, timing=PATIENT, open_port=written.open)
+        assert (identity.version, identity.name, identity.side) == (b"tgdsl emulator", b"emulated", None)
+        hand = XHand1.open(emulator.device, timing=PATIENT, open_port=written.open)
         tare = hand.tare(5)
         assert tare.mean.tolist() == [[7, -3, 40]] * 5
         assert (tare.spread == 0).all()
         assert tare.num_frames == 5
         with pytest.raises(HandError, match="a tare over 4 frames, expected at least 5"):
             hand.tare(4)
+        hand.close()
     assert {data for data in written.writes if data[4] == 2} == {READ}
     assert {data[4] for data in written.writes} == {0x02, 0x13, 0x15}
 
@@ -93,7 +88,7 @@ def test_a_saturated_fingertip_cannot_be_tared():
         return TipForces(np.full((5, 3), 300.0), np.zeros((5, 120, 3)))
 
     with (
-        Emulator(EmulatedHand(forces=pressed)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=pressed)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, max_age_s=20.0) as hand,
     ):
         assert hand.read().state.total_force.tolist() == [[127, 127, 255]] * 5
@@ -113,7 +108,7 @@ def failure_of(hand: XHand1) -> HandError | None:
 def test_all_faults_at_once():
     """What comes is new and whole, and what does not come has a name."""
     stamps, readings, errors = Stamps(), [], []
-    with Emulator(EmulatedHand(forces=stamps), seed=5) as emulator, open_again(emulator.device, timing=CALM) as hand:
+    with FaultyEmulator(EmulatedHand(forces=stamps), seed=5) as emulator, open_again(emulator.device, timing=CALM) as hand:
         emulator.set_faults(Faults.each(0.05))
 
         def is_read() -> bool:
@@ -131,7 +126,7 @@ def test_all_faults_at_once():
 
 def test_a_silent_device_is_named():
     stamps = Stamps()
-    with Emulator(EmulatedHand(forces=stamps)) as emulator:
+    with FaultyEmulator(EmulatedHand(forces=stamps)) as emulator:
         with open_again(emulator.device, timing=CALM) as hand:
             emulator.set_faults(Faults(silence=1.0))
             assert wait_until(lambda: isinstance(failure_of(hand), HandTimeoutError))
@@ -152,13 +147,13 @@ def refusal(device: str) -> str:
 
 def test_a_line_that_damages_everything():
     timing = SerialTiming(reply_timeout_s=1.0, silence_s=0.1)
-    with Emulator(faults=Faults(corrupt=1.0)) as emulator, pytest.raises(HandChecksumError, match="came damaged"):
+    with FaultyEmulator(faults=Faults(corrupt=1.0)) as emulator, pytest.raises(HandTimeoutError, match="came damaged"):
         XHand1.open(emulator.device, timing=timing)
 
 
 def test_unplug_and_replug():
     stamps = Stamps()
-    with Emulator(EmulatedHand(forces=stamps)) as emulator, open_again(emulator.device, timing=CALM) as hand:
+    with FaultyEmulator(EmulatedHand(forces=stamps)) as emulator, open_again(emulator.device, timing=CALM) as hand:
         for _ in range(3):
             emulator.unplug()
             assert wait_until(lambda: isinstance(failure_of(hand), HandDisconnectedError))
@@ -170,7 +165,7 @@ def test_unplug_and_replug():
 
 
 def test_the_wrong_hand():
-    with Emulator(EmulatedHand(3)) as emulator:
+    with FaultyEmulator(EmulatedHand(3)) as emulator:
         with pytest.raises(HandTimeoutError):
             XHand1.open(emulator.device)
         with XHand1.open(emulator.device, Addresses(3), timing=PATIENT) as hand:
@@ -180,11 +175,11 @@ def test_the_wrong_hand():
 
 
 def test_a_closed_hand_says_so():
-    with Emulator() as emulator:
+    with FaultyEmulator() as emulator:
         hand = XHand1.open(emulator.device, timing=PATIENT)
         hand.close()
         hand.close()
-        for call in (hand.read, hand.version, lambda: hand.command(np.zeros(12))):
+        for call in (hand.read, lambda: hand.command(np.zeros(12))):
             with pytest.raises(HandClosedError, match="this hand was closed"):
                 call()
 
@@ -193,7 +188,7 @@ def test_a_port_that_is_not_there_or_taken():
     with pytest.raises(HandDisconnectedError, match="/dev/no-such-port cannot be opened at 3000000 baud"):
         XHand1.open("/dev/no-such-port")
     taken = pytest.raises(HandDisconnectedError, match="cannot be opened")
-    with Emulator() as emulator, XHand1.open(emulator.device, timing=PATIENT), taken:
+    with FaultyEmulator() as emulator, XHand1.open(emulator.device, timing=PATIENT), taken:
         XHand1.open(emulator.device)
 
 

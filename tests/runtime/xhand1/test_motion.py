@@ -6,6 +6,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from faulty_lines import Faults, FaultyEmulator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from xhand1_hands import PATIENT, Stamps, WrittenBytes, drive_until, open_again, wait_until
@@ -13,10 +14,8 @@ from xhand1_hands import PATIENT, Stamps, WrittenBytes, drive_until, open_again,
 from tgdsl.files.find import robot_names
 from tgdsl.runtime.xhand1 import reader
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
-from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ranges
+from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, MotionError, WatchdogError
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS, PASSIVE, Mode, encode_command
@@ -48,20 +47,20 @@ def positions(motion: Motion, now: float) -> np.ndarray:
 @pytest.mark.parametrize("name", ["xhand1_right", "xhand1_left"])
 def test_ranges_come_from_the_robot_file(name):
     model = mujoco.MjModel.from_xml_path(str(robot_names()[name]))
-    assert np.abs(joint_ranges(model)) == pytest.approx(np.abs(np.array(RANGES)), abs=1e-9)
+    assert np.abs(model.jnt_range[joint_ids(model)]) == pytest.approx(np.abs(np.array(RANGES)), abs=1e-9)
     found = MotionLimits.of_robot(model, speed=0.5, current_limit=200, kp=80)
-    assert [found.lower, found.upper] == [tuple(joint_ranges(model)[:, i]) for i in (0, 1)]
+    assert [found.lower, found.upper] == [tuple(model.jnt_range[joint_ids(model)][:, i]) for i in (0, 1)]
     assert (found.speed, found.current_limit, found.watchdog_s) == ((0.5,) * 12, (200,) * 12, 0.1)
 
 
 def test_another_robot_has_no_such_joints():
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with pytest.raises(MotionError, match="is a whole hand: expected one joint with a range for each of thumb_bend_joint, "):
-        joint_ranges(model)
+        model.jnt_range[joint_ids(model)]
     finger = "".join(f'<body><joint name="{name}" range="0 90"/><geom size=".1"/></body>' for name in JOINTS[1:])
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{finger}</worldbody></mujoco>")
     with pytest.raises(MotionError, match=f"for each of {JOINTS[0]}; the robot has {JOINTS[1]}, "):
-        joint_ranges(model)
+        model.jnt_range[joint_ids(model)]
 
 
 def test_a_set_point_starts_where_the_joint_is_and_moves_at_its_speed():
@@ -166,25 +165,28 @@ def test_limits_that_limit_nothing_are_refused(wrong, message):
 
 def test_leave_to_move_alone_moves_nothing():
     written = WrittenBytes()
-    with Emulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits(), open_port=written.open) as hand:
+    with (
+        FaultyEmulator() as emulator,
+        XHand1.open(emulator.device, timing=PATIENT, motion=limits(), open_port=written.open) as hand,
+    ):
         for _ in range(10):
             hand.read()
     passive = encode_frame(Frame(0xFE, 0x80, 2, encode_command(PASSIVE)))
     assert set(written.writes) == {passive, bytes.fromhex("55aafe80130000efc3")}
 
 
-def drive(hand: XHand1, emulator: Emulator) -> None:
+def drive(hand: XHand1, emulator: FaultyEmulator) -> None:
     """Command until the hand has been told to move."""
     before = len(driven(emulator))
     drive_until(hand, REST, lambda: len(driven(emulator)) > before)
 
 
-def driven(emulator: Emulator) -> list[float]:
+def driven(emulator: FaultyEmulator) -> list[float]:
     """Return when requests came that drive the hand [s]."""
     return [at for at, frame in list(emulator.requests) if frame.payload[14:16] == MODE_POSITION]
 
 
-def becomes_passive(emulator: Emulator) -> bool:
+def becomes_passive(emulator: FaultyEmulator) -> bool:
     """Wait until the hand was last told to be passive, and is: a request is noted before it is obeyed."""
 
     def is_so() -> bool:
@@ -195,7 +197,7 @@ def becomes_passive(emulator: Emulator) -> bool:
 
 
 def test_an_emulated_hand_goes_where_it_is_told_and_close_makes_it_passive():
-    with Emulator(EmulatedHand(time_constant_s=0.02)) as emulator:
+    with FaultyEmulator(EmulatedHand(time_constant_s=0.02)) as emulator:
         with XHand1.open(emulator.device, timing=PATIENT, motion=limits(speed=5.0, watchdog_s=1.0)) as hand:
             assert emulator.hand.is_passive
             drive_until(hand, REST, lambda: abs(emulator.hand.position - REST).max() < 0.01)
@@ -203,7 +205,7 @@ def test_an_emulated_hand_goes_where_it_is_told_and_close_makes_it_passive():
 
 
 def test_a_policy_that_stalls_leaves_the_hand_passive():
-    with Emulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits()) as hand:
+    with FaultyEmulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits()) as hand:
         for _ in range(3):
             drive(hand, emulator)
             assert becomes_passive(emulator)
@@ -220,7 +222,7 @@ def test_a_policy_that_stalls_leaves_the_hand_passive():
 @pytest.mark.parametrize("faults", [Faults(corrupt=1.0), Faults(drop=1.0), Faults(truncate=1.0)])
 def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_understood(faults):
     """The watchdog may be first where the machine stands still: in virtual time it is the failure."""
-    with Emulator() as emulator, open_again(emulator.device, timing=CALM, motion=limits(watchdog_s=1.0)) as hand:
+    with FaultyEmulator() as emulator, open_again(emulator.device, timing=CALM, motion=limits(watchdog_s=1.0)) as hand:
         drive(hand, emulator)
         emulator.set_faults(faults)
         assert becomes_passive(emulator)
@@ -233,7 +235,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
 def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back():
     stamps = Stamps()
     with (
-        Emulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, motion=limits(watchdog_s=1.0)) as hand,
     ):
         drive(hand, emulator)
@@ -247,7 +249,7 @@ def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back():
 
 
 def test_a_target_outside_its_range_leaves_the_hand_passive():
-    with Emulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits(watchdog_s=1.0)) as hand:
+    with FaultyEmulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits(watchdog_s=1.0)) as hand:
         for wrong in (np.full(12, 5.0), np.zeros(3)):
             drive(hand, emulator)
             hand.relax()
@@ -261,12 +263,12 @@ def test_a_reader_that_fails_for_a_reason_of_its_own_leaves_the_hand_passive(mon
     def broken(payload):
         raise ValueError("a mistake of ours")
 
-    with Emulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits(watchdog_s=1.0)) as hand:
+    with FaultyEmulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits(watchdog_s=1.0)) as hand:
         drive(hand, emulator)
         monkeypatch.setattr(reader, "decode_state", broken)
         assert becomes_passive(emulator)
         hand._reader.join()
-        for call in (lambda: hand.command(REST), hand.read, hand.version):
+        for call in (lambda: hand.command(REST), hand.read):
             with pytest.raises(HandClosedError, match=r"the reader ended: ValueError\('a mistake of ours'\)"):
                 call()
 
@@ -292,7 +294,7 @@ raise RuntimeError("a policy that fails")
 
 
 def test_a_program_that_fails_without_closing_leaves_the_hand_passive():
-    with Emulator() as emulator:
+    with FaultyEmulator() as emulator:
         run = subprocess.run([sys.executable, "-c", SCRIPT, emulator.device], capture_output=True, text=True)
         assert "a policy that fails" in run.stderr
         assert driven(emulator)

@@ -5,18 +5,17 @@ import time
 import numpy as np
 import pytest
 import torch
+from virtual_hands import virtual_hand
 from xhand1_hands import PATIENT, wait_until
 
 from tgdsl.errors import StateError
 from tgdsl.runtime.source import Source
-from tgdsl.runtime.xhand1 import source as step_timer
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.body import TipForces
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.source import RealTime, XHand1Source
+from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogError
 
@@ -77,34 +76,20 @@ def test_a_sample_and_its_features():
     assert not sample.joint_error.any()
 
 
-class Clock:
-    """A clock that only sleeping, and work, move on."""
-
-    def __init__(self):
-        self.now = 50.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        assert seconds >= 0
-        self.now += seconds
-
-
 def test_steps_keep_their_time_and_late_ones_are_counted(monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(step_timer, "time", clock)
-    steps, ends = RealTime(0.04), []
-    for work in (0.0, 0.03, 0.01, 0.0399, 0.1, 0.0, 0.2, 0.0):
-        clock.now += work
-        steps.wait(None, lambda: None)
-        ends.append(clock.now - 50.0)
-    assert ends == pytest.approx([0.04, 0.08, 0.12, 0.16, 0.26, 0.3, 0.5, 0.54])
-    assert steps.num_late_steps == 2
-    clock.now += 1.0
-    steps.restart()
-    steps.wait(None, lambda: None)
-    assert (clock.now - 50.0, steps.num_late_steps) == (pytest.approx(1.58), 2)
+    with virtual_hand(monkeypatch) as (hand, _, clock):
+        start, ends = clock.now, []
+        source = XHand1Source(hand, control_step=0.04)
+        for work in (0.0, 0.03, 0.01, 0.0399, 0.1, 0.0, 0.2, 0.0):
+            clock.sleep(work)
+            source._wait()
+            ends.append(clock.now - start)
+        assert ends == pytest.approx([0.04, 0.08, 0.12, 0.16, 0.26, 0.3, 0.5, 0.54])
+        assert source.num_late_steps == 2
+        clock.sleep(1.0)
+        source.reset()
+        source._wait()
+        assert (clock.now - start, source.num_late_steps) == (pytest.approx(1.58), 2)
 
 
 def test_each_step_gives_a_new_reading_and_no_sooner():

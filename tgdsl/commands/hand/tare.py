@@ -61,11 +61,11 @@ class Tare:
 
 def _tare(hand: driver.XHand1, num_frames: int) -> driver.Tare:
     """Tare a hand, again if a reply is lost or damaged on the way; after a few times that is an error."""
-    from tgdsl.runtime.xhand1.wire.errors import HandChecksumError, HandTimeoutError, StaleReadingError
+    from tgdsl.runtime.xhand1.wire.errors import HandTimeoutError
 
     for _ in range(_TRIES - 1):
         try:
             return hand.tare(num_frames)
-        except (HandTimeoutError, HandChecksumError, StaleReadingError):
+        except HandTimeoutError:
             continue
     return hand.tare(num_frames)

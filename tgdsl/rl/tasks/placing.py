@@ -15,7 +15,7 @@ from tgdsl.rl import rotations
 from tgdsl.rl.draws import within
 from tgdsl.rl.spec import PlacedRandomSpec
 from tgdsl.rl.task import Setup
-from tgdsl.runtime.simulators.model_ids import body_id
+from tgdsl.runtime.simulators.model_ids import element_id
 
 
 def object_qpos(setup: Setup) -> slice:
@@ -29,7 +29,7 @@ def free_qpos(model: mujoco.MjModel, name: str) -> slice:
     Raises:
         SimulationError: If there is no such body, or it does not move freely.
     """
-    body = model.body(body_id(model, name))
+    body = model.body(element_id(model, "body", name))
     if int(body.dofnum[0]) != 6 or int(body.jntnum[0]) != 1:
         raise SimulationError(f'the object\'s body "{name}" has no free joint, by which it could be put elsewhere')
     first = int(model.jnt_qposadr[int(body.jntadr[0])])

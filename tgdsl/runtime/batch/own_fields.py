@@ -37,18 +37,9 @@ class OwnFields(ObjectProperties):
         batch: mujoco.batch.Batch,
         model: mujoco.MjModel,
         bodies_of: Mapping[str, str],
-        variants: Sequence[mujoco.MjModel] = (),
-        is_open: bool = False,
+        variants: Sequence[mujoco.MjModel],
+        is_open: bool,
     ):
-        """Begin: all environments have the batch's model.
-
-        Args:
-            batch: The environments.
-            model: The batch's model.
-            bodies_of: Body of each of the document's objects.
-            variants: The model of each variant that an object may have.
-            is_open: Whether models that are not among these may come.
-        """
         super().__init__(model, bodies_of, batch.nsim, torch.device("cpu"))
         self._batch = batch
         self._fields: dict[str, Array] = {}
@@ -57,11 +48,7 @@ class OwnFields(ObjectProperties):
         self._is_derived = False
 
     def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
-        """Give environments other models than they had; those that keep theirs keep their masses and frictions too.
-
-        Args:
-            models: The model of each environment.
-        """
+        """Give environments other models; those that keep theirs keep their masses and frictions too."""
         changed = [env for env, model in enumerate(models) if model is not self._chosen[env]]
         self._chosen = list(models)
         if self._own is not None:
@@ -82,15 +69,15 @@ class OwnFields(ObjectProperties):
     def fields(self) -> dict[str, Tensor]:
         """Return what environments have of their own: see `ObjectProperties.fields`."""
         names = list(self._fields) if self._own is None else list(_OWN)
-        return {name: torch.from_numpy(np.array(self._values(name))) for name in names}
+        return {name: self._values(name) for name in names}
 
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
         """Give environments fields of their own: see `ObjectProperties.set_fields`."""
         names = [name for name in fields if name in mujoco.batch.MODEL_FIELDS]
-        refuse_other_fields(fields, {name: torch.from_numpy(np.array(self._values(name))) for name in names})
+        refuse_other_fields(fields, {name: self._values(name) for name in names})
         changed = set()
         for name, value in fields.items():
-            now = self._values(name)
+            now = self._arrays_of(name)
             for env in np.flatnonzero((now != value.numpy()).reshape(len(now), -1).any(axis=1)).tolist():
                 self._row(name, env)[...] = value[env].numpy()
                 changed.add(env)
@@ -126,13 +113,10 @@ class OwnFields(ObjectProperties):
         if self._own is not None:
             self._batch.set_models(self._own)
 
-    def _mass(self, target: RigidObject) -> Float[Tensor, " env"]:
-        return torch.from_numpy(self._values("body_mass")[:, target.bodies].sum(axis=1))
+    def _values(self, field: str) -> Float[Tensor, "env ..."]:
+        return torch.from_numpy(np.array(self._arrays_of(field)))
 
-    def _friction(self, target: RigidObject) -> Float[Tensor, " env"]:
-        return torch.from_numpy(self._values("geom_friction")[:, target.geoms, 0].max(axis=1))
-
-    def _values(self, name: str) -> Array:
+    def _arrays_of(self, name: str) -> Array:
         """Return a field of all environments, to be read."""
         if self._own is not None:
             return np.stack([getattr(model, name) for model in self._own])

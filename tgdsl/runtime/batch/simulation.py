@@ -6,37 +6,33 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from tgdsl.errors import SimulationError, listed
+from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module.memory.some_rows import few_rows
-from tgdsl.module.module import TactileModule
-from tgdsl.module.state import SceneState, shape_of
+from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.runtime.batch import require_batch
 from tgdsl.runtime.batch.own_fields import OwnFields
-from tgdsl.runtime.simulators.bodies import STATE_ARRAYS, BodyFields, warn_of_mocap
-from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
-from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
-from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
+from tgdsl.runtime.simulators.bodies import STATE_ARRAYS, BodyFields
+from tgdsl.runtime.simulators.devices import checked_device
+from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
+from tgdsl.runtime.simulators.joint_fields import JointColumns
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
-from tgdsl.runtime.simulators.model_ids import geoms_of, keyframe_id
+from tgdsl.runtime.simulators.model_ids import geoms_of
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
-from tgdsl.runtime.simulators.objects.heat import EnvHeat
-from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
-from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.simulators.objects.properties import PER_ENV
+from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
-from tgdsl.runtime.simulators.watch import Watch, WatchReader
 from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
-from tgdsl.scene.options import Options
-from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask, is_env_mask
+from tgdsl.tensors.env_ids import EnvIds, env_mask
 
 if TYPE_CHECKING:
     import mujoco.batch
@@ -59,15 +55,6 @@ class ContactSensors:
     """
 
     def __init__(self, model: mujoco.MjModel, inputs: Inputs):
-        """Look up where everything is.
-
-        Args:
-            model: The model.
-            inputs: What the module wants.
-
-        Raises:
-            SimulationError: If the model lacks a sensor, one does not show what is wanted, or sensors are disabled.
-        """
         if inputs.pairs and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
             what = "the scene has sensors disabled, and contacts are read of sensors: they would read 0"
             raise SimulationError(f'{what}; take <flag sensor="disable"/> out of its <option>')
@@ -107,7 +94,6 @@ class _PointSensor:
     """A sensor of single contacts."""
 
     def __init__(self, model: mujoco.MjModel, name: str, num_slots: int):
-        """Look up what it shows."""
         self._place = _place(model, name)
         sensor = int(model.sensor(name).id)
         bits, _, self._num = model.sensor_intprm[sensor, :3].tolist()
@@ -204,30 +190,45 @@ def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 class BatchReader:
-    """Gathers the fields of a state that are poses, velocities or contacts."""
+    """Gathers the fields of a state that are poses, velocities, contacts or joints.
+
+    A physics step moves joints on, but leaves poses, velocities and contacts as they were at its start, which is a state's
+    instant: so joints are kept from just before it.
+    """
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, batch: mujoco.batch.Batch):
-        """Look up where everything is.
-
-        Args:
-            inputs: What the module wants.
-            model: The scene.
-            batch: The environments.
-
-        Raises:
-            SimulationError: If the model lacks a body or a contact sensor.
-        """
         self._batch = batch
         self._bodies = BodyFields(inputs, model, index=np.asarray, take=_rows, cross=_cross)
         self._contacts = ContactSensors(model, inputs)
-        for name in STATE_ARRAYS:
+        self._joints = JointColumns.of(inputs, model)
+        for name in (*STATE_ARRAYS, *self._joints.fields.values()):
             batch.bind(name)  # an array is filled only by calls that come after its first use
+        self._kept = {name: self._joints_now(name) for name in self._joints.moved}
 
-    def read(self, rows: Int[np.ndarray, " n"] | slice = slice(None)) -> dict[str, np.ndarray]:
+    @property
+    def keeps_joints(self) -> bool:
+        """Whether `keep` has anything to do."""
+        return bool(self._kept)
+
+    def keep(self, env_ids: SomeRows = None) -> None:
+        """Keep where some environments' joints are, and their controls: a physics step follows, or poses are new."""
+        for name, kept in self._kept.items():
+            kept[slice(None) if env_ids is None else env_ids] = self._joints_now(name, env_ids)
+
+    def read(self, rows: SomeRows = None) -> dict[str, torch.Tensor]:
         """Return the fields of some environments (default: all), (env, …), each an array of its own."""
-        live = {name: getattr(self._batch, name)[rows] for name in STATE_ARRAYS}
+        chosen = slice(None) if rows is None else rows
+        live = {name: getattr(self._batch, name)[chosen] for name in STATE_ARRAYS}
         arrays = self._bodies.read(live) | self._contacts.read(live["sensordata"])
-        return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        for name in self._joints.fields:
+            arrays[name] = self._kept[name][chosen].copy() if name in self._kept else self._joints_now(name, rows)
+        return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+    def _joints_now(self, name: str, rows: SomeRows = None) -> Array:
+        array = self._joints.fields[name]
+        values = getattr(self._batch, array)[slice(None) if rows is None else rows]
+        return np.array(values[:, self._joints.by_array[array]], dtype=np.float64)
 
 
 Array = np.ndarray
@@ -237,178 +238,105 @@ _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in
 
 
 class BatchSimulation(Simulation):
-    """Environments in MuJoCo's `Batch`, read by one module.
-
-    Everything `state` hands out is of one instant: after `step`, MuJoCo's poses, velocities and contacts are those at the
-    start of the last substep, and so is the state, its joints included. After `reset`, `set_state` and `forward` they are of
-    where the environments are. `qpos`, `qvel` and `ctrl` are live tensors in float64 that share MuJoCo's memory, and of now.
+    """Environments in MuJoCo's `Batch` on CPU threads, in float64. `qpos`, `qvel` and `ctrl` share MuJoCo's memory.
 
     Attributes:
-        model: The compiled scene; where objects differ between environments, that of the first.
         batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).
-        substeps: Physics steps per control step.
     """
 
+    OPTIONS = ("substeps", "threads", "keyframe", "model", "options", "watch", "per_env", "on_fault", "prepare")
     properties: OwnFields
-    _objects: EnvObjects | None = None
-
-    def __init__(
-        self,
-        touch: TactileModule,
-        num_envs: int,
-        *,
-        substeps: int = 1,
-        threads: int = 0,
-        keyframe: str | None = None,
-        model: mujoco.MjModel | None = None,
-        options: Options | None = None,
-        watch: Watch | None = None,
-        on_fault: OnFault = "raise",
-        prepare: Callable[[mujoco.MjSpec], None] | None = None,
-    ):
-        """Start all environments.
-
-        Args:
-            touch: The module that reads them.
-            num_envs: Number of environments.
-            substeps: Physics steps per control step.
-            threads: CPU threads; 0: one per CPU.
-            keyframe: Name of the keyframe to start from; default: the model's own initial state.
-            model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
-                artefact's scene. Its objects are the same in all environments.
-            options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
-            watch: What `watched` returns.
-            on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset. "reset" restarts
-                them, in the simulator and in the module, counts them in `fault_counts` and warns once. "note" leaves it to
-                whoever looks at `faults` and resets them. The same holds for environments with controls that are not finite,
-                which "raise" refuses.
-            prepare: Changes the artefact's scene before it is compiled; bodies and contact sensors must stay.
-
-        Raises:
-            ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor, the keyframe or what is watched, if its integrator is
-                RK4, if its bodies may sleep, if there is nothing to step, more environments than this computer has memory for,
-                if the module's state is another simulation's or of other environments, or if this MuJoCo has no `mujoco.batch`.
-        """
-        require_batch()
-        refuse_unfit(touch, num_envs, substeps, model, options)
-        if model is None:
-            scenes = SharedMeshModels(touch.plan.scene, options, prepare)
-            model = scenes.model({})
-            if touch.inputs.objects:
-                self._objects = EnvObjects(scenes, touch.inputs, num_envs)
-        self.model: mujoco.MjModel = model
-        what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
-        refuse_two_instants(model, f'{what}; take <flag sleep="enable"/> out of its <option>')
-        refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
-        self.substeps = substeps
-        self._touch = touch
-        self._keyframe = keyframe_id(model, keyframe)
-        self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
-        self._warnings = StepWarnings()
-        warn_of_mocap(touch.inputs, self.model)
-        self._reader = BatchReader(touch.inputs, self.model, self.batch)
-        self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
-        self._keepers = [self._kept]
-        if watch is not None:
-            self._watch = WatchReader(watch, touch.inputs, self.model, torch.device("cpu"))
-            self._watch_reader = BatchReader(self._watch.inputs, self.model, self.batch)
-            self._watched_joints = KeptJoints(JointColumns.of(self._watch.inputs, self.model), self.batch)
-            self._keepers.append(self._watched_joints)
-        with torch.inference_mode(False):
-            self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
-            self._time = torch.zeros(num_envs, dtype=torch.float64)
-            self._table = StateTable(self.model, self._arrays)
-            self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
-        self.heat = EnvHeat(touch.inputs, num_envs, torch.device("cpu"), torch.float64)
-        bodies_of = touch.inputs.bodies_of
-        if self._objects is None:
-            self.properties = OwnFields(self.batch, model, bodies_of)
-        else:
-            self.properties = OwnFields(self.batch, model, bodies_of, *self._objects.variants())
-            self.properties.use_models(self._objects.models())
-        claim(touch, self)
-        self.reset()
-
-    @property
-    def num_envs(self) -> int:
-        """Number of environments."""
-        return self.batch.nsim
-
-    @property
-    def time(self) -> Float[torch.Tensor, " env"]:
-        """When the instant is that `state` is of [s]: see `Simulation.time`."""
-        return self._time.clone()
-
-    @property
-    def arrays(self) -> Mapping[str, torch.Tensor]:
-        """Live tensors (env, …) of the arrays that MuJoCo integrates, in float64: they share its memory."""
-        return self._arrays
-
-    def forward(self, env_ids: EnvIds | None = None) -> None:
-        """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
-        self._refuse_if_closed()
-        ids = self._ascending(env_ids)
-        self._start_contacts.forget(env_mask(torch.from_numpy(ids), self.num_envs, torch.device("cpu")))
-        self._evaluate(ids)
+    _reader: BatchReader
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return where all bodies of the model are in one environment [m], and their quaternions w, x, y, z."""
+        """Return where all bodies are in one environment: see `Simulation.body_poses`."""
         return self.batch.xpos[env], self.batch.xquat[env]
 
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment."""
         return self.batch.get_model(env)
 
-    def _use_objects(self) -> None:
-        assert self._objects is not None
-        models = self._objects.models()
+    def read(self, env_ids: EnvIds | None = None) -> dict[str, torch.Tensor]:
+        """Return the module's readings: see `Simulation.read`. Of few environments only these states are gathered."""
+        if env_ids is None or self._touch.inputs.substeps > 1 or self._touch.device.type != "cpu":
+            return super().read(env_ids)
+        mask = env_mask(env_ids, self.num_envs, self._device)
+        rows = few_rows(mask)
+        if rows is None:
+            return super().read(mask)
+        self._refuse_if_closed()
+        state = self._start_contacts.applied_to(self._state(self.control_step, rows.numpy()), rows=rows)
+        return self._touch.read_few(state, rows, self.num_envs)
+
+    def _open_device(self, device: str, options: SimOptions) -> torch.device:
+        require_batch()
+        if unknown := [word for word in options.get("per_env", ()) if word not in PER_ENV]:
+            hint = did_you_mean(unknown[0], PER_ENV, "words")
+            raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {hint}')
+        return checked_device(device, ("cpu",))
+
+    def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
+        what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
+        refuse_two_instants(self.model, f'{what}; take <flag sleep="enable"/> out of its <option>')
+        refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
+        self.batch = mujoco.batch.Batch(self.model, num_envs, options.get("threads", 0))
+        self._keyframe, self._warnings = keyframe, StepWarnings()
+        self._readers: list[BatchReader] = []
+        with torch.inference_mode(False):
+            self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
+            self._instant = torch.zeros(num_envs, dtype=torch.float64)
+            self._table = StateTable(self.model, self._arrays)
+            self._faults = EnvFaults(num_envs, self._device, options.get("on_fault", "raise"))
+        objects = self._objects
+        variants, is_open = ([], False) if objects is None else objects.variants()
+        self.properties = OwnFields(self.batch, self.model, self._touch.inputs.bodies_of, variants, is_open)
+        if objects is not None:
+            self.properties.use_models(objects.models())
+
+    def _make_reader(self, inputs: Inputs) -> BatchReader:
+        self._readers.append(BatchReader(inputs, self.model, self.batch))
+        return self._readers[-1]
+
+    def _refresh(self) -> None:
+        """Do nothing: environments are evaluated at once."""
+
+    def _use_objects(self, objects: EnvObjects) -> None:
+        models = objects.models()
         self._run(lambda: self.properties.use_models(models))
 
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
-        ids = self._ascending(env_ids)
-        if not len(ids):
-            return
-        self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe, stage=mujoco.mjtStage.mjSTAGE_NONE.value))
-        self._write(ids, rows)
-        self._evaluate(ids, _FORWARD if finds_contacts else _VELOCITIES)
-        self._touch.reset(torch.from_numpy(ids))
-        is_new = torch.zeros(self.num_envs, dtype=torch.bool)
-        is_new[torch.from_numpy(ids)] = True
-        self._faults.clear(is_new)
-
-    def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
-        ids = self._ascending(env_ids)
-        self._write(ids, rows)
-        self._evaluate(ids)
-
-    def _ascending(self, env_ids: EnvIds | None) -> Int[Array, " n"]:
-        """Return environments as MuJoCo takes them: in ascending order, each once."""
-        ids = env_indices(env_ids, self.num_envs)
-        return ids if env_ids is None or is_env_mask(env_ids, self.num_envs) else np.unique(ids)
-
-    def _write(self, ids: Int[Array, " n"], rows: Rows) -> None:
-        chosen = torch.from_numpy(ids)
-        for name, values in rows.values.items():
-            self._arrays[name][chosen] = values[chosen]
-
-    def _evaluate(self, ids: Int[Array, " n"], stage: int = _FORWARD) -> None:
+    def _begin_episodes(self, mask: Bool[torch.Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
+        ids = np.flatnonzero(mask.numpy())
         if len(ids):
-            self._run(lambda: self.batch.forward(ids, stage=stage))
-            self._time[ids] = self._arrays["time"][ids]
-            for keeper in self._keepers:
-                keeper.keep(ids)
+            self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe, stage=mujoco.mjtStage.mjSTAGE_NONE.value))
+            self._put(mask, rows)
+            self._forward(ids, _FORWARD if finds_contacts else _VELOCITIES)
+            self._faults.clear(mask)
+
+    def _put(self, mask: Bool[torch.Tensor, " env"], rows: Rows) -> None:
+        for name, values in rows.values.items():
+            self._arrays[name][mask] = values[mask]
+
+    def _evaluate(self, mask: Bool[torch.Tensor, " env"]) -> None:
+        ids = np.flatnonzero(mask.numpy())
+        if len(ids):
+            self._forward(ids, _FORWARD)
+
+    def _forward(self, ids: Int[Array, " n"], stage: int) -> None:
+        self._run(lambda: self.batch.forward(ids, stage=stage))
+        self._instant[ids] = self._arrays["time"][ids]
+        for reader in self._readers:
+            reader.keep(ids)
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
-        keepers = [keeper for keeper in self._keepers if keeper.is_wanted]
-        self._physics_steps(num_steps - 1 if keepers else num_steps)
-        if keepers:
+        readers = [reader for reader in self._readers if reader.keeps_joints]
+        self._physics_steps(num_steps - 1 if readers else num_steps)
+        if readers:
             self._drive()
-            for keeper in keepers:
-                keeper.keep()
+            for reader in readers:
+                reader.keep()
             self._run(lambda: self.batch.step(nstep=1))
-        self._time.copy_(self._arrays["time"]).sub_(float(self.model.opt.timestep))
+        self._instant.copy_(self._arrays["time"]).sub_(float(self.model.opt.timestep))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.update()
         if not is_faulty.any():
@@ -416,7 +344,8 @@ class BatchSimulation(Simulation):
         if self._faults.on_fault == "raise":
             raise SimulationError("; ".join(self._faults.messages(diverged=", and MuJoCo has restarted them")))
         if self._faults.on_fault == "reset":
-            self._begin_episodes(is_faulty, Rows({}))
+            self._begin_episodes(is_faulty, Rows({}), finds_contacts=True)
+            self._touch.reset(is_faulty)
             self._faults.note_restarted(is_faulty)
         self._faults.warn_once()
 
@@ -432,31 +361,6 @@ class BatchSimulation(Simulation):
     def _drive(self) -> None:
         if self.drive is not None:
             self.drive()
-
-    def read(self, env_ids: EnvIds | None = None) -> dict[str, torch.Tensor]:
-        """Return the module's readings: see `Simulation.read`. Of few environments only these states are gathered."""
-        if env_ids is None or self._touch.inputs.substeps > 1 or self._touch.device.type != "cpu":
-            return super().read(env_ids)
-        mask = env_mask(env_ids, self.num_envs, torch.device("cpu"))
-        rows = few_rows(mask)
-        if rows is None:
-            return super().read(mask)
-        self._refuse_if_closed()
-        state = self._start_contacts.applied_to(self._state(self.control_step, rows.numpy()), rows=rows)
-        return self._touch.read_few(state, rows, self.num_envs)
-
-    def _state(self, dt: float, rows: Int[Array, " n"] | slice = slice(None)) -> SceneState:
-        values = self._reader.read(rows) | self._kept.read(rows)
-        if self._objects is not None:
-            values |= {"variant": self._objects.variant[rows], "object_size": self._objects.object_size[rows]}
-        tensors = {name: torch.from_numpy(value) for name, value in values.items()}
-        tensors |= {name: value[rows] for name, value in self.heat.read().items()} | {"time": self.time[rows]}
-        return self._scene_state({name: value.to(self._touch.device) for name, value in tensors.items()}, dt)
-
-    def _read_watch(self) -> SceneState:
-        arrays = self._watch_reader.read() | self._watched_joints.read()
-        values: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        return SceneState(**values)
 
     def _run(self, call: Callable[[], None]) -> None:
         try:

@@ -303,15 +303,7 @@ def _slacken(joint: mujoco.MjsJoint) -> None:
 
 
 def _resting_group(disabled: int, others: set[int]) -> int:
-    """Return the group of actuators that rest: one that is disabled already, or that no other actuator is in.
-
-    Args:
-        disabled: MuJoCo's option `disableactuator`, a bit for each group.
-        others: Groups of the actuators that do not rest.
-
-    Raises:
-        SimulationError: If other actuators are in all groups.
-    """
+    """Return a group of actuators that is disabled already, by the bits of `disableactuator`, or that no other is in."""
     groups = [group for group in range(NUM_GROUPS) if disabled >> group & 1 or group not in others]
     if not groups:
         what = f"the scene's actuators that are not the hand's are in all {NUM_GROUPS} groups"

@@ -127,12 +127,7 @@ def leaders(joint: int, follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]
 
 
 def movement(scene: Model, bodies: frozenset[str]) -> Movement:
-    """Return how the hand of a scene moves; nothing closes if it is not clear how.
-
-    Args:
-        scene: The scene, its bodies and joints named.
-        bodies: Bodies that carry sensors.
-    """
+    """Return how the hand of a scene moves whose `bodies` carry sensors; nothing closes if it is not clear how."""
     model = scene.compiled
     trees = frozenset(int(model.body_rootid[model.body(name).id]) for name in bodies) - {0}
     follows = {}

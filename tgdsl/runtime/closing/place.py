@@ -49,12 +49,6 @@ class Sweep:
     """A hand that closes on an object, pose by pose."""
 
     def __init__(self, movement: Movement, body: int):
-        """Look at what can touch: geoms that collide, or of a body without such all.
-
-        Args:
-            movement: How the hand moves.
-            body: The object.
-        """
         self.movement, self.model, self.body = movement, movement.model, body
         self.data = mujoco.MjData(self.model)
         self.is_free = int(self.model.body_dofnum[body]) == 6 and int(self.model.body_jntnum[body]) == 1
@@ -86,11 +80,7 @@ class Sweep:
         return result
 
     def grip(self, origin: Float[np.ndarray, " 3"] | None = None) -> Grip:
-        """Return what the hand meets as it closes.
-
-        Args:
-            origin: Where the object's frame is, in the world [m]; default: where it starts.
-        """
+        """Return what the hand meets as it closes, the object's frame at `origin` in the world [m] or where it starts."""
         sides: dict[int, np.ndarray] = {}
         overlap = -np.inf
         for share in SHARES:

@@ -15,7 +15,7 @@ import torch
 
 from tgdsl.errors import listed
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.model_ids import body_id
+from tgdsl.runtime.simulators.model_ids import element_id
 
 T = TypeVar("T", np.ndarray, torch.Tensor)
 STATE_ARRAYS = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
@@ -26,10 +26,10 @@ def warn_of_mocap(inputs: Inputs, model: mujoco.MjModel) -> None:
     """Warn of mocap bodies whose velocity a module wants, as MuJoCo has them at rest however they are moved."""
     if not {"body_linvel", "body_angvel"} & set(inputs.fields):
         return
-    mocap = [name for name in inputs.bodies if model.body_mocapid[model.body_rootid[body_id(model, name)]] >= 0]
+    mocap = [name for name in inputs.bodies if model.body_mocapid[model.body_rootid[element_id(model, "body", name)]] >= 0]
     if mocap:
         what = "MuJoCo gives a mocap body that is moved no velocity: shear, slip and sound of its motion are not felt"
-        warnings.warn(f"{what}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=5)
+        warnings.warn(f"{what}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=4)
 
 
 class BodyFields:
@@ -52,11 +52,8 @@ class BodyFields:
             index: Makes indices of the arrays that are read: NumPy's, or tensors on their device.
             take: Returns the rows of an array (env, row, …) that such indices name.
             cross: Their cross product along the last axis.
-
-        Raises:
-            SimulationError: If the model lacks a body.
         """
-        ids = np.array([body_id(model, name) for name in inputs.bodies], dtype=np.int64)
+        ids = np.array([element_id(model, "body", name) for name in inputs.bodies], dtype=np.int64)
         self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
         self._fields = inputs.fields
         self._take, self._cross = take, cross

@@ -11,14 +11,10 @@ from tgdsl.tensors.devices import why_there_is_none
 
 
 def checked_device(device: str, supported: Sequence[str]) -> torch.device:
-    """Return a device with its index, as torch finds it.
-
-    Args:
-        device: As torch names it: "cpu", "cuda" or "cuda:1".
-        supported: Types of devices that physics can run on.
+    """Return a device with its index, by torch's name for it: "cpu", "cuda" or "cuda:1".
 
     Raises:
-        SimulationError: If there is no such device, or its type is not among these.
+        SimulationError: If there is no such device, or its type is not supported.
     """
     try:
         result = torch.empty(0, device=device).device

@@ -38,44 +38,31 @@ class EnvFaults:
     Attributes:
         on_fault: What becomes of environments with a fault.
         counts: How many times each environment has had a fault.
+        totals: Number of faults of each kind so far.
+        restarted: Environments that the last step has restarted.
     """
 
     counts: Int[Tensor, " env"]
+    totals: Int[Tensor, " kind"]
+    restarted: Bool[Tensor, " env"]
     _held: Bool[Tensor, "kind env"]
-    _restarted: Bool[Tensor, " env"]
-    _totals: Int[Tensor, " kind"]
 
     def __init__(self, num_envs: int, device: torch.device, on_fault: str = "raise"):
-        """Begin without faults.
-
-        Raises:
-            SimulationError: If `on_fault` is no choice.
-        """
         if on_fault not in get_args(OnFault):
             hint = did_you_mean(on_fault, get_args(OnFault), "choices")
             raise SimulationError(f'on_fault is "{on_fault}"; {hint}')
         self.on_fault = on_fault
         self._held = torch.zeros((len(_COUNTS), num_envs), dtype=torch.bool, device=device)
         self._is_counted = torch.zeros_like(self._held)
-        self._restarted = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.restarted = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.counts = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        self._totals = torch.zeros(len(_COUNTS), dtype=torch.int64, device=device)
+        self.totals = torch.zeros(len(_COUNTS), dtype=torch.int64, device=device)
         self._has_warned = False
-
-    @property
-    def totals(self) -> Int[Tensor, " kind"]:
-        """Number of faults of each kind so far."""
-        return self._totals
-
-    @property
-    def restarted(self) -> Bool[Tensor, " env"]:
-        """Environments that the last step has restarted."""
-        return self._restarted
 
     @property
     def mask(self) -> Bool[Tensor, " env"]:
         """Environments that wait for a reset, or that the last step restarted."""
-        return self._held.any(dim=0) | self._restarted
+        return self._held.any(dim=0) | self.restarted
 
     def note(self, kind: int, where: Bool[Tensor, " env"] | Bool[Tensor, ""]) -> None:
         """Note a fault in some environments, or in all."""
@@ -84,13 +71,13 @@ class EnvFaults:
     def begin_step(self) -> None:
         """Forget which environments the last step has restarted."""
         if self.on_fault == "reset":
-            self._restarted.zero_()
+            self.restarted.zero_()
 
     def update(self) -> Bool[Tensor, " env"]:
         """Count faults that are new; return which environments have any."""
         is_new = self._held & ~self._is_counted
         self.counts += is_new.any(dim=0)
-        self._totals += is_new.sum(dim=1)
+        self.totals += is_new.sum(dim=1)
         self._is_counted |= is_new
         return self._held.any(dim=0)
 
@@ -98,18 +85,14 @@ class EnvFaults:
         """Forget the faults of environments that are restarted."""
         self._held &= ~where
         self._is_counted &= ~where
-        self._restarted &= ~where
+        self.restarted &= ~where
 
     def note_restarted(self, where: Bool[Tensor, " env"]) -> None:
         """Note environments that a step has restarted."""
-        self._restarted |= where
+        self.restarted |= where
 
     def messages(self, diverged: str = "") -> list[str]:
-        """Return which environments have which fault, in words; it waits for a GPU.
-
-        Args:
-            diverged: What else to say of environments that diverged.
-        """
+        """Return which environments have which fault, in words; it waits for a GPU. `diverged` is added to divergence."""
         results = []
         for text, where in zip(_MESSAGES, self._held.cpu(), strict=True):
             if where.any():
@@ -118,12 +101,8 @@ class EnvFaults:
         return results
 
     def warn_once(self, totals: list[int] | None = None) -> None:
-        """Warn of the first environments that were restarted.
-
-        Args:
-            totals: Number of faults of each kind; default: those counted, for which a GPU is waited for.
-        """
-        found = self._totals.tolist() if totals is None else totals
+        """Warn of the first faults; without `totals`, a GPU is waited for."""
+        found = self.totals.tolist() if totals is None else totals
         if self._has_warned or not any(found):
             return
         self._has_warned = True

@@ -10,15 +10,7 @@ from tgdsl.errors import SimulationError
 
 
 def refuse_beyond_memory(what: str, num_bytes: int) -> None:
-    """Raise an error if something needs more memory than this computer has; where that cannot be told, do nothing.
-
-    Args:
-        what: What needs it.
-        num_bytes: How much.
-
-    Raises:
-        SimulationError: If so.
-    """
+    """Raise an error if something needs more memory than this computer has; where that is not known, do nothing."""
     try:
         there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):  # no such call on Windows

@@ -1,6 +1,8 @@
-"""Where in a model stands what a module wants: bodies, sites, geoms, keyframes."""
+"""Where the named elements of a model stand: bodies, sites, geoms, joints, actuators, keyframes."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -9,46 +11,47 @@ from jaxtyping import Int
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.plan.inputs import ContactPart
 
+_ELEMENTS = {
+    "body": ("nbody", "body", "bodies"),
+    "site": ("nsite", "site", "sites"),
+    "geom": ("ngeom", "geom", "geoms"),
+    "joint": ("njnt", "joint", "joints"),
+    "actuator": ("nu", "actuator", "actuators"),
+    "key": ("nkey", "keyframe", "keyframes"),
+}
+"""By MuJoCo's accessor: where the model counts them, and what one and several are called."""
 
-def body_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the index of a body.
+
+def element_id(model: mujoco.MjModel, kind: str, name: str) -> int:
+    """Return the index of an element by name.
+
+    Args:
+        model: The model.
+        kind: MuJoCo's accessor: "body", "site", "geom", "joint", "actuator" or "key".
+        name: The element's name.
 
     Raises:
         SimulationError: If there is none of that name.
     """
+    element = getattr(model, kind)
     try:
-        return int(model.body(name).id)
+        return int(element(name).id)
     except KeyError as error:
-        known = [model.body(i).name for i in range(model.nbody)]
-        raise SimulationError(f'the scene has no body "{name}"; {did_you_mean(name, known, "bodies")}') from error
+        count, one, several = _ELEMENTS[kind]
+        known = [element(i).name for i in range(getattr(model, count))]
+        raise SimulationError(f'the scene has no {one} "{name}"; {did_you_mean(name, known, several)}') from error
 
 
-def site_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the index of a site.
-
-    Raises:
-        SimulationError: If there is none of that name.
-    """
-    try:
-        return int(model.site(name).id)
-    except KeyError as error:
-        known = [model.site(i).name for i in range(model.nsite)]
-        raise SimulationError(f'the scene has no site "{name}"; {did_you_mean(name, known, "sites")}') from error
+def keyframe_id(model: mujoco.MjModel, name: str | None) -> int:
+    """Return the index of a keyframe; without a name −1, the model's own initial state."""
+    return -1 if name is None else element_id(model, "key", name)
 
 
 def part_geoms(model: mujoco.MjModel, part: ContactPart) -> Int[np.ndarray, " geom"]:
-    """Return the indices of the geoms of a part of an object or link.
-
-    Raises:
-        SimulationError: If there is no body or geom of that name.
-    """
+    """Return the indices of the geoms of a part of an object or link."""
     if part.kind == "geom":
-        try:
-            return np.array([model.geom(part.name).id])
-        except KeyError as error:
-            known = [model.geom(i).name for i in range(model.ngeom)]
-            raise SimulationError(f'the scene has no geom "{part.name}"; {did_you_mean(part.name, known, "geoms")}') from error
-    return geoms_of(model, body_id(model, part.name), part.kind == "subtree")
+        return np.array([element_id(model, "geom", part.name)])
+    return geoms_of(model, element_id(model, "body", part.name), part.kind == "subtree")
 
 
 def geoms_of(model: mujoco.MjModel, body: int, with_below: bool) -> Int[np.ndarray, " geom"]:
@@ -59,16 +62,43 @@ def geoms_of(model: mujoco.MjModel, body: int, with_below: bool) -> Int[np.ndarr
     return np.flatnonzero(np.isin(model.geom_bodyid, bodies))
 
 
-def keyframe_id(model: mujoco.MjModel, name: str | None) -> int:
-    """Return the index of a keyframe; without a name −1, the model's own initial state.
+@dataclass(frozen=True)
+class Joint:
+    """Where one joint stands.
 
-    Raises:
-        SimulationError: If there is none of that name.
+    Attributes:
+        qpos: Its part of `qpos`: of a free joint 7 numbers, position [m] and quaternion w, x, y, z; of a ball 4, else 1.
+        qvel: Its part of `qvel`: of a free joint 6 numbers, velocity [m/s] in the world and angular velocity [rad/s] in the
+            body's frame; of a ball 3, else 1.
     """
-    if name is None:
-        return -1
-    try:
-        return int(model.key(name).id)
-    except KeyError as error:
-        known = [model.key(i).name for i in range(model.nkey)]
-        raise SimulationError(f'the scene has no keyframe "{name}"; {did_you_mean(name, known, "keyframes")}') from error
+
+    qpos: slice
+    qvel: slice
+
+
+_SIZES = {
+    int(mujoco.mjtJoint.mjJNT_FREE): (7, 6),
+    int(mujoco.mjtJoint.mjJNT_BALL): (4, 3),
+    int(mujoco.mjtJoint.mjJNT_SLIDE): (1, 1),
+    int(mujoco.mjtJoint.mjJNT_HINGE): (1, 1),
+}
+"""Numbers in `qpos` and `qvel` by type of joint."""
+
+
+class Joints(dict[str, Joint]):
+    """Joints by name, in the model's order. One without a name goes by its body's, if the body has no other."""
+
+    def __init__(self, model: mujoco.MjModel):
+        super().__init__()
+        named = {model.joint(i).name for i in range(model.njnt)}
+        for i in range(model.njnt):
+            name, body = model.joint(i).name, model.body(model.jnt_bodyid[i])
+            if not name and int(body.jntnum[0]) == 1 and body.name not in named:
+                name = body.name
+            if name:
+                qpos, qvel = int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])
+                num_qpos, num_qvel = _SIZES[int(model.jnt_type[i])]
+                self[name] = Joint(slice(qpos, qpos + num_qpos), slice(qvel, qvel + num_qvel))
+
+    def __missing__(self, name: str) -> Joint:
+        raise SimulationError(f'the scene has no joint "{name}"; {did_you_mean(name, self, "joints")}')

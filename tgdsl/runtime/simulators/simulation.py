@@ -1,4 +1,4 @@
-"""What simulators of a module's scene have in common, whatever steps the physics.
+"""Simulations of a module's scene: what users call, whichever engine steps the physics.
 
 Shapes: `env` environments, `nq`, `nv` and `nu` as in MuJoCo's model.
 """
@@ -6,10 +6,12 @@ Shapes: `env` environments, `nq`, `nv` and `nu` as in MuJoCo's model.
 from __future__ import annotations
 
 import dataclasses
+import gc
+import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any, TypeVar, Unpack
+from typing import Any, ClassVar, TypedDict, TypeVar, Unpack
 
 import mujoco
 import numpy as np
@@ -17,78 +19,71 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.errors import SimulationError, listed
+from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.controls import warn_of_range, write_controls
-from tgdsl.runtime.simulators.claims import release
-from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
-from tgdsl.runtime.simulators.joints import Joints
-from tgdsl.runtime.simulators.objects.choices import ObjectChoices, Values
+from tgdsl.runtime.simulators.bodies import warn_of_mocap
+from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults, OnFault
+from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
+from tgdsl.runtime.simulators.objects.choices import EnvObjects, Values
 from tgdsl.runtime.simulators.objects.heat import EnvHeat
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
+from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable, StateValues
-from tgdsl.runtime.simulators.watch import Watched, WatchReader
+from tgdsl.runtime.simulators.watch import Watch, Watched, WatchReader
+from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, env_mask
 
-
-def saved_state(
-    arrays: Mapping[str, Tensor],
-    heat: Mapping[str, Tensor],
-    properties: ObjectProperties,
-    start: StartContacts,
-    faults: EnvFaults,
-) -> dict[str, Tensor]:
-    """Return copies of a simulation's state by name."""
-    is_placed, values = start.placed
-    result = {f"state/{name}": arrays[name] for name in INTEGRATED} | dict(heat)
-    result |= {f"properties/{name}": value for name, value in properties.fields().items()}
-    if is_placed is not None:
-        result |= {"start/is_placed": is_placed} | {f"start/{name}": value for name, value in values.items()}
-    return {name: value.clone() for name, value in (result | {"faults/counts": faults.counts}).items()}
+T = TypeVar("T")
+Control = Tensor | np.ndarray | None
+"""Controls of a step, (actuator,) or (env, actuator); None: as they were."""
+SomeRows = Int[np.ndarray, " n"] | None
+"""Rows of environments to read; None: all."""
 
 
-def load_state(
-    saved: Mapping[str, Tensor],
-    arrays: Mapping[str, Tensor],
-    heat: Mapping[str, Tensor],
-    properties: ObjectProperties,
-    start: StartContacts,
-    faults: EnvFaults,
-    forward: Callable[[], None],
-) -> None:
-    """Put a simulation into a saved state, and evaluate poses and contacts there.
+class SimOptions(TypedDict, total=False):
+    """Options of a simulation; an engine knows those of its `OPTIONS`."""
 
-    Raises:
-        SimulationError: If it is that of another simulation; nothing has changed.
-    """
-    wanted = {f"state/{name}": arrays[name] for name in INTEGRATED} | {**heat, "faults/counts": faults.counts}
-    wrong = [name for name, now in wanted.items() if name not in saved or saved[name].shape != now.shape]
-    if wrong:
-        raise SimulationError(f"this is the state of another simulation: {listed(wrong)} missing or of another shape")
-    own = {part: _below(saved, part) for part in ("properties", "start")}
-    properties.set_fields(own["properties"])
-    with torch.no_grad():
-        for name, now in wanted.items():
-            now.copy_(saved[name])
-        faults.clear(torch.ones_like(faults.mask))
-    forward()
-    is_placed = own["start"].pop("is_placed", None)
-    device = faults.counts.device
-    start.placed = None if is_placed is None else (is_placed.to(device), {n: v.to(device) for n, v in own["start"].items()})
-
-
-def _below(saved: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    return {name.removeprefix(f"{part}/"): value for name, value in saved.items() if name.startswith(f"{part}/")}
+    substeps: int
+    """Physics steps per control step; default 1."""
+    threads: int
+    """CPU threads; default 0: one per CPU."""
+    keyframe: str | None
+    """Keyframe to start from; default: the model's own initial state."""
+    options: Options | None
+    """Fields of MuJoCo's `mjOption` that are to differ from the scene's, by name and in its units, such as
+    `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`, and `solref` and `solimp` of all contacts."""
+    watch: Watch | None
+    """Names of bodies, sites, joints, actuators and pairs that `watched` returns, of the instant of readings."""
+    per_env: Sequence[str]
+    """Properties that may differ between environments: "mass" and "friction" for `properties`, on a GPU also fields of MuJoCo's
+    model by name. On the CPU masses and frictions may always differ."""
+    on_fault: OnFault
+    """Treatment of environments that diverge, are given controls that are not finite, or, on a GPU, whose search for contacts
+    of convex shapes runs out of room. "raise" (default): `step` raises until they are reset. "reset": they are restarted, in
+    the simulator and in the module; on a GPU without waiting, and each `state` then evaluates all environments once more.
+    "note": the caller looks at `faults` and resets them. All are counted in `fault_counts`, the last two warn once. Pools of
+    MuJoCo Warp that are too small always raise."""
+    nconmax: int | None
+    """On a GPU, capacity for contacts per environment, in a pool that all share; default 48."""
+    njmax: int | None
+    """On a GPU, capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make."""
+    model: mujoco.MjModel | None
+    """A model of one's own in place of the artefact's scene; its objects are the same in all environments. On the CPU it has to
+    hold the contact sensors that `tgdsl.instrument` adds."""
+    prepare: Callable[[mujoco.MjSpec], None] | None
+    """On the CPU, changes the artefact's scene before it is compiled; bodies and contact sensors must stay."""
+    graph: bool
+    """Whether a GPU's work is captured as CUDA graphs (default); without them it is slower and easier to debug."""
 
 
 class SubstepStates:
     """Copies of the states after each physics step of the last control step but for the last one."""
 
     def __init__(self, inputs: Inputs):
-        """Begin: no step was made yet."""
         self._wanted = inputs.substeps
         self._earlier: list[SceneState] = []
         self._restarted: Bool[Tensor, " env"] | None = None
@@ -119,15 +114,12 @@ class SubstepStates:
         self._earlier.append(SceneState(**copies))
 
     def restart(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Note environments that have begun a new episode since: what was before is none of theirs."""
+        """Note environments that have begun a new episode since: the earlier states are not of it."""
         if self._earlier:
             self._restarted = chosen.clone() if self._restarted is None else self._restarted | chosen
 
     def stepped(self, restarted: Bool[Tensor, " env"]) -> None:
-        """Note that a captured step has written the states again, and which environments it has restarted.
-
-        A replayed graph runs no Python: neither `begin` nor `restart`.
-        """
+        """Note that a replayed graph, which runs no Python, has written the states, and which environments it restarted."""
         if self._earlier:
             self._restarted = restarted.clone()
 
@@ -153,42 +145,101 @@ def _mixed(chosen: Bool[Tensor, " env"], now: SceneState, then: SceneState) -> S
     return SceneState(**mixed)
 
 
-T = TypeVar("T")
-
-
 class Simulation(ABC):
     """Environments of one model, read by one module.
+
+    **The instant of a state.** As with `mj_step`, after `step` poses, velocities and contacts are those at the start of the
+    last physics step, and `state`, `read`, `watched` and `time` are of that instant, joints included: with `substeps=1` the
+    instant before the step. After `reset`, `set_state` and `forward` they are of where the environments are. `qpos`, `qvel`
+    and `ctrl` are live tensors, and of now.
 
     A module with state remembers each environment's episode: one simulation at a time reads it, from when it is made until it
     is closed or garbage-collected.
 
+    An engine implements `_open_device`, `_start`, `_make_reader`, `_refresh`, `_advance`, `_begin_episodes`, `_put`,
+    `_evaluate` and `_use_objects`.
+
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
         substeps: Physics steps per control step.
-        properties: Masses and frictions of objects, which environments may have of their own.
+        properties: Masses and frictions of objects, which may differ between environments.
         heat: Temperatures and materials of objects that hold heat, in live tensors.
-        drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: what an
-            actuator does that MuJoCo's does not. It is captured with the step on a GPU, so it must not wait for it there.
+        drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: an
+            actuator model that MuJoCo lacks. It is captured with the step on a GPU, so it must not wait for it there.
     """
+
+    OPTIONS: ClassVar[tuple[str, ...]]
+    """The options of `SimOptions` that this engine knows."""
+    DEVICE: ClassVar[str] = "cpu"
+    """The default device."""
 
     model: mujoco.MjModel
     substeps: int
     properties: ObjectProperties
     heat: EnvHeat
     drive: Callable[[], None] | None = None
-    _touch: TactileModule
+    _device: torch.device
     _arrays: Mapping[str, Tensor]
+    _instant: Float[Tensor, " env"]
     _faults: EnvFaults
     _table: StateTable
-    _objects: ObjectChoices | None = None
+    _objects: EnvObjects | None = None
     _watch: WatchReader | None = None
     _is_closed = False
     _has_warned_of_range = False
 
+    def __init__(self, touch: TactileModule, num_envs: int, *, device: str | None = None, **options: Unpack[SimOptions]):
+        """Start all environments.
+
+        Args:
+            touch: The module that reads them.
+            num_envs: Number of environments.
+            device: Where physics runs; default: `DEVICE`.
+            **options: See `SimOptions`.
+
+        Raises:
+            ArtifactError: If an asset of the scene is missing or has changed.
+            SimulationError: If the model lacks a body, a contact sensor, the keyframe or what is watched, or holds something
+                that the engine does not support; if the device or a library is missing; if there is nothing to step, more
+                environments than there is memory for, or if the module's state is another simulation's or of other
+                environments.
+        """
+        if unknown := [name for name in options if name not in self.OPTIONS]:
+            hint = did_you_mean(unknown[0], self.OPTIONS, "options")
+            raise SimulationError(f'{type(self).__name__} has no option "{unknown[0]}"; {hint}')
+        self._touch, self.substeps = touch, options.get("substeps", 1)
+        _refuse_unfit(touch, num_envs, options)
+        self._device = self._open_device(device or self.DEVICE, options)
+        model, watch = options.get("model"), options.get("watch")
+        if model is None:
+            scenes = SharedMeshModels(touch.plan.scene, options.get("options"), options.get("prepare"))
+            model = scenes.model({})
+            if touch.inputs.objects:
+                self._objects = EnvObjects(scenes, touch.inputs, num_envs)
+        self.model = model
+        if watch is not None:
+            self._watch = WatchReader(watch, touch.inputs, model, self._device)
+        self._start(num_envs, keyframe_id(model, options.get("keyframe")), options)
+        self.heat = EnvHeat(touch.inputs, num_envs, self._device, self.qpos.dtype)
+        self._object_fields: dict[str, Tensor] = {}
+        if self._objects is not None:
+            variant, size = self._objects.variant, self._objects.object_size
+            with torch.inference_mode(False):
+                self._object_fields["variant"] = torch.from_numpy(variant.copy()).to(self._device)
+                self._object_fields["object_size"] = torch.from_numpy(size.copy()).to(self._device, self.qpos.dtype)
+        warn_of_mocap(touch.inputs, model)
+        self._earlier, self._start_contacts = SubstepStates(touch.inputs), StartContacts(touch.inputs)
+        self._reader = self._make_reader(touch.inputs)
+        if self._watch is not None:
+            self._watch_reader = self._make_reader(self._watch.inputs)
+        if touch.has_state:
+            _READERS[touch] = weakref.ref(self)
+        self.reset()
+
     @property
-    @abstractmethod
     def num_envs(self) -> int:
         """Number of environments."""
+        return len(self.qpos)
 
     @property
     def control_step(self) -> float:
@@ -196,40 +247,33 @@ class Simulation(ABC):
         return self.substeps * float(self.model.opt.timestep)
 
     @property
-    def qpos(self) -> Float[Tensor, "env nq"]:
-        """Positions of the joints, as MuJoCo's `qpos`: a live tensor.
+    def arrays(self) -> Mapping[str, Tensor]:
+        """Live tensors (env, …) of MuJoCo's arrays by their names in `mjData`: at least those that it integrates."""
+        return self._arrays
 
-        What is written into it counts from the next step on, and what `state` hands out stays that of the last step: use
-        `set_state`, or call `forward`. After `step` it is where the environments are now.
+    @property
+    def qpos(self) -> Float[Tensor, "env nq"]:
+        """Positions of the joints now, as MuJoCo's `qpos`: a live tensor.
+
+        What is written into it counts from the next step on; use `set_state`, or call `forward`, to have `state` follow.
         """
         return self._arrays["qpos"]
 
     @property
     def qvel(self) -> Float[Tensor, "env nv"]:
-        """Velocities of the joints, as MuJoCo's `qvel`: a live tensor, as `qpos` is."""
+        """Velocities of the joints now, as MuJoCo's `qvel`: a live tensor, as `qpos` is."""
         return self._arrays["qvel"]
 
     @property
     def ctrl(self) -> Float[Tensor, "env nu"]:
-        """Controls of the actuators, as MuJoCo's `ctrl`: a live tensor, as `qpos` is."""
+        """Controls of the actuators now, as MuJoCo's `ctrl`: a live tensor, as `qpos` is."""
         return self._arrays["ctrl"]
 
     @property
-    @abstractmethod
     def time(self) -> Float[Tensor, " env"]:
-        """When the instant is that `state` and `read` are of, by MuJoCo's clock [s].
-
-        After `step` it is a physics step before now: see `state`. Readings of two times within a control step differ by it.
-        """
-
-    @property
-    @abstractmethod
-    def arrays(self) -> Mapping[str, Tensor]:
-        """Live tensors (env, …) of the arrays that MuJoCo integrates, by their names in `mjData`."""
-
-    @abstractmethod
-    def env_model(self, env: int) -> mujoco.MjModel:
-        """Return the model of one environment, its objects as they are there."""
+        """The state's instant by MuJoCo's clock [s]: after `step` a physics step before now."""
+        self._refresh()
+        return self._instant.clone()
 
     @cached_property
     def joints(self) -> Joints:
@@ -238,16 +282,6 @@ class Simulation(ABC):
         A joint without a name goes by its body's, if the body has no other.
         """
         return Joints(self.model)
-
-    @cached_property
-    def _earlier(self) -> SubstepStates:
-        """The states of the last control step's earlier physics steps."""
-        return SubstepStates(self._touch.inputs)
-
-    @cached_property
-    def _start_contacts(self) -> StartContacts:
-        """The contacts of environments that were placed since the last step without looking for contacts."""
-        return StartContacts(self._touch.inputs)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -267,11 +301,8 @@ class Simulation(ABC):
         """How many times each environment has had a fault since the simulation was made."""
         return self._faults.counts.clone()
 
-    def step(self, control: Tensor | np.ndarray | None = None) -> None:
-        """Advance all environments by one control step.
-
-        As with `mj_step`, poses, velocities and contacts are then those at the start of the last physics step, and `state`
-        hands out these: with `substeps=1` what was before the step. `forward` evaluates them where the environments are now.
+    def step(self, control: Control = None) -> None:
+        """Advance all environments by one control step; see the class for the instant that `state` then is of.
 
         Args:
             control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were. Those on a GPU
@@ -299,8 +330,8 @@ class Simulation(ABC):
         if fault is not None:
             raise fault
 
-    def substates(self, control: Tensor | np.ndarray | None = None) -> Iterator[SceneState]:
-        """Advance all environments by one control step, and hand out the state after each of its physics steps.
+    def substates(self, control: Control = None) -> Iterator[SceneState]:
+        """Advance all environments by one control step, and yield the state after each of its physics steps.
 
         For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
         simulator is where `step` would have left it once all are taken; who stops earlier has made fewer physics steps. With
@@ -328,13 +359,9 @@ class Simulation(ABC):
             yield state
 
     def state(self) -> SceneState:
-        """Return what the module wants on its device, all of one instant; `dt` is that of a control step.
+        """Return what the module wants on its device, all of one instant (see the class); `dt` is that of a control step.
 
         If it has sensors that are advanced at each physics step, the states after the earlier ones are in `substeps`.
-
-        After `step` the instant is the start of the last physics step, where MuJoCo has evaluated poses, velocities and
-        contacts: with `substeps=1` that before the step. After `reset`, `set_state` and `forward` it is where the environments
-        are.
         """
         self._refuse_if_closed()
         return self._earlier.added_to(self._start_contacts.applied_to(self._state(self.control_step)))
@@ -342,7 +369,7 @@ class Simulation(ABC):
     def read(self, env_ids: EnvIds | None = None) -> dict[str, Tensor]:
         """Return the module's readings of the present state: `touch(state())`, for some environments (default: all).
 
-        The others' noise, delays and histories stay where they are, and their rows are as they were handed out before: read
+        The others' noise, delays and histories stay where they are, and their rows are as they were returned before: read
         all after a step, and after a reset those that were reset.
 
         Args:
@@ -353,7 +380,7 @@ class Simulation(ABC):
         return self._touch(self.state(), env_mask(env_ids, self.num_envs, self._touch.device))
 
     def watched(self) -> Watched:
-        """Return what `watch` named when the simulation was made, of the instant that `state` is of, on the physics' device.
+        """Return what the option `watch` names, of the instant that `state` is of, on the physics' device.
 
         Raises:
             SimulationError: If nothing is watched.
@@ -361,7 +388,9 @@ class Simulation(ABC):
         self._refuse_if_closed()
         if self._watch is None:
             raise SimulationError("nothing is watched: simulate(..., watch=Watch(bodies=(...), joints=(...)))")
-        values = self._start_contacts.applied_to(self._read_watch(), is_stored=False)
+        self._refresh()
+        fields: dict[str, Any] = dict(self._watch_reader.read())
+        values = self._start_contacts.applied_to(SceneState(**fields), is_stored=False)
         return self._watch.watched(values, self.state() if self._watch.has_pairs else None)
 
     def reset(self, env_ids: EnvIds | None = None, *, contacts: Contacts = "evaluate", **values: Unpack[StateValues]) -> None:
@@ -387,19 +416,19 @@ class Simulation(ABC):
                 finite, or MuJoCo reports an environment as failed.
         """
         self._refuse_if_closed()
-        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._faults.counts.device)
+        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._device)
         if contacts == "evaluate":
             self._start_contacts.forget(mask)
         else:
             self._start_contacts.place(mask, contacts)
-        self._begin_episodes(env_ids, rows, finds_contacts=contacts == "evaluate")
+        self._begin_episodes(mask, rows, finds_contacts=contacts == "evaluate")
+        self._touch.reset(mask)
         self._earlier.restart(mask)
 
     def set_state(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
         """Put some environments (default: all) into a state; their time and the module's memory go on.
 
-        What follows from it is evaluated, as `mj_forward` does: `state` hands out this instant. Nothing of the other
-        environments changes.
+        What follows from it is evaluated, as `mj_forward` does. Nothing of the other environments changes.
 
         Args:
             env_ids: Indices, or a boolean mask over environments.
@@ -415,15 +444,15 @@ class Simulation(ABC):
                 and have a fault.
         """
         self._refuse_if_closed()
-        rows = self._table.rows(values, env_ids)
-        self._start_contacts.forget(env_mask(env_ids, self.num_envs, self._faults.counts.device))
-        self._put(env_ids, rows)
+        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._device)
+        self._start_contacts.forget(mask)
+        self._put(mask, rows)
+        self._evaluate(mask)
 
-    @abstractmethod
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments (default: all) where they are now, as `mj_forward` does.
 
-        `state` then hands out this instant, for the price of about one physics step; forces follow from the present controls.
+        It costs about one physics step; forces follow from the present controls.
 
         Args:
             env_ids: Indices, or a boolean mask over environments.
@@ -431,6 +460,10 @@ class Simulation(ABC):
         Raises:
             SimulationError: If there are no such environments.
         """
+        self._refuse_if_closed()
+        mask = env_mask(env_ids, self.num_envs, self._device)
+        self._start_contacts.forget(mask)
+        self._evaluate(mask)
 
     def set_objects(
         self,
@@ -441,7 +474,7 @@ class Simulation(ABC):
         temperatures: Mapping[str, Values] | None = None,
         materials: Mapping[str, Values] | None = None,
     ) -> None:
-        """Say what objects are like in some environments (default: all), and restart these; resets leave it as it is.
+        """Choose what objects are like in some environments (default: all), and restart these; resets keep the choice.
 
         At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
         the XHand1's palm, 10 ms; on the CPU each is kept and takes 3 MB.
@@ -463,7 +496,9 @@ class Simulation(ABC):
         chosen = self.heat.choose(ids, temperatures or {}, materials or {})
         if self._objects is not None and (variants or sizes):
             self._objects.choose(ids, variants or {}, sizes or {})
-            self._use_objects()
+            self._use_objects(self._objects)
+            self._object_fields["variant"].copy_(torch.from_numpy(self._objects.variant))
+            self._object_fields["object_size"].copy_(torch.from_numpy(self._objects.object_size))
         self.heat.write(ids, chosen)
         self.reset(ids)
 
@@ -477,7 +512,11 @@ class Simulation(ABC):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of all that the future of the environments follows from, but for the module's own `state_dict`."""
-        return saved_state(self._arrays, self.heat.saved, self.properties, self._start_contacts, self._faults)
+        result = self._saved_arrays() | {f"properties/{name}": value for name, value in self.properties.fields().items()}
+        start = self._start_contacts
+        if start.is_placed is not None:
+            result |= {"start/is_placed": start.is_placed} | {f"start/{name}": value for name, value in start.values.items()}
+        return {name: value.clone() for name, value in result.items()}
 
     def load_state_dict(self, saved: Mapping[str, Tensor]) -> None:
         """Go on where a simulation of the same scene, objects and number of environments was saved.
@@ -486,41 +525,87 @@ class Simulation(ABC):
             SimulationError: If it was another one; nothing has changed.
         """
         self._refuse_if_closed()
-        load_state(saved, self._arrays, self.heat.saved, self.properties, self._start_contacts, self._faults, self.forward)
+        live = self._saved_arrays()
+        wrong = [name for name, now in live.items() if name not in saved or saved[name].shape != now.shape]
+        if wrong:
+            raise SimulationError(f"this is the state of another simulation: {listed(wrong)} missing or of another shape")
+        properties, start = (
+            {name.removeprefix(part): value for name, value in saved.items() if name.startswith(part)}
+            for part in ("properties/", "start/")
+        )
+        self.properties.set_fields(properties)
+        with torch.no_grad():
+            for name, now in live.items():
+                now.copy_(saved[name])
+            self._faults.clear(torch.ones_like(self._faults.mask))
+        self.forward()
+        contacts = {name: value.to(self._device) for name, value in start.items()}
+        self._start_contacts.is_placed, self._start_contacts.values = contacts.pop("is_placed", None), contacts
 
     def close(self) -> None:
         """Release the module, so that another simulation can read it; this one can no longer be used."""
         self._is_closed = True
-        release(self._touch, self)
+        if _reader_of(self._touch) is self:
+            del _READERS[self._touch]
 
     @abstractmethod
-    def _state(self, dt: float) -> SceneState: ...
+    def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
+        """Return where all bodies are in one environment at the state's instant: origins [m], quaternions w, x, y, z."""
 
     @abstractmethod
-    def _read_watch(self) -> SceneState:
-        """Return the fields that the watch wants."""
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return the model of one environment, its objects as they are there."""
 
     @abstractmethod
-    def _use_objects(self) -> None:
-        """Simulate the objects that were chosen."""
+    def _open_device(self, device: str, options: SimOptions) -> torch.device:
+        """Load the engine's libraries and return the device."""
+
+    @abstractmethod
+    def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
+        """Set `_arrays`, `_instant`, `_faults`, `_table` and `properties`; `model`, `_objects` and `_watch` are there."""
+
+    @abstractmethod
+    def _make_reader(self, inputs: Inputs) -> Any:
+        """Return an object whose `read(rows)` returns poses, velocities, contacts and joints by field of a state."""
+
+    @abstractmethod
+    def _refresh(self) -> None:
+        """Evaluate environments whose evaluation was put off, so that the arrays are of the state's instant."""
 
     @abstractmethod
     def _advance(self, num_steps: int) -> None:
         """Make physics steps, and see to faults."""
 
     @abstractmethod
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
-        """Begin episodes; without a look for contacts, evaluate poses and velocities alone."""
+    def _begin_episodes(self, mask: Bool[Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
+        """Restart environments with values, but for the module; without a look for contacts, evaluate poses and velocities."""
 
     @abstractmethod
-    def _put(self, env_ids: EnvIds | None, rows: Rows) -> None: ...
+    def _put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+        """Write values into the state of environments."""
 
-    def _begin_step(self, control: Tensor | np.ndarray | None) -> None:
-        """Take controls over.
+    @abstractmethod
+    def _evaluate(self, mask: Bool[Tensor, " env"]) -> None:
+        """Evaluate environments where they are, at once or by the next `_refresh`."""
 
-        Raises:
-            SimulationError: If they do not fit, or are the host's and not finite.
-        """
+    @abstractmethod
+    def _use_objects(self, objects: EnvObjects) -> None:
+        """Simulate the objects that were chosen."""
+
+    def _state(self, dt: float, rows: SomeRows = None) -> SceneState:
+        self._refresh()
+        return self._gathered(dt, rows).to(self._touch.device)
+
+    def _gathered(self, dt: float, rows: SomeRows = None) -> SceneState:
+        """Return the fields that the module wants from the arrays as they are, on the physics' device; `dt` in s."""
+        rest = self.heat.read() | {"time": self._instant.clone()}
+        rest |= {name: field.clone() for name, field in self._object_fields.items()}
+        if rows is not None:
+            rest = {name: value[rows] for name, value in rest.items()}
+        values: dict[str, Any] = self._reader.read(rows) | rest | {"dt": dt}
+        return SceneState(**{name: value for name, value in values.items() if name in (*self._touch.inputs.fields, "time")})
+
+    def _begin_step(self, control: Control) -> None:
         self._refuse_if_closed()
         self._start_contacts.forget()
         self._faults.begin_step()
@@ -529,11 +614,52 @@ class Simulation(ABC):
         self._faults.note(BAD_CONTROL, write_controls(control, self.ctrl, self._faults.on_fault == "raise"))
         self._has_warned_of_range = self._has_warned_of_range or warn_of_range(control, self.model)
 
-    def _scene_state(self, values: Mapping[str, Tensor], dt: float) -> SceneState:
-        """Return a state of the fields that the module wants; `dt` in s."""
-        fields: dict[str, Any] = {**values, "dt": dt}
-        return SceneState(**{name: value for name, value in fields.items() if name in (*self._touch.inputs.fields, "time")})
+    def _saved_arrays(self) -> dict[str, Tensor]:
+        """Return the live tensors of a saved state, by their names there."""
+        arrays = {f"state/{name}": self._arrays[name] for name in INTEGRATED}
+        return arrays | self.heat.saved | {"faults/counts": self._faults.counts}
 
     def _refuse_if_closed(self) -> None:
         if self._is_closed:
             raise SimulationError("this simulation is closed; make another one")
+
+
+_READERS: weakref.WeakKeyDictionary[TactileModule, weakref.ref[Simulation]] = weakref.WeakKeyDictionary()
+"""The simulation that reads each module that has state."""
+
+
+def _reader_of(touch: TactileModule) -> Simulation | None:
+    reference = _READERS.get(touch)
+    return None if reference is None else reference()
+
+
+def _refuse_unfit(touch: TactileModule, num_envs: int, options: SimOptions) -> None:
+    """Raise an error for what no simulation can do."""
+    substeps = options.get("substeps", 1)
+    if num_envs < 1 or substeps < 1:
+        raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
+    if options.get("model") is not None and touch.inputs.objects:
+        what = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
+        raise SimulationError(f"{what}; leave `model` out")
+    if options.get("model") is not None and options.get("options"):
+        raise SimulationError("`options` are for the artefact's scene; a model of your own has them in its `opt`")
+    if not touch.has_state:
+        return
+    if _reader_of(touch) is not None:
+        gc.collect()  # a simulation that nobody holds may still hold itself
+    if (other := _reader_of(touch)) is not None:
+        raise SimulationError(
+            f"this module is read by a simulation of {other.num_envs} environments, whose state it holds; `close` that one, or "
+            "give this one a module of its own: tgdsl.compile(...) again, or copy.deepcopy(touch)"
+        )
+    if touch.num_envs not in (None, num_envs):
+        what = f"this module holds the state of {touch.num_envs} environments, and num_envs is {num_envs}"
+        raise SimulationError(f"{what}; touch.free() frees it")
+
+
+def refuse_two_instants(model: mujoco.MjModel, sleep: str) -> None:
+    """Raise an error for a model whose state would not be of one instant; `sleep` is the message if its bodies may sleep."""
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        raise SimulationError(sleep)

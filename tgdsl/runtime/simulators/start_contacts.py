@@ -28,68 +28,55 @@ Contacts = str | Mapping[str, Tensor]
 
 
 class StartContacts:
-    """The contacts of environments that were placed since the last step, in the place of what the simulator has."""
+    """The contacts of environments that were placed since the last step, in the place of what the simulator has.
+
+    Attributes:
+        is_placed: Environments that were placed; None if none were.
+        values: What was stored of their contacts, by field.
+    """
 
     def __init__(self, inputs: Inputs):
-        """Begin: nothing was placed."""
         self._inputs = inputs
-        self._is_placed: Bool[Tensor, " env"] | None = None
-        self._values: dict[str, Tensor] = {}
-
-    @property
-    def placed(self) -> tuple[Bool[Tensor, " env"] | None, dict[str, Tensor]]:
-        """Environments that were placed, if any were, and what was stored of their contacts by field."""
-        return self._is_placed, self._values
-
-    @placed.setter
-    def placed(self, placed: tuple[Bool[Tensor, " env"] | None, dict[str, Tensor]] | None) -> None:
-        self._is_placed, self._values = placed or (None, {})
+        self.is_placed: Bool[Tensor, " env"] | None = None
+        self.values: dict[str, Tensor] = {}
 
     def forget(self, chosen: Bool[Tensor, " env"] | None = None) -> None:
         """Forget some environments (default: all), whose contacts the simulator has evaluated."""
         if chosen is None:
-            self._is_placed, self._values = None, {}
-        elif self._is_placed is not None:
-            self._is_placed = self._is_placed & ~chosen
+            self.is_placed, self.values = None, {}
+        elif self.is_placed is not None:
+            self.is_placed = self.is_placed & ~chosen
 
     def place(self, chosen: Bool[Tensor, " env"], contacts: Contacts) -> None:
-        """Note environments that were placed, and their contacts.
-
-        Args:
-            chosen: The environments.
-            contacts: "none", or fields of a state by name, one row for all environments alike or (env, …); those left out are
-                zero.
+        """Note environments that were placed, and their contacts: "none", or fields of a state by name, the others zero.
 
         Raises:
             SimulationError: If there is no such word or field, or a shape does not fit.
         """
         given = self._given(contacts, chosen)
-        for name in {**self._values, **given}:
-            old, new = self._values.get(name), given.get(name)
+        for name in {**self.values, **given}:
+            old, new = self.values.get(name), given.get(name)
             like = old if new is None else new
             assert like is not None
             old, new = (torch.zeros_like(like) if value is None else value for value in (old, new))
-            self._values[name] = torch.where(broadcast_over(chosen, like), new, old.to(new.dtype))
-        self._is_placed = chosen.clone() if self._is_placed is None else self._is_placed | chosen
+            self.values[name] = torch.where(broadcast_over(chosen, like), new, old.to(new.dtype))
+        self.is_placed = chosen.clone() if self.is_placed is None else self.is_placed | chosen
 
     def applied_to(
         self, state: SceneState, is_stored: bool = True, rows: Int[Tensor, " n"] | slice = slice(None)
     ) -> SceneState:
-        """Return a state in which placed environments have the contacts of their start.
+        """Return a state, of all or some rows, in which placed environments have the contacts of their start.
 
-        Args:
-            state: What the simulator has.
-            is_stored: Whether those that were stored are of this state's pairs and joints; if not, all are zero.
-            rows: The environments that the state is of; default: all.
+        Unless `is_stored`, the stored ones are not of this state's pairs and joints, and all are zero.
         """
-        if self._is_placed is None:
+        if self.is_placed is None:
             return state
-        is_placed = self._is_placed[rows]
+        is_placed = self.is_placed[rows]
         values: dict[str, Any] = {}
         for name in FIELDS:
             now = getattr(state, name)
             if now is not None:
-                start = self._values.get(name) if is_stored else None
+                start = self.values.get(name) if is_stored else None
                 value = torch.zeros_like(now) if start is None else start[rows].to(now.device, now.dtype)
                 values[name] = torch.where(broadcast_over(is_placed.to(now.device), now), value, now)
         return dataclasses.replace(state, **values)

@@ -64,12 +64,6 @@ class StateTable:
     """The live arrays of a simulator's state, and what may be put into them."""
 
     def __init__(self, model: mujoco.MjModel, arrays: Mapping[str, Tensor]):
-        """Look up where quaternions stand.
-
-        Args:
-            model: The scene.
-            arrays: The arrays that `INTEGRATED` names, (env, …), all on one device.
-        """
         self._arrays = {name: arrays[name] for name in INTEGRATED}
         self._num_envs, self._device = len(arrays["qpos"]), arrays["qpos"].device
         free = model.jnt_qposadr[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)] + 3

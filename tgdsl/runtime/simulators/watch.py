@@ -5,7 +5,6 @@ Shapes: `env` environments, `body`, `site`, `joint`, `actuator` and `pair` as a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.geometry.rotations import product, rotated
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.model_ids import site_id
+from tgdsl.runtime.simulators.model_ids import element_id
 
 _BODY_FIELDS = ("body_pos", "body_quat", "body_linvel", "body_angvel")
 _JOINT_FIELDS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
@@ -103,22 +102,12 @@ class WatchReader:
     """Makes a `Watched` of what a simulator reads."""
 
     def __init__(self, watch: Watch, inputs: Inputs, model: mujoco.MjModel, device: torch.device):
-        """Look up sites and pairs.
-
-        Args:
-            watch: What is looked at.
-            inputs: What the module wants.
-            model: The scene.
-            device: Where the tensors are.
-
-        Raises:
-            SimulationError: If the model has no such site, or its body no name, or the module does not read a pair.
-        """
         self._watch = watch
-        sites = np.array([site_id(model, name) for name in watch.sites], dtype=np.int64)
+        sites = np.array([element_id(model, "site", name) for name in watch.sites], dtype=np.int64)
         of_sites = [_carrier(model, int(site)) for site in sites]
         bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
-        self.inputs = _inputs(watch, bodies)
+        fields = (*_BODY_FIELDS, *_JOINT_FIELDS)
+        self.inputs = Inputs(fields, bodies, (), {}, 0, joints=watch.joints, actuators=watch.actuators)
         """What a simulator has to read for it."""
         carriers = [bodies.index(name) for name in of_sites]
         self._carriers = torch.tensor(carriers, dtype=torch.int64, device=device)
@@ -133,15 +122,9 @@ class WatchReader:
         return bool(len(self._pairs))
 
     def watched(self, values: SceneState, state: SceneState | None) -> Watched:
-        """Return what was looked at.
-
-        Args:
-            values: The fields of `inputs`.
-            state: The module's state of the same instant; only needed if pairs are watched.
-        """
-        pos, quat, linvel, angvel = (_present(getattr(values, name)) for name in _BODY_FIELDS)
-        joint_pos, joint_vel, joint_effort, last_action = (_present(getattr(values, name)) for name in _JOINT_FIELDS)
-        num = len(self._watch.bodies)
+        """Return what was looked at, from the fields of `inputs` and, for pairs, the module's state of that instant."""
+        fields: dict[str, Tensor] = {name: getattr(values, name) for name in (*_BODY_FIELDS, *_JOINT_FIELDS)}
+        pos, quat, num = fields["body_pos"], fields["body_quat"], len(self._watch.bodies)
         site_pos, site_quat = self._sites(pos, quat) if self._watch.sites else (pos[:, :0], quat[:, :0])
         force = pos.new_zeros((len(pos), 0, 3))
         if self.has_pairs:
@@ -149,16 +132,10 @@ class WatchReader:
             force = state.contact_netforce[:, self._pairs]
         return Watched(
             watch=self._watch,
-            body_pos=pos[:, :num],
-            body_quat=quat[:, :num],
-            body_linvel=linvel[:, :num],
-            body_angvel=angvel[:, :num],
+            **{name: fields[name][:, :num] for name in _BODY_FIELDS},
             site_pos=site_pos,
             site_quat=site_quat,
-            joint_pos=joint_pos,
-            joint_vel=joint_vel,
-            joint_effort=joint_effort,
-            last_action=last_action,
+            **{name: fields[name] for name in _JOINT_FIELDS},
             pair_force=force,
         )
 
@@ -169,21 +146,11 @@ class WatchReader:
         return pos[:, self._carriers] + rotated(carried, site_pos), product(carried, site_quat)
 
 
-def _inputs(watch: Watch, bodies: Sequence[str]) -> Inputs:
-    """Return what a simulator has to read: all fields of bodies and joints."""
-    return Inputs((*_BODY_FIELDS, *_JOINT_FIELDS), tuple(bodies), (), {}, 0, joints=watch.joints, actuators=watch.actuators)
-
-
 def merged_joints(inputs: Inputs, watch: WatchReader | None) -> Inputs:
     """Return inputs with the joints' fields that a watch needs besides: what is to be kept from before a physics step."""
     if watch is None:
         return inputs
     return replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *watch.inputs.fields))))
-
-
-def _present(value: Tensor | None) -> Tensor:
-    assert value is not None  # `inputs` wants all of them
-    return value
 
 
 def _carrier(model: mujoco.MjModel, site: int) -> str:

@@ -37,9 +37,6 @@ def contact_force_function(mjw: Any) -> Any:
 
     The public `mujoco_warp.contact_force` is a kernel's launch over a list of contacts: a kernel can call a function, but no
     kernel, and to launch both would need the list, and memory for its answers, on the device.
-
-    Raises:
-        SimulationError: If this version has none.
     """
     return _part(mjw, "support.contact_force_fn")
 
@@ -48,9 +45,6 @@ def constraint_contact_bit(mjw: Any) -> int:
     """Return the bit of `Contact.type` of contacts that carry force, rather than those that only sensors look for.
 
     `Contact.type` is public, the enumeration of its values is not.
-
-    Raises:
-        SimulationError: If this version has none.
     """
     return int(_part(mjw, "types.ContactType.CONSTRAINT"))
 
@@ -86,17 +80,6 @@ class PairContacts:
     arrays: dict[str, Float[Tensor, "env ..."]]
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, num_envs: int, device: torch.device):
-        """Allocate memory for what is wanted.
-
-        Args:
-            inputs: What the module wants.
-            model: The scene.
-            num_envs: Number of environments.
-            device: Where physics runs.
-
-        Raises:
-            SimulationError: If the model lacks a body or geom.
-        """
         wp, mjw = libraries()
         self._fields = [name for name in ("contact_found", *_VECTORS) if name in inputs.fields]
         geoms = {name: _geoms(model, inputs.parts_of(name)) for name in inputs.bodies_of}

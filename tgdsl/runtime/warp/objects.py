@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.objects.choices import EnvObjects, Values
+from tgdsl.runtime.simulators.objects.choices import EnvObjects
 from tgdsl.runtime.warp.stream import libraries
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.scene import Choice, SceneModels, is_absent
@@ -50,33 +47,20 @@ FAR = 1e6
 
 
 class WorldObjects:
-    """What the objects of `inputs.objects` are like in each environment, and how these are told.
+    """What the objects of `inputs.objects` are like in each environment, as MuJoCo Warp's model has it.
 
     Types of geoms are shared by all environments: of the geoms that an object has in any variant, those that an environment
     lacks weigh nothing and are kept out of its collisions.
 
     Attributes:
         model: The model that all environments share.
-        variant: The field `variant` of a state.
-        object_size: The field `object_size` of a state [m].
     """
 
-    variant: Int[Tensor, "env object"]
-    object_size: Float[Tensor, "env object 3"]
-
-    def __init__(self, scenes: SceneModels, inputs: Inputs, num_envs: int, device: torch.device):
-        """Give environment i the variant i modulo their number, in the size that the document or the scene gives."""
-        self._scenes, self._names = scenes, inputs.objects
-        self._chosen = EnvObjects(scenes, inputs, num_envs)
+    def __init__(self, chosen: EnvObjects, inputs: Inputs):
+        self._scenes, self._names, self._chosen = chosen.scenes, inputs.objects, chosen
         self._rows: dict[tuple[Choice, ...], Row] = {}
         self._written: list[tuple[Choice, ...]] = []
-        self.model = shared_model(scenes, inputs)
-        self.variant = torch.zeros(self._chosen.variant.shape, dtype=torch.int64, device=device)
-        self.object_size = torch.zeros(self._chosen.object_size.shape, dtype=torch.float32, device=device)
-
-    def choose(self, ids: Int[Array, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
-        """Say what objects are like in some environments: see `Simulation.set_objects`; then `write_to` them."""
-        self._chosen.choose(ids, variants, sizes)
+        self.model = shared_model(chosen.scenes, inputs)
 
     def write_to(self, worlds: Worlds) -> None:
         """Write the fields of environments whose objects were chosen again, in place; the others keep their masses.
@@ -86,18 +70,17 @@ class WorldObjects:
         """
         choices = [self._choices(env) for env in range(len(self._chosen.variant))]
         before, self._written = self._written or [None] * len(choices), choices
-        changed = torch.tensor([old != new for old, new in zip(before, choices, strict=True)], device=self.variant.device)
+        device = worlds.arrays["qpos"].device
+        changed = torch.tensor([old != new for old, new in zip(before, choices, strict=True)], device=device)
         distinct = list(dict.fromkeys(choices))
         self._rows = {key: self._rows[key] if key in self._rows else self._row(key) for key in distinct}
         number = {key: i for i, key in enumerate(distinct)}
-        index = torch.tensor([number[key] for key in choices], device=self.variant.device)
+        index = torch.tensor([number[key] for key in choices], device=device)
         for name in (*OWN_FIELDS, "geom_xpos", "geom_xmat"):
             target = worlds.parameters[name] if name in OWN_FIELDS else worlds.arrays[name]
             rows = torch.from_numpy(np.stack([self._rows[key][name] for key in distinct]))
             new = rows.to(target.device, target.dtype)[index].reshape(target.shape)
             target.copy_(torch.where(broadcast_over(changed, new), new, target))
-        self.variant.copy_(torch.from_numpy(self._chosen.variant))
-        self.object_size.copy_(torch.from_numpy(self._chosen.object_size))
 
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment."""

@@ -5,7 +5,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import mujoco
@@ -15,15 +15,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.module.module import TactileModule
-from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.bodies import BodyFields, warn_of_mocap
-from tgdsl.runtime.simulators.claims import claim, refuse_unfit
-from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.bodies import BodyFields
 from tgdsl.runtime.simulators.joint_fields import JointColumns
-from tgdsl.runtime.simulators.model_ids import keyframe_id
-from tgdsl.runtime.simulators.objects.heat import EnvHeat
+from tgdsl.runtime.simulators.objects.choices import EnvObjects
 from tgdsl.runtime.simulators.objects.properties import (
     MASS_FIELDS,
     PER_ENV,
@@ -31,16 +26,14 @@ from tgdsl.runtime.simulators.objects.properties import (
     RigidObject,
     refuse_other_fields,
 )
-from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
-from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.simulators.simulation import Control, SimOptions, Simulation, SomeRows
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
-from tgdsl.runtime.simulators.watch import Watch, WatchReader, merged_joints
+from tgdsl.runtime.simulators.watch import merged_joints
 from tgdsl.runtime.warp.contacts import PairContacts
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
-from tgdsl.scene.options import Options
-from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_mask
+from tgdsl.tensors.env_ids import broadcast_over
 
 
 class StateReader:
@@ -54,18 +47,6 @@ class StateReader:
         kept: Mapping[str, Tensor],
         contacts: PairContacts | None = None,
     ):
-        """Look up where everything is.
-
-        Args:
-            inputs: What the module wants.
-            model: The scene.
-            sources: The arrays that `STATE_ARRAYS` names and those of `joint_fields.FORCES`, (env, …).
-            kept: The arrays of joints and actuators at the state's instant, (env, …).
-            contacts: The contacts that are wanted; default: none.
-
-        Raises:
-            SimulationError: If the model lacks a body, a joint or an actuator.
-        """
         self._sources, self._contacts = sources, contacts
         device = sources["xpos"].device
         self._bodies = BodyFields(
@@ -81,8 +62,8 @@ class StateReader:
             for name, array in indices.fields.items()
         }
 
-    def read(self) -> dict[str, Tensor]:
-        """Return the fields of a state that are poses, velocities, contacts or joints, each a tensor of its own."""
+    def read(self, rows: SomeRows = None) -> dict[str, Tensor]:
+        """Return poses, velocities, contacts and joints by field of a state, each a tensor of its own, of all environments."""
         values = self._bodies.read(self._sources) | ({} if self._contacts is None else self._contacts.read())
         values |= {name: array[:, columns] for name, (array, columns) in self._joints.items()}
         return values
@@ -99,18 +80,8 @@ class WorldProperties(ObjectProperties):
         num_envs: int,
         device: torch.device,
     ):
-        """Begin: all environments are as the scene has them.
-
-        Args:
-            parameters: The fields that environments have of their own, (env, …).
-            model: The scene.
-            bodies_of: Body of each of the document's objects.
-            num_envs: Number of environments.
-            device: Where physics runs.
-        """
         super().__init__(model, bodies_of, num_envs, device)
         self._fields = parameters
-        self._indices: dict[tuple[str, str], Tensor] = {}
         self._plain: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
 
     def renew(self) -> None:
@@ -135,7 +106,7 @@ class WorldProperties(ObjectProperties):
             what = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
             raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
         own, inertia, subtree, body, dof = (self._fields[name] for name in MASS_FIELDS)
-        bodies, above, dofs = (self._index(target, name, own.device) for name in ("bodies", "above", "dofs"))
+        bodies, above, dofs = (self._index(target, name) for name in ("bodies", "above", "dofs"))
         parts = [(own, bodies), (inertia, bodies), (subtree, bodies), (body, bodies), (dof, dofs)]
         if target.name not in self._plain:  # what masses are changed from each time: rounding would add up
             self._plain[target.name] = [(array, columns, array[:, columns].clone()) for array, columns in parts]
@@ -151,16 +122,8 @@ class WorldProperties(ObjectProperties):
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         self._check("friction")
         own = self._fields["geom_friction"]
-        geoms = self._index(target, "geoms", own.device)
+        geoms = self._index(target, "geoms")
         own[:, geoms, 0] = torch.where(mask[:, None], friction.to(own.dtype)[:, None], own[:, geoms, 0])
-
-    def _mass(self, target: RigidObject) -> Float[Tensor, " env"]:
-        own = self._values("body_mass")
-        return own[:, self._index(target, "bodies", own.device)].sum(dim=1)
-
-    def _friction(self, target: RigidObject) -> Float[Tensor, " env"]:
-        own = self._values("geom_friction")
-        return own[:, self._index(target, "geoms", own.device), 0].amax(dim=1)
 
     def _values(self, field: str) -> Float[Tensor, "env ..."]:
         """Return what each environment has of a field of the model, also where all share it."""
@@ -173,152 +136,44 @@ class WorldProperties(ObjectProperties):
         if not self._fields.keys() >= set(PER_ENV[word]):
             raise SimulationError(f'environments share each {word}; simulate(..., per_env=("{word}",)) gives them their own')
 
-    def _index(self, target: RigidObject, name: str, device: torch.device) -> Tensor:
-        key = (target.name, name)
-        if key not in self._indices:
-            self._indices[key] = torch.from_numpy(getattr(target, name)).to(device)
-        return self._indices[key]
-
 
 T = TypeVar("T")
 
 
 class WarpSimulation(Simulation):
-    """Environments in MuJoCo Warp, read by one module.
+    """Environments in MuJoCo Warp, in float32; `qpos`, `qvel` and `ctrl` are on the physics' device.
 
-    It offers what `BatchSimulation` does, in float32, and everything `state` hands out is of one instant: after `step`, poses,
-    velocities and contacts are those at the start of the last substep. After `reset`, `set_state` and `forward` they are of
-    where the environments are. `qpos`, `qvel` and `ctrl` are live tensors in float32 on the physics' device. Contacts of a
-    pair come in any order; where there are more than slots, any of them are kept. Its solver stops at 1e-6 where MuJoCo's
-    stops at 1e-8: forces of sliding contacts agree to 3e-3 of the largest one, and to 2e-4 after
+    Contacts of a pair come in any order; where there are more than slots, any of them are kept. Its solver stops at 1e-6 where
+    MuJoCo's stops at 1e-8: forces of sliding contacts agree to 3e-3 of the largest one, and to 2e-4 after
     `warp_model.opt.tolerance.fill_(1e-8)`; those of contacts that stick to 1e-5 either way.
 
-    On a GPU nothing waits for it unless the host's own numbers are handed in or asked for. What goes wrong there is therefore
-    reported by a later call: `check` looks at once.
+    Devices are "cuda", "cuda:1", or "cpu", which is slow and meant for tests. On a GPU nothing waits for it unless the host's
+    own numbers are handed in or asked for. What goes wrong there is therefore reported by a later call: `check` looks at once.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first, and with a spare body at the
             end if some of their variants are meshes.
-        substeps: Physics steps per control step.
-        arrays: Live tensors (env, …) of MuJoCo's arrays, such as `arrays["qpos"]`. In `arrays["sensordata"]` the contact
-            sensors that `tgdsl.instrument` adds are zero: their contacts are read elsewhere.
-        parameters: Live tensors (env, …) of the model's fields that environments have of their own; what MuJoCo derives from
-            them, such as `body_subtreemass`, is not derived again.
-        warp_model: MuJoCo Warp's model.
-        warp_data: MuJoCo Warp's data.
     """
 
+    OPTIONS = ("substeps", "keyframe", "nconmax", "njmax", "model", "options", "watch", "per_env", "on_fault", "graph")
+    DEVICE = "cuda"
     properties: WorldProperties
-    _objects: WorldObjects | None = None
-
-    def __init__(
-        self,
-        touch: TactileModule,
-        num_envs: int,
-        *,
-        substeps: int = 1,
-        keyframe: str | None = None,
-        nconmax: int | None = None,
-        njmax: int | None = None,
-        model: mujoco.MjModel | None = None,
-        options: Options | None = None,
-        watch: Watch | None = None,
-        per_env: Sequence[str] = (),
-        device: str = "cuda",
-        graph: bool = True,
-        on_fault: OnFault = "raise",
-    ):
-        """Start all environments.
-
-        Args:
-            touch: The module that reads them; on the same device nothing is copied.
-            num_envs: Number of environments.
-            substeps: Physics steps per control step.
-            keyframe: Name of the keyframe to start from; default: the model's own initial state.
-            nconmax: Capacity for contacts per environment, in a pool that all share; default 48.
-            njmax: Capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make.
-            model: A model of your own; default: the artefact's scene. Its objects are the same in all environments. Contacts
-                are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
-            options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
-            watch: What `watched` returns.
-            per_env: What environments shall have of their own: "mass" and "friction" for `set_properties`, or fields of the
-                model by name, such as "geom_friction".
-            device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
-            graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
-            on_fault: What becomes of environments that diverge, are given controls that are not finite, or whose search for
-                contacts of convex shapes runs out of room: "raise" has `step` raise until they are reset; "reset" starts them
-                again, in the simulator and in the module, counts them in `fault_counts` and warns once; "note" leaves it to
-                whoever looks at `faults` and resets them. On a GPU "reset" is done there, without waiting, and each `state`
-                then evaluates all environments once more. Pools that are too small raise either way.
-
-        Raises:
-            ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, the keyframe or what is watched, holds something that MuJoCo Warp does
-                not support, if there is nothing to step, no such device or library, or if the module's state is another
-                simulation's or of other environments.
-        """
-        refuse_unfit(touch, num_envs, substeps, model, options)
-        self._touch, self.substeps = touch, substeps
-        self._stream = WarpStream(device, graph)
-        if model is None:
-            scenes = SharedMeshModels(touch.plan.scene, options)
-            model = scenes.model({})
-            if touch.inputs.objects:
-                self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._stream.device)
-        self.model: mujoco.MjModel = model
-        if watch is not None:
-            self._watch = WatchReader(watch, touch.inputs, model, self._stream.device)
-        own = list(OWN_FIELDS) if self._objects else []
-        self._worlds = Worlds(
-            model if self._objects is None else self._objects.model,
-            merged_joints(touch.inputs, self._watch),
-            num_envs,
-            self._stream,
-            keyframe=keyframe_id(model, keyframe),
-            nconmax=nconmax,
-            njmax=njmax,
-            per_env=list(dict.fromkeys([f for word in per_env for f in PER_ENV.get(word, (word,))] + own)),
-            on_fault=on_fault,
-        )
-        self._arrays, self._faults = self._worlds.arrays, self._worlds.faults
-        parameters, bodies_of = self._worlds.parameters, touch.inputs.bodies_of
-        self.properties = WorldProperties(parameters, model, bodies_of, num_envs, self._stream.device)
-        self.heat = EnvHeat(touch.inputs, num_envs, self._stream.device, torch.float32)
-        with self._stream.scope():
-            self._table = StateTable(model, self._arrays)
-        if self._objects is not None:
-            self._objects.write_to(self._worlds)
-        warn_of_mocap(touch.inputs, model)
-        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
-        if self._watch is not None:
-            self._watch_reader = StateReader(self._watch.inputs, model, self._worlds.arrays, self._worlds.kept)
-        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps, self.drive))
-        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1, self.drive))
-        self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
-        self._held: tuple[object, ...] = ()
-        self._driven = self.drive
-        claim(touch, self)
-        self.reset()
-
-    @property
-    def num_envs(self) -> int:
-        """Number of environments."""
-        return int(self._worlds.data.nworld)
-
-    @property
-    def time(self) -> Float[Tensor, " env"]:
-        """When the instant is that `state` is of [s]: see `Simulation.time`."""
-        self._worlds.refresh()
-        return self._worlds.kept["time"].clone()
+    _world_objects: WorldObjects | None = None
 
     @property
     def arrays(self) -> Mapping[str, Tensor]:
-        """Live tensors (env, …) of MuJoCo's arrays: what it integrates, and what states are read from."""
-        return self._worlds.arrays
+        """Live tensors (env, …) of MuJoCo's arrays: what it integrates, and what states are read from.
+
+        In `arrays["sensordata"]` the contact sensors that `tgdsl.instrument` adds are zero: their contacts are read elsewhere.
+        """
+        return self._arrays
 
     @property
     def parameters(self) -> Mapping[str, Tensor]:
-        """Live tensors (env, …) of the model's fields that environments have of their own."""
+        """Live tensors (env, …) of the model's fields that environments have of their own.
+
+        What MuJoCo derives from them, such as `body_subtreemass`, is not derived again.
+        """
         return self._worlds.parameters
 
     @property
@@ -331,7 +186,7 @@ class WarpSimulation(Simulation):
         """MuJoCo Warp's data."""
         return self._worlds.data
 
-    def step_and_read(self, control: Tensor | np.ndarray | None = None) -> dict[str, Tensor]:
+    def step_and_read(self, control: Control = None) -> dict[str, Tensor]:
         """Advance by one control step and return the module's readings: on a GPU all in one CUDA graph.
 
         It is `step(control)` and then `touch(state())`, without gradients, and for the price of one launch. As with any CUDA
@@ -359,7 +214,8 @@ class WarpSimulation(Simulation):
 
     def repeated(self, body: Callable[[], T]) -> Callable[[], T]:
         """Return work that is done again and again, such as a whole step of an environment: see `Simulation.repeated`."""
-        call, placed = GraphedCall(self._stream, body), None
+        call = GraphedCall(self._stream, body)
+        placed: tuple[Bool[Tensor, " env"] | None, dict[str, Tensor]] = (None, {})
 
         def done() -> T:
             nonlocal placed
@@ -367,19 +223,13 @@ class WarpSimulation(Simulation):
             was_captured = call.is_captured
             result = call()
             if call.is_captured:  # what the work notes on the host is as it was when it was captured
-                placed = placed if was_captured else self._start_contacts.placed
-                self._start_contacts.placed = placed
+                start = self._start_contacts
+                placed = placed if was_captured else (start.is_placed, dict(start.values))
+                start.is_placed, start.values = placed[0], dict(placed[1])
                 self._finish_step(is_evaluated=True)
             return result
 
         return done
-
-    def forward(self, env_ids: EnvIds | None = None) -> None:
-        """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
-        self._refuse_if_closed()
-        mask = env_mask(env_ids, self.num_envs, self._stream.device)
-        self._start_contacts.forget(mask)
-        self._worlds.make_stale(mask)
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
         """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
@@ -389,7 +239,7 @@ class WarpSimulation(Simulation):
 
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment, its objects as they are there; `parameters` are not in it."""
-        return self.model if self._objects is None else self._objects.env_model(env)
+        return self.model if self._world_objects is None else self._world_objects.env_model(env)
 
     def check(self) -> None:
         """Look for what has gone wrong in any environment since it was last reset. It waits for a GPU.
@@ -421,41 +271,67 @@ class WarpSimulation(Simulation):
             self._earlier.begin(self.substeps)
             for i in range(self.substeps):
                 if i:
-                    self._earlier.note(self._read(float(self.model.opt.timestep)))
+                    self._earlier.note(self._gathered(float(self.model.opt.timestep)))
                 self._worlds.step(1, self.drive)
             self._earlier.restart(self._faults.restarted)
         if self._faults.on_fault == "reset":
             self._touch.reset(self._worlds.restarted)
             self._worlds.evaluate_stale()
-        return self._touch(self._earlier.added_to(self._read(self.control_step)))
+        return self._touch(self._earlier.added_to(self._gathered(self.control_step)))
 
-    def _state(self, dt: float) -> SceneState:
-        self._worlds.refresh()
-        return self._read(dt).to(self._touch.device)
+    def _open_device(self, device: str, options: SimOptions) -> torch.device:
+        self._stream = WarpStream(device, options.get("graph", True))
+        return self._stream.device
 
-    def _read(self, dt: float) -> SceneState:
-        values = self._reader.read() | self.heat.read() | {"time": self._worlds.kept["time"].clone()}
+    def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
+        inputs = self._touch.inputs
         if self._objects is not None:
-            values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
-        return self._scene_state(values, dt)
+            self._world_objects = WorldObjects(self._objects, inputs)
+        own = list(OWN_FIELDS) if self._world_objects else []
+        per_env = [field for word in options.get("per_env", ()) for field in PER_ENV.get(word, (word,))]
+        self._worlds = Worlds(
+            self.model if self._world_objects is None else self._world_objects.model,
+            merged_joints(inputs, self._watch),
+            num_envs,
+            self._stream,
+            keyframe=keyframe,
+            nconmax=options.get("nconmax"),
+            njmax=options.get("njmax"),
+            per_env=list(dict.fromkeys(per_env + own)),
+            on_fault=options.get("on_fault", "raise"),
+        )
+        self._arrays, self._faults, self._instant = self._worlds.arrays, self._worlds.faults, self._worlds.kept["time"]
+        self.properties = WorldProperties(self._worlds.parameters, self.model, inputs.bodies_of, num_envs, self._device)
+        with self._stream.scope():
+            self._table = StateTable(self.model, self._arrays)
+        if self._world_objects is not None:
+            self._world_objects.write_to(self._worlds)
+        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps, self.drive))
+        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1, self.drive))
+        self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
+        self._held: tuple[object, ...] = ()
+        self._driven = self.drive
 
-    def _read_watch(self) -> SceneState:
+    def _make_reader(self, inputs: Inputs) -> StateReader:
+        contacts = self._worlds.contacts if inputs is self._touch.inputs else None
+        return StateReader(inputs, self.model, self._worlds.arrays, self._worlds.kept, contacts)
+
+    def _refresh(self) -> None:
         self._worlds.refresh()
-        values: dict[str, Any] = dict(self._watch_reader.read())
-        return SceneState(**values)
 
-    def _use_objects(self) -> None:
-        assert self._objects is not None
-        self._objects.write_to(self._worlds)
+    def _use_objects(self, objects: EnvObjects) -> None:
+        assert self._world_objects is not None
+        self._world_objects.write_to(self._worlds)
         self.properties.renew()
 
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
-        mask = env_mask(env_ids, self.num_envs, self._stream.device)
+    def _begin_episodes(self, mask: Bool[Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
         self._worlds.reset(mask, rows, finds_contacts=finds_contacts)
-        self._touch.reset(None if env_ids is None else mask.to(self._touch.device))
 
-    def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
-        self._worlds.put(env_mask(env_ids, self.num_envs, self._stream.device), rows)
+    def _put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+        self._worlds.put(mask, rows)
+
+    def _evaluate(self, mask: Bool[Tensor, " env"]) -> None:
+        self._worlds.make_stale(mask)
 
     def _advance(self, num_steps: int) -> None:
         self._worlds.prepare()

@@ -18,11 +18,7 @@ _EAGER_CALLS = 2
 
 
 def libraries() -> tuple[Any, Any]:
-    """Return the modules `warp` and `mujoco_warp`.
-
-    Raises:
-        SimulationError: If they are not installed.
-    """
+    """Return the modules `warp` and `mujoco_warp`."""
     try:
         import mujoco_warp
         import warp
@@ -40,15 +36,6 @@ class WarpStream:
     """
 
     def __init__(self, device: str, graph: bool = True):
-        """Open the device.
-
-        Args:
-            device: As torch names it: "cpu", "cuda" or "cuda:1".
-            graph: Whether to capture graphs; on the CPU there are none.
-
-        Raises:
-            SimulationError: If there is no such device, or Warp is not installed.
-        """
         self._warp = libraries()[0]
         self.device = checked_device(device, ("cuda", "cpu"))
         self.is_captured = graph and self.device.type == "cuda"
@@ -152,7 +139,6 @@ class GraphedCall(Generic[T]):
     """Work that is done again and again on the same arrays: on a GPU captured at its third call, and replayed from then on."""
 
     def __init__(self, stream: WarpStream, body: Callable[[], T]):
-        """Take work that reads and writes the same arrays each time, and nothing of the host."""
         self._stream, self._body = stream, body
         self.forget()
 

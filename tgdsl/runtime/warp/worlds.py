@@ -17,9 +17,9 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, listed
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.bodies import STATE_ARRAYS
-from tgdsl.runtime.simulators.claims import refuse_two_instants
 from tgdsl.runtime.simulators.faults import BAD_VALUES, DIVERGED, NO_ROOM, EnvFaults
 from tgdsl.runtime.simulators.joint_fields import FORCES, JointColumns
+from tgdsl.runtime.simulators.simulation import refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
@@ -56,11 +56,6 @@ class Faults(EnvFaults):
     """
 
     def __init__(self, arrays: Mapping[str, Tensor], on_fault: str):
-        """Watch over MuJoCo Warp's arrays `overflow`, `qpos` and `qvel`.
-
-        Raises:
-            SimulationError: If `on_fault` is no choice.
-        """
         device = arrays["qpos"].device
         super().__init__(len(arrays["qpos"]), device, on_fault)
         self._arrays = arrays
@@ -104,11 +99,7 @@ class Faults(EnvFaults):
         return bool(first), totals
 
     def message(self, sizes: Mapping[str, int]) -> str:
-        """Return what went wrong and where, in words; nothing if nothing did. It waits for a GPU.
-
-        Args:
-            sizes: Values for the pools' messages.
-        """
+        """Return what went wrong and where, in words with the pools' sizes; nothing if nothing did. It waits for a GPU."""
         result, overflow = self.messages(), self._arrays["overflow"].cpu()
         for bit, text in POOLS.items():
             envs = torch.nonzero((overflow >> bit) & 1).flatten().tolist()
@@ -152,18 +143,7 @@ class Worlds:
         per_env: Sequence[str] = (),
         on_fault: str = "raise",
     ):
-        """Put model and data on the device, all environments at the start.
-
-        Args:
-            model: The scene.
-            inputs: What the module wants.
-            num_envs: Number of environments.
-            stream: Where to work.
-            keyframe: Index of the keyframe to start from; -1: the model's own initial state.
-            nconmax: Capacity for contacts per environment; all environments share it.
-            njmax: Capacity for rows of constraints in each environment; default: as many as `nconmax` contacts make.
-            per_env: Fields of the model that environments have of their own.
-            on_fault: What becomes of environments with a fault of their own.
+        """Put model and data on the device, all environments at the start; `keyframe` is -1 for the model's own initial state.
 
         Raises:
             SimulationError: If MuJoCo Warp does not support something of the model, a field cannot differ, or the model lacks a
@@ -207,11 +187,7 @@ class Worlds:
         """Advance all environments by some physics steps, and restart those that shall not wait: for a `GraphedCall`.
 
         Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
-        some of them remember earlier steps.
-
-        Args:
-            num_steps: How many physics steps.
-            drive: Is called before each of them.
+        some of them remember earlier steps. `drive` is called before each step.
         """
         whole = self.model.opt.disableflags
         idle = whole if self.model.nhistory else whole | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
@@ -243,11 +219,7 @@ class Worlds:
             self.refresh()
 
     def note_step(self, is_evaluated: bool = False) -> None:
-        """Take note, on the host, that all environments have been stepped.
-
-        Args:
-            is_evaluated: Whether those that were restarted have been evaluated; which these are, only the device knows.
-        """
+        """Take note, on the host, that all environments were stepped, and whether restarted ones were evaluated."""
         if not self._stream.is_capturing:
             self._has_stale = False
         if self.faults.on_fault == "reset" and not is_evaluated:
@@ -260,18 +232,14 @@ class Worlds:
         """
         self._is_reset.copy_(mask)
         self._reset()
-        self._write(mask, rows)
+        self.put(mask, rows)
         if finds_contacts:
             self.make_stale(mask)
         else:
             self._move()
 
     def put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
-        """Put values into the state of some environments; those that cannot be used are left out and noted."""
-        self._write(mask, rows)
-        self.make_stale(mask)
-
-    def _write(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+        """Write values into the state of some environments; those that cannot be used are left out and noted."""
         with torch.no_grad():
             is_put = mask
             if rows.is_bad is not None:
@@ -350,7 +318,7 @@ class Worlds:
             call.forget()
 
     def message(self) -> str:
-        """Return what has gone wrong since the last reset, in words; it waits for a GPU."""
+        """Return what went wrong and where, in words with the pools' sizes; nothing if nothing did. It waits for a GPU."""
         sizes = {
             "njmax": int(self.data.njmax),
             "nconmax": self.nconmax,

@@ -132,20 +132,12 @@ class Calibration:
         return cls("counts", np.ones((num, 3)), np.tile(np.eye(3), (num, 1, 1)), zero, zero)
 
     def apply(self, counts: Num[np.ndarray, "*batch finger 3"]) -> Float[np.ndarray, "*batch finger 3"]:
-        """Return the force on each fingertip, along its link's axes [units].
-
-        Args:
-            counts: What the hand sums up per fingertip, `HandState.total_force`.
-        """
+        """Return the force on each fingertip, along its link's axes [units], from `HandState.total_force`."""
         along_sensor = self.scale * (counts - self.tare)
         return np.einsum("fij,...fj->...fi", self.rotation, along_sensor) + self.bias
 
     def counts_of(self, force: Float[np.ndarray, "*batch finger 3"]) -> Float[np.ndarray, "*batch finger 3"]:
-        """Return the counts, not rounded, that `apply` makes a force of: what an emulated fingertip is to feel.
-
-        Args:
-            force: Force on each fingertip, along its link's axes [units].
-        """
+        """Return the counts, not rounded, that `apply` makes a force of, along the links' axes [units]."""
         return np.einsum("fij,...fi->...fj", self.rotation, force - self.bias) / self.scale + self.tare
 
     def with_tare(self, tare: Tare) -> Calibration:
@@ -175,11 +167,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def parse_calibration(text: str, name: str) -> Calibration:
-    """Read the text of a calibration file, whose mistakes then go by a name.
-
-    Raises:
-        SpecError: All its mistakes, each at its place.
-    """
+    """Read the text of a calibration file, whose mistakes then go by a name."""
     return _calibration(parse_spec(text.encode(), name, CalibrationSpec, _REQUIRED)[0])
 
 

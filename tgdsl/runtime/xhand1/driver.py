@@ -13,11 +13,9 @@ from jaxtyping import Float
 
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
 from tgdsl.runtime.xhand1.reader import HandReader, Reading
-from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialCounters, SerialTiming
-from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError, StaleReadingError
-from tgdsl.runtime.xhand1.wire.payloads import NUM_JOINTS, encode_register_request
-from tgdsl.runtime.xhand1.wire.protocol import Command
-from tgdsl.runtime.xhand1.wire.replies import Addresses
+from tgdsl.runtime.xhand1.wire.client import Addresses, SerialClient, SerialCounters, SerialTiming
+from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError
+from tgdsl.runtime.xhand1.wire.payloads import NUM_JOINTS
 from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
 
 MAX_AGE_S = 0.1
@@ -55,7 +53,6 @@ class XHand1:
     """
 
     def __init__(self, reader: HandReader, timing: SerialTiming, max_age_s: float | None = None):
-        """Take over a reader that runs; use `open`."""
         self._reader = reader
         two_replies_s = 2 * timing.reply_timeout_s
         self._max_age_s = max(MAX_AGE_S, two_replies_s) if max_age_s is None else max_age_s
@@ -115,8 +112,7 @@ class XHand1:
             timeout_s: How long to wait [s]; default: 0.08 s, or as long as two replies may take.
 
         Raises:
-            HandError: What kept a new reading from coming, by name: `HandTimeoutError`, `HandChecksumError`,
-                `HandDisconnectedError` and so on; `StaleReadingError` if nothing failed but none came in time.
+            HandError: What kept a new reading from coming, by name: `HandTimeoutError`, `HandDisconnectedError` and so on.
             HandClosedError: If the hand was closed.
         """
         reader, wait_s = self._reader, self._read_timeout_s if timeout_s is None else timeout_s
@@ -204,23 +200,6 @@ class XHand1:
         forces = np.array([state.total_force for state in states], dtype=np.float64)
         return Tare(forces.mean(axis=0), np.ptp(forces, axis=0), num_frames)
 
-    def read_register(self, number: int) -> bytes:
-        """Return what a register's reply holds, as it came: its layout is unverified.
-
-        Raises:
-            HandError: If the hand does not answer.
-        """
-        request = encode_register_request(number)
-        return self._run(lambda client: client.exchange(Command.READ_REGISTER, request).payload)
-
-    def version(self) -> bytes:
-        """Return what the version's reply holds, as it came: its layout is unverified.
-
-        Raises:
-            HandError: If the hand does not answer.
-        """
-        return self._run(lambda client: client.exchange(Command.VERSION).payload)
-
     def close(self) -> None:
         """Make the hand passive, if it is not, and release the port.
 
@@ -253,13 +232,7 @@ class XHand1:
             return type(failure[0])(str(failure[0]))
         if reading is None:
             return HandTimeoutError("the hand has not answered yet")
-        return StaleReadingError(f"no new reading came in time; the newest is {1e3 * reading.age_s():.0f} ms old")
-
-    def _run(self, job: Callable[[SerialClient], bytes]) -> bytes:
-        try:
-            return self._reader.submit(job).result(self._patience_s)
-        except TimeoutError as error:
-            raise HandTimeoutError(f"the line was not free within {self._patience_s:g} s") from error
+        return HandTimeoutError(f"no new reading came in time; the newest is {1e3 * reading.age_s():.0f} ms old")
 
     def _leave(self) -> None:
         atexit.unregister(self._leave)

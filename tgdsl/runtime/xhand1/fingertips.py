@@ -10,7 +10,7 @@ from tgdsl.observations.observations import HAND_ONLY
 from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedObservation, PlannedSensor
-from tgdsl.runtime.xhand1.controls import JointControls
+from tgdsl.runtime.xhand1.motion import JointControls
 from tgdsl.runtime.xhand1.wire.errors import MotionError
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, JOINTS
 from tgdsl.scene.scene import scene_model
@@ -52,12 +52,7 @@ class HandTerm:
 
 
 def hand_terms(plan: Plan, contact_threshold: float | None, is_log: bool = False) -> tuple[HandTerm, ...]:
-    """Return the observations of a plan as a hand gives them.
-
-    Args:
-        plan: The plan.
-        contact_threshold: Force above which a fingertip is in contact, if it is known.
-        is_log: Whether the hand is a recorded one, which does not say what it was told.
+    """Return the observations of a plan as a hand gives them, or a log, which does not hold its commands.
 
     Raises:
         ObservationError: If a hand cannot give some: all of them, each with its reason, and what it can give.

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialTiming
-from tgdsl.runtime.xhand1.wire.discovery import FoundHand
-from tgdsl.runtime.xhand1.wire.errors import HandChecksumError, HandRefusedError, HandTimeoutError
+from tgdsl.runtime.xhand1.wire.errors import HandRefusedError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.payloads import encode_register_request
+from tgdsl.runtime.xhand1.wire.ports import FoundHand
 from tgdsl.runtime.xhand1.wire.protocol import Command, Register
 from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
 
 UNTOLD = "not told"
+_BYTES = ("version", "side", "serial_number", "name")
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,17 @@ class HandIdentity:
     serial_number: bytes | None = None
     name: bytes | None = None
 
+    def as_json(self) -> dict[str, Any]:
+        """Return it for a log, bytes as hexadecimal text."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value.hex() if isinstance(value, bytes) else value for name, value in values.items()}
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> HandIdentity:
+        """Return the identity that `as_json` has written."""
+        as_bytes = {name: None if values[name] is None else bytes.fromhex(values[name]) for name in _BYTES}
+        return cls(str(values["device"]), int(values["hand_id"]), **as_bytes)  # type: ignore[arg-type]
+
     def __str__(self) -> str:
         told = {"version": self.version, "side": self.side, "serial number": self.serial_number, "name": self.name}
         return f"{self.device}: hand {self.hand_id}, " + ", ".join(f"{what} {shown(value)}" for what, value in told.items())
@@ -44,11 +57,6 @@ def identify(
     found: FoundHand, *, timing: SerialTiming | None = None, open_port: Callable[[str, int], Port] = open_serial_port
 ) -> HandIdentity:
     """Ask a hand that was found for its registers.
-
-    Args:
-        found: The hand.
-        timing: Times of the line.
-        open_port: Opens a port, given its name and baud rate.
 
     Raises:
         HandDisconnectedError: If the port cannot be opened, or went away.
@@ -76,5 +84,5 @@ def _register(client: SerialClient, number: int) -> bytes | None:
     """Return what a register holds; None if the hand refuses to tell, or does not answer."""
     try:
         return client.exchange(Command.READ_REGISTER, encode_register_request(number)).payload
-    except (HandRefusedError, HandTimeoutError, HandChecksumError):
+    except (HandRefusedError, HandTimeoutError):
         return None

@@ -1,4 +1,4 @@
-"""What the driver may make the hand do: nothing, unless limits say otherwise; and the set-points that stay within them.
+"""Leave for the hand to move: limits, the set-points that stay within them, and the model's actuators that give targets.
 
 No clock and no I/O here: time is passed in. A hand that was stopped, for whatever reason, stays passive until `resume`.
 """
@@ -91,7 +91,7 @@ class MotionLimits:
         Raises:
             MotionError: If the robot lacks a joint, or one has no range.
         """
-        ranges = joint_ranges(model)
+        ranges = model.jnt_range[joint_ids(model)]
         lower, upper = (tuple(map(float, ranges[:, i])) for i in (0, 1))
         speeds, currents = (speed,) * NUM_JOINTS, (current_limit,) * NUM_JOINTS
         return cls(lower, upper, speeds, currents, kp, ki, kd, watchdog_s)
@@ -111,30 +111,76 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
     return np.array(results)[:, 0]
 
 
-def joint_ranges(model: mujoco.MjModel) -> Float[np.ndarray, "joint 2"]:
-    """Return the range of each joint in the order of the hand's ids [rad].
+@dataclass(frozen=True, eq=False)
+class JointControls:
+    """Controls of a model that are the hand's joint angles.
 
-    Raises:
-        MotionError: If the robot lacks a joint, or one has no range.
+    Attributes:
+        actuator_id: Actuator of each joint.
+        qpos_id: Place of each joint in the model's `qpos`.
     """
-    return model.jnt_range[joint_ids(model)]
+
+    actuator_id: Int[np.ndarray, " joint"]
+    qpos_id: Int[np.ndarray, " joint"]
+
+    @classmethod
+    def of_model(cls, model: mujoco.MjModel) -> JointControls:
+        """Return those of a model.
+
+        Raises:
+            MotionError: If a joint has not just one actuator that takes its angle in rad, or there are others.
+        """
+        joints = joint_ids(model)
+        actuators = [_actuator(model, name, int(joint)) for name, joint in zip(JOINTS, joints, strict=True)]
+        others = [model.actuator(i).name or str(i) for i in range(model.nu) if i not in actuators]
+        if others:
+            raise MotionError(f"the actuators {listed(others)} are not of the hand's joints, so a hand cannot do what they do")
+        return cls(np.array(actuators), model.jnt_qposadr[joints].astype(np.int64))
+
+    def targets(self, control: np.ndarray) -> Float[np.ndarray, " joint"]:
+        """Return joint angles by joint id [rad] from controls by actuator, (actuator,) or (1, actuator)."""
+        if control.shape not in ((NUM_JOINTS,), (1, NUM_JOINTS)):
+            raise MotionError(f"control has shape {control.shape}, expected (1, {NUM_JOINTS}) or ({NUM_JOINTS},)")
+        return control.reshape(-1)[self.actuator_id].astype(np.float64)
+
+
+def check_ranges(model: mujoco.MjModel, limits: MotionLimits) -> None:
+    """Raise an error unless motion limits stay within the robot file's."""
+    ranges = model.jnt_range[joint_ids(model)]
+    for name, lower, upper, (least, largest) in zip(JOINTS, limits.lower, limits.upper, ranges, strict=True):
+        if lower < least - ROUNDING or upper > largest + ROUNDING:
+            what = f"{name}: limits from {lower:g} to {upper:g} rad"
+            raise MotionError(f"{what}, expected them within the robot file's {least:g} to {largest:g}")
+
+
+def _actuator(model: mujoco.MjModel, name: str, joint: int) -> int:
+    """Return the one actuator of a joint, whose control is the angle to go to [rad]."""
+    is_own = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
+    found = np.flatnonzero(is_own)
+    if len(found) != 1:
+        raise MotionError(f"{name} has {len(found)} actuators, expected one")
+    i = int(found[0])
+    gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
+    is_position = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and gain > 0 and bias[0] == 0 and bias[1] == -gain
+    if not is_position or model.actuator_gear[i, 0] != 1:
+        raise MotionError(f'{name}: actuator "{model.actuator(i).name}" takes no angle in rad; expected a position actuator')
+    return i
 
 
 class Motion:
-    """The set-points of a hand that may move. The first starts from where the joints are; each moves at a limited speed."""
+    """The set-points of a hand that may move. The first starts from where the joints are; each moves at a limited speed.
+
+    Attributes:
+        limits: How far it may move.
+        stopped: Why the hand was made passive; None if it was not.
+    """
 
     def __init__(self, limits: MotionLimits):
-        """Start passive."""
         self.limits = limits
-        self._stopped: HandError | None = None
+        self.stopped: HandError | None = None
         self._target: JointArray | None = None
         self._setpoint = np.zeros(NUM_JOINTS)
         self._commanded_at = self._stepped_at = 0.0
-
-    @property
-    def stopped(self) -> HandError | None:
-        """Why the hand was made passive; None if it was not."""
-        return self._stopped
 
     def command(self, target: JointArray, now: float, measured: JointArray | None) -> None:
         """Take a new target.
@@ -150,8 +196,8 @@ class Motion:
             WatchdogError: If the last command is too long ago. The hand is then passive.
         """
         self._watch(now)
-        if self._stopped is not None:
-            raise type(self._stopped)(f"the hand was made passive: {self._stopped}; call resume() to go on")
+        if self.stopped is not None:
+            raise type(self.stopped)(f"the hand was made passive: {self.stopped}; call resume() to go on")
         lower, upper = np.array(self.limits.lower), np.array(self.limits.upper)
         outside = ~((target >= lower - ROUNDING) & (target <= upper + ROUNDING))
         if outside.any():
@@ -181,7 +227,7 @@ class Motion:
     def stop(self, reason: HandError) -> HandError:
         """Make the hand passive until `resume`, if it is not already, and return the reason."""
         self._target = None
-        self._stopped = self._stopped or reason
+        self.stopped = self.stopped or reason
         return reason
 
     def fail(self, reason: HandError) -> None:
@@ -195,7 +241,7 @@ class Motion:
 
     def resume(self) -> None:
         """Allow commands again."""
-        self._stopped = self._target = None
+        self.stopped = self._target = None
 
     def _watch(self, now: float) -> None:
         waited = now - self._commanded_at

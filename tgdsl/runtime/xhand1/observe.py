@@ -21,8 +21,8 @@ from torch import Tensor
 
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.fingertips import HandTerm, hand_terms
+from tgdsl.runtime.xhand1.motion import JointControls
 from tgdsl.runtime.xhand1.source import HandSample
 from tgdsl.scene.scene import scene_model
 
@@ -35,17 +35,6 @@ class HandObserver:
     """
 
     def __init__(self, touch: TactileModule, calibration: Calibration, control_step: float, *, is_log: bool = False):
-        """Look whether a hand can give what the module observes.
-
-        Args:
-            touch: The module.
-            calibration: The hand's; of it the contact threshold is used.
-            control_step: Time from one call of `observe` to the next [s].
-            is_log: Whether the hand is a recorded one.
-
-        Raises:
-            ObservationError: If a hand cannot give an observation; all of them are named.
-        """
         self.terms = hand_terms(touch.plan, calibration.contact_threshold, is_log)
         self._like = torch.empty(0, dtype=touch.dtype, device=touch.device)
         self._threshold = calibration.contact_threshold
@@ -55,11 +44,7 @@ class HandObserver:
         self._action: Tensor | None = None
 
     def note(self, control: Tensor | np.ndarray | None) -> None:
-        """Take note of controls that were given, by actuator, (actuator,) or (1, actuator) [rad]; None: the last still hold.
-
-        Raises:
-            MotionError: If there are not as many as the hand has joints.
-        """
+        """Take note of controls that were given, by actuator, (actuator,) or (1, actuator) [rad]; None: the last still hold."""
         if control is not None and self._controls is not None:
             values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
             self._action = torch.from_numpy(self._controls.targets(values)).unsqueeze(0)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from tgdsl.runtime.xhand1.motion import Motion
-from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialCounters
+from tgdsl.runtime.xhand1.wire.client import Reply, SerialClient, SerialCounters
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, ProtocolError
 from tgdsl.runtime.xhand1.wire.payloads import (
     JOINTS,
@@ -25,7 +22,6 @@ from tgdsl.runtime.xhand1.wire.payloads import (
     encode_command,
 )
 from tgdsl.runtime.xhand1.wire.protocol import Command
-from tgdsl.runtime.xhand1.wire.replies import Reply
 
 _RECONNECT_S = 0.02
 _LAST_TRIES = 6
@@ -67,13 +63,6 @@ class HandReader(threading.Thread):
     """
 
     def __init__(self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion | None):
-        """Take over a client.
-
-        Args:
-            client: The client to begin with.
-            connect: Opens another after that went away.
-            motion: What may move; None: nothing.
-        """
         super().__init__(name="xhand1", daemon=True)
         self.changed = threading.Condition()
         self.reading: Reading | None = None
@@ -85,18 +74,8 @@ class HandReader(threading.Thread):
         self.left_driven: HandError | None = None
         self._client: SerialClient | None = client
         self._connect = connect
-        self._jobs: queue.SimpleQueue[tuple[Callable[[SerialClient], Any], Future[Any]]] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._is_driven = False
-
-    def submit(self, job: Callable[[SerialClient], Any]) -> Future[Any]:
-        """Run something on the client between two exchanges."""
-        future: Future[Any] = Future()
-        with self.changed:
-            if self.ended is not None:
-                raise self.ended
-            self._jobs.put((job, future))
-        return future
 
     def stop(self) -> None:
         """Ask the thread to make the hand passive and to end."""
@@ -116,15 +95,12 @@ class HandReader(threading.Thread):
             with self.changed:
                 self.ended = reason
                 self.changed.notify_all()
-            while not self._jobs.empty():
-                self._jobs.get()[1].set_exception(reason)
 
     def _turn(self) -> None:
         try:
             if self._client is None:
                 self._client = self._connect(self.counters)
                 self.num_connects += 1
-            self._do_jobs(self._client)
             with self.changed:
                 joints = PASSIVE if self.motion is None else self.motion.joints(time.monotonic())
             reply = self._exchange(self._client, joints)
@@ -143,16 +119,6 @@ class HandReader(threading.Thread):
         reply = client.exchange(Command.EXCHANGE, encode_command(joints), STATE_SIZE)
         self._is_driven = is_driven
         return reply
-
-    def _do_jobs(self, client: SerialClient) -> None:
-        while not self._jobs.empty():
-            job, future = self._jobs.get()
-            try:
-                future.set_result(job(client))
-            except Exception as error:
-                future.set_exception(error)
-                if isinstance(error, HandError):
-                    raise
 
     def _fail(self, error: HandError) -> None:
         self._drop_if_gone(error)
@@ -197,11 +163,7 @@ class HandReader(threading.Thread):
 
 
 def _plausible(state: HandState) -> HandState:
-    """Return a state whose numbers can be those of a hand.
-
-    Raises:
-        ProtocolError: If the joints are not numbered 0 to 11, or an angle is not finite.
-    """
+    """Return a state, or raise an error if its numbers cannot be those of a hand."""
     if state.joint_id.tolist() != list(range(len(JOINTS))):
         raise ProtocolError(f"the joints of a reply are numbered {state.joint_id.tolist()}, expected 0 to 11")
     if not np.isfinite(state.position).all():

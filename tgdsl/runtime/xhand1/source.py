@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,69 +18,13 @@ from torch import Tensor
 
 from tgdsl.errors import StateError
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.source import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
-from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, StaleReadingError
+from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError
 from tgdsl.tensors.env_ids import EnvIds
-
-
-@runtime_checkable
-class StepTimer(Protocol):
-    """Waits for the end of control steps."""
-
-    num_late_steps: int
-    """Steps that began after they should have ended."""
-
-    def wait(self, target: Float[np.ndarray, " joint"] | None, command: Callable[[], None]) -> float:
-        """Wait until the control step is over.
-
-        Args:
-            target: Where the joints are told to go, by joint id [rad]; None if they are not told.
-            command: Repeats the step's command, for who keeps a hand with a watchdog waiting for long.
-
-        Returns:
-            When a reading must have been asked for at the earliest, to be one of the end of this step; on the clock of
-            `time.monotonic` [s].
-        """
-        ...
-
-    def time_of(self, reading: Reading) -> float:
-        """Return when the joints were where a reading says that they were [s]."""
-        ...
-
-    def restart(self) -> None:
-        """Count steps from now."""
-        ...
-
-
-class RealTime:
-    """Steps of one duration. After one that begins later than it should have ended, the next ones are counted from there."""
-
-    def __init__(self, control_step: float):
-        """Start counting."""
-        self.num_late_steps = 0
-        self._control_step = control_step
-        self.restart()
-
-    def wait(self, target: Float[np.ndarray, " joint"] | None, command: Callable[[], None]) -> float:
-        """Sleep until the step is over; any new reading is then one of its end."""
-        now = time.monotonic()
-        self._next_step_at += self._control_step
-        if self._next_step_at < now:
-            self.num_late_steps += 1
-            self._next_step_at = now
-        time.sleep(self._next_step_at - now)
-        return -math.inf
-
-    def time_of(self, reading: Reading) -> float:
-        """Return when it was asked for."""
-        return reading.requested_at
-
-    def restart(self) -> None:
-        """Count steps from now."""
-        self._next_step_at = time.monotonic()
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +59,7 @@ class HandSample:
 
     @classmethod
     def of(cls, reading: Reading, calibration: Calibration, velocity: VelocityFilter, time_s: float) -> HandSample:
-        """Return what a reading says.
-
-        Args:
-            reading: The reading.
-            calibration: What its counts mean.
-            velocity: The filter of joint speeds, which takes note of it.
-            time_s: When the joints were where it says [s].
-        """
+        """Return what a reading says; the filter takes note of it, at the time when the joints were there [s]."""
         state = reading.state
         speeds = velocity.update(time_s, state.position.astype(np.float64))
         return cls(
@@ -140,13 +77,93 @@ class HandSample:
         )
 
 
-class XHand1Source:
-    """A hand that steps at a fixed rate, as one environment.
+class HandSource(ABC):
+    """A hand, or the log of one, that steps as one environment.
+
+    Attributes:
+        calibration: What its counts mean.
+        num_envs: One: there is one hand.
+        num_late_steps: Steps that began after they should have ended.
+    """
+
+    NAME: str
+    num_envs = 1
+    num_late_steps = 0
+
+    def __init__(self, calibration: Calibration | None, velocity_time_constant: float):
+        self.calibration = calibration or Calibration.none()
+        self._velocity = VelocityFilter(velocity_time_constant)
+
+    @property
+    @abstractmethod
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is nothing more to read."""
+        return False
+
+    @property
+    @abstractmethod
+    def age_s(self) -> float | None:
+        """How old the sample is at most, now [s]; None where nothing runs in real time."""
+
+    @abstractmethod
+    def step(self, control: Control = None) -> None:
+        """Advance by one control step, and read."""
+
+    @abstractmethod
+    def sample(self) -> HandSample:
+        """Return what the hand said at the end of the last step, or after a reset."""
+
+    def state(self) -> SceneState:
+        """Refuse: a hand does not know where objects are, so no taxel reading can be computed from it.
+
+        Raises:
+            StateError: Always; it lists what the hand can give.
+        """
+        able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
+        raise StateError(f"{self.NAME} cannot give the poses and contacts of a SceneState; its sample() gives {able}")
+
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Forget the speeds and the last target, make a hand passive until the next command, and read it.
+
+        Nothing moves a hand to where it started, and a log goes on in time. A hand that was stopped by an error stays so until
+        `resume`.
+
+        Args:
+            env_ids: Indices, or a boolean mask over environments, of which there is one; default: it.
+
+        Raises:
+            HandError: If no new reading comes, or there are no such environments.
+            ReplayOverError: If a log is at its end.
+        """
+        if env_ids is None or is_chosen(env_ids):
+            self._velocity.reset()
+            self._restart()
+
+    @abstractmethod
+    def _restart(self) -> None:
+        """Reset, but for the speeds."""
+
+    def resume(self) -> None:
+        """Allow a hand that was made passive by an error to move again."""
+        return
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the hand or the log."""
+
+
+class XHand1Source(HandSource):
+    """A hand that steps at a fixed rate. After a step that begins late, the next ones are counted from there.
 
     Attributes:
         hand: The hand.
-        calibration: What its counts mean.
     """
+
+    NAME = "a real XHand1"
 
     def __init__(
         self,
@@ -155,7 +172,6 @@ class XHand1Source:
         control_step: float,
         calibration: Calibration | None = None,
         velocity_time_constant: float = 0.02,
-        timer: StepTimer | None = None,
         read_timeout_s: float | None = None,
     ):
         """Take an open hand.
@@ -165,7 +181,6 @@ class XHand1Source:
             control_step: Duration of one control step [s].
             calibration: What its counts mean; default: they stay counts.
             velocity_time_constant: Time constant of the filter of joint speeds [s].
-            timer: What control steps wait for; default: that their time is over.
             read_timeout_s: How long to wait for a new reading after a step [s]; default: as `hand.read`.
 
         Raises:
@@ -175,39 +190,21 @@ class XHand1Source:
         if not 0 < control_step < math.inf:
             raise HandError(f"a control step of {control_step:g} s, expected a finite time above 0")
         refuse_beyond_watchdog(control_step, hand.watchdog_s)
+        super().__init__(calibration, velocity_time_constant)
         self.hand = hand
-        self.calibration = calibration or Calibration.none()
-        self._velocity = VelocityFilter(velocity_time_constant)
         self._control_step = control_step
         self._read_timeout_s = read_timeout_s
-        self._timer = RealTime(control_step) if timer is None else timer
+        self._step_ends_at = time.monotonic()
         self._target: np.ndarray | None = None
         self._sample: HandSample | None = self._read(-math.inf)
-
-    @property
-    def num_envs(self) -> int:
-        """One: there is one hand."""
-        return 1
 
     @property
     def control_step(self) -> float:
         """Duration of one control step [s]."""
         return self._control_step
 
-    @property
-    def is_over(self) -> bool:
-        """Never: there is always more to read."""
-        return False
-
-    @property
-    def num_late_steps(self) -> int:
-        """Steps that began after they should have ended."""
-        return self._timer.num_late_steps
-
-    def step(self, control: Tensor | np.ndarray | None = None) -> None:
+    def step(self, control: Control = None) -> None:
         """Command the joints, wait until the control step is over, and read the hand.
-
-        After a step that begins later than it should have ended, the next ones are counted from there.
 
         Args:
             control: Joint angles to go to by joint id, (joint,) or (1, joint) [rad]; default: as they were.
@@ -221,49 +218,22 @@ class XHand1Source:
             self._target = values[0] if values.ndim == 2 and len(values) == 1 else values
         self._sample = None
         self._command()
-        self._sample = self._read(self._timer.wait(self._target, self._command))
+        self._sample = self._read(self._wait())
 
     def sample(self) -> HandSample:
         """Return what the hand said at the end of the last step, or after a reset.
 
         Raises:
-            StaleReadingError: If that step or reset failed: what was said before is not handed out as if it were new.
+            HandTimeoutError: If that step or reset failed: what was said before is not returned as if it were new.
         """
         if self._sample is None:
-            raise StaleReadingError("the last step or reset gave no reading; step or reset again")
+            raise HandTimeoutError("the last step or reset gave no reading; step or reset again")
         return self._sample
 
     @property
     def age_s(self) -> float | None:
         """How old the sample is at most, now [s]."""
         return self.sample().reading.age_s()
-
-    def state(self) -> SceneState:
-        """Refuse: a hand does not know where objects are, so no taxel reading can be computed from it.
-
-        Raises:
-            StateError: Always; it lists what the hand can give.
-        """
-        raise no_scene_state("a real XHand1")
-
-    def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Forget the speeds and the last target, make the hand passive until the next command, and read it.
-
-        Nothing moves it to where it started. One that was stopped by an error stays so until `hand.resume()`.
-
-        Args:
-            env_ids: Indices, or a boolean mask over environments, of which there is one; default: it.
-
-        Raises:
-            HandError: If no new reading comes, or there are no such environments.
-        """
-        if env_ids is not None and not is_chosen(env_ids):
-            return
-        self._velocity.reset()
-        self._target, self._sample = None, None
-        self.hand.relax()
-        self._timer.restart()
-        self._sample = self._read(time.monotonic())
 
     def resume(self) -> None:
         """Allow a hand that was made passive by an error to move again."""
@@ -277,31 +247,41 @@ class XHand1Source:
         """
         self.hand.close()
 
+    def _restart(self) -> None:
+        self._target, self._sample = None, None
+        self.hand.relax()
+        self._step_ends_at = time.monotonic()
+        self._sample = self._read(time.monotonic())
+
     def _command(self) -> None:
         if self._target is not None:
             self.hand.command(self._target)
 
+    def _wait(self) -> float:
+        """Wait until the control step is over; return when a reading must have been asked for at the earliest [s]."""
+        now = time.monotonic()
+        self._step_ends_at += self._control_step
+        if self._step_ends_at < now:
+            self.num_late_steps += 1
+            self._step_ends_at = now
+        time.sleep(self._step_ends_at - now)
+        return -math.inf
+
+    def _time_of(self, reading: Reading) -> float:
+        """Return when the joints were where a reading says that they were [s]."""
+        return reading.requested_at
+
     def _read(self, requested_after: float) -> HandSample:
         while (reading := self.hand.read(self._read_timeout_s)).requested_at < requested_after:
             continue
-        return HandSample.of(reading, self.calibration, self._velocity, self._timer.time_of(reading))
+        return HandSample.of(reading, self.calibration, self._velocity, self._time_of(reading))
 
 
 def refuse_beyond_watchdog(control_step: float, watchdog_s: float | None) -> None:
-    """See that commands, one per control step, come before a watchdog bites.
-
-    Raises:
-        MotionError: If they do not.
-    """
+    """Raise an error unless commands, one per control step, come before a watchdog bites."""
     if watchdog_s is not None and control_step >= watchdog_s:
         what = f"a control step of {1e3 * control_step:g} ms, and the watchdog bites after {1e3 * watchdog_s:g} ms"
         raise MotionError(f"{what}; expected a shorter step")
-
-
-def no_scene_state(who: str) -> StateError:
-    """Return the error of a source that does not know where objects are; it lists what a `HandSample` holds."""
-    able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
-    return StateError(f"{who} cannot give the poses and contacts of a SceneState; its sample() gives {able}")
 
 
 def is_chosen(env_ids: EnvIds) -> bool:

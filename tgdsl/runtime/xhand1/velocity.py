@@ -30,11 +30,9 @@ class VelocityFilter:
         self._position = self._velocity = np.zeros(0)
 
     def update(self, time_s: float, position: Float[np.ndarray, " joint"]) -> Float[np.ndarray, " joint"]:
-        """Take a reading and return the speeds [rad/s]; those of the first reading are 0.
+        """Take the angles [rad] at a time [s] and return the speeds [rad/s]; those of the first reading are 0.
 
-        Args:
-            time_s: When it was taken [s]; one that is not later than the last changes nothing.
-            position: Joint angles [rad].
+        A time that is not later than the last changes nothing.
         """
         if self._time_s is None:
             self._velocity = np.zeros(len(position))

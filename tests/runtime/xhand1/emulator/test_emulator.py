@@ -6,16 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_lines import Faults, FaultyEmulator, FaultyLine
+from xhand1_hands import wait_until
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.body import TipForces
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults, FaultyLine
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1.emulator.emulator import EmulatedLine
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.parser import FrameParser
 from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, HandState, JointCommand, Mode, decode_state, encode_command
-from tgdsl.runtime.xhand1.wire.protocol import Command, Frame, encode_frame
+from tgdsl.runtime.xhand1.wire.protocol import Command, Frame, FrameParser, encode_frame
 
 BAUD = 3_000_000
 MOVING = tuple(JointCommand(0.1 * i, 100, 0, 0, 300, Mode.POSITION) for i in range(12))
@@ -70,9 +69,9 @@ def test_what_a_hand_does_not_know_it_refuses_and_what_is_for_others_it_ignores(
 
 def test_bytes_take_their_time_and_follow_one_another():
     """They come out as at the far end of an adapter: 124 at a time, whatever frame they are of, and the rest at the end."""
-    line, byte, both = FaultyLine(BAUD, Faults(), 0), 10 / BAUD, b"a" * 2217 + b"b" * 297
-    line.send(both[:2217], b"", 5.0)
-    line.send(both[2217:], b"", 5.001)
+    line, byte, both = EmulatedLine(EmulatedHand()), 10 / BAUD, b"a" * 2217 + b"b" * 297
+    line.send(both[:2217], 5.0)
+    line.send(both[2217:], 5.001)
     out = b""
     for num_chunks in (1, 17, 18, 20):
         end = 5.0 + 124 * num_chunks * byte
@@ -87,9 +86,9 @@ def test_bytes_take_their_time_and_follow_one_another():
 
 
 def test_after_a_pause_the_line_starts_anew():
-    line = FaultyLine(BAUD, Faults(), 0)
-    line.send(b"a" * 100, b"", 5.0)
-    line.send(b"b" * 100, b"", 6.0)
+    line = EmulatedLine(EmulatedHand())
+    line.send(b"a" * 100, 5.0)
+    line.send(b"b" * 100, 6.0)
     assert line.due(5.0 + 1001 / BAUD) == b"a" * 100
     assert line.due(6.0 + 999 / BAUD) == b""
     assert line.due(6.0 + 1001 / BAUD) == b"b" * 100
@@ -103,8 +102,8 @@ REPLY, OTHER = encode_frame(Frame(0x80, 0xFE, 2, bytes(50))), encode_frame(Frame
     [("corrupt", 0), ("truncate", 0), ("drop", 0), ("delay", 1), ("duplicate", 2), ("noise", 1), ("foreign", 2)],
 )
 def test_each_fault_does_what_it_says(fault, frames):
-    line = FaultyLine(BAUD, Faults(**{fault: 1.0}), 1)
-    line.send(REPLY, OTHER, 0.0)
+    line = FaultyLine(faults=Faults(**{fault: 1.0}), seed=1)
+    line.reply(REPLY, OTHER, 0.0)
     early, late = line.due(0.039), line.due(1.0)
     assert (late if fault == "delay" else early) == early + late
     parser = FrameParser()
@@ -115,10 +114,10 @@ def test_each_fault_does_what_it_says(fault, frames):
 
 
 def test_faults_are_as_frequent_as_they_say_and_the_same_for_a_seed():
-    lines = [FaultyLine(BAUD, Faults.each(0.05), 4) for _ in range(2)]
+    lines = [FaultyLine(faults=Faults.each(0.05), seed=4) for _ in range(2)]
     for line in lines:
         for _ in range(4000):
-            line.send(REPLY, OTHER, 0.0)
+            line.reply(REPLY, OTHER, 0.0)
     assert lines[0].due(1e9) == lines[1].due(1e9)
     spread = 5 * math.sqrt(4000 * 0.05 * 0.95)
     for name in ("corrupt", "delay", "drop", "duplicate", "foreign", "noise", "truncate"):
@@ -145,7 +144,7 @@ def test_a_thread_that_ends_says_so_to_who_waits(monkeypatch):
     def broken(time_s, position):
         raise ValueError("a mistake of ours")
 
-    emulator = Emulator(EmulatedHand(forces=broken))
+    emulator = FaultyEmulator(EmulatedHand(forces=broken))
     message = r"the emulator's thread ended: ValueError\('a mistake of ours'\)"
     with pytest.raises(HandError):
         XHand1.open(emulator.device)
@@ -157,21 +156,21 @@ def test_a_thread_that_ends_says_so_to_who_waits(monkeypatch):
     emulator.close()
 
 
-def test_a_call_under_way_is_told_too(monkeypatch):
-    """The thread ends between a call's arrival and its turn."""
-    emulator = Emulator()
+def test_a_mistake_in_the_line_ends_the_thread_and_calls_raise_it(monkeypatch):
+    emulator = FaultyEmulator()
 
     def broken(now):
         raise RuntimeError("a mistake of ours")
 
-    monkeypatch.setattr(emulator._wire, "due", broken)
+    monkeypatch.setattr(emulator.line, "due", broken)
+    assert wait_until(lambda: emulator.failure is not None)
     for call in (lambda: emulator.set_faults(Faults()), emulator.close):
         with pytest.raises(HandError, match="the emulator's thread ended: RuntimeError"):
             call()
 
 
 def test_what_a_call_raises_is_raised_to_its_caller_and_the_hand_goes_on(monkeypatch):
-    with Emulator() as emulator:
+    with FaultyEmulator() as emulator:
         emulator.unplug()
         with monkeypatch.context() as patched:
             patched.setattr("os.symlink", lambda *paths: 1 / 0)

@@ -1,20 +1,17 @@
 """Logs: what was written comes back bit for bit, or as an error that says what is wrong with the file."""
 
-import io
 import json
 import tracemalloc
-import zipfile
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from faulty_lines import Faults, FaultyEmulator
 from hand_logs import assert_same_reading, random_readings, write_log
 from xhand1_hands import Stamps
 
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.identity import HandIdentity
 from tgdsl.runtime.xhand1.log.log import CHUNK, RECORD, STATE, Fault, LogError, open_log
@@ -46,13 +43,6 @@ def test_readings_come_back_bit_for_bit(logged):
     assert (log.identity, log.calibration) == (None, None)
 
 
-@pytest.mark.parametrize("start", [1, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 6, 2 * CHUNK + 7])
-def test_readings_from_anywhere(logged, start):
-    readings, path = logged
-    for one, other in zip(open_log(path).readings(start), readings[start:], strict=True):
-        assert_same_reading(one, other)
-
-
 def test_a_log_is_plain_numpy(logged):
     readings, path = logged
     with np.load(path) as archive:
@@ -75,7 +65,7 @@ def test_whose_and_what_and_what_went_wrong(tmp_path):
     calibration = Calibration(
         "N", rng.uniform(0.1, 1, (5, 3)), rotation, rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), "it's"
     )
-    faults = (Fault.of(HandTimeoutError("no reply — 30 ms"), 1.05), Fault.of(errors.StaleReadingError("old"), 1.13))
+    faults = (Fault.of(HandTimeoutError("no reply — 30 ms"), 1.05), Fault.of(errors.HandDisconnectedError("gone"), 1.13))
     path = write_log(
         tmp_path / "a.npz", random_readings(np.array([1.0, 1.2])), faults, identity=IDENTITY, calibration=calibration
     )
@@ -86,7 +76,7 @@ def test_whose_and_what_and_what_went_wrong(tmp_path):
     assert (log.calibration.units, log.calibration.hand) == ("N", "it's")
     for name in ("scale", "rotation", "bias", "tare"):
         assert (getattr(log.calibration, name) == getattr(calibration, name)).all()
-    assert [type(fault.error()) for fault in log.faults] == [HandTimeoutError, errors.StaleReadingError]
+    assert [type(fault.error()) for fault in log.faults] == [HandTimeoutError, errors.HandDisconnectedError]
     assert str(log.faults[0].error()) == "no reply — 30 ms"
 
 
@@ -136,19 +126,6 @@ def test_an_empty_log_and_a_disk_that_fails_leave_nothing(tmp_path, monkeypatch)
     with pytest.raises(OSError, match="No space left"), LogWriter(tmp_path / "a.npz") as log:
         log.add(random_readings(np.array([1.0]))[0])
     assert not list(tmp_path.iterdir())
-
-
-def test_what_is_not_newer_is_refused(tmp_path):
-    first, second = random_readings(np.array([1.0, 1.1]))
-    with LogWriter(tmp_path / "a.npz") as log:
-        log.add(second)
-        for wrong in (second, first, Reading(99, 0.9, 1.05, first.state)):
-            with pytest.raises(LogError, match=f"reading {wrong.sequence} is not newer than reading 12"):
-                log.add(wrong)
-        log.add(Fault(2.0, "HandError", "x"))
-        with pytest.raises(LogError, match=r"a failure at 1\.9 s after one at 2\.0 s"):
-            log.add(Fault(1.9, "HandError", "x"))
-        assert (log.num_readings, log.num_faults) == (1, 1)
 
 
 def test_a_long_log_takes_little_memory(tmp_path):
@@ -225,29 +202,11 @@ def rewritten(tmp_path, name: str, change) -> LogError:
         ("about", lambda a: np.array("{"), "damaged, cut, or no .npz file: Expecting property name"),
         ("about", lambda a: np.array("[]"), "damaged, cut, or no .npz file: "),
         ("position", lambda a: None, "There is no item named 'position.npy'"),
-        ("position", lambda a: a.astype(np.float64), "position is float64 of shape (3, 12), expected float32 of shape (reading, 12,)"),
-        ("total_force", lambda a: a[:, :4], "total_force is int16 of shape (3, 4, 3), expected int16 of shape (reading, 5, 3)"),
-        ("taxel_force", lambda a: a[:2], "2 rows in taxel_force, but 3 in sequence"),
-        ("sequence", lambda a: a[::-1], "its times do not go forward"),
-        ("received_at", lambda a: np.array([1.0, 1.1, np.nan]), "its times do not go forward"),
-        ("requested_at", lambda a: a + 1, "its times do not go forward"),
         ("fault_kind", lambda a: a[:0], "damaged"),
-        ("fault_reading", lambda a: a + 2, "its times do not go forward"),
-        ("fault_reading", lambda a: a[:0], "fault_reading is int64 of shape (0,), expected int64 of shape (1,)"),
     ],
 )  # fmt: skip
 def test_arrays_that_are_not_a_log_s(tmp_path, name, change, says):
     assert says in str(rewritten(tmp_path, name, change))
-
-
-def test_an_array_without_rows(tmp_path):
-    small(tmp_path)
-    with np.load(tmp_path / "small.npz") as archive:
-        np.savez(
-            tmp_path / "x.npz", **{name: archive[name][:0] if name in RECORD.names else archive[name] for name in archive.files}
-        )
-    with pytest.raises(LogError, match="this log holds no reading"):
-        open_log(tmp_path / "x.npz")
 
 
 def test_files_that_are_no_logs(tmp_path):
@@ -260,34 +219,10 @@ def test_files_that_are_no_logs(tmp_path):
         open_log(tmp_path / "text.npz")
 
 
-def test_a_log_that_goes_while_it_is_read(tmp_path):
-    log = open_log(write_log(tmp_path / "a.npz", random_readings(np.array([1.0]))))
-    (tmp_path / "a.npz").unlink()
-    with pytest.raises(LogError, match="cannot read this log"):
-        next(log.readings())
-    with pytest.raises(LogError, match="cannot read this log"):
-        log.column("position")
-
-
-def test_a_huge_array_is_not_believed(tmp_path):
-    """A header that promises 10^12 rows is refused before any of them is given room."""
-    small(tmp_path)
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**12, 12)})
-    with zipfile.ZipFile(tmp_path / "small.npz") as old, zipfile.ZipFile(tmp_path / "x.npz", "w") as new:
-        for member in old.namelist():
-            new.writestr(member, header.getvalue() if member == "position.npy" else old.read(member))
-    with pytest.raises(LogError, match="1000000000000 rows in position, but 3 in sequence"):
-        open_log(tmp_path / "x.npz")
-
-
-# a hand
-
-
 def test_recording_an_emulated_hand_through_failures(tmp_path):
     stamps = Stamps()
     with (
-        Emulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
         XHand1.open(emulator.device) as hand,
         LogWriter(tmp_path / "a.npz") as log,
     ):
@@ -306,12 +241,12 @@ def test_recording_an_emulated_hand_through_failures(tmp_path):
     assert len(found) > 20  # a busy machine may have lost one before the thirtieth
     assert all(one < other for one, other in pairwise(found))
     assert log.faults
-    assert all(isinstance(fault.error(), (HandTimeoutError, errors.StaleReadingError)) for fault in log.faults)
+    assert all(isinstance(fault.error(), HandTimeoutError) for fault in log.faults)
     assert log.received_at[0] < log.faults[0].time < log.received_at[-1]
 
 
 def test_a_closed_hand_ends_a_recording():
-    with Emulator() as emulator:
+    with FaultyEmulator() as emulator:
         hand = XHand1.open(emulator.device)
         coming = events(hand, 60.0)
         next(coming)

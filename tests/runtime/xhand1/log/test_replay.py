@@ -8,14 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from faulty_lines import Faults, FaultyEmulator
 from hand_logs import assert_same_reading, random_readings, write_log
 
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.runtime.source import Source
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.log.log import Fault, LogError
 from tgdsl.runtime.xhand1.log.record import LogWriter
@@ -23,7 +22,7 @@ from tgdsl.runtime.xhand1.log.replay import ReplayOverError, ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.source import HandSample, XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandTimeoutError, StaleReadingError
+from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.payloads import saturated
 
 RNG = np.random.default_rng(5)
@@ -55,7 +54,7 @@ def run_live(path) -> list[HandSample | Fault]:
     """Let a hand move, press beyond its range and fall silent for a while; log all of it, and return it."""
     live: list[HandSample | Fault] = []
     with (
-        Emulator(EmulatedHand(forces=swelling, time_constant_s=0.1)) as emulator,
+        FaultyEmulator(EmulatedHand(forces=swelling, time_constant_s=0.1)) as emulator,
         XHand1.open(emulator.device, motion=LIMITS, timing=SerialTiming(reply_timeout_s=2.0, silence_s=1.0)) as hand,
         LogWriter(path, calibration=NEWTON) as log,
     ):
@@ -172,7 +171,7 @@ def test_a_gap_without_a_failure_is_a_stale_reading(tmp_path):
     path = write_log(tmp_path / "a.npz", random_readings(np.array([1.0, 1.01, 2.0])))
     source = ReplaySource(path, control_step=0.02, speed=math.inf)
     source.step()
-    with pytest.raises(StaleReadingError, match=r"no new reading came in time; the newest is 118 ms old"):
+    with pytest.raises(HandTimeoutError, match=r"no new reading came in time; the newest is 118 ms old"):
         source.step()  # due at 1.04, given up at 1.12; asked for at 1.002
 
 
@@ -194,7 +193,7 @@ def expected_steps(times, faults, control_step: float) -> list[int | str]:
             now = due + 0.08
             last = max(t for t in times if t <= now)
             after = [fault for fault in faults if last < fault.time <= now]
-            out.append(after[-1].kind if after else "StaleReadingError")
+            out.append(after[-1].kind if after else "HandTimeoutError")
     return out
 
 

@@ -7,11 +7,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from xhand1_streams import frame_bytes, frames_of
 
-from tgdsl.runtime.xhand1.wire.parser import FrameParser
-from tgdsl.runtime.xhand1.wire.protocol import MAX_FRAME
+from tgdsl.runtime.xhand1.wire.protocol import MAX_PAYLOAD, OVERHEAD, FrameParser
 
 BYTE = st.integers(0, 255)
-BOUND = MAX_FRAME + 4096
+BOUND = MAX_PAYLOAD + OVERHEAD + 4096
 FRAMES = st.builds(frame_bytes, BYTE, BYTE, BYTE, st.binary(max_size=40))
 BIG = frame_bytes(0x80, 0xFE, 2, bytes(range(256)) * 8 + bytes(160))
 NESTED = st.builds(frame_bytes, BYTE, BYTE, BYTE, FRAMES)

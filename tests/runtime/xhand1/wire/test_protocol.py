@@ -10,9 +10,8 @@ from xhand1_streams import bitwise_crc16
 
 from tgdsl.runtime.xhand1.wire import payloads, protocol
 from tgdsl.runtime.xhand1.wire.errors import ProtocolError
-from tgdsl.runtime.xhand1.wire.parser import FrameParser
 from tgdsl.runtime.xhand1.wire.payloads import JointCommand, Mode
-from tgdsl.runtime.xhand1.wire.protocol import Frame
+from tgdsl.runtime.xhand1.wire.protocol import Frame, FrameParser
 
 BYTE = st.integers(0, 255)
 WORD = st.integers(0, 0xFFFF)
@@ -99,12 +98,6 @@ def test_a_state_cannot_be_written_to():
 )
 def test_saturation(counts, is_end):
     assert payloads.saturated(np.array(counts)).tolist() == [i == is_end for i in range(3)]
-
-
-def test_the_display_programs_cells_are_each_used_once():
-    cells = payloads.unverified_taxel_cells()
-    assert cells[[0, 11, 12, 119]].tolist() == [[11, 0], [0, 0], [11, 1], [0, 9]]
-    assert len({tuple(cell) for cell in cells.tolist()}) == 120
 
 
 @given(st.binary(min_size=2208, max_size=2208))

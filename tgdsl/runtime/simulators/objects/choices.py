@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,14 +19,6 @@ Values = int | float | Sequence[Any] | np.ndarray
 """Numbers, one per environment or one for all."""
 
 
-class ObjectChoices(Protocol):
-    """Objects whose variants and sizes can be chosen."""
-
-    def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
-        """Choose variants and sizes for some environments: see `Simulation.set_objects`."""
-        ...
-
-
 class EnvObjects:
     """What the objects of `inputs.objects` are like in each environment.
 
@@ -35,6 +27,7 @@ class EnvObjects:
     Shapes: `env` environments, `object` objects of `inputs.objects`.
 
     Attributes:
+        scenes: The models of the scene.
         variant: The field `variant` of a state.
         object_size: The field `object_size` of a state [m]; 0 for objects whose size is not part of it.
     """
@@ -43,7 +36,7 @@ class EnvObjects:
     object_size: Float[np.ndarray, "env object 3"]
 
     def __init__(self, scenes: SceneModels, inputs: Inputs, num_envs: int):
-        self._scenes = scenes
+        self.scenes = scenes
         self._num_variants = dict(zip(inputs.objects, inputs.num_variants, strict=True))
         self._choices = [{name: Choice(env % num) for name, num in self._num_variants.items()} for env in range(num_envs)]
         self._tabulate()
@@ -56,7 +49,7 @@ class EnvObjects:
                 choices[name] = Choice(int(variant))
         for name, value in sizes.items():
             for choices, size in zip(chosen, self._sizes(name, value, len(ids)), strict=True):
-                num = NUM_SIZES[self._scenes.type(name, choices[name].variant)]
+                num = NUM_SIZES[self.scenes.type(name, choices[name].variant)]
                 if len(size) < num or not (size[:num] > 0).all():
                     raise SimulationError(f"size of object {name} is {size.tolist()}, expected {num} positive lengths")
                 x, y, z = [*size[:num].tolist(), 0.0, 0.0][:3]
@@ -72,16 +65,16 @@ class EnvObjects:
     def variants(self) -> tuple[list[mujoco.MjModel], bool]:
         """Return a model with each variant that an object may have, and whether a compound's sizes may make further ones."""
         chosen = [(name, v) for name, num in self._num_variants.items() for v in range(num)]
-        objects = self._scenes.objects.values()
+        objects = self.scenes.objects.values()
         is_open = any(target.is_sized and len(target.types) > 1 for target in objects)
-        return [self._scenes.model({name: Choice(v)}) for name, v in chosen], is_open
+        return [self.scenes.model({name: Choice(v)}) for name, v in chosen], is_open
 
     def models(self) -> list[mujoco.MjModel]:
         """Return each environment's model; those that are alike share one."""
-        return self._scenes.models(self._choices)
+        return self.scenes.models(self._choices)
 
     def _size(self, name: str, choice: Choice) -> tuple[float, float, float]:
-        return self._scenes.size(name, choice) if self._scenes.objects[name].is_sized else (0.0, 0.0, 0.0)
+        return self.scenes.size(name, choice) if self.scenes.objects[name].is_sized else (0.0, 0.0, 0.0)
 
     def _known(self, name: str) -> None:
         if name not in self._num_variants:
@@ -97,7 +90,7 @@ class EnvObjects:
 
     def _sizes(self, name: str, value: Values, count: int) -> Float[np.ndarray, "n size"]:
         self._known(name)
-        if not self._scenes.objects[name].is_sized:
+        if not self.scenes.objects[name].is_sized:
             raise SimulationError(f"the size of object {name} is fixed; the document frees it with `size: per_env`")
         result = np.atleast_1d(np.asarray(value, dtype=np.float64))
         if result.shape[:-1] not in ((), (count,)) or not np.isfinite(result).all():

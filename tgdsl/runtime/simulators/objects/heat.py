@@ -38,7 +38,6 @@ class EnvHeat:
     material: Int[Tensor, "env heated"]
 
     def __init__(self, inputs: Inputs, num_envs: int, device: torch.device, dtype: torch.dtype):
-        """Begin with what the document says."""
         self.names = inputs.heated
         self._starts, self._num_materials = inputs.start_temperatures, inputs.num_materials
         with torch.inference_mode(False):
@@ -61,11 +60,7 @@ class EnvHeat:
     def choose(
         self, ids: Int[np.ndarray, " n"], temperatures: Mapping[str, Values], materials: Mapping[str, Values]
     ) -> dict[tuple[str, int], np.ndarray]:
-        """Return what `write` writes, after a look at it: see `Simulation.set_objects`.
-
-        Raises:
-            SimulationError: If there is no such object, or a value does not fit.
-        """
+        """Return, checked, what `write` writes: see `Simulation.set_objects`."""
         result = {("temperature", self._column(name)): self._degrees(name, v, len(ids)) for name, v in temperatures.items()}
         return result | {("material", self._column(name)): self._numbers(name, v, len(ids)) for name, v in materials.items()}
 

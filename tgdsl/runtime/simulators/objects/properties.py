@@ -54,16 +54,9 @@ class ObjectProperties(ABC):
     """Masses and frictions of a simulation's objects, by the name of an object or body, with all that is welded to it."""
 
     def __init__(self, model: mujoco.MjModel, bodies_of: Mapping[str, str], num_envs: int, device: torch.device):
-        """Begin: all environments are as the scene has them.
-
-        Args:
-            model: The scene.
-            bodies_of: Body of each of the document's objects.
-            num_envs: Number of environments.
-            device: Where physics runs.
-        """
         self._model, self._bodies_of, self._num_envs, self._device = model, bodies_of, num_envs, device
         self._objects: dict[str, RigidObject] = {}
+        self._indices: dict[tuple[str, str], Tensor] = {}
 
     def set(
         self,
@@ -98,11 +91,11 @@ class ObjectProperties(ABC):
 
     def mass(self, name: str) -> Float[Tensor, " env"]:
         """Return the mass of an object in each environment [kg]."""
-        return self._mass(self._object(name))
+        return self._values("body_mass")[:, self._index(self._object(name), "bodies")].sum(dim=1)
 
     def friction(self, name: str) -> Float[Tensor, " env"]:
         """Return the coefficient of sliding friction of an object in each environment, the largest of its geoms'."""
-        return self._friction(self._object(name))
+        return self._values("geom_friction")[:, self._index(self._object(name), "geoms"), 0].amax(dim=1)
 
     @abstractmethod
     def fields(self) -> dict[str, Tensor]:
@@ -123,10 +116,15 @@ class ObjectProperties(ABC):
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None: ...
 
     @abstractmethod
-    def _mass(self, target: RigidObject) -> Float[Tensor, " env"]: ...
+    def _values(self, field: str) -> Float[Tensor, "env ..."]:
+        """Return a field of MuJoCo's model in each environment, also where all share it."""
 
-    @abstractmethod
-    def _friction(self, target: RigidObject) -> Float[Tensor, " env"]: ...
+    def _index(self, target: RigidObject, name: str) -> Int[Tensor, " element"]:
+        """Return an object's `bodies`, `geoms`, `dofs` or `above` on the device."""
+        key = (target.name, name)
+        if key not in self._indices:
+            self._indices[key] = torch.from_numpy(getattr(target, name)).to(self._device)
+        return self._indices[key]
 
     def _object(self, name: str) -> RigidObject:
         if name not in self._objects:
@@ -135,11 +133,7 @@ class ObjectProperties(ABC):
 
 
 def refuse_other_fields(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Refuse fields that environments do not have, or of another shape.
-
-    Raises:
-        SimulationError: If there are any.
-    """
+    """Raise an error for fields that environments do not have, or of another shape."""
     for name, value in given.items():
         if name not in own or tuple(own[name].shape) != tuple(value.shape):
             raise SimulationError(f'environments cannot have a "{name}" of shape {tuple(value.shape)} of their own')
@@ -147,11 +141,6 @@ def refuse_other_fields(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) 
 
 def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str]) -> RigidObject:
     """Return an object by its name in the document, or by its body's in the scene.
-
-    Args:
-        model: The scene.
-        name: The name.
-        bodies_of: Body of each of the document's objects.
 
     Raises:
         SimulationError: If there is no such object or body, or it has no mass.
@@ -184,18 +173,7 @@ def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str])
 def property_rows(
     what: str, given: Numbers, num_envs: int, device: torch.device, is_positive: bool = False
 ) -> Float[Tensor, " env"]:
-    """Return a property's value for each environment; numbers on the host are looked at.
-
-    Args:
-        what: How errors call it.
-        given: One value for all, or (env,).
-        num_envs: Number of environments.
-        device: Where it is wanted.
-        is_positive: Whether it cannot be 0.
-
-    Raises:
-        SimulationError: If a shape does not fit, or a number on the host is out of range.
-    """
+    """Return a property's value for each environment; those on the host must be finite and at least 0, or more than 0."""
     values = given if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given, dtype=np.float64))
     if tuple(values.shape) not in ((), (1,), (num_envs,)):
         raise SimulationError(f"{what} has shape {tuple(values.shape)}, expected one number or ({num_envs},)")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import select
 import tempfile
 import threading
@@ -12,57 +11,111 @@ import time
 import tty
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 
-from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
-from tgdsl.runtime.xhand1.emulator.wire import EmulatedWire
 from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.protocol import Frame
+from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD, Frame, FrameParser, encode_frame
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD
 
 _IDLE_S = 0.05
+_KEPT_REQUESTS = 20_000
+_CHUNK = 124
+"""Bytes that come out of the line at a time: 0.4 ms at 3 Mbaud."""
+
+
+class EmulatedLine:
+    """The line between a host and an emulated hand: bytes in, bytes out at the speed of its baud rate. Time is passed in.
+
+    Attributes:
+        hand: The hand.
+        requests: The latest requests that arrived, with their times [s].
+    """
+
+    def __init__(self, hand: EmulatedHand, *, baud: int = BAUD, turnaround_s: float = 0.0002):
+        """Connect a hand.
+
+        Args:
+            hand: The hand.
+            baud: Bits per second.
+            turnaround_s: Time from a request's last byte to the reply's first [s].
+        """
+        self.hand = hand
+        self.requests: deque[tuple[float, Frame]] = deque(maxlen=_KEPT_REQUESTS)
+        self._byte_s, self._turnaround_s = 10 / baud, turnaround_s
+        self.cut()
+
+    def hear(self, data: bytes, now: float) -> None:
+        """Take bytes that the host has sent; the hand answers its requests."""
+        for frame in self._parser.feed(data):
+            self.requests.append((now, frame))
+            self.answer(frame, now + (OVERHEAD + len(frame.payload)) * self._byte_s)
+
+    def answer(self, frame: Frame, arrived_at: float) -> None:
+        """Let the hand answer a request that arrived at a time [s]."""
+        if (reply := self.hand.answer(frame, arrived_at)) is not None:
+            self.send(encode_frame(reply), arrived_at + self._turnaround_s)
+
+    def send(self, raw: bytes, ready_at: float) -> None:
+        """Put bytes on the line from a time on [s], behind those that are on their way.
+
+        Where they follow others without a gap, the pieces in which they come out do not show the seam.
+        """
+        start = max(ready_at, self._free_at)
+        if self._chunks and start == self._free_at and len(self._chunks[-1][1]) < _CHUNK:
+            _, begun = self._chunks.pop()
+            start -= len(begun) * self._byte_s
+            raw = begun + raw
+        for at in range(0, len(raw), _CHUNK):
+            chunk = raw[at : at + _CHUNK]
+            self._chunks.append((start + (at + len(chunk)) * self._byte_s, chunk))
+        self._free_at = start + len(raw) * self._byte_s
+
+    def due(self, now: float) -> bytes:
+        """Return, and forget, the bytes that have reached the host by now."""
+        out = []
+        while self._chunks and self._chunks[0][0] <= now:
+            out.append(self._chunks.popleft()[1])
+        return b"".join(out)
+
+    def next_due(self) -> float | None:
+        """Return when more reaches it [s], or None if nothing is on its way."""
+        return self._chunks[0][0] if self._chunks else None
+
+    def cut(self) -> None:
+        """Lose all bytes on their way, in both directions."""
+        self._chunks: deque[tuple[float, bytes]] = deque()
+        self._free_at = 0.0
+        self._parser = FrameParser()
 
 
 class Emulator:
     """A thread that lets an emulated hand answer on a pseudo-terminal, as fast as a line of its baud rate would.
 
     Attributes:
+        line: The hand's line.
         device: The serial port's name. It stays the same when the hand is unplugged and plugged in again.
         num_lost_bytes: Bytes that nobody read in time.
-        failure: What ended its thread; None if nothing did. The port is then gone, and every call says why.
+        failure: The error that ended its thread, or None. The port is then gone, and every call raises it.
     """
 
-    def __init__(
-        self,
-        hand: EmulatedHand | None = None,
-        *,
-        faults: Faults | None = None,
-        baud: int = BAUD,
-        turnaround_s: float = 0.0002,
-        seed: int = 0,
-    ):
+    def __init__(self, hand: EmulatedHand | None = None, *, line: EmulatedLine | None = None):
         """Plug the hand in and switch it on.
 
         Args:
             hand: The hand; default: one with id 0 that feels nothing.
-            faults: What goes wrong on the line; default: nothing.
-            baud: Bits per second.
-            turnaround_s: Time from a request's last byte to the reply's first [s].
-            seed: Seed of the faults.
+            line: Its line, in place of a hand.
         """
+        self.line = line or EmulatedLine(hand or EmulatedHand())
         self.num_lost_bytes = 0
         self.failure: Exception | None = None
-        self._wire = EmulatedWire(hand or EmulatedHand(), faults or Faults(), baud, turnaround_s, seed)
         self._folder = tempfile.TemporaryDirectory(prefix="xhand1-")
         self.device = str(Path(self._folder.name) / "ttyXHAND1")
         self._ends: tuple[int, int] | None = None
-        self._calls: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = queue.SimpleQueue()
-        self._calling = threading.Lock()
+        self._lock = threading.Lock()
         self._wake_read, self._wake_write = os.pipe()
-        self._is_running = self._is_serving = True
+        self._is_serving = True
         self._plug()
         self._thread = threading.Thread(target=self._run, name="xhand1-emulator", daemon=True)
         self._thread.start()
@@ -70,28 +123,31 @@ class Emulator:
     @property
     def hand(self) -> EmulatedHand:
         """The hand."""
-        return self._wire.hand
+        return self.line.hand
 
     @property
     def requests(self) -> deque[tuple[float, Frame]]:
         """The latest requests that arrived, with the time of `time.monotonic` [s]."""
-        return self._wire.requests
-
-    def set_faults(self, faults: Faults) -> None:
-        """Let other faults strike from now on."""
-        self._call(lambda: setattr(self._wire.line, "faults", faults))
-
-    def fault_counts(self) -> dict[str, int]:
-        """Return how often each fault has struck, by its name."""
-        return dict(self._wire.line.counts)
+        return self.line.requests
 
     def unplug(self) -> None:
-        """Pull the cable: the port goes away, and what is on its way is lost."""
-        self._call(self._unplug)
+        """Pull the cable: the port goes away, and the bytes on their way are lost."""
+        self.call(self._unplug)
 
     def replug(self) -> None:
         """Plug it in again: the port is there under the same name. The hand was on all the time."""
-        self._call(self._plug)
+        self.call(self._plug)
+
+    def call(self, change: Callable[[], None]) -> None:
+        """Change the emulator or its line between two of the thread's turns.
+
+        Raises:
+            HandError: If the thread has ended, and why.
+        """
+        with self._lock:
+            self.check()
+            change()
+        os.write(self._wake_write, b"!")
 
     def check(self) -> None:
         """Look whether the emulator still answers.
@@ -100,7 +156,7 @@ class Emulator:
             HandError: If its thread has ended, and why.
         """
         if self.failure is not None:
-            raise self._ended()
+            raise HandError(f"the emulator's thread ended: {self.failure!r}") from self.failure
 
     def close(self) -> None:
         """Switch the hand off and remove the port.
@@ -108,10 +164,9 @@ class Emulator:
         Raises:
             HandError: If the emulator's thread had ended before, and why.
         """
-        if self._is_running:
-            with contextlib.suppress(HandError):
-                self._call(self._stop)
-            self._is_running = False
+        if self._is_serving:
+            self._is_serving = False
+            os.write(self._wake_write, b"!")
             self._thread.join()
             self._unplug()
             for end in (self._wake_read, self._wake_write):
@@ -124,27 +179,6 @@ class Emulator:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
-
-    def _call(self, call: Callable[[], None]) -> None:
-        """Run something in the emulator's thread, wait until it is done, and raise what it raises.
-
-        Raises:
-            HandError: If the thread has ended, or ends before it is done, and why.
-        """
-        done: Future[None] = Future()
-        with self._calling:
-            self.check()
-            self._calls.put((call, done))
-        os.write(self._wake_write, b"!")
-        done.result()
-
-    def _ended(self) -> HandError:
-        error = HandError(f"the emulator's thread ended: {self.failure!r}")
-        error.__cause__ = self.failure
-        return error
-
-    def _stop(self) -> None:
-        self._is_serving = False
 
     def _plug(self) -> None:
         if self._ends is None:
@@ -166,46 +200,37 @@ class Emulator:
             for end in self._ends:
                 os.close(end)
             self._ends = None
-            self._wire.cut()
+            self.line.cut()
 
     def _run(self) -> None:
         try:
-            self._serve()
+            while self._is_serving:
+                self._turn()
         except Exception as error:
-            with self._calling:
+            with self._lock:
                 self.failure = error
-            self._unplug()
-            while not self._calls.empty():
-                self._calls.get()[1].set_exception(self._ended())
+                self._unplug()
 
-    def _serve(self) -> None:
-        while self._is_serving:
-            next_due = self._wire.next_due()
-            wait = _IDLE_S if next_due is None else max(next_due - time.monotonic(), 0.0)
-            watched = [self._wake_read] if self._ends is None else [self._wake_read, self._ends[0]]
-            ready = select.select(watched, [], [], min(wait, _IDLE_S))[0]
-            if self._ends is not None and self._ends[0] in ready:
-                self._listen(self._ends[0])
-            if self._ends is not None and (data := self._wire.due(time.monotonic())):
-                self._speak(self._ends[0], data)
+    def _turn(self) -> None:
+        """Wait until bytes come or are due, or something was changed; then take and give them."""
+        with self._lock:
+            ends, next_due = self._ends, self.line.next_due()
+        wait = _IDLE_S if next_due is None else max(next_due - time.monotonic(), 0.0)
+        ready: list[int] = []
+        with contextlib.suppress(OSError):  # the cable was pulled meanwhile
+            ready = select.select([self._wake_read, *(ends or ())[:1]], [], [], min(wait, _IDLE_S))[0]
+        with self._lock:
             if self._wake_read in ready:
                 os.read(self._wake_read, 1)
-                call, done = self._calls.get()
-                try:
-                    call()
-                    done.set_result(None)
-                except Exception as error:
-                    done.set_exception(error)
-
-    def _listen(self, end: int) -> None:
-        data = b""
-        with contextlib.suppress(OSError):
-            data = os.read(end, 65536)
-        self._wire.hear(data, time.monotonic())
-
-    def _speak(self, end: int, data: bytes) -> None:
-        try:
-            sent = os.write(end, data)
-        except OSError:
-            sent = 0
-        self.num_lost_bytes += len(data) - sent
+            if self._ends is None:
+                return
+            if self._ends[0] in ready:
+                data = b""
+                with contextlib.suppress(OSError):
+                    data = os.read(self._ends[0], 65536)
+                self.line.hear(data, time.monotonic())
+            if data := self.line.due(time.monotonic()):
+                sent = 0
+                with contextlib.suppress(OSError):
+                    sent = os.write(self._ends[0], data)
+                self.num_lost_bytes += len(data) - sent

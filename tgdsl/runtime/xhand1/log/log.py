@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -61,7 +61,7 @@ STATE = tuple(name for name in RECORD.names or () if name not in TIMES)
 CHUNK = 256
 """Readings that are in memory at a time: 1 MB of them."""
 _DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zlib.error, zipfile.BadZipFile, struct.error)
-"""What a damaged archive raises, of all kinds."""
+"""Errors that a damaged archive raises."""
 
 
 class LogError(TgdslError):
@@ -84,7 +84,7 @@ class Fault:
 
     @classmethod
     def of(cls, error: HandError, time: float) -> Fault:
-        """Return that of an error."""
+        """Return the failure that is an error at a time [s]."""
         return cls(time, type(error).__name__, str(error))
 
     def error(self) -> HandError:
@@ -132,41 +132,21 @@ class HandLog:
         return max([float(self.received_at[-1]), *(fault.time for fault in self.faults)]) - float(self.received_at[0])
 
     def column(self, name: str) -> np.ndarray:
-        """Return one array of the file, all readings at once: `total_force` (reading, finger, 3) and so on.
+        """Return one array of the file, all readings at once: `total_force` (reading, finger, 3) and so on."""
+        with zipfile.ZipFile(self.path) as archive:
+            return _array(archive, name)
 
-        Raises:
-            LogError: If the file has gone, or changed.
-        """
-        try:
-            with zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
-                return np.lib.format.read_array(member, allow_pickle=False)
-        except _DAMAGE as error:
-            raise _damaged(self.path, error) from error
-
-    def readings(self, start: int = 0) -> Iterator[Reading]:
-        """Yield the readings in order, as they were; `CHUNK` of them are in memory at a time.
-
-        Args:
-            start: Index of the first one.
-
-        Raises:
-            LogError: If the file has gone, or changed.
-        """
+    def readings(self) -> Iterator[Reading]:
+        """Yield the readings in order, as they were; `CHUNK` of them are in memory at a time."""
         with ExitStack() as stack:
-            try:
-                archive = stack.enter_context(zipfile.ZipFile(self.path))
-                members = {name: stack.enter_context(archive.open(f"{name}.npy")) for name in STATE}
-                for name, member in members.items():
-                    _read_header(member, name)
-                    _skip(member, start * RECORD[name].itemsize)
-            except _DAMAGE as error:
-                raise _damaged(self.path, error) from error
-            for first in range(start, self.num_readings, CHUNK):
+            archive = stack.enter_context(zipfile.ZipFile(self.path))
+            members = {name: stack.enter_context(archive.open(f"{name}.npy")) for name in STATE}
+            for member in members.values():
+                np.lib.format.read_magic(member)
+                np.lib.format.read_array_header_1_0(member)
+            for first in range(0, self.num_readings, CHUNK):
                 last = min(first + CHUNK, self.num_readings)
-                try:
-                    chunk = {name: _rows(member, name, last - first) for name, member in members.items()}
-                except _DAMAGE as error:
-                    raise _damaged(self.path, error) from error
+                chunk = {name: _rows(member, name, last - first) for name, member in members.items()}
                 for i in range(first, last):
                     state = HandState(**{name: rows[i - first] for name, rows in chunk.items()})
                     times = float(self.requested_at[i]), float(self.received_at[i])
@@ -177,7 +157,7 @@ def open_log(path: str | Path) -> HandLog:
     """Read a log's times and failures, and check every byte of it.
 
     Raises:
-        LogError: If it cannot be read, is no log, is damaged or cut, of another format, or holds no reading.
+        LogError: If it cannot be read, is no log, is damaged or cut, or of another format.
     """
     path = Path(path)
     try:
@@ -189,41 +169,27 @@ def open_log(path: str | Path) -> HandLog:
             about = json.loads(str(_array(archive, "about")))
             if about["format"] != FORMAT:
                 raise LogError(f"{path}: a log of format {about['format']}, this version of tgdsl reads format {FORMAT}")
-            log = _log(path, archive, about)
+            return _log(path, archive, about)
     except _DAMAGE as error:
-        raise _damaged(path, error) from error
-    _check(log)
-    return log
+        if isinstance(error, FileNotFoundError | IsADirectoryError | PermissionError):
+            raise LogError(f"{path}: cannot read this log: {error.strerror}") from error
+        raise LogError(f"{path}: this log is damaged, cut, or no .npz file: {error}") from error
 
 
 def _log(path: Path, archive: zipfile.ZipFile, about: dict[str, Any]) -> HandLog:
-    sequence, requested_at, received_at = (_array(archive, name) for name in TIMES)
-    for name in RECORD.names or ():
-        with archive.open(f"{name}.npy") as member:
-            num_rows = _read_header(member, name)
-        if num_rows != len(sequence):
-            raise LogError(f"{path}: this log is damaged: {num_rows} rows in {name}, but {len(sequence)} in sequence")
+    for name in STATE:
+        archive.getinfo(f"{name}.npy")
     times, kinds, messages, places = (_array(archive, f"fault_{name}") for name in ("time", "kind", "message", "reading"))
-    told = zip(times, kinds, messages, strict=True)
-    faults = tuple(Fault(float(time), str(kind), str(message)) for time, kind, message in told)
-    identity, started_at = _identity(about["hand"]), float(about["started_at"])
-    if places.shape != times.shape or places.dtype != np.dtype("<i8"):
-        raise ValueError(f"fault_reading is {places.dtype} of shape {places.shape}, expected int64 of shape {times.shape}")
-    calibration = _calibration(about)
-    return HandLog(path, identity, calibration, started_at, sequence, requested_at, received_at, faults, places)
-
-
-def _check(log: HandLog) -> None:
-    """Raise a `LogError` unless times go forward."""
-    if not log.num_readings:
-        raise LogError(f"{log.path}: this log holds no reading")
-    rises = all((np.diff(values) >= 0).all() for values in (log.requested_at, log.received_at))
-    rises = rises and bool((np.diff(log.sequence) > 0).all())
-    is_causal = np.isfinite(log.received_at).all() and (log.requested_at <= log.received_at).all()
-    times, places = [fault.time for fault in log.faults], [0, *log.fault_reading, log.num_readings]
-    is_ordered = (np.diff(times) >= 0).all() and (np.diff(places) >= 0).all()
-    if not rises or not is_causal or not is_ordered:
-        raise LogError(f"{log.path}: this log is damaged: its times do not go forward")
+    faults = zip(times, kinds, messages, strict=True)
+    return HandLog(
+        path,
+        None if about["hand"] is None else HandIdentity.from_json(about["hand"]),
+        None if about["calibration"] is None else parse_calibration(about["calibration"], "calibration"),
+        float(about["started_at"]),
+        *(_array(archive, name) for name in TIMES),
+        faults=tuple(Fault(float(time), str(kind), str(message)) for time, kind, message in faults),
+        fault_reading=places,
+    )
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
@@ -231,52 +197,6 @@ def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
         return np.lib.format.read_array(member, allow_pickle=False)
 
 
-def _read_header(member: Any, name: str) -> int:
-    """Read an array's header; return its number of rows.
-
-    Raises:
-        ValueError: If it is not that of a log's array of this name.
-    """
-    version = np.lib.format.read_magic(member)
-    if version != (1, 0):
-        raise ValueError(f"{name} is an array of version {version}, expected (1, 0)")
-    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(member)
-    base, row = RECORD[name].base, RECORD[name].shape
-    if is_fortran or dtype != base or not shape or shape[1:] != row:
-        raise ValueError(f"{name} is {dtype} of shape {shape}, expected {base} of shape (reading, {str(row)[1:]}")
-    return shape[0]
-
-
-def _rows(member: Any, name: str, num_rows: int) -> np.ndarray:
+def _rows(member: IO[bytes], name: str, num_rows: int) -> np.ndarray:
     data = member.read(num_rows * RECORD[name].itemsize)
     return np.frombuffer(data, RECORD[name].base).reshape(num_rows, *RECORD[name].shape)
-
-
-def _skip(member: Any, num_bytes: int) -> None:
-    while num_bytes > 0 and (data := member.read(min(num_bytes, 1 << 20))):
-        num_bytes -= len(data)
-
-
-def _identity(told: dict[str, Any] | None) -> HandIdentity | None:
-    if told is None:
-        return None
-    as_bytes = {name: None if told[name] is None else bytes.fromhex(told[name]) for name in IDENTITY_BYTES}
-    return HandIdentity(str(told["device"]), int(told["hand_id"]), **as_bytes)  # type: ignore[arg-type]
-
-
-IDENTITY_BYTES = ("version", "side", "serial_number", "name")
-"""Attributes of `HandIdentity` that are bytes, and hexadecimal text in a log."""
-
-
-def _calibration(about: dict[str, Any]) -> Calibration | None:
-    if (text := about["calibration"]) is None:
-        return None
-    if not isinstance(text, str):
-        raise TypeError(f"calibration is of type {type(text).__name__}, expected str")
-    return parse_calibration(text, "calibration")
-
-
-def _damaged(path: Path, error: BaseException) -> LogError:
-    if isinstance(error, FileNotFoundError | IsADirectoryError | PermissionError):
-        return LogError(f"{path}: cannot read this log: {error.strerror}")
-    return LogError(f"{path}: this log is damaged, cut, or no .npz file: {error}")

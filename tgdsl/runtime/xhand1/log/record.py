@@ -23,7 +23,7 @@ from tgdsl.files.write import as_file_error, atomic_open
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.identity import HandIdentity
-from tgdsl.runtime.xhand1.log.log import CHUNK, FORMAT, IDENTITY_BYTES, RECORD, STATE, Fault, LogError
+from tgdsl.runtime.xhand1.log.log import CHUNK, FORMAT, RECORD, STATE, Fault, LogError
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandError
 
@@ -31,11 +31,7 @@ _COMPRESSION = 1
 
 
 def events(hand: XHand1, seconds: float) -> Iterator[Reading | Fault]:
-    """Yield every reading of a hand, and every failure, as they come.
-
-    Args:
-        hand: The hand.
-        seconds: For how long [s]; may be infinite.
+    """Yield every reading of a hand, and every failure, as they come, for some seconds, which may be infinite.
 
     Raises:
         HandClosedError: If the hand was closed.
@@ -74,13 +70,12 @@ class LogWriter:
         self._path = Path(path)
         self._about = {
             "format": FORMAT,
-            "hand": _told(identity),
+            "hand": None if identity is None else identity.as_json(),
             "calibration": None if calibration is None else calibration.text(),
             "started_at": time.time(),
         }
         self._faults: list[Fault] = []
         self._fault_readings: list[int] = []
-        self._newest: Reading | None = None
         self.num_readings = 0
         self._spool: IO[bytes] | None = tempfile.TemporaryFile(dir=self._path.parent)  # noqa: SIM115  closed by `close`
 
@@ -93,25 +88,17 @@ class LogWriter:
         """Add a reading or a failure.
 
         Raises:
-            LogError: If the log is closed, or the reading or failure is not newer than the last one.
+            LogError: If the log is closed.
             FileError: If it cannot be kept.
         """
         if self._spool is None:
             raise LogError(f"{self._path}: this log is closed")
         if isinstance(event, Fault):
-            if self._faults and event.time < self._faults[-1].time:
-                raise LogError(f"{self._path}: a failure at {event.time} s after one at {self._faults[-1].time} s")
             self._fault_readings.append(self.num_readings)
             self._faults.append(event)
             return
-        last = self._newest
-        if last is not None and not (
-            event.sequence > last.sequence and event.requested_at >= last.requested_at and event.received_at >= last.received_at
-        ):
-            raise LogError(f"{self._path}: reading {event.sequence} is not newer than reading {last.sequence}")
         with as_file_error(self._path):
             self._spool.write(_record(event).tobytes())
-        self._newest = event
         self.num_readings += 1
 
     def close(self) -> None:
@@ -174,11 +161,3 @@ def _record(reading: Reading) -> np.ndarray:
     for name in STATE:
         record[name] = getattr(reading.state, name)
     return record
-
-
-def _told(identity: HandIdentity | None) -> dict[str, object] | None:
-    if identity is None:
-        return None
-    values = {name: getattr(identity, name) for name in IDENTITY_BYTES}
-    as_text = {name: None if value is None else value.hex() for name, value in values.items()}
-    return {"device": identity.device, "hand_id": identity.hand_id, **as_text}

@@ -13,25 +13,22 @@ from types import TracebackType
 from typing import NoReturn
 
 import numpy as np
-from torch import Tensor
 
 from tgdsl.errors import TgdslError
-from tgdsl.module.state import SceneState
+from tgdsl.runtime.source import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S
-from tgdsl.runtime.xhand1.log.log import Fault, LogError, open_log
+from tgdsl.runtime.xhand1.log.log import Fault, open_log
 from tgdsl.runtime.xhand1.reader import Reading
-from tgdsl.runtime.xhand1.source import HandSample, is_chosen, no_scene_state
-from tgdsl.runtime.xhand1.velocity import VelocityFilter
-from tgdsl.runtime.xhand1.wire.errors import StaleReadingError
-from tgdsl.tensors.env_ids import EnvIds
+from tgdsl.runtime.xhand1.source import HandSample, HandSource
+from tgdsl.runtime.xhand1.wire.errors import HandTimeoutError
 
 
 class ReplayOverError(TgdslError):
     """A step beyond the end of a log. `ReplaySource.is_over` says before that it would come."""
 
 
-class ReplaySource:
+class ReplaySource(HandSource):
     """A log that steps like `XHand1Source`, as one environment.
 
     With a control step, a step delivers what the live source would have had: the newest reading that had arrived when the step
@@ -40,9 +37,9 @@ class ReplaySource:
 
     Attributes:
         log: The log.
-        calibration: What its counts mean.
-        num_late_steps: Steps that began after they should have ended.
     """
+
+    NAME = "the log of an XHand1"
 
     def __init__(
         self,
@@ -73,19 +70,13 @@ class ReplaySource:
         if not speed > 0 or not (control_step is None or 0 < control_step < math.inf):
             raise TgdslError(f"a speed of {speed:g} and a control step of {control_step} s, expected more than 0 of each")
         self.log = open_log(path)
+        super().__init__(calibration or self.log.calibration, velocity_time_constant)
         self._speed, self._control_step = speed, control_step
-        self.calibration = calibration or self.log.calibration or Calibration.none()
-        self._velocity = VelocityFilter(velocity_time_constant)
         self._clock, self._sleep = clock, sleep
         self._fault_times = np.array([fault.time for fault in self.log.faults])
         self._end = self._start = float(self.log.received_at[0])
         self._end += self.log.seconds
         self.rewind()
-
-    @property
-    def num_envs(self) -> int:
-        """One: there is one hand."""
-        return 1
 
     @property
     def control_step(self) -> float:
@@ -111,7 +102,7 @@ class ReplaySource:
             return self._next_reading == self.log.num_readings and self._next_fault == len(self.log.faults)
         return self._now >= self._end
 
-    def step(self, control: Tensor | np.ndarray | None = None) -> None:
+    def step(self, control: Control = None) -> None:
         """Advance by one control step, and wait until it is over unless the replay is as fast as possible.
 
         Args:
@@ -131,37 +122,6 @@ class ReplaySource:
         """Return what the hand said at the end of the last step that delivered a reading; its times are the log's."""
         return self._sample
 
-    def state(self) -> SceneState:
-        """Refuse: a hand does not know where objects are, so no taxel reading can be computed from it.
-
-        Raises:
-            StateError: Always; it lists what the log can give.
-        """
-        raise no_scene_state("the log of an XHand1")
-
-    def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Forget the speeds, count steps from now, and deliver the first reading that was asked for from then on.
-
-        As with the live hand, time goes on; `rewind` restarts the log.
-
-        Args:
-            env_ids: Indices, or a boolean mask over environments, of which there is one; default: it.
-
-        Raises:
-            ReplayOverError: If the log is at its end.
-            HandError: The failure that kept a reading from coming, as it was.
-        """
-        if env_ids is not None and not is_chosen(env_ids):
-            return
-        self._expect_more()
-        self._velocity.reset()
-        if self._control_step is None:
-            self._next_event()
-            return
-        now = self._due = max(self._now, self._log_time())
-        coming = max(int(np.searchsorted(self.log.requested_at, now)), self._next_reading)
-        self._await(coming, max(now, float(self.log.received_at[coming - 1])) + READ_TIMEOUT_S)
-
     def rewind(self) -> None:
         """Restart with the log's first reading."""
         self._velocity.reset()
@@ -172,9 +132,6 @@ class ReplaySource:
         self._now = self._due = self._start
         self._began_at = self._clock()
         self._take(0)
-
-    def resume(self) -> None:
-        """Nothing: what was recorded moves or not as it did."""
 
     def close(self) -> None:
         """Release the file."""
@@ -187,6 +144,16 @@ class ReplaySource:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+    def _restart(self) -> None:
+        """Count steps from now, and deliver the first reading that was asked for from then on."""
+        self._expect_more()
+        if self._control_step is None:
+            self._next_event()
+            return
+        now = self._due = max(self._now, self._log_time())
+        coming = max(int(np.searchsorted(self.log.requested_at, now)), self._next_reading)
+        self._await(coming, max(now, float(self.log.received_at[coming - 1])) + READ_TIMEOUT_S)
 
     def _expect_more(self) -> None:
         if self.is_over:
@@ -231,7 +198,7 @@ class ReplaySource:
         if last >= 0 and self._fault_times[last] > self.log.received_at[newest]:
             return Fault(now, self.log.faults[last].kind, self.log.faults[last].message)
         age = 1e3 * (now - float(self.log.requested_at[newest]))
-        return Fault.of(StaleReadingError(f"no new reading came in time; the newest is {age:.0f} ms old"), now)
+        return Fault.of(HandTimeoutError(f"no new reading came in time; the newest is {age:.0f} ms old"), now)
 
     def _fail(self, fault: Fault) -> NoReturn:
         self._wait_until(fault.time)
@@ -250,10 +217,7 @@ class ReplaySource:
 
     def _take(self, index: int) -> None:
         """Deliver a reading; those before it that were not delivered are skipped, as a slow reader would."""
-        try:
-            while self._next_reading <= index:
-                reading = next(self._readings)
-                self._next_reading += 1
-        except StopIteration as error:
-            raise LogError(f"{self.log.path}: this log was changed while it was replayed") from error
+        while self._next_reading <= index:
+            reading = next(self._readings)
+            self._next_reading += 1
         self._sample = HandSample.of(reading, self.calibration, self._velocity, reading.requested_at)

@@ -18,18 +18,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from tgdsl.runtime.xhand1.wire.errors import (
-    HandAddressError,
-    HandChecksumError,
-    HandDisconnectedError,
-    HandError,
-    HandRefusedError,
-    HandTimeoutError,
-)
-from tgdsl.runtime.xhand1.wire.parser import FrameParser
+from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandRefusedError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
-from tgdsl.runtime.xhand1.wire.protocol import HOST_ADDRESS, OVERHEAD, Command, Frame, encode_frame, hand_address
-from tgdsl.runtime.xhand1.wire.replies import Addresses, Reply, Waiting
+from tgdsl.runtime.xhand1.wire.protocol import HOST_ADDRESS, OVERHEAD, Command, Frame, FrameParser, encode_frame, hand_address
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD, Port
 
 _CLOCK_TOLERANCE = 0.97
@@ -89,6 +80,89 @@ class SerialCounters:
     num_discarded_bytes: int = 0
 
 
+@dataclass(frozen=True)
+class Addresses:
+    """Where requests go, and from and to where replies come. What a real hand puts into its replies is unverified.
+
+    Attributes:
+        hand_id: The hand's id.
+        reply_source: Source of its replies; default: the hand's address.
+        reply_destination: Destination of its replies; default: the host's address.
+    """
+
+    hand_id: int = 0
+    reply_source: int | None = None
+    reply_destination: int | None = None
+
+    @property
+    def reply(self) -> tuple[int, int]:
+        """Source and destination of replies."""
+        source = hand_address(self.hand_id) if self.reply_source is None else self.reply_source
+        return source, HOST_ADDRESS if self.reply_destination is None else self.reply_destination
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A reply.
+
+    Attributes:
+        payload: Its bytes.
+        requested_at: When the request went out, on the client's clock [s]: the reply is not older than this.
+        received_at: When the reply was complete [s].
+        source: Address that it came from.
+        destination: Address that it was for.
+    """
+
+    payload: bytes
+    requested_at: float
+    received_at: float
+    source: int
+    destination: int
+
+
+class _Waiting:
+    """What came while one reply was waited for."""
+
+    def __init__(
+        self, command: Command, reply_size: int | None, addresses: Addresses | None, wire_time: float, requested_at: float
+    ):
+        self.command, self.reply_size, self.requested_at = command, reply_size, requested_at
+        self.reply: Reply | None = None
+        self.refusal: bytes | None = None
+        self.foreign: Frame | None = None
+        self.wrong_size: int | None = None
+        self.is_early = self.is_babble = False
+        self.num_foreign = self.num_unexpected = self.num_damaged = self.num_incomplete = 0
+        self._addresses, self._wire_time = addresses, wire_time
+
+    def sort(self, frames: list[Frame], now: float) -> None:
+        """Take frames that came by now [s]: this request's reply, a refusal, another's or none that was asked for."""
+        for frame in frames:
+            ends = frame.source, frame.destination
+            if self._addresses is None and frame.source == HOST_ADDRESS and not frame.payload:
+                continue  # an adapter that hears its own requests
+            if self._addresses is not None and ends != self._addresses.reply:
+                if ends != (HOST_ADDRESS, hand_address(self._addresses.hand_id)):
+                    self.num_foreign += 1
+                    self.foreign = frame
+            elif frame.command == Command.ERROR:
+                self.refusal = frame.payload
+            elif self._is_sought(frame, now):
+                self.num_unexpected += self.reply is not None
+                self.reply = Reply(frame.payload, self.requested_at, now, *ends)
+            else:
+                self.num_unexpected += 1
+
+    def _is_sought(self, frame: Frame, now: float) -> bool:
+        if frame.command != self.command:
+            return False
+        if self.reply_size not in (None, len(frame.payload)):
+            self.wrong_size = len(frame.payload)
+            return False
+        self.is_early = now - self.requested_at < self._wire_time
+        return not self.is_early
+
+
 class SerialClient:
     """A port on which one hand answers, one request at a time. Not for use by two threads."""
 
@@ -129,9 +203,7 @@ class SerialClient:
             hand_id: Whom to ask where the client has no addresses.
 
         Raises:
-            HandTimeoutError: If no reply came in time, or the line does not fall silent.
-            HandChecksumError: If bytes came, but no sound reply.
-            HandAddressError: If only others replied.
+            HandTimeoutError: If no reply came in time, a damaged one or another hand's, or the line does not fall silent.
             HandRefusedError: If the hand replied with its error command.
             HandDisconnectedError: If the port went away.
         """
@@ -161,7 +233,7 @@ class SerialClient:
         request = encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload))
         self._is_suspect = True
         self.counters.num_requests += 1
-        waiting = Waiting(command, reply_size, self._addresses, self._wire_time(request, reply_size), self._clock())
+        waiting = _Waiting(command, reply_size, self._addresses, self._wire_time(request, reply_size), self._clock())
         self.port.write(request)
         self._listen(waiting)
         if waiting.reply is None:
@@ -171,11 +243,7 @@ class SerialClient:
         return waiting.reply
 
     def _synchronise(self) -> None:
-        """Ask for the version, so that what is still on its way comes before the answer; learn at first whether there is one.
-
-        Raises:
-            HandError: If there was one before, and is none now.
-        """
+        """Ask for the version: earlier replies come before the answer. Learn at first whether there is one."""
         for left in range(1 if self._tells_version else _VERSION_TRIES, 0, -1):
             try:
                 self._ask(Command.VERSION, b"", None, 0)
@@ -197,11 +265,7 @@ class SerialClient:
         return _CLOCK_TOLERANCE * 10 * num_bytes / self.timing.baud
 
     def _await_silence(self) -> None:
-        """Wait until the line is silent, if it may not be.
-
-        Raises:
-            HandTimeoutError: If it does not fall silent.
-        """
+        """Wait until the line is silent, if it may not be; raise an error if it does not fall silent."""
         if not self._is_suspect and not self.port.pending():
             return
         self._is_suspect = True
@@ -214,7 +278,7 @@ class SerialClient:
                 raise HandTimeoutError(_BABBLE)
         self._parser = FrameParser()
 
-    def _listen(self, waiting: Waiting) -> None:
+    def _listen(self, waiting: _Waiting) -> None:
         """Collect what comes until a reply has come and the line is silent, or nothing more is to be expected."""
         timing, parser = self.timing, self._parser
         give_up_at = waiting.requested_at + timing.reply_timeout_s
@@ -247,30 +311,28 @@ class SerialClient:
         self.counters.num_foreign += waiting.num_foreign
         self.counters.num_unexpected += waiting.num_unexpected
 
-    def _failure(self, waiting: Waiting) -> HandError:
+    def _failure(self, waiting: _Waiting) -> HandError:
         what = f"command {waiting.command:#04x} ({waiting.command.name.lower()})"
+        within = f"{1e3 * self.timing.reply_timeout_s:.0f} ms"
         if waiting.refusal is not None:
             return HandRefusedError(f"the hand refused {what}; its error reply holds {waiting.refusal.hex(' ') or 'nothing'}")
         if waiting.is_babble:
             return HandTimeoutError(_BABBLE)
         if waiting.num_damaged > waiting.num_incomplete:
             self.counters.num_damaged += 1
-            return HandChecksumError(f"the reply to {what} came damaged: {waiting.num_damaged} bytes are in no sound frame")
+            return HandTimeoutError(f"the reply to {what} came damaged: {waiting.num_damaged} bytes are in no sound frame")
         self.counters.num_timeouts += 1
         if waiting.foreign is not None and self._addresses is not None:
             expected = "from {:#04x} to {:#04x}".format(*self._addresses.reply)
-            result = f"from {waiting.foreign.source:#04x} to {waiting.foreign.destination:#04x}"
-            return HandAddressError(
-                f"a reply came {result}, expected {expected}; if it is this hand's, set its reply addresses"
-            )
-        if waiting.is_early:
+            ends = f"from {waiting.foreign.source:#04x} to {waiting.foreign.destination:#04x}"
+            message = f"a reply came {ends}, expected {expected}; if it is this hand's, set its reply addresses"
+        elif waiting.is_early:
             took = f"sooner than {self.timing.baud} baud allow"
-            return HandTimeoutError(f"a reply to {what} came {took}: an earlier one's, or set checks_wire_time=False")
-        if waiting.wrong_size is not None:
-            return HandTimeoutError(f"the reply to {what} has {waiting.wrong_size} bytes, expected {waiting.reply_size}")
-        if waiting.num_incomplete:
-            within = f"{1e3 * self.timing.reply_timeout_s:.0f} ms"
-            return HandTimeoutError(
-                f"the reply to {what} was not complete within {within}: {waiting.num_incomplete} bytes had come"
-            )
-        return HandTimeoutError(f"no reply to {what} within {1e3 * self.timing.reply_timeout_s:.0f} ms")
+            message = f"a reply to {what} came {took}: an earlier one's, or set checks_wire_time=False"
+        elif waiting.wrong_size is not None:
+            message = f"the reply to {what} has {waiting.wrong_size} bytes, expected {waiting.reply_size}"
+        elif waiting.num_incomplete:
+            message = f"the reply to {what} was not complete within {within}: {waiting.num_incomplete} bytes had come"
+        else:
+            message = f"no reply to {what} within {within}"
+        return HandTimeoutError(message)

@@ -1,4 +1,4 @@
-"""Errors of the XHand1 on its serial line, each by name."""
+"""Errors of an XHand1."""
 
 from __future__ import annotations
 
@@ -14,23 +14,11 @@ class HandDisconnectedError(HandError):
 
 
 class HandTimeoutError(HandError):
-    """A hand that did not answer in time."""
-
-
-class HandChecksumError(HandError):
-    """An answer that arrived damaged."""
-
-
-class HandAddressError(HandError):
-    """Answers that came, but from or to another address than the hand's."""
+    """No sound answer of the hand in time: none came, it was damaged, of another address, or too old."""
 
 
 class HandRefusedError(HandError):
     """A request that the hand answered with its error command."""
-
-
-class StaleReadingError(HandError):
-    """No reading that is both new and recent enough."""
 
 
 class HandClosedError(HandError):

@@ -22,8 +22,6 @@ from tgdsl.runtime.xhand1.wire.errors import ProtocolError
 NUM_JOINTS = 12
 NUM_TAXELS = 120
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
-TIP_JOINTS = (2, 5, 7, 9, 11)
-"""Id of the joint that moves each fingertip."""
 JOINTS = (
     "thumb_bend_joint",
     "thumb_rota_joint1",
@@ -97,11 +95,7 @@ def encode_command(joints: Sequence[JointCommand]) -> bytes:
 
 
 def decode_command(payload: bytes) -> tuple[JointCommand, ...]:
-    """Return the joint commands of an exchange's request.
-
-    Raises:
-        ProtocolError: If it is not 288 bytes long, or the joints are not numbered 0 to 11.
-    """
+    """Return the joint commands of an exchange's request."""
     _expect_size("a command", payload, COMMAND_SIZE)
     joints = []
     for i, (id_, kp, ki, kd, position, current_limit, mode, *_) in enumerate(_JOINT_COMMAND.iter_unpack(payload)):
@@ -184,11 +178,7 @@ def saturated(force: Int[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch 3"
 
 
 def decode_state(payload: bytes) -> HandState:
-    """Return the state that an exchange's reply of 2208 bytes holds, value for value.
-
-    Raises:
-        ProtocolError: If it has another length.
-    """
+    """Return the state that an exchange's reply of 2208 bytes holds, value for value."""
     _expect_size("a state", payload, STATE_SIZE)
     record = np.frombuffer(payload, dtype=_STATE)[0]
     joint, tip = record["joint"], record["tip"]
@@ -209,11 +199,7 @@ def decode_state(payload: bytes) -> HandState:
 
 
 def encode_state(state: HandState) -> bytes:
-    """Return a state's 2208 bytes.
-
-    Raises:
-        ProtocolError: If a force is beyond what its byte holds.
-    """
+    """Return a state's 2208 bytes."""
     record = np.zeros((), dtype=_STATE)
     joint, tip = record["joint"], record["tip"]
     joint["id"], joint["sensor_id"], joint["position"] = state.joint_id, state.sensor_id, state.position
@@ -228,18 +214,8 @@ def encode_state(state: HandState) -> bytes:
     return record.tobytes()
 
 
-def unverified_taxel_cells() -> Int[np.ndarray, "taxel 2"]:
-    """Return row (of 12) and column (of 10) of each taxel as one display program draws them; no source says where they are."""
-    index = np.arange(NUM_TAXELS)
-    return np.stack([11 - index % 12, index // 12], axis=-1)
-
-
 def encode_register_request(number: int) -> bytes:
-    """Return the payload that asks for a register: its number as u16 (*unverified*).
-
-    Raises:
-        ProtocolError: If the number does not fit.
-    """
+    """Return the payload that asks for a register: its number as u16 (*unverified*)."""
     if not 0 <= number <= 0xFFFF:
         raise ProtocolError(f"register {number}: expected 0 to 65535")
     return struct.pack("<H", number)

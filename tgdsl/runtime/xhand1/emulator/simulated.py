@@ -1,0 +1,312 @@
+"""An emulated hand whose body is the scene of a module, in MuJoCo.
+
+Joints go where the set-points say, with the gains and forces of the robot file: a drive's own gain and current only say whether
+it is driven at all. A drive that becomes passive holds where it is, as geared ones do. Taxels feel nothing, for where a real
+hand's are is not known.
+
+Shapes: `joint` and `finger` as in `payloads`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import ObservationError, SimulationError
+from tgdsl.module.memory.history import last_step
+from tgdsl.module.module import TactileModule
+from tgdsl.observations import observations
+from tgdsl.observations.observations import HAND_ONLY
+from tgdsl.plan.plan import Plan
+from tgdsl.plan.sensors import PlannedObservation
+from tgdsl.runtime.source import Control
+from tgdsl.runtime.stepped_scene import SteppedScene
+from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces, is_driven
+from tgdsl.runtime.xhand1.fingertips import HandTerm
+from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
+from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.source import XHand1Source
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
+from tgdsl.runtime.xhand1.wire.errors import WatchdogError
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, NUM_TAXELS, PASSIVE, JointCommand
+
+PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
+"""For an emulator on a busy machine, where bytes are late but not lost: pseudo-terminals then take up to half a second."""
+_POLL_S = 0.001
+_LATE_S = 0.2
+"""Physics that is later than this is not made up for [s]."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a finger's force stands among the features of an observation."""
+
+    term: HandTerm
+    link: int
+
+    def force(self, features: Float[Tensor, " feature"]) -> Float[np.ndarray, " axis"]:
+        by_axis = features.reshape(3, len(self.term.fingers))[:, self.link].double().cpu().numpy()
+        return by_axis[np.argsort(self.term.axes)]
+
+    def operator(self, plan: Plan) -> tuple[str | None, bytes]:
+        """Return the reading and the matrix that the force is made with, to compare."""
+        planned = self.term.planned
+        matrix = plan.arrays[f"observations/{planned.group}/{planned.index}/operator"]
+        columns = matrix.reshape(len(matrix), 3, len(self.term.fingers))[:, np.argsort(self.term.axes), self.link]
+        return planned.reading, np.ascontiguousarray(columns).tobytes()
+
+
+class SimulatedTips:
+    """Forces on the fingertips: the aggregate forces that a module observes in its own scene."""
+
+    def __init__(self, touch: TactileModule, terms: Sequence[HandTerm]):
+        """Find the observation of each fingertip's force.
+
+        Raises:
+            ObservationError: If the emulator cannot give some, as no observation has the force on their fingertips.
+        """
+        self._touch = touch
+        self._places: dict[int, _Place] = {}
+        for term in terms:
+            if term.planned.type in HAND_ONLY:
+                raise ObservationError(f"{term.label}: the emulator cannot give it: where the hand's taxels are is not known")
+            if term.planned.type == "agg_force":
+                for link, finger in enumerate(term.fingers):
+                    self._take(finger, _Place(term, link))
+        for term in terms:
+            missing = [FINGERS[finger] for finger in term.fingers if finger not in self._places]
+            if missing:
+                what = f"{term.label}: the emulator's {', '.join(missing)} would feel nothing"
+                raise ObservationError(f"{what}; give an observation agg_force that says what force its fingertips feel")
+
+    def forces(self, readings: Mapping[str, Tensor]) -> Float[np.ndarray, "finger 3"]:
+        """Return the force on each fingertip, along its link's axes [unit of `agg_force`]; 0 where none is observed."""
+        result = np.zeros((len(FINGERS), 3))
+        features: dict[PlannedObservation, Tensor] = {}
+        for finger, place in self._places.items():
+            planned = place.term.planned
+            if planned not in features:
+                constants = self._touch.constants.tree["observations"][planned.key]
+                reading = last_step(readings[str(planned.reading)])
+                features[planned] = observations.observe(planned.type, reading, planned.channels, constants)[0]
+            result[finger] = place.force(features[planned])
+        return result
+
+    def _take(self, finger: int, place: _Place) -> None:
+        known = self._places.setdefault(finger, place)
+        if known.operator(self._touch.plan) != place.operator(self._touch.plan):
+            what = f"{known.term.label} and {place.term.label} differ, but the hand has one force on its {FINGERS[finger]}"
+            raise ObservationError(f"{what}; give them the same `scale` and sensor")
+
+
+class SimulatedBody:
+    """A hand in a simulation of one environment. It moves when `step` is called; `run` calls it in real time.
+
+    Attributes:
+        time: Time of the simulation, since its start or reset [s].
+        clipped: Fingertips that felt more than their bytes can hold.
+        failure: The error that ended `run`, or None.
+    """
+
+    def __init__(self, scene: SteppedScene, tips: SimulatedTips, calibration: Calibration):
+        self.time = 0.0
+        self.clipped: set[str] = set()
+        self.failure: Exception | None = None
+        self._scene, self._tips, self._calibration = scene, tips, calibration
+        self._controls = JointControls.of_model(scene.sim.model)
+        self._names = [scene.sim.model.joint(int(i)).name for i in joint_ids(scene.sim.model)]
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._joints: Sequence[JointCommand] = PASSIVE
+        self._feel()
+
+    def command(self, time_s: float, joints: Sequence[JointCommand]) -> None:
+        """Take set-points; a drive that is no longer driven holds where it is."""
+        with self._lock:
+            setpoints = self._scene.sim.qpos[0].double().cpu().numpy()[self._controls.qpos_id]
+            changed = [i for i, joint in enumerate(joints) if is_driven(joint) or is_driven(self._joints[i])]
+            for i in changed:
+                if is_driven(joints[i]):
+                    setpoints[i] = joints[i].position
+            self._scene.put(self._controls.actuator_id[changed], setpoints[changed])
+            self._joints = tuple(joints)
+
+    def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
+        """Return angles and counts after the last step."""
+        with self._lock:
+            return self._position.copy(), TipForces(self._counts, np.zeros((len(FINGERS), NUM_TAXELS, 3)))
+
+    def goes_to(self, target: Float[np.ndarray, " joint"]) -> bool:
+        """Return whether the last command sends all joints just there, as far as the wire's floats can say it."""
+        with self._lock:
+            setpoints = [joint.position for joint in self._joints if is_driven(joint)]
+        return len(setpoints) == NUM_JOINTS and np.array_equal(np.array(setpoints, np.float32), target.astype(np.float32))
+
+    def step(self) -> None:
+        """Make one control step.
+
+        Raises:
+            SimulationError: If it diverges.
+        """
+        with self._lock:
+            self._scene.step()
+            self.time += self._scene.control_step
+            self._feel()
+
+    def reset(self) -> None:
+        """Restart the scene."""
+        with self._lock:
+            self._scene.reset()
+            self.time = 0.0
+            self._feel()
+
+    def run(self) -> None:
+        """Step in real time from now on, in a thread of its own, until `close`."""
+        self._thread = threading.Thread(target=self._run, name="xhand1-physics", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and the simulation."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._scene.close()
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        try:
+            while not self._stopping.wait(max(due - time.monotonic(), 0.0)):
+                self.step()
+                due += self._scene.control_step
+                late = time.monotonic() - due
+                if late > _LATE_S:
+                    due += late
+        except Exception as error:  # raised by whoever steps the source
+            self.failure = error
+
+    def _feel(self) -> None:
+        """Take angles and counts of one instant."""
+        self._position = self._scene.positions(self._names)
+        self._counts = self._calibration.counts_of(self._tips.forces(self._scene.readings))
+        rounded = np.round(self._counts)
+        outside = np.asarray(np.any((rounded < FORCE_MIN) | (rounded > FORCE_MAX), axis=1))
+        self.clipped |= {name for name, is_outside in zip(FINGERS, outside, strict=True) if is_outside}
+
+
+class EmulatedSource(XHand1Source):
+    """A hand whose body is simulated, behind a pseudo-terminal and read as a real hand is.
+
+    Attributes:
+        emulator: The device.
+        body: The simulation.
+    """
+
+    def __init__(
+        self,
+        body: SimulatedBody,
+        *,
+        control_step: float,
+        calibration: Calibration,
+        motion: MotionLimits | None = None,
+        timing: SerialTiming | None = None,
+        lockstep: bool = False,
+    ):
+        """Plug the hand in and open it.
+
+        Args:
+            body: The simulation, whose control step is the same.
+            control_step: Duration of one control step [s].
+            calibration: What its counts mean.
+            motion: Leave to move it; default: none.
+            timing: Times of the line; default: `PATIENT`.
+            lockstep: Whether the simulation waits for `step`, and makes one control step then; else it runs in real time.
+
+        Raises:
+            HandError: If the hand does not answer.
+        """
+        self.body, self._is_lockstep, self._has_warned = body, lockstep, False
+        with ExitStack() as opened:
+            opened.callback(body.close)
+            self.emulator = opened.enter_context(Emulator(EmulatedHand(body=body)))
+            hand = opened.enter_context(XHand1.open(self.emulator.device, motion=motion, timing=timing or PATIENT))
+            if not lockstep:
+                body.run()
+            super().__init__(hand, control_step=control_step, calibration=calibration)
+            self._opened = opened.pop_all()
+
+    @property
+    def age_s(self) -> float | None:
+        """How old the sample is at most, now [s]; None in lockstep, where the scene waits."""
+        return None if self._is_lockstep else super().age_s
+
+    def step(self, control: Control = None) -> None:
+        """Step as a hand does.
+
+        Raises:
+            SimulationError: If the simulation ended, as it diverged.
+            HandError: As with a real hand, or if the emulator ended.
+        """
+        try:
+            super().step(control)
+        finally:
+            self._check_threads()
+        if self.body.clipped and not self._has_warned:
+            self._has_warned = True
+            who = ", ".join(sorted(self.body.clipped))
+            what = f"the emulated {who} felt more than counts of -128…127 along x and y and 0…255 along z can say"
+            warnings.warn(f"{what}; see the calibration's scale and rotation", stacklevel=2)
+
+    def close(self) -> None:
+        """Close the hand, pull the plug and end the simulation."""
+        self._opened.close()
+
+    def _restart(self) -> None:
+        """Make the hand passive, then restart the scene."""
+        try:
+            super()._restart()
+            self._read(time.monotonic())  # the hand has answered a passive command
+            self.body.reset()
+            self._velocity.reset()
+            self._sample = self._read(time.monotonic())
+        finally:
+            self._check_threads()
+
+    def _command(self) -> None:
+        try:
+            super()._command()
+        except WatchdogError:
+            if not self._is_lockstep:
+                raise
+            self.hand.resume()  # nothing runs in real time, so a caller who took long is not late
+            super()._command()
+
+    def _wait(self) -> float:
+        """In lockstep, repeat the command until all of it has arrived, then step the scene: the same at every run."""
+        if not self._is_lockstep:
+            return super()._wait()
+        while self._target is not None and not self.body.goes_to(self._target):
+            self._command()
+            time.sleep(_POLL_S)
+        self.body.step()
+        return time.monotonic()
+
+    def _time_of(self, reading: Reading) -> float:
+        return self.body.time if self._is_lockstep else super()._time_of(reading)
+
+    def _check_threads(self) -> None:
+        """Raise the error that ended a thread, in place of what follows from it."""
+        if self.body.failure is not None:
+            raise SimulationError(f"the emulated hand's simulation ended: {self.body.failure}") from self.body.failure
+        self.emulator.check()
