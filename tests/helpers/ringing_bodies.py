@@ -15,16 +15,16 @@ def hollow(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def thin_box(side: float, wall: float) -> trimesh.Trimesh:
     """Return a closed box with a cavity."""
-    return hollow(box(*[side] * 3), box(*[side - 2 * wall] * 3))
+    return hollow(box([side] * 3), box([side - 2 * wall] * 3))
 
 
 def slabs(side: float, wall: float, lid: bool = True) -> list[trimesh.Trimesh]:
     """Return the walls of a box, which touch and do not overlap."""
     far, inner = (side - wall) / 2, side - 2 * wall
-    found = [box(side, side, wall, at=(0, 0, -far)), box(side, side, wall, at=(0, 0, far))]
+    found = [box((side, side, wall), at=(0, 0, -far)), box((side, side, wall), at=(0, 0, far))]
     found = found if lid else found[:1]
-    found += [box(side, wall, inner, at=(0, sign * far, 0)) for sign in (-1, 1)]
-    return found + [box(wall, inner, inner, at=(sign * far, 0, 0)) for sign in (-1, 1)]
+    found += [box((side, wall, inner), at=(0, sign * far, 0)) for sign in (-1, 1)]
+    return found + [box((wall, inner, inner), at=(sign * far, 0, 0)) for sign in (-1, 1)]
 
 
 def turned(mesh: trimesh.Trimesh, vector: tuple[float, float, float], shift: tuple[float, float, float]) -> trimesh.Trimesh:

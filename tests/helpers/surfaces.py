@@ -21,25 +21,6 @@ def placement(method: str, **keys: object) -> Placement:
     return TypeAdapter(Placement).validate_python({key: value for key, value in keys.items() if value is not None})
 
 
-def surface_of(*meshes: trimesh.Trimesh) -> Surface:
-    parts = [
-        Surface(np.array(mesh.vertices), np.array(mesh.faces), np.zeros(len(mesh.faces), int), ((f"g{i}", f"mesh{i}"),))
-        for i, mesh in enumerate(meshes)
-    ]
-    return Surface.joined(parts)
-
-
-def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0), cuts: int = 0) -> trimesh.Trimesh:
-    mesh = trimesh.creation.box(size)
-    for _ in range(cuts):
-        mesh = mesh.subdivide()
-    return mesh.apply_translation(at)
-
-
-def ball(radius: float, at: tuple[float, float, float] = (0, 0, 0), subdivisions: int = 4) -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius).apply_translation(at)
-
-
 def plate(normal: np.ndarray, size: float = 0.02) -> trimesh.Trimesh:
     """An open square whose edges run along y and across."""
     across = np.cross([0.0, 1.0, 0.0], normal)

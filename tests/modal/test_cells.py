@@ -33,13 +33,13 @@ def integral(found: cells.Filled, function) -> float:
 
 def test_a_box_is_exact_in_every_moment():
     """Up to degree four along each axis; cells end where it ends."""
-    found, on = cut(surface_of(box(2.0, 1.0, 0.5)), 0.3)
+    found, on = cut(surface_of(box((2.0, 1.0, 0.5))), 0.3)
     assert (found.weight > 0).all()
     for powers in [(0, 0, 0), (2, 0, 0), (0, 4, 2), (4, 4, 4), (3, 0, 0)]:
         wanted = np.prod(
             [0 if p % 2 else 2 * (side / 2) ** (p + 1) / (p + 1) for side, p in zip((2.0, 1.0, 0.5), powers, strict=True)]
         )
-        axes = grid.axes(*closed(surface_of(box(2.0, 1.0, 0.5))))
+        axes = grid.axes(*closed(surface_of(box((2.0, 1.0, 0.5)))))
         mine = np.abs(axes).argmax(axis=0)  # which of the grid's axes is the body's x, y, z
         got = integral(found, lambda at, p=powers, m=mine: np.prod([at[..., m[i]] ** p[i] for i in range(3)], axis=0))
         assert got == pytest.approx(wanted, abs=1e-12)
@@ -47,7 +47,7 @@ def test_a_box_is_exact_in_every_moment():
 
 
 def test_a_ball_that_is_cut_by_its_cells():
-    mesh = ball(1.0, 5)
+    mesh = ball(1.0, subdivisions=5)
     found, on = cut(surface_of(mesh), 0.45)
     assert found.volume.sum() == pytest.approx(mesh.volume, rel=1e-3)
     second = integral(found, lambda at: (at**2).sum(axis=-1))
@@ -73,7 +73,7 @@ def test_geoms_that_overlap_or_touch_are_one_solid():
     found, on = cut(surface_of(*slabs(0.1, 0.002)), 0.02)
     assert found.volume.sum() == pytest.approx(wanted_volume, rel=1e-9)
     assert on.area.sum() == pytest.approx(wanted_area, rel=1e-9)
-    crossing = surface_of(box(0.1, 0.02, 0.02), box(0.02, 0.1, 0.02), box(0.02, 0.02, 0.1))
+    crossing = surface_of(box((0.1, 0.02, 0.02)), box((0.02, 0.1, 0.02)), box((0.02, 0.02, 0.1)))
     found, on = cut(crossing, 0.01)
     arms = 3 * 0.1 * 0.02**2 - 2 * 0.02**3
     assert found.volume.sum() == pytest.approx(arms, rel=1e-9)
@@ -81,11 +81,11 @@ def test_geoms_that_overlap_or_touch_are_one_solid():
 
 
 def test_a_screw_in_its_hole_is_part_of_the_body():
-    inside = trimesh.util.concatenate([box(0.1, 0.1, 0.1), box(0.05, 0.05, 0.05)])
+    inside = trimesh.util.concatenate([box((0.1, 0.1, 0.1)), box((0.05, 0.05, 0.05))])
     found, on = cut(surface_of(inside), 0.03)
     assert found.volume.sum() == pytest.approx(1e-3, rel=1e-9)
     assert on.area.sum() == pytest.approx(0.06, rel=1e-9)
-    found, _ = cut(surface_of(hollow(box(0.1, 0.1, 0.1), box(0.05, 0.05, 0.05))), 0.03)
+    found, _ = cut(surface_of(hollow(box((0.1, 0.1, 0.1)), box((0.05, 0.05, 0.05)))), 0.03)
     assert found.volume.sum() == pytest.approx(1e-3 - 0.05**3, rel=1e-9)
 
 
@@ -104,7 +104,7 @@ def test_edges_where_lines_of_sight_are(sections, cell):
 def test_axes_follow_the_flat_faces():
     """Of a box that is turned, its own; of a rod with round ends its length; of a ball the frame's."""
     vector = (0.3, 0.8, -0.4)
-    mesh = turned(box(0.3, 0.2, 0.1), vector, (1.0, 2.0, 3.0))
+    mesh = turned(box((0.3, 0.2, 0.1)), vector, (1.0, 2.0, 3.0))
     found = grid.axes(*closed(surface_of(mesh)))
     own = turned(trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False), vector, (0.0, 0.0, 0.0)).vertices
     assert np.abs(found @ own.T).max(axis=1) == pytest.approx(np.ones(3))

@@ -23,13 +23,13 @@ def changed(mesh: trimesh.Trimesh, vertices=None, faces=None) -> Surface:
 
 
 def test_what_needs_no_repair():
-    assert volume(surface_of(box(0.1, 0.1, 0.1))) == pytest.approx(CUBE)
+    assert volume(surface_of(box((0.1, 0.1, 0.1)))) == pytest.approx(CUBE)
     assert volume(surface_of(thin_box(0.1, 0.002))) == pytest.approx(CUBE - 0.096**3)
 
 
 def test_triangles_of_their_own_corners_are_joined():
     """As a file of STL has them, and a little apart."""
-    mesh = box(0.1, 0.1, 0.1)
+    mesh = box((0.1, 0.1, 0.1))
     noise = 1e-10 * np.random.default_rng(0).standard_normal((36, 3))
     apart = mesh.vertices[mesh.faces].reshape(-1, 3) + noise
     vertices, faces = closed(changed(mesh, apart, np.arange(36).reshape(-1, 3)))
@@ -43,20 +43,20 @@ def test_a_mesh_that_is_inside_out_is_turned_and_keeps_its_cavity():
 
 
 def test_neighbours_that_disagree_are_turned_as_most_of_the_area_is():
-    mesh = ball(0.05, 2)
+    mesh = ball(0.05, subdivisions=2)
     faces = mesh.faces.copy()
     faces[:40] = faces[:40, ::-1]
     assert volume(changed(mesh, faces=faces)) == pytest.approx(mesh.volume)
 
 
 def test_repeated_and_flat_triangles_are_dropped():
-    mesh = box(0.1, 0.1, 0.1)
+    mesh = box((0.1, 0.1, 0.1))
     faces = np.concatenate([mesh.faces, np.roll(mesh.faces[3:5], 1, axis=1), [[0, 0, 1]]])
     assert volume(changed(mesh, faces=faces)) == pytest.approx(CUBE)
 
 
 def test_a_small_hole_is_closed():
-    mesh = ball(0.05, 3)
+    mesh = ball(0.05, subdivisions=3)
     found = volume(changed(mesh, faces=mesh.faces[1:]))
     assert found == pytest.approx(mesh.volume, rel=1e-4)
 
@@ -65,16 +65,16 @@ def test_a_small_hole_is_closed():
     ("surface", "message"),
     [
         (
-            changed(box(0.1, 0.1, 0.1), faces=box(0.1, 0.1, 0.1).faces[:-2]),
-            r'"part0" is open: 400 mm of edges without a second',
+            changed(box((0.1, 0.1, 0.1)), faces=box((0.1, 0.1, 0.1)).faces[:-2]),
+            r'"g0" is open: 400 mm of edges without a second',
         ),
-        (surface_of(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])), r'"part0" is open: '),
+        (surface_of(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])), r'"g0" is open: '),
         (
-            changed(box(1, 1, 1), box(1, 1, 1).vertices * [1, 1, 0]),
-            r'"part0" encloses no volume; a thin wall needs both of its sides',
+            changed(box((1, 1, 1)), box((1, 1, 1)).vertices * [1, 1, 0]),
+            r'"g0" encloses no volume; a thin wall needs both of its sides',
         ),
-        (changed(box(1, 1, 1), np.full((8, 3), np.nan)), r'"part0" has a vertex that is no number'),
-        (changed(box(1, 1, 1), faces=np.array([[0, 0, 1]])), r'"part0" has no triangle with an area'),
+        (changed(box((1, 1, 1)), np.full((8, 3), np.nan)), r'"g0" has a vertex that is no number'),
+        (changed(box((1, 1, 1)), faces=np.array([[0, 0, 1]])), r'"g0" has no triangle with an area'),
         (Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0, np.int64), ()), "there are no triangles"),
     ],
     ids=["no lid", "sheet", "flat", "not a number", "no area", "nothing"],
@@ -87,6 +87,6 @@ def test_what_has_no_inside(surface, message):
 
 def test_a_shell_wound_like_the_outer_one_is_no_cavity():
     """A screw in its hole is part of the body: only what is wound the other way round is a cavity."""
-    inside = trimesh.util.concatenate([box(0.1, 0.1, 0.1), box(0.096, 0.096, 0.096)])
+    inside = trimesh.util.concatenate([box((0.1, 0.1, 0.1)), box((0.096, 0.096, 0.096))])
     assert volume(surface_of(inside)) == pytest.approx(CUBE + 0.096**3), "counted as often as it is wound around"
-    assert volume(surface_of(hollow(box(0.1, 0.1, 0.1), box(0.096, 0.096, 0.096)))) == pytest.approx(CUBE - 0.096**3)
+    assert volume(surface_of(hollow(box((0.1, 0.1, 0.1)), box((0.096, 0.096, 0.096))))) == pytest.approx(CUBE - 0.096**3)

@@ -61,9 +61,9 @@ def test_a_thin_square_plate():
 
 def test_a_body_that_is_turned_and_moved():
     """Frequencies do not depend on where a body is in its frame, nor on how it is turned."""
-    found, _, _ = spectrum(surface_of(box(0.05, 0.03, 0.02)), 0.3, 6, 4000)
-    moved, _, middle = spectrum(surface_of(turned(box(0.05, 0.03, 0.02), (0.3, 0.8, -0.4), (0.1, 0.2, 3.0))), 0.3, 6, 4000)
-    size = np.ptp(turned(box(0.05, 0.03, 0.02), (0.3, 0.8, -0.4), (0, 0, 0)).vertices, axis=0).max()
+    found, _, _ = spectrum(surface_of(box((0.05, 0.03, 0.02))), 0.3, 6, 4000)
+    moved, _, middle = spectrum(surface_of(turned(box((0.05, 0.03, 0.02)), (0.3, 0.8, -0.4), (0.1, 0.2, 3.0))), 0.3, 6, 4000)
+    size = np.ptp(turned(box((0.05, 0.03, 0.02)), (0.3, 0.8, -0.4), (0, 0, 0)).vertices, axis=0).max()
     assert moved.wave_number / size == pytest.approx(found.wave_number / 0.05, rel=1e-6)
     assert moved.gain == pytest.approx(found.gain, rel=1e-5)
     assert middle == pytest.approx([0.1, 0.2, 3.0])

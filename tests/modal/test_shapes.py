@@ -54,7 +54,7 @@ def test_the_first_node_of_a_beam_is_where_the_textbook_has_it():
 
 def test_the_other_side_is_struck_from_the_other_side():
     """Through a thin plate, displacement is that of both of its sides: shares differ by their sign alone."""
-    found = modes(box(SIDE, SIDE, THICKNESS), 6)
+    found = modes(box((SIDE, SIDE, THICKNESS)), 6)
     top = share(found, (0.03, 0.05, THICKNESS / 2), along=-UP)
     bottom = share(found, (0.03, 0.05, -THICKNESS / 2), along=UP)
     assert np.abs(top).max() > 0.5
@@ -66,13 +66,13 @@ def test_the_other_side_is_struck_from_the_other_side():
 def test_the_centre_of_a_square_plate_excites_even_modes_alone(monkeypatch):
     """Of the first four: xy, x² − y² and a pair have a node there; x² + y² has not."""
     monkeypatch.setattr(spectra, "UNKNOWNS", 4000)
-    found = modes(box(SIDE, SIDE, THICKNESS), 6)
+    found = modes(box((SIDE, SIDE, THICKNESS)), 6)
     assert abs(share(found, (0.0, 0.0, THICKNESS / 2))[0, 2]) > 0.7
 
 
 def test_points_that_symmetry_makes_equal_are_struck_alike():
     """The four quadrants of a square plate, and the diagonal's mirror, for pairs of modes too."""
-    found = modes(box(SIDE, SIDE, THICKNESS), 6)
+    found = modes(box((SIDE, SIDE, THICKNESS)), 6)
     x, y, z = 0.031, 0.072, THICKNESS / 2
     got = np.abs(share(found, *[(a, b, z) for p, q in ((x, y), (y, x)) for a in (p, -p) for b in (q, -q)]))
     assert got == pytest.approx(np.broadcast_to(got[0], got.shape), abs=0.01)
@@ -80,7 +80,7 @@ def test_points_that_symmetry_makes_equal_are_struck_alike():
 
 
 @pytest.mark.parametrize(
-    "mesh", [box(LENGTH, WIDTH, HEIGHT), box(SIDE, SIDE, THICKNESS), ball(0.05)], ids=["beam", "plate", "ball"]
+    "mesh", [box((LENGTH, WIDTH, HEIGHT)), box((SIDE, SIDE, THICKNESS)), ball(0.05)], ids=["beam", "plate", "ball"]
 )
 def test_interpolation_is_as_exact_as_is_said(mesh):
     """Against the elements' own displacement along the surface's normal, at the points that `at` has."""
@@ -94,7 +94,7 @@ def test_interpolation_is_as_exact_as_is_said(mesh):
 
 def test_shares_are_one_in_the_mean_over_the_surface():
     """The energy of an impulse somewhere on the surface is that of the mean gain."""
-    found, mesh = modes(box(SIDE, SIDE, THICKNESS), 6), box(SIDE, SIDE, THICKNESS)
+    found, mesh = modes(box((SIDE, SIDE, THICKNESS)), 6), box((SIDE, SIDE, THICKNESS))
     rng = np.random.default_rng(0)
     corners = rng.dirichlet(np.ones(3), 4000)
     which = rng.choice(len(mesh.faces), 4000, p=mesh.area_faces / mesh.area)
@@ -105,8 +105,8 @@ def test_shares_are_one_in_the_mean_over_the_surface():
 
 def test_a_body_that_is_moved_and_scaled():
     """Places are in the body's frame, in metres: points that correspond are struck alike."""
-    first = modes(box(LENGTH, WIDTH, HEIGHT), 6)
-    moved = modes(box(2 * LENGTH, 2 * WIDTH, 2 * HEIGHT, at=(0.1, -0.2, 0.5)), 6)
+    first = modes(box((LENGTH, WIDTH, HEIGHT)), 6)
+    moved = modes(box((2 * LENGTH, 2 * WIDTH, 2 * HEIGHT), at=(0.1, -0.2, 0.5)), 6)
     at = np.array([0.07, 0.002, 0.003])
     other = 2 * at + np.array([0.1, -0.2, 0.5])
     assert share(moved, tuple(other)) == pytest.approx(share(first, tuple(at)), abs=1e-5)

@@ -135,7 +135,7 @@ def oracle(
     `name`, `equation` (of the exact value), `source` and labels may contain the function's arguments in braces, as
     `str.format` has them; in float32 the name says so. `quantity` and `over`, the abscissa, end in their unit in brackets;
     without a unit, `at` are labels. An error may be `atol + rtol·|exact|`; `of_peak` is `atol` over the largest exact value.
-    `series` names curves, `defects` the findings of `tgdsl.report.defects` that it answers. `each` are arguments of the rows
+    `series` names curves, `defects` the findings of `oracles.defects` that it answers. `each` are arguments of the rows
     of the report, tuples or single ones, `also` those of more tests; `slow` those whose tests are slow, or all (True).
     """
     quantity, unit = _with_unit(quantity)

@@ -30,7 +30,7 @@ oracle = field("sound: modes of bodies", "contact_audio")
 def slender_beam(length: float = 0.5, height: float = 0.0125, width: float = 0.008):
     beta = roots(lambda b: np.cos(b) - 1 / np.cosh(b), 3.5, 12.0)
     exact = np.sort([b**2 * side / np.sqrt(12) / length for b in beta for side in (height, width)])[:5]
-    modes, size, _ = spectrum(surface_of(box(length, height, width)), 0.3, 12, 4000)
+    modes, size, _ = spectrum(surface_of(box((length, height, width))), 0.3, 12, 4000)
     is_each = size == length and modes.multiplicity[:5].tolist() == [1] * 5
     return exact, modes.wave_number[:5] if is_each else np.nan
 
@@ -40,7 +40,7 @@ def slender_beam(length: float = 0.5, height: float = 0.0125, width: float = 0.0
     "Timoshenko, with Cowper's shear coefficient (1966)", "wave number [1]", "mode", at=range(1, 4), rtol=0.01,
 )  # fmt: skip
 def thick_beam(height: float = 0.125):
-    modes, _, _ = spectrum(surface_of(box(1.0, height, height)), 0.3, 8, 4000)
+    modes, _, _ = spectrum(surface_of(box((1.0, height, height))), 0.3, 8, 4000)
     return timoshenko(1.0, height, height, 0.3, 5.0)[:3], modes.wave_number[modes.multiplicity == 2][:3]
 
 
@@ -49,7 +49,7 @@ def thick_beam(height: float = 0.125):
     at=["1", "2"], rtol=0.003,
 )  # fmt: skip
 def rod():
-    modes, _, _ = spectrum(surface_of(box(0.02, 0.8, 0.02)), 0.3, 24, 5000)
+    modes, _, _ = spectrum(surface_of(box((0.02, 0.8, 0.02))), 0.3, 24, 5000)
     exact = np.pi * np.array([1.0, 2.0])
     return exact, [modes.wave_number[np.abs(modes.wave_number - k).argmin()] for k in exact]
 
@@ -86,7 +86,7 @@ def modes_of_a_ball(poissons_ratio: float):
     at=range(1, 6), rtol=0.01,
 )  # fmt: skip
 def square_plate():
-    modes, _, _ = spectrum(surface_of(box(0.2, 0.2, 0.004)), 0.3, 6, 6000)
+    modes, _, _ = spectrum(surface_of(box((0.2, 0.2, 0.004))), 0.3, 6, 6000)
     return plate_frequencies(0.3)[:5], (np.repeat(modes.wave_number, modes.multiplicity) * np.sqrt(12 * (1 - 0.09)) / 0.02)[:5]
 
 
@@ -107,7 +107,7 @@ def scaled(sides: tuple[float, ...] = (0.06, 0.05, 0.04)):
     other = replace(steel, youngs_modulus=3e9, density=1100.0, mass_damping=7.0, stiffness_damping=2e-7)
     speed = np.sqrt(3e9 / 1100.0 / (steel.youngs_modulus / steel.density))
     base, *ours = (
-        analysed("block", surface_of(box(*(scale * side for side in sides))), made_of(material, 8), 1e9).frequency
+        analysed("block", surface_of(box((*(scale * side for side in sides),))), made_of(material, 8), 1e9).frequency
         for material, scale in ((steel, 1.0), *((other, scale) for scale in SCALES))
     )
     return [base * speed / scale for scale in SCALES], ours
@@ -125,7 +125,7 @@ def struck_along_a_beam(number: int, length: float = 0.4, height: float = 0.006,
     node = max(roots(lambda at: bending(at, number), 0.1, 0.49))
     x = np.sort([*np.linspace(-0.5, 0.5, 21), node])
     exact = bending(x, number) / 2
-    shapes = analysed("beam", surface_of(box(length, width, height)), made_of(MATERIALS["steel"], 4), 1e9).shapes
+    shapes = analysed("beam", surface_of(box((length, width, height))), made_of(MATERIALS["steel"], 4), 1e9).shapes
     share = shapes.share(np.stack([length * x, 0 * x, 0 * x + height / 2], axis=1), np.tile(UP, (len(x), 1)))
     ours = share[:, int(np.argmax(np.abs(share.T @ exact)))]
     return Values(exact, ours / ours[-1], at=x, words={"mode": number + 1})
@@ -137,5 +137,5 @@ def struck_along_a_beam(number: int, length: float = 0.4, height: float = 0.006,
     "gain at the contact, over the mean [1]", at=["xy", "x² − y²", "the pair"], atol=5e-3, slow=True,
 )  # fmt: skip
 def struck_at_the_centre(side: float = 0.2, thickness: float = 0.004):
-    shapes = analysed("plate", surface_of(box(side, side, thickness)), made_of(MATERIALS["steel"], 6), 1e9).shapes
+    shapes = analysed("plate", surface_of(box((side, side, thickness))), made_of(MATERIALS["steel"], 6), 1e9).shapes
     return 0.0, np.abs(shapes.share(np.array([[0.0, 0.0, thickness / 2]]), UP[None])[0])[[0, 1, 3]]

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 
 from oracles.comparison import CASES, Case, Comparison
 from oracles.hard.case import HARD, HardCase
+from oracles.sheet import Entry, Section, Sheet
 from tgdsl.errors import TgdslError
-from tgdsl.report.sheet import Entry, Section, Sheet
 from tgdsl.view.style import FAINT, INK
 
 for module in (

@@ -5,9 +5,9 @@ import pytest
 
 from oracles import report
 from oracles.comparison import CASES, Comparison, Values, oracle
+from oracles.defects import DEFECTS
 from oracles.hard.case import HARD, Allowed, HardCase
 from tgdsl.errors import TgdslError
-from tgdsl.report.defects import DEFECTS
 from tgdsl.sensors import KINDS
 
 ALL = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.is_slow else []) for case in CASES]

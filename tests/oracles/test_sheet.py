@@ -8,9 +8,9 @@ import numpy as np
 
 from oracles import report
 from oracles.comparison import CASES
+from oracles.defects import DEFECTS
 from oracles.hard.case import Allowed, HardCase
-from tgdsl.report.defects import DEFECTS, answers
-from tgdsl.report.sheet import sheet_page, sheet_text, write_sheet
+from oracles.sheet import Entry, findings, sheet_page, sheet_text, write_sheet
 
 
 def sheet():
@@ -49,4 +49,9 @@ def test_the_text_says_what_does_not_hold():
 
 
 def test_the_first_entry_answers_a_finding():
-    assert answers([("a", "1", (3,)), ("b", "2", (3, 4))]) == {3: ("a", "1"), 4: ("b", "2")}
+    entries = [
+        Entry(title, (), {}, (), lambda _: None, True, numbers, title * 2) for title, numbers in (("a", (3,)), ("b", (3, 4)))
+    ]
+    answered = {defect.number: (title, figure) for defect, title, figure in findings(entries)}
+    assert list(answered) == [defect.number for defect in DEFECTS]
+    assert answered[3] == ("a", "aa") and answered[4] == ("b", "bb") and answered[1] == ("", "")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from surfaces import ball, box, plate, surface_of
+from oracles.setups.solids import ball, box, surface_of
+from surfaces import plate
 
 from tgdsl.files import cache as where
 from tgdsl.geometry.grid import one_grid

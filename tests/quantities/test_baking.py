@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
-from surfaces import box, surface_of
+from oracles.setups.solids import box, surface_of
 
 from tgdsl.quantities.bake import geom_distance
 from tgdsl.surfaces.geom import Geom, SurfaceGeom

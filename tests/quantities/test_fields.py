@@ -17,7 +17,7 @@ from oracles.proximity import (
     sphere_moments,
     sums,
 )  # fmt: skip
-from surfaces import box, surface_of
+from oracles.setups.solids import box, surface_of
 
 from tgdsl.errors import BakeError
 from tgdsl.geometry.planes import split

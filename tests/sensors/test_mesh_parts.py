@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from surfaces import ball, box
+from oracles.setups.solids import ball, box
 
 import tgdsl
 from tgdsl.module.state import SceneState

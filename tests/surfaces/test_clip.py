@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from oracles.setups.solids import ball, box, surface_of
 from pydantic import TypeAdapter
-from surfaces import ball, box, surface_of
 
 from tgdsl.errors import SampleError
 from tgdsl.fields.regions import Region

@@ -4,8 +4,9 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+from oracles.setups.solids import ball, box
 from scipy.spatial.transform import Rotation
-from surfaces import ball, box, plate
+from surfaces import plate
 
 from tgdsl.errors import BakeError
 from tgdsl.surfaces import crossings

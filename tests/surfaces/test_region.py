@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from surfaces import HERE, ball, box, error_of, placement, surface_of
+from oracles.setups.solids import ball, box, surface_of
+from surfaces import HERE, error_of, placement
 
 from tgdsl.placement.sample.sample import sample
 

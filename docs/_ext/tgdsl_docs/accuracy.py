@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +11,6 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from tgdsl.commands.report.sheets import tests_of_clone
-from tgdsl.report.defects import DEFECTS, answers
 from tgdsl_docs.tables import inline, table
 
 HEADER = ("comparison", "quantity", "largest exact", "error", "of what is allowed", "error of the paper's", "source")
@@ -58,11 +58,10 @@ class Accuracy:
         for field, comparisons in self.fields.items():
             parts.append(f"## {field[0].upper()}{field[1:]}\n\n{_table(comparisons)}")
         entries = [report.entry_of(own) for comparisons in self.fields.values() for own in comparisons]
-        first = answers((entry.title, entry.figure, entry.defects) for entry in entries)
-        rows = []
-        for defect in DEFECTS:
-            by, figure = first.get(defect.number, (f"`tgdsl bench --{defect.answered_in}`", ""))
-            rows.append((str(defect.number), inline(defect.about), defect.measured, inline(by), figure))
+        rows = [
+            (str(d.number), inline(d.about), d.measured, inline(title or f"`tgdsl bench --{d.answered_in}`"), figure)
+            for d, title, figure in importlib.import_module("oracles.sheet").findings(entries)
+        ]
         about = (
             "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
         )

@@ -1,6 +1,6 @@
-"""Solids that ring, as triangles, and closed forms of their modes, in units of their size, with E = 1 and ρ = 1."""
+"""Solids as triangles, and closed forms of their modes of vibration, in units of their size, with E = 1 and ρ = 1."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import trimesh
@@ -11,22 +11,25 @@ from tgdsl.surfaces.surface import Surface
 
 
 def surface_of(*meshes: trimesh.Trimesh) -> Surface:
-    """Return the triangles of meshes, each a geom."""
-    parts = []
-    for i, mesh in enumerate(meshes):
-        faces = np.asarray(mesh.faces, np.int64)
-        parts.append(Surface(np.asarray(mesh.vertices, float), faces, np.zeros(len(faces), np.int64), ((f"part{i}",),)))
+    """Return the triangles of meshes, each a geom `g0`, `g1`, … of a mesh `mesh0` and so on."""
+    parts = [
+        Surface(np.array(mesh.vertices), np.array(mesh.faces), np.zeros(len(mesh.faces), int), ((f"g{i}", f"mesh{i}"),))
+        for i, mesh in enumerate(meshes)
+    ]
     return Surface.joined(parts)
 
 
-def box(*sides: float | int, at: tuple[float | int, ...] = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
-    """Return a box by its full sides [m]."""
-    return trimesh.creation.box(sides).apply_translation(at)
+def box(size: Sequence[float], at: Sequence[float] = (0, 0, 0), cuts: int = 0) -> trimesh.Trimesh:
+    """Return a box by its full sides [m], its faces subdivided."""
+    mesh = trimesh.creation.box(size)
+    for _ in range(cuts):
+        mesh = mesh.subdivide()
+    return mesh.apply_translation(at)
 
 
-def ball(radius: float, subdivisions: int = 4) -> trimesh.Trimesh:
+def ball(radius: float, at: Sequence[float] = (0, 0, 0), subdivisions: int = 4) -> trimesh.Trimesh:
     """Return a ball."""
-    return trimesh.creation.icosphere(subdivisions, radius=radius)
+    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius).apply_translation(at)
 
 
 def lamb(degree: int, poissons_ratio: float, below: float) -> list[float]:

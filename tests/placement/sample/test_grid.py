@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
-from surfaces import DOWN, HERE, ball, box, error_of, placement, plate, surface_of
+from oracles.setups.solids import ball, box, surface_of
+from surfaces import DOWN, HERE, error_of, placement, plate
 
 from tgdsl.placement.sample.sample import sample
 

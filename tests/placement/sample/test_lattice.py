@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from oracles.setups.solids import ball, box
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from surfaces import ball, box, plate
+from surfaces import plate
 
 from tgdsl.placement.sample import lattice
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from surfaces import HERE, ball, error_of, placement, surface_of
+from oracles.setups.solids import ball, surface_of
+from surfaces import HERE, error_of, placement
 
 from tgdsl.errors import SampleError
 from tgdsl.placement.sample.sample import sample

@@ -5,8 +5,9 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from oracles.setups.solids import ball, box, surface_of
 from scipy.spatial import KDTree
-from surfaces import DOWN, HERE, ball, box, error_of, placement, surface_of
+from surfaces import DOWN, HERE, error_of, placement
 
 from tgdsl.placement.sample import poisson
 from tgdsl.placement.sample.sample import sample

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from surfaces import HERE, ball, box, placement, shaken, surface_of
+from oracles.setups.solids import ball, box, surface_of
+from surfaces import HERE, placement, shaken
 
 from tgdsl.formats.robot import export_model, load_model
 from tgdsl.placement.sample.sample import Samples, sample

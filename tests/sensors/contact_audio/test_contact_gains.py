@@ -54,7 +54,7 @@ def struck(touch: TactileModule, places: np.ndarray, force: float = FORCE) -> np
 def wanted(touch: TactileModule, places: np.ndarray) -> np.ndarray:
     """Return the phasors that modal analysis gives: J s e^((−d + 2πif) Δt), as (env, 1, part, mode)."""
     given = ShapeModes.model_construct(material=MATERIALS["steel"], count=4)
-    shapes = analysed("plate", surface_of(box(0.2, 0.2, 0.01)), given, 0.45 * 32 / STEP).shapes
+    shapes = analysed("plate", surface_of(box((0.2, 0.2, 0.01))), given, 0.45 * 32 / STEP).shapes
     constants = touch.plan.sensors[0].constants
     rate = -constants["decay"][:1] + 2j * np.pi * constants["frequency"][:1]
     found = FORCE * STEP * shapes.share(places, np.tile(ALONG, (len(places), 1))) * np.exp(rate * STEP)

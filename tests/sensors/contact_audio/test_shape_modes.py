@@ -66,7 +66,7 @@ def test_materials_are_told_apart_by_pitch_and_decay(tmp_path):
 
 
 def test_a_mesh_without_an_inside_is_a_mistake_of_the_document(tmp_path):
-    mesh = box(SIDE, SIDE, SIDE)
+    mesh = box((SIDE, SIDE, SIDE))
     mesh.update_faces(np.arange(12) > 1)
     found = document(tmp_path, mesh, modes="steel")
     text = (tmp_path / "plate.xml").read_text().replace('inertia="exact"', 'inertia="shell"')

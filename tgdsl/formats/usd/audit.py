@@ -7,7 +7,7 @@ model of physics (looks, display, subdivision, bookkeeping) is listed in the tab
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from tgdsl.formats.usd.stage import Prim, Stage
@@ -82,19 +82,13 @@ DRAWN_TYPES = ("Shader", "NodeGraph", "GeomSubset", "Camera", "Skel", "Render", 
 """What types begin with that are only drawn: their properties are not looked at."""
 
 
-def note_unread(stage: Stage, owners: Mapping[str, str | None]) -> None:
-    """Record what was authored and not read, for the warnings when the stage is closed. Nothing may be read after this.
-
-    Args:
-        stage: The stage.
-        owners: For the path of each prim, that of the rigid body which it moves with; None is the world, whose parts have no
-            mass.
-    """
+def note_unread(stage: Stage) -> None:
+    """Record what was authored and not read, for the warnings when the stage is closed. Nothing may be read after this."""
     for prim in stage.prims:
         kind = str(prim.GetTypeName())
         if kind.startswith(DRAWN_TYPES) or kind.endswith("Light") or _is_off(stage, prim):
             continue
-        if owners[str(prim.GetPath())] is None:
+        if stage.owners[str(prim.GetPath())] is None:  # the world's parts have no mass
             stage.note(prim, *MASS)
         if kind not in KNOWN_TYPES:
             stage.drop(f"prims of type {kind} were dropped", prim)

@@ -15,32 +15,27 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from itertools import combinations
 
+from tgdsl.formats.usd.attributes import SELF_COLLISION, read_attributes
 from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import Joint
-from tgdsl.formats.usd.mjc.attributes import Source, read_attributes
 from tgdsl.formats.usd.stage import Prim, Stage
 
 Pair = frozenset[str | None]
 """Paths of two bodies; None is the world."""
-SELF_COLLISION = {"self": (Source("newton:selfCollisionEnabled"), Source("physxArticulation:enabledSelfCollisions"))}
 
 
-def exclusions(
-    stage: Stage, bodies: Iterable[str], joints: Iterable[Joint], geoms: Iterable[Gprim], welded: Iterable[Pair] = ()
-) -> list[Pair]:
+def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], welded: Iterable[Pair] = ()) -> list[Pair]:
     """Return the pairs of bodies that must not collide, sorted.
 
     MuJoCo tells bodies apart, not their colliders: what only holds for some colliders of a body is dropped, with a warning.
 
     Args:
         stage: The stage.
-        bodies: Paths of all bodies.
         joints: All joints.
         geoms: All geoms.
         welded: Pairs that MuJoCo's own filter would keep apart, where it is off only because some joints' bodies collide.
     """
-    bodies, joints = list(bodies), list(joints)
-    colliders: dict[str | None, list[str]] = {body: [] for body in bodies}
+    colliders: dict[str | None, list[str]] = {body: [] for body in stage.bodies}
     prims: dict[str, Prim] = {}
     for geom in geoms:
         if geom.is_collider:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.formats.usd.custom_attributes import SITE, read_custom, read_mjcf_attributes, text_of
-from tgdsl.formats.usd.mjc.attributes import ASSET, COLLIDER, FRICTION, GROUP, read_attributes
-from tgdsl.formats.usd.mjc.solids import MASS_MODELS
+from tgdsl.formats.usd.attributes import FRICTION, GEOM, GROUP, MESH, SITE, read_attributes, read_custom, text_of
 from tgdsl.formats.usd.shapes import SCHEMAS, Shape, collision_shape, shape_of
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
+MASS_MODELS = ("legacy", "convex", "exact", "shell")
+"""Ways in which MuJoCo takes the mass of a mesh; `shell` is there for all shapes."""
 MASKS = ("tgdsl:contype", "tgdsl:conaffinity")
 FRICTIONS = ("dynamicFriction", "staticFriction")
 """Coefficients of a physics material, the one that MuJoCo gets first."""
@@ -30,13 +29,13 @@ class Gprim:
         shape: What it is, in the body's frame.
         is_collider: Whether it collides.
         is_visible: Whether it is drawn by default.
+        color: Red, green, blue, alpha, or None.
+        mesh: Attributes of its MJCF mesh, its name among them.
         is_hull: Whether a mesh was meant to be its convex hull.
         friction: Coefficients of sliding, torsional [m] and rolling [m] friction, each None if its material does not say.
         density: Density of its material [kg/m³], or 0.
-        color: Red, green, blue, alpha, or None.
         mass_model: How MuJoCo takes its mass and inertia, or empty: as UsdPhysics does.
-        mjcf_attributes: More attributes of the MJCF geom, if it collides.
-        mesh: Attributes of its MJCF mesh, its name among them.
+        mjcf_attributes: More attributes of the MJCF geom.
     """
 
     path: str
@@ -45,13 +44,13 @@ class Gprim:
     shape: Shape
     is_collider: bool
     is_visible: bool
-    is_hull: bool
-    friction: tuple[float | None, float | None, float | None]
-    density: float
     color: Float[np.ndarray, " 4"] | None
+    mesh: dict[str, str]
+    is_hull: bool = False
+    friction: tuple[float | None, float | None, float | None] = (None, None, None)
+    density: float = 0.0
     mass_model: str = ""
     mjcf_attributes: dict[str, str] = field(default_factory=dict)
-    mesh: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +70,17 @@ class Site:
     mjcf_attributes: dict[str, str]
 
 
-def read_sites(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Site]:
-    """Read all sites: prims with the custom attribute `site`, and gprims with MjcSiteAPI or NewtonSiteAPI.
-
-    Args:
-        stage: The stage.
-        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
-        frames: World pose of each rigid body [m].
-    """
+def read_sites(stage: Stage) -> list[Site]:
+    """Read all sites: prims with the custom attribute `site`, and gprims with MjcSiteAPI or NewtonSiteAPI."""
     sites = []
     for prim in stage.prims:
         if not _is_site(stage, prim):
             continue
-        body, pose, attributes = owners[str(prim.GetPath())], stage.frame(prim)[0], read_mjcf_attributes(stage, prim, SITE)
-        attributes |= read_attributes(stage, prim, GROUP)
+        body, pose, attributes = stage.owners[str(prim.GetPath())], stage.frame(prim)[0], read_attributes(stage, prim, SITE)
         if prim.GetTypeName() in SCHEMAS:
             pose, drawn = _drawn_site(stage, prim, pose)
             attributes = drawn | attributes
-        place = pose if body is None else np.linalg.inv(frames[body]) @ pose
-        sites.append(Site(prim, body, place, attributes))
+        sites.append(Site(prim, body, stage.in_body(pose, body), attributes))
     return sites
 
 
@@ -106,15 +97,10 @@ def _drawn_site(stage: Stage, prim: Prim, pose: Matrix) -> tuple[Matrix, dict[st
     return pose, result
 
 
-def read_gprims(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Gprim]:
+def read_gprims(stage: Stage) -> list[Gprim]:
     """Read all colliders and all that is visible.
 
     A mesh that collides as a box or ball and is visible gives two geoms.
-
-    Args:
-        stage: The stage.
-        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
-        frames: World pose of each rigid body [m].
 
     Raises:
         RobotError: If a mesh is broken.
@@ -137,48 +123,47 @@ def read_gprims(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[
             if prim.IsA(stage.pxr.UsdGeom.PointInstancer):
                 instancer = f"{prim.GetPath()}/"
         elif is_collider or is_visible or stage.has(prim, "MjcImageableAPI"):
-            geoms += _geoms(stage, prim, owners[str(prim.GetPath())], frames, is_collider, is_visible)
+            geoms += _geoms(stage, prim, is_collider, is_visible)
     return geoms
 
 
-def _geoms(
-    stage: Stage, prim: Prim, body: str | None, frames: Mapping[str, Matrix], is_collider: bool, is_visible: bool
-) -> list[Gprim]:
-    pose = stage.pose(prim)
+def _geoms(stage: Stage, prim: Prim, is_collider: bool, is_visible: bool) -> list[Gprim]:
+    pose, path = stage.pose(prim), str(prim.GetPath())
+    body = stage.owners[path]
     if abs(np.linalg.det(pose[:3, :3])) == 0:
         raise stage.error(prim, "its transform is flat: a scale is zero")
-    place = pose if body is None else np.linalg.inv(frames[body]) @ pose
+    place = stage.in_body(pose, body)
     shape = shape_of(stage, prim, place)
     color = _color(stage, prim)
-    mesh = read_attributes(stage, prim, ASSET) if shape.kind == "mesh" else {}
-    model = _mass_model(stage, prim, mesh)
+    mesh = read_attributes(stage, prim, MESH) if shape.kind == "mesh" else {}
+    model = _mass_model(stage, prim)
     mesh |= {"name": name} if (name := read_custom(stage, prim, "mesh")) else {}
-    path, nothing = str(prim.GetPath()), (None, None, None)
+    visual = Gprim(path, prim, body, shape, False, is_visible, color, mesh)
     if not is_collider:
         if shape.vertices is not None and len(shape.vertices) < 4:
             stage.drop("visual meshes with less than four points were dropped", prim)
             return []
-        attributes = read_attributes(stage, prim, GROUP)
         stage.note(prim, *MASKS)  # of a visual, zero
-        return [Gprim(path, prim, body, shape, False, is_visible, False, nothing, 0.0, color, "", attributes, mesh)]
-    attributes = read_attributes(stage, prim, COLLIDER)
+        return [replace(visual, mjcf_attributes=read_attributes(stage, prim, GROUP))]
+    attributes = read_attributes(stage, prim, GEOM)
     friction, density = _material(stage, prim, "solref" in attributes)
-    collided, is_hull = (
-        collision_shape(stage, prim, shape, place) if shape.kind == "mesh" and prim.GetTypeName() == "Mesh" else (shape, True)
+    is_mesh = prim.GetTypeName() == "Mesh"
+    collided, is_hull = collision_shape(stage, prim, shape, place) if is_mesh else (shape, True)
+    collider = replace(
+        visual,
+        shape=collided,
+        is_collider=True,
+        is_visible=is_visible and collided is shape,
+        is_hull=is_hull,
+        friction=friction,
+        density=density,
+        mass_model=model if collided is shape else "",
+        mjcf_attributes=attributes,
     )
-    is_same = collided is shape
-    results = [
-        Gprim(
-            *(path, prim, body, collided, True, is_visible and is_same, is_hull),
-            *(friction, density, color, model if is_same else "", attributes, mesh),
-        )
-    ]
-    if is_visible and not is_same:
-        results.append(Gprim(path, prim, body, shape, False, True, False, nothing, 0.0, color, "", {}, mesh))
-    return results
+    return [collider, visual] if is_visible and collided is not shape else [collider]
 
 
-def _mass_model(stage: Stage, prim: Prim, mesh: Mapping[str, str]) -> str:
+def _mass_model(stage: Stage, prim: Prim) -> str:
     """Return how MuJoCo takes a geom's mass and inertia, or nothing if only UsdPhysics says so."""
     is_shell = stage.authored(prim, "newton:massModel") == "shell" or stage.authored(prim, "mjc:shellinertia")
     own = "shell" if is_shell else str(stage.authored(prim, "mjc:inertia") or "")

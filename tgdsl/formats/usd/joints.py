@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.custom_attributes import read_custom
-from tgdsl.formats.usd.drives import INFINITE, Drive, Range, read_drive
-from tgdsl.formats.usd.mjc.attributes import JOINTS, read_attributes, with_limits
+from tgdsl.formats.usd.attributes import JOINT, read_attributes, read_custom, with_limits
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
+INFINITE = 1e30
+"""Limits of this magnitude and more are infinite: the largest float32 is often written for infinity."""
+ROUNDING = 1e-6
+"""A drive's damping below this share of the joint's own, which was subtracted from it, is rounding of float32."""
+Range = tuple[float, float]
 FAR_LIMIT = 1e10
 """Stands for an infinite limit opposite a finite one: MuJoCo limits both sides or none [rad or m]."""
 FRAME_TOLERANCE = 1e-4
@@ -28,6 +30,33 @@ FORCES = ("damping", "armature", "frictionloss", "stiffness", "springdamper")
 """Attributes of an MJCF joint that an equality constraint does not have."""
 KINDS = {"PhysicsRevoluteJoint": "hinge", "PhysicsPrismaticJoint": "slide", "PhysicsSphericalJoint": "ball"}
 """MuJoCo's joints by the schemas of UsdPhysics; fixed, generic and distance joints are seen to one by one."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A spring and damper that pulls a joint towards a target.
+
+    Attributes:
+        stiffness: [N·m/rad or N/m].
+        damping: [N·m·s/rad or N·s/m].
+        max_force: [N·m or N], or infinity.
+        target: Target position [rad or m].
+        target_velocity: [rad/s or m/s].
+        actuator: Name of its actuator, or empty: the joint's.
+        control: Range of the target, or None if it is free.
+        gear: The actuator's control is the target times this; it enters its gains twice, its force once.
+        order: Place of its actuator among those that say so; the others come after them.
+    """
+
+    stiffness: float
+    damping: float
+    max_force: float
+    target: float = 0.0
+    target_velocity: float = 0.0
+    actuator: str = ""
+    control: Range | None = None
+    gear: float = 1.0
+    order: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +113,10 @@ class Joint:
         parent, child = self.frames[::-1] if is_swapped else self.frames
         return parent @ np.linalg.inv(child)
 
-    def authored(self, world: tuple[Matrix, Matrix]) -> tuple[Matrix, float, float]:
-        """Return where frame 1 is in frame 0 in given poses, the position [rad or m] and how far off the joint's motion it is.
-
-        Args:
-            world: World poses of body 0 and body 1 [m].
-        """
-        first, second = (pose @ frame for pose, frame in zip(world, self.frames, strict=True))
+    def authored(self, stage: Stage) -> tuple[Matrix, float, float]:
+        """Return where frame 1 is in frame 0 as authored, the position [rad or m] and how far off the joint's motion it is."""
+        poses = [np.eye(4) if body is None else stage.body_frames[body] for body in self.bodies]
+        first, second = (pose @ frame for pose, frame in zip(poses, self.frames, strict=True))
         apart = np.linalg.inv(first) @ second
         turn = Rotation.from_matrix(apart[:3, :3])
         position, off, tilt = 0.0, apart[:3, 3], turn.magnitude()
@@ -114,13 +140,8 @@ def _wrapped(angle: float, limits: Range | None) -> float:
     return min((angle, angle - 2 * math.pi, angle + 2 * math.pi), key=lambda a: max(limits[0] - a, a - limits[1], 0.0))
 
 
-def read_joints(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Joint]:
+def read_joints(stage: Stage) -> list[Joint]:
     """Read all enabled joints.
-
-    Args:
-        stage: The stage.
-        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
-        frames: World pose of each rigid body [m].
 
     Raises:
         RobotError: If a joint is one that MuJoCo does not have, or joins what does not exist.
@@ -135,7 +156,7 @@ def read_joints(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[
                 )
             continue
         if stage.value(prim, "physics:jointEnabled") or _constraint(stage, prim):
-            joint = _joint(stage, prim, owners, frames)
+            joint = _joint(stage, prim)
             if joint.bodies[0] == joint.bodies[1]:
                 stage.drop("joints were dropped that join a body to itself, or the world to the world", prim)
             else:
@@ -143,12 +164,12 @@ def read_joints(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[
     return joints
 
 
-def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> Joint:
+def _joint(stage: Stage, prim: Prim) -> Joint:
     kind, axis, limits, instance = _kind(stage, prim)
     if limits and limits[0] > limits[1]:
         raise stage.error(prim, f"its lower limit {limits[0]!r} is above its upper limit {limits[1]!r}")
-    (first, frame0, target0), (second, frame1, target1) = (_side(stage, prim, side, owners, frames) for side in (0, 1))
-    attributes = with_limits(stage, read_attributes(stage, prim, JOINTS, kind != "slide"), ("actuatorfrc",))
+    (first, frame0, target0), (second, frame1, target1) = (_side(stage, prim, side) for side in (0, 1))
+    attributes = with_limits(stage, read_attributes(stage, prim, JOINT, kind != "slide"), ("actuatorfrc",))
     if kind not in ("hinge", "slide"):
         attributes.pop("ref", None)
     if limits and limits[0] == limits[1]:  # a range without width is a weld at that position
@@ -162,7 +183,7 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
     drive = None
     if kind in ("hinge", "slide"):
         shared = float(read_custom(stage, prim, "damping") or 0.0)  # only `tgdsl:damping` is part of the drive's
-        drive, own = read_drive(stage, prim, instance, kind, shared)
+        drive, own = _read_drive(stage, prim, instance, kind, shared)
         attributes |= {"damping": repr(own)} if shared else {}
     return Joint(
         path=str(prim.GetPath()),
@@ -264,17 +285,15 @@ def _range(low: float, high: float, unit: float) -> Range | None:
     return None if max(abs(low), abs(high)) >= INFINITE and min(abs(low), abs(high)) >= INFINITE else (ends[0], ends[1])
 
 
-def _side(
-    stage: Stage, prim: Prim, side: int, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]
-) -> tuple[str | None, Matrix, str]:
+def _side(stage: Stage, prim: Prim, side: int) -> tuple[str | None, Matrix, str]:
     """Return the body on one side of a joint, the joint frame in it, and the path of the prim that is named, or nothing."""
     targets = stage.targets(prim, f"physics:body{side}")
     if len(targets) > 1:
         raise stage.error(prim, f"physics:body{side} has {len(targets)} targets; expected one at most")
     target = stage.usd.GetPrimAtPath(targets[0]) if targets else stage.usd.GetPseudoRoot()
-    if not target or str(target.GetPath()) not in owners:  # an inactive prim is found, but is not there
+    if not target or str(target.GetPath()) not in stage.owners:  # an inactive prim is found, but is not there
         raise stage.error(prim, f"physics:body{side} names {targets[0]}, which does not exist")
-    body = owners[str(target.GetPath())]
+    body = stage.owners[str(target.GetPath())]
     frame, scale = stage.frame(target)
     own = np.eye(4)
     own[:3, 3] = scale * np.array(stage.value(prim, f"physics:localPos{side}"), dtype=np.float64)
@@ -282,7 +301,7 @@ def _side(
     if not np.isfinite(own).all():
         raise stage.error(prim, f"physics:localPos{side} is not finite")
     frame = frame @ own
-    return body, frame if body is None else np.linalg.inv(frames[body]) @ frame, str(targets[0]) if targets else ""
+    return body, stage.in_body(frame, body), str(targets[0]) if targets else ""
 
 
 def rotation_of(stage: Stage, prim: Prim, name: str) -> Rotation:
@@ -310,3 +329,60 @@ def _drop_the_rest(stage: Stage, prim: Prim, instance: str) -> None:
     for name in ("physics:breakForce", "physics:breakTorque"):
         if stage.number(prim, name, math.inf) < INFINITE:
             stage.drop("joints do not break: their breakForce and breakTorque were dropped", prim)
+
+
+def _read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -> tuple[Drive | None, float]:
+    """Return a joint's drive, if it has one that can exert a force, and the joint's own damping.
+
+    Args:
+        stage: The stage.
+        prim: The joint.
+        instance: Which drive is along its degree of freedom.
+        kind: `hinge` or `slide`.
+        own: The joint's own damping [N·m·s/rad or N·s/m], which is part of the drive's.
+    """
+    if not prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, instance):
+        return None, own
+    stiffness, damping, most, target, velocity = (
+        stage.number(prim, f"drive:{instance}:physics:{name}")
+        for name in ("stiffness", "damping", "maxForce", "targetPosition", "targetVelocity")
+    )
+    if not stiffness and not damping:
+        return None, own  # it never exerts a force
+    if stage.value(prim, f"drive:{instance}:physics:type") == "acceleration":
+        stage.drop("drives were dropped whose gains are per mass (type acceleration), which MuJoCo does not have", prim)
+        return None, own
+    gain, force, unit = _si_units(stage, is_angular=kind == "hinge")
+    most = math.inf if most >= INFINITE else most * force
+    own = min(own, damping * gain)
+    rest = damping * gain - own
+    rest = 0.0 if rest < ROUNDING * own else rest
+    if not stiffness and not rest:
+        return None, own
+    gear = float(read_custom(stage, prim, "gear") or 1.0)
+    of_joint, of_actuator = (read_custom(stage, prim, key) for key in ("actuatorfrcrange", "forcerange"))
+    if of_joint is not None and math.isclose(most, np.abs(of_joint).max(), rel_tol=ROUNDING):
+        # The drive's limit is the smaller of the joint's, which is read with the joint, and the actuator's.
+        most = math.inf if of_actuator is None else float(of_actuator[1]) * abs(gear)
+    control = read_custom(stage, prim, "ctrlrange")
+    order = read_custom(stage, prim, "order")
+    drive = Drive(
+        stiffness * gain,
+        rest,
+        most,
+        target * unit,
+        velocity * unit,
+        str(read_custom(stage, prim, "actuator") or ""),
+        None if control is None else (float(control[0]), float(control[1])),
+        gear,
+        math.inf if order is None else float(order),
+    )
+    return drive, own
+
+
+def _si_units(stage: Stage, is_angular: bool) -> tuple[float, float, float]:
+    """Return the stage's units of a drive's gains, of its force and of its target, in SI and radians."""
+    if is_angular:
+        torque = stage.kilograms_per_unit * stage.metres_per_unit**2
+        return stage.kilograms_per_unit * (stage.metres_per_unit**2 * math.degrees(1)), torque, math.radians(1)
+    return stage.kilograms_per_unit, stage.kilograms_per_unit * stage.metres_per_unit, stage.metres_per_unit

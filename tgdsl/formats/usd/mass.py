@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +11,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.formats.model import LEAST_INERTIA
-from tgdsl.formats.usd.custom_attributes import read_custom
+from tgdsl.formats.usd.attributes import read_custom
 from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import rotation_of
-from tgdsl.formats.usd.mjc.solids import mujoco_mass_properties
-from tgdsl.formats.usd.stage import Matrix, Prim, Stage
+from tgdsl.formats.usd.stage import Prim, Stage
 
 DENSITY = 1000.0
 """What a collider weighs if nothing says so: UsdPhysics takes water [kg/m³]."""
@@ -68,7 +67,7 @@ class _Authored:
     axes: tuple[Vector, Rotation] | None = None
 
 
-def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Gprim], frame: Matrix) -> Inertial | None:
+def inertial_of(stage: Stage, body: Prim, geoms: Sequence[Gprim]) -> Inertial | None:
     """Return the mass and inertia of a body, or None if it has neither mass nor colliders.
 
     A body's mass overrules its colliders', a collider's density overrules its body's, and that its material's. A centre of
@@ -79,18 +78,17 @@ def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Gprim], frame: Matrix)
         stage: The stage.
         body: The body's prim.
         geoms: Its geoms.
-        frame: Its world pose [m].
 
     Raises:
         RobotError: If what is authored is no mass, or no inertia.
     """
-    own, geoms = _authored(stage, body), list(geoms)
+    own = _authored(stage, body)
     if (exact := _with_zeros(stage, body, own)) is not None:
         return exact
     colliders = [(geom, _own_mass(stage, geom)) for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
     if own.mass and own.centre is not None and own.tensor is not None:
         return _repaired(stage, body, Inertial(own.mass, own.centre, own.tensor, own.axes))
-    parts = [_collider(stage, geom, found, own.density, frame) for geom, found in colliders]
+    parts = [_collider(stage, geom, found, own.density) for geom, found in colliders]
     whole = _sum([part for part in parts if part.mass > 0])
     if own.mass and whole is not None:
         whole = Inertial(own.mass, whole.centre, whole.tensor * (own.mass / whole.mass))
@@ -160,7 +158,7 @@ def _own_mass(stage: Stage, geom: Gprim) -> _Authored:
     return _authored(stage, geom.prim) if str(geom.prim.GetPath()) != geom.body else _Authored()
 
 
-def _collider(stage: Stage, geom: Gprim, own: _Authored, body_density: float, frame: Matrix) -> Inertial:
+def _collider(stage: Stage, geom: Gprim, own: _Authored, body_density: float) -> Inertial:
     """Return what a collider contributes, in the body's frame."""
     density = own.density or body_density or geom.density or DENSITY
     volume, centre, tensor = _properties(stage, geom)
@@ -168,7 +166,7 @@ def _collider(stage: Stage, geom: Gprim, own: _Authored, body_density: float, fr
     computed = Inertial(mass, centre, tensor * (mass / volume if volume else 0.0))
     if own.centre is None and own.tensor is None:
         return computed
-    place = np.linalg.inv(frame) @ stage.frame(geom.prim)[0]
+    place = stage.in_body(stage.frame(geom.prim)[0], geom.body)
     turn, point = place[:3, :3], place[:3, 3]
     return _overruled(
         computed,
@@ -187,7 +185,7 @@ def _properties(stage: Stage, geom: Gprim) -> tuple[float, Vector, Tensor]:
     if not geom.mass_model:
         return geom.shape.mass_properties(geom.is_hull)
     try:
-        volume, centre, tensor = mujoco_mass_properties(geom.shape, geom.mass_model)
+        volume, centre, tensor = geom.shape.mujoco_mass_properties(geom.mass_model)
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise stage.error(geom.prim, f"MuJoCo has no {geom.mass_model} inertia for it: {reason}") from error
@@ -204,7 +202,7 @@ def _sum(parts: list[Inertial]) -> Inertial | None:
     return Inertial(mass, centre, np.sum([part.about(centre) for part in parts], axis=0))
 
 
-def _fallback_inertial(stage: Stage, body: Prim, mass: float, geoms: list[Gprim]) -> Inertial:
+def _fallback_inertial(stage: Stage, body: Prim, mass: float, geoms: Sequence[Gprim]) -> Inertial:
     """Return the inertia of a body of which only the mass is known: that of its visuals as solids, or of a ball."""
     solids = [geom.shape.mass_properties(False) for geom in geoms if geom.shape.kind != "plane"]
     whole = _sum([Inertial(*solid) for solid in solids if solid[0] > 0])

@@ -2,7 +2,7 @@
 
 The semantics are those of the UsdPhysics schemas; of MuJoCo's own (`mjc:`) and Newton's (`newton:`) where they are authored,
 whose plugins need not be installed. Where several say the same, the most specific counts: `tgdsl:`, `mjc:`, `newton:`,
-`physx…:`, UsdPhysics, in this order; who contradicts it is warned of (`mjc/attributes.py`). Exceptions are what a user edits in
+`physx…:`, UsdPhysics, in this order; who contradicts it is warned of (`attributes.py`). Exceptions are what a user edits in
 a stage that `export` wrote: UsdPhysics' value of a drive, a friction or a mass overrules our exact copy of the old one.
 
 Where MuJoCo leaves a choice:
@@ -31,9 +31,10 @@ Where MuJoCo leaves a choice:
 
 from __future__ import annotations
 
+import hashlib
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -41,64 +42,33 @@ import numpy as np
 
 from tgdsl.errors import RobotError
 from tgdsl.formats.model import Model
+from tgdsl.formats.usd.actuators import read_actuators, read_keyframes, read_tendons, servos_of
 from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, filtered_pairs, spanning_tree
+from tgdsl.formats.usd.attributes import BODY, read_attributes, read_custom, text_of
 from tgdsl.formats.usd.audit import note_unread
-from tgdsl.formats.usd.custom_attributes import read_custom
-from tgdsl.formats.usd.elements import (
-    MeshAssets,
-    add_actuators_and_key,
-    add_geom,
-    add_joint_element,
-    add_loop_constraint,
-    add_site,
-    floats_text,
-    own_drives,
-    with_pose,
+from tgdsl.formats.usd.equalities import (
+    constraint_attributes,
+    put_in_order,
+    read_couplings,
+    read_exact_constraint,
+    read_polynomials,
 )
 from tgdsl.formats.usd.filters import exclusions
 from tgdsl.formats.usd.geoms import Gprim, Site, read_gprims, read_sites
 from tgdsl.formats.usd.joints import FRAME_TOLERANCE, Joint, read_joints
 from tgdsl.formats.usd.mass import Inertial, inertial_of
-from tgdsl.formats.usd.mjc.actuators import Named, read_actuators
-from tgdsl.formats.usd.mjc.attributes import BODY, EQUALITY, WELD, read_attributes
-from tgdsl.formats.usd.mjc.equalities import add_couplings, add_exact_constraint, add_polynomials, put_in_order
-from tgdsl.formats.usd.mjc.keyframes import add_keyframes
-from tgdsl.formats.usd.mjc.tendons import add_tendons
 from tgdsl.formats.usd.scene import add_scene
-from tgdsl.formats.usd.stage import NAME_ATTRIBUTE, Matrix, Prim, Stage, open_stage, unique_names
+from tgdsl.formats.usd.shapes import Shape, quaternion
+from tgdsl.formats.usd.stage import NAME_ATTRIBUTE, Matrix, Names, Stage, open_stage, unique_names
 
-
-@dataclass(frozen=True, eq=False)
-class _Robot:
-    """All that a stage holds.
-
-    Attributes:
-        bodies: Prims of the rigid bodies, by path.
-        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
-        frames: Their world poses [m].
-        joints: All joints.
-        geoms: All geoms.
-        sites: All sites.
-        inertials: Mass and inertia of each body that has one.
-        tree: Parent and joint of each body.
-        kinematic: Whether each body is kinematic.
-        body_attributes: Attributes of each MJCF body.
-        names: Name of each body, then of each geom, of each joint and of each site, by path.
-        free: Name of each floating body's joint, or empty, by the body's path.
-    """
-
-    bodies: dict[str, Prim]
-    owners: dict[str, str | None]
-    frames: dict[str, Matrix]
-    joints: list[Joint]
-    geoms: list[Gprim]
-    sites: list[Site]
-    inertials: dict[str, Inertial | None]
-    tree: SpanningTree
-    kinematic: dict[str, bool]
-    body_attributes: dict[str, dict[str, str]]
-    names: tuple[dict[str, str], dict[str, str], dict[str, str], dict[str, str]]
-    free: dict[str, str]
+AXIS_ARM = 0.05
+"""Distance between the two connect constraints along the axis of a revolute joint that closes a loop [m]."""
+REST_TOLERANCE = 1e-6
+"""Largest authored position without a keyframe [rad or m]: it is rounding of float32."""
+VISIBLE, VISUAL, HIDDEN = "0", "2", "3"
+"""Groups of geoms: colliders that are visible, visuals that do not collide, what is not visible."""
+FRICTION = (1.0, 0.005, 0.0001)
+"""MuJoCo's default friction of a geom."""
 
 
 def read_usd(path: Path) -> Model:
@@ -121,51 +91,56 @@ def usd_to_mjcf(path: Path) -> str:
             something that MuJoCo cannot express.
     """
     with open_stage(path) as stage:
+        if not stage.bodies:
+            raise RobotError(f"{stage.file}: /: no prim has an enabled PhysicsRigidBodyAPI: there is no robot in it")
         robot = _read(stage)
-        _check(stage, robot)
-        root = _mjcf_root(stage, robot)
-        note_unread(stage, robot.owners)
+        _check(robot)
+        root = _Mjcf(robot).root
+        note_unread(stage)
         return ET.tostring(root, encoding="unicode")
 
 
+@dataclass(frozen=True, eq=False)
+class _Robot:
+    """What a stage holds: joints, geoms, sites, mass and inertia of each body that has one, tree, and names in MJCF."""
+
+    stage: Stage
+    joints: list[Joint]
+    geoms: list[Gprim]
+    sites: list[Site]
+    inertials: dict[str, Inertial | None]
+    tree: SpanningTree
+    names: Names
+
+
 def _read(stage: Stage) -> _Robot:
-    bodies = {
-        str(prim.GetPath()): prim
-        for prim in stage.prims
-        if stage.has(prim, "PhysicsRigidBodyAPI") and stage.value(prim, "physics:rigidBodyEnabled")
-    }
-    if not bodies:
-        raise RobotError(f"{stage.file}: /: no prim has an enabled PhysicsRigidBodyAPI: there is no robot in it")
-    owners: dict[str, str | None] = {"/": None}
-    for prim in stage.prims:
-        path = str(prim.GetPath())
-        owners[path] = path if path in bodies else owners[path.rpartition("/")[0] or "/"]
-    frames = {path: stage.frame(prim)[0] for path, prim in bodies.items()}
-    joints, geoms = read_joints(stage, owners, frames), read_gprims(stage, owners, frames)
-    sites = read_sites(stage, owners, frames)
+    joints, geoms, sites = read_joints(stage), read_gprims(stage), read_sites(stage)
     inertials = {
-        path: inertial_of(stage, prim, [geom for geom in geoms if geom.body == path], frames[path])
-        for path, prim in bodies.items()
+        path: inertial_of(stage, prim, [geom for geom in geoms if geom.body == path]) for path, prim in stage.bodies.items()
     }
-    kinematic = {path: bool(stage.value(prim, "physics:kinematicEnabled")) for path, prim in bodies.items()}
-    attributes = {path: read_attributes(stage, prim, BODY) for path, prim in bodies.items()}
     roots = [str(prim.GetPath()) for prim in stage.prims if stage.has(prim, "PhysicsArticulationRootAPI")]
-    names = (
-        unique_names(stage, bodies.values(), ["world"]),
-        unique_names(stage, {geom.path: geom.prim for geom in geoms}.values()),
-        unique_names(stage, [joint.prim for joint in joints]),
-        unique_names(stage, [site.prim for site in sites]),
+    tree = spanning_tree(stage.kinematic, joints, roots)
+    kinds = {joint.path: joint.kind for node in tree.nodes.values() for joint in node.joints}
+    bodies = unique_names(stage, stage.bodies.values(), ["world"])
+    geom_names = unique_names(stage, {geom.path: geom.prim for geom in geoms}.values())
+    joint_names = unique_names(stage, [joint.prim for joint in joints])
+    names = Names(
+        bodies=bodies,
+        geoms=geom_names,
+        sites=unique_names(stage, [site.prim for site in sites]),
+        joints=joint_names,
+        moving={path: name for path, name in joint_names.items() if kinds.get(path, "fixed") != "fixed"},
+        scalars={path: joint_names[path] for path, kind in kinds.items() if kind in ("hinge", "slide")},
     )
-    tree = spanning_tree(kinematic, joints, roots)
-    free = {path: str(read_custom(stage, prim, "freejoint") or "") for path, prim in bodies.items()}
-    return _Robot(bodies, owners, frames, joints, geoms, sites, inertials, tree, kinematic, attributes, names, free)
+    return _Robot(stage, joints, geoms, sites, inertials, tree, names)
 
 
-def _check(stage: Stage, robot: _Robot) -> None:
+def _check(robot: _Robot) -> None:
     """Refuse what MuJoCo would refuse without naming the prim, and take note of what it cannot start with."""
+    stage = robot.stage
     for path, node in robot.tree.nodes.items():
-        prim = robot.bodies[path]
-        is_moving = not robot.kinematic[path] and (node.joint is None or node.joint.kind != "fixed")
+        prim = stage.bodies[path]
+        is_moving = not stage.kinematic[path] and (node.joint is None or node.joint.kind != "fixed")
         if is_moving and not _has_mass(robot, path):
             raise stage.error(prim, "the body can move, but has neither mass nor colliders")
         for name in ("velocity", "angularVelocity"):
@@ -173,10 +148,10 @@ def _check(stage: Stage, robot: _Robot) -> None:
                 stage.drop("initial velocities were dropped", prim)
         poses = [joint.pose(node.is_swapped(joint)) for joint in node.joints]
         is_apart = any(np.abs(pose - poses[0]).max() > FRAME_TOLERANCE for pose in poses)
-        if node.joint is not None and (is_apart or _authored(robot, node.joint)[2] > FRAME_TOLERANCE):
+        if node.joint is not None and (is_apart or node.joint.authored(stage)[2] > FRAME_TOLERANCE):
             stage.drop("in the authored poses the frames of joints do not meet; MuJoCo will join them", node.joint.prim)
     for geom in robot.geoms:
-        if geom.shape.kind == "plane" and geom.body is not None and not robot.kinematic[geom.body]:
+        if geom.shape.kind == "plane" and geom.body is not None and not stage.kinematic[geom.body]:
             raise stage.error(geom.prim, "a plane can only belong to the world or to a kinematic body")
 
 
@@ -186,138 +161,239 @@ def _has_mass(robot: _Robot, path: str) -> bool:
     return robot.inertials[path] is not None or any(_has_mass(robot, node.body) for node in welded)
 
 
-def _authored(robot: _Robot, joint: Joint) -> tuple[Matrix, float, float]:
-    world = tuple(np.eye(4) if body is None else robot.frames[body] for body in joint.bodies)
-    return joint.authored((world[0], world[1]))
+class _Mjcf:
+    """The MJCF of a robot.
 
-
-def _mjcf_root(stage: Stage, robot: _Robot) -> ET.Element:
-    first = stage.usd.GetDefaultPrim()
-    name = stage.authored(first, NAME_ATTRIBUTE) if first else None
-    root = ET.Element("mujoco", model=str(name or stage.file.stem))
-    compiler = ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    option = ET.SubElement(root, "option")
-    flags = add_scene(stage, option, compiler)
-    meshes = MeshAssets(ET.SubElement(root, "asset"))
-    world = ET.SubElement(root, "worldbody")
-    elements: dict[str | None, ET.Element] = {None: world}
-    _add_geoms(robot, None, world, meshes)
-    for node in robot.tree.children(None):
-        _add_body(robot, node, world, meshes, elements)
-    flags |= _add_exclusions(stage, robot, ET.SubElement(root, "contact"), flags)
-    if flags:
-        ET.SubElement(option, "flag", flags)
-    parts = ("equality", "tendon", "actuator", "keyframe")
-    equality, tendon, actuator, keyframe = (ET.SubElement(root, part) for part in parts)
-    for joint in robot.tree.loops:
-        _add_loop_constraint(stage, robot, joint, elements, equality)
-    named = _named(robot)
-    add_couplings(stage, equality, robot.joints, _scalars(robot))
-    named = replace(named, tendons=add_tendons(stage, tendon, replace(named, joints=_scalars(robot))))
-    add_polynomials(stage, equality, {"joint": _scalars(robot), "tendon": named.tendons})
-    put_in_order(equality)
-    nodes = list(robot.tree.nodes.values())
-    motions = [(node, _authored(robot, node.joint) if node.joint else None) for node in nodes]
-    others = read_actuators(stage, named)
-    driven = own_drives(stage, [joint for node in nodes for joint in node.joints], others)
-    add_actuators_and_key(keyframe, actuator, motions, robot.frames, robot.kinematic, robot.names[2], driven, others)
-    add_keyframes(stage, root, keyframe)
-    for empty in [element for element in root if len(element) == 0 and not element.attrib]:
-        root.remove(empty)
-    return root
-
-
-def _named(robot: _Robot) -> Named:
-    joints = {joint.path for node in robot.tree.nodes.values() for joint in node.joints if joint.kind != "fixed"}
-    chosen = {path: name for path, name in robot.names[2].items() if path in joints}
-    return Named(chosen, robot.names[0], robot.names[3], robot.names[1], {})
-
-
-def _scalars(robot: _Robot) -> dict[str, str]:
-    """Return the names of the hinges and slides of the tree."""
-    joints = [joint for node in robot.tree.nodes.values() for joint in node.joints]
-    return {joint.path: robot.names[2][joint.path] for joint in joints if joint.kind in ("hinge", "slide")}
-
-
-def _add_exclusions(stage: Stage, robot: _Robot, contact: ET.Element, flags: Mapping[str, str]) -> dict[str, str]:
-    """Add the pairs of bodies that do not collide; return the flags that this needs.
-
-    MuJoCo never collides a parent with its child. Where a joint says that they do, its filter is off, and all that it would
-    have kept apart is listed. What it never collides by itself is not.
+    Attributes:
+        root: The whole model.
     """
-    nodes, (welded, parents) = robot.tree.nodes, filtered_pairs(robot.tree)
-    is_on = flags.get("filterparent") != "disable"
-    filtering = {pair: joint.is_filtering for pair, child in parents.items() if (joint := nodes[child].joint) is not None}
-    is_off = is_on and False in filtering.values()
-    silent = [pair for pair, said in filtering.items() if said is None] if is_off else ()
-    by_itself = welded | parents.keys() if is_on and not is_off else welded
-    for pair in exclusions(stage, robot.bodies, robot.joints, robot.geoms, silent):
-        if pair not in by_itself:
-            first, second = sorted("world" if path is None else robot.names[0][path] for path in pair)
-            ET.SubElement(contact, "exclude", body1=first, body2=second)
-    return {"filterparent": "disable"} if is_off else {}
 
-
-def _add_body(
-    robot: _Robot, node: TreeNode, parent: ET.Element, meshes: MeshAssets, elements: dict[str | None, ET.Element]
-) -> None:
-    pose = robot.frames[node.body] if node.joint is None else node.joint.pose(node.is_swapped(node.joint))
-    attributes = {"name": robot.names[0][node.body]} | robot.body_attributes[node.body]
-    element = with_pose(ET.SubElement(parent, "body", attributes), pose)
-    elements[node.body] = element
-    if robot.kinematic[node.body]:
-        element.set("mocap", "true")
-    else:
-        add_joint_element(element, node, robot.names[2], robot.free[node.body])
-    if (inertial := robot.inertials[node.body]) is not None:
-        moments, axes = inertial.principal()
-        ET.SubElement(
-            element,
-            "inertial",
-            pos=floats_text(inertial.centre),
-            quat=floats_text(axes.as_quat(canonical=True, scalar_first=True)),
-            mass=floats_text([inertial.mass]),
-            diaginertia=floats_text(moments),
+    def __init__(self, robot: _Robot):
+        stage = self._stage = robot.stage
+        self._robot, self._names = robot, robot.names
+        first = stage.usd.GetDefaultPrim()
+        name = stage.authored(first, NAME_ATTRIBUTE) if first else None
+        self.root = ET.Element("mujoco", model=str(name or stage.file.stem))
+        compiler = ET.SubElement(self.root, "compiler", angle="radian", autolimits="true")
+        option = ET.SubElement(self.root, "option")
+        flags = add_scene(stage, option, compiler)
+        self._asset = ET.SubElement(self.root, "asset")
+        self._mesh_names: dict[str, str] = {}
+        self._elements: dict[str | None, ET.Element] = {None: ET.SubElement(self.root, "worldbody")}
+        self._add_geoms(None)
+        for node in robot.tree.children(None):
+            self._add_body(node)
+        flags |= self._add_exclusions(ET.SubElement(self.root, "contact"), flags)
+        if flags:
+            ET.SubElement(option, "flag", flags)
+        self._equality, tendon, actuator, keyframe = (
+            ET.SubElement(self.root, part) for part in ("equality", "tendon", "actuator", "keyframe")
         )
-    _add_geoms(robot, node.body, element, meshes)
-    for child in robot.tree.children(node.body):
-        _add_body(robot, child, element, meshes, elements)
+        for joint in robot.tree.loops:
+            self._add_loop_constraint(joint)
+        read_couplings(stage, self._equality, robot.joints, self._names.scalars)
+        read_tendons(stage, tendon, self._names)
+        read_polynomials(stage, self._equality, self._names)
+        put_in_order(self._equality)
+        self._add_actuators(actuator, keyframe)
+        read_keyframes(stage, self.root, keyframe)
+        for empty in [element for element in self.root if len(element) == 0 and not element.attrib]:
+            self.root.remove(empty)
 
+    def _add_body(self, node: TreeNode) -> None:
+        stage, path = self._stage, node.body
+        pose = stage.body_frames[path] if node.joint is None else node.joint.pose(node.is_swapped(node.joint))
+        attributes = {"name": self._names.bodies[path]} | read_attributes(stage, stage.bodies[path], BODY)
+        element = ET.SubElement(self._elements[node.parent], "body", attributes | _pose(pose))
+        self._elements[path] = element
+        if stage.kinematic[path]:
+            element.set("mocap", "true")
+        else:
+            self._add_joints(element, node)
+        if (inertial := self._robot.inertials[path]) is not None:
+            moments, axes = inertial.principal()
+            ET.SubElement(
+                element,
+                "inertial",
+                pos=text_of(inertial.centre),
+                quat=text_of(axes.as_quat(canonical=True, scalar_first=True)),
+                mass=text_of([inertial.mass]),
+                diaginertia=text_of(moments),
+            )
+        self._add_geoms(path)
+        for child in self._robot.tree.children(path):
+            self._add_body(child)
 
-def _add_geoms(robot: _Robot, body: str | None, element: ET.Element, meshes: MeshAssets) -> None:
-    names, taken = robot.names[1], set(robot.names[1].values())
-    written: set[str] = set()
-    for geom in robot.geoms:
-        if geom.body == body:
-            name = names[geom.path]
+    def _add_joints(self, body: ET.Element, node: TreeNode) -> None:
+        """Add a body's joints to its parent: none if it is fixed, a free joint if it floats."""
+        if node.joint is None:
+            free = str(read_custom(self._stage, self._stage.bodies[node.body], "freejoint") or "")
+            ET.SubElement(body, "freejoint", {"name": free} if free else {})
+        for joint in node.joints:
+            if joint.kind == "fixed":
+                continue
+            frame = joint.frames[0 if node.is_swapped(joint) else 1]
+            attributes = {"name": self._names.joints[joint.path], "type": joint.kind, "pos": text_of(frame[:3, 3])}
+            if joint.kind != "ball":
+                # Positions count body 1 against body 0; where body 0 is the child, it turns the other way.
+                attributes["axis"] = text_of(frame[:3, :3] @ joint.axis * (-1 if node.is_swapped(joint) else 1))
+            if joint.range is not None:
+                attributes["range"] = text_of(joint.range)
+            ET.SubElement(body, "joint", attributes | joint.mjcf_attributes)
+
+    def _add_geoms(self, body: str | None) -> None:
+        """Add the geoms and sites of a body, or of the world."""
+        element, taken, written = self._elements[body], set(self._names.geoms.values()), set[str]()
+        for geom in (geom for geom in self._robot.geoms if geom.body == body):
+            name = self._names.geoms[geom.path]
             if geom.path in written:  # a visible mesh that collides as a box or ball: this is how it looks
                 name = next(f"{name}_visual{i or ''}" for i in range(len(taken) + 1) if f"{name}_visual{i or ''}" not in taken)
                 taken.add(name)
             written.add(geom.path)
-            add_geom(element, name, geom, meshes)
-    for site in robot.sites:
-        if site.body == body:
-            add_site(element, robot.names[3][str(site.prim.GetPath())], site)
+            self._add_geom(element, name, geom)
+        for site in (site for site in self._robot.sites if site.body == body):
+            name = self._names.sites[str(site.prim.GetPath())]
+            ET.SubElement(element, "site", {"name": name} | site.mjcf_attributes | _pose(site.pose))
 
+    def _add_geom(self, body: ET.Element, name: str, geom: Gprim) -> None:
+        element = ET.SubElement(body, "geom", {"name": name, "type": geom.shape.kind} | _pose(geom.shape.pose))
+        if geom.shape.kind == "mesh":
+            element.set("mesh", self._mesh(geom.shape, name, geom.mesh))
+        else:
+            element.set("size", text_of(geom.shape.size))
+        if geom.is_collider:
+            element.set("group", VISIBLE if geom.is_visible else HIDDEN)
+            element.attrib |= geom.mjcf_attributes
+            if (friction := _friction(geom)) is not None:
+                element.set("friction", friction)
+        else:
+            element.set("group", geom.mjcf_attributes.get("group", VISUAL if geom.is_visible else HIDDEN))
+            for attribute in ("contype", "conaffinity", "mass"):
+                element.set(attribute, "0")
+        if geom.color is not None:
+            element.set("rgba", text_of(geom.color))
 
-def _add_loop_constraint(
-    stage: Stage, robot: _Robot, joint: Joint, elements: Mapping[str | None, ET.Element], equality: ET.Element
-) -> None:
-    if joint.constraint:
-        sites = {str(site.prim.GetPath()): (robot.names[3][str(site.prim.GetPath())], site.pose) for site in robot.sites}
-        if add_exact_constraint(stage, equality, joint, robot.names[0], sites, robot.names[2][joint.path]):
+    def _mesh(self, shape: Shape, name: str, attributes: Mapping[str, str]) -> str:
+        """Return the name of a shape's mesh, which is added if it is new: under its custom name, or else the given one.
+
+        Meshes are the same if they are in float32, which is MuJoCo's type.
+        """
+        assert shape.vertices is not None and shape.faces is not None
+        vertices = np.ascontiguousarray(shape.vertices + 0.0, dtype=np.float32)
+        faces = np.ascontiguousarray(shape.faces, dtype=np.int64)
+        content = vertices.tobytes() + b"|" + faces.tobytes() + repr(sorted(attributes.items())).encode()
+        key, names = hashlib.sha256(content).hexdigest(), self._mesh_names
+        if key not in names:
+            wanted = (attributes.get("name", name), name, *(f"{name}_{i + 2}" for i in range(len(names))))
+            names[key] = next(own for own in wanted if own not in names.values())
+            # Masses are given with the bodies; a shell is what MuJoCo never finds wrong with a mesh that is open or flat.
+            mesh = ET.SubElement(self._asset, "mesh", {"inertia": "shell", **attributes, "name": names[key]})
+            mesh.set("vertex", " ".join(map(str, vertices.reshape(-1))))
+            mesh.set("face", " ".join(map(str, faces.reshape(-1).tolist())))
+        return names[key]
+
+    def _add_exclusions(self, contact: ET.Element, flags: Mapping[str, str]) -> dict[str, str]:
+        """Add the pairs of bodies that do not collide; return the flags that this needs.
+
+        MuJoCo never collides a parent with its child. Where a joint says that they do, its filter is off, and all that it
+        would have kept apart is listed. What it never collides by itself is not.
+        """
+        robot = self._robot
+        nodes, (welded, parents) = robot.tree.nodes, filtered_pairs(robot.tree)
+        is_on = flags.get("filterparent") != "disable"
+        filtering = {pair: joint.is_filtering for pair, child in parents.items() if (joint := nodes[child].joint) is not None}
+        is_off = is_on and False in filtering.values()
+        silent = [pair for pair, said in filtering.items() if said is None] if is_off else ()
+        by_itself = welded | parents.keys() if is_on and not is_off else welded
+        for pair in exclusions(self._stage, robot.joints, robot.geoms, silent):
+            if pair not in by_itself:
+                first, second = sorted("world" if path is None else self._names.bodies[path] for path in pair)
+                ET.SubElement(contact, "exclude", body1=first, body2=second)
+        return {"filterparent": "disable"} if is_off else {}
+
+    def _add_loop_constraint(self, joint: Joint) -> None:
+        """Add the equality constraint of a joint that closes a loop: position zero of the model need not close it."""
+        stage, robot = self._stage, self._robot
+        if joint.constraint:
+            sites = {str(site.prim.GetPath()): site.pose for site in robot.sites}
+            if read_exact_constraint(stage, self._equality, joint, self._names, sites):
+                return
+        if all(body is None or stage.kinematic[body] for body in joint.bodies):
+            stage.drop("joints between bodies that no force can move were dropped", joint.prim)
             return
-    if all(body is None or robot.kinematic[body] for body in joint.bodies):
-        stage.drop("joints between bodies that no force can move were dropped", joint.prim)
-        return
-    if joint.kind == "slide" and not joint.constraint:
-        raise stage.error(joint.prim, "a prismatic joint closes a loop, for which MuJoCo has no constraint")
-    if not joint.is_passive:
-        stage.drop("limits, drives, armature and friction of joints that close a loop were dropped", joint.prim)
-    taken = {site.get("name", "") for element in elements.values() for site in element.iter("site")}
-    attributes = {}
-    if joint.constraint:
-        attributes = read_attributes(stage, joint.prim, WELD if joint.constraint.startswith("MjcEqualityWeld") else EQUALITY)
-        attributes |= {} if joint.is_active else {"active": "false"}
-    ends = (elements[joint.bodies[0]], elements[joint.bodies[1]])
-    add_loop_constraint(equality, ends, joint, robot.names[2][joint.path], attributes, taken)
+        if joint.kind == "slide" and not joint.constraint:
+            raise stage.error(joint.prim, "a prismatic joint closes a loop, for which MuJoCo has no constraint")
+        if not joint.is_passive:
+            stage.drop("limits, drives, armature and friction of joints that close a loop were dropped", joint.prim)
+        name, attributes = self._names.joints[joint.path], constraint_attributes(stage, joint) if joint.constraint else {}
+        taken = {site.get("name", "") for site in self._elements[None].iter("site")}
+        is_hinge = joint.kind == "hinge" and not joint.constraint
+        tag = "weld" if (joint.constraint or joint.kind) in ("MjcEqualityWeldAPI", "fixed") else "connect"
+        for end in range(2 if is_hinge else 1):
+            ends = {"name": f"{name}_{end}" if is_hinge else name}
+            for side in (0, 1):
+                site = f"{name}_{end}{side}"
+                while site in taken:
+                    site += "_"
+                place = joint.frames[side].copy()
+                place[:3, 3] += place[:3, :3] @ joint.axis * AXIS_ARM * end
+                body = self._elements[joint.bodies[side]]
+                ET.SubElement(body, "site", {"name": site, "size": "0.001", "group": "4"} | _pose(place))
+                ends[f"site{side + 1}"] = site
+            ET.SubElement(self._equality, tag, ends | attributes)
+
+    def _add_actuators(self, actuator: ET.Element, keyframe: ET.Element) -> None:
+        """Add all actuators, and the keyframe `authored` if the authored poses or the drives' targets are no defaults."""
+        nodes = list(self._robot.tree.nodes.values())
+        prims = read_actuators(self._stage, self._names)
+        servos = servos_of(self._stage, [joint for node in nodes for joint in node.joints], prims, self._names)
+        actuators = sorted((*prims, *servos), key=lambda own: own.order)
+        for own in actuators:
+            ET.SubElement(actuator, own.kind, own.attributes)
+        ctrl = [own.control for own in actuators]
+        qpos, is_needed = self._authored_qpos(nodes)
+        if is_needed or any(ctrl):
+            key = ET.SubElement(keyframe, "key", name="authored", qpos=text_of(qpos))
+            if ctrl:
+                key.set("ctrl", text_of(ctrl))
+
+    def _authored_qpos(self, nodes: list[TreeNode]) -> tuple[list[float], bool]:
+        """Return `qpos` in the authored poses, and whether any joint is not at position zero."""
+        qpos: list[float] = []
+        is_needed = False
+        for node in nodes:
+            joint = node.joint
+            if joint is None:
+                if not self._stage.kinematic[node.body]:
+                    frame = self._stage.body_frames[node.body]
+                    qpos += [*frame[:3, 3], *quaternion(frame)]
+                continue
+            apart, position, _ = joint.authored(self._stage)
+            if node.stacked:
+                for own in node.joints:
+                    qpos += [1.0, 0.0, 0.0, 0.0] if own.kind == "ball" else [own.reference]
+            elif joint.kind in ("hinge", "slide"):
+                qpos.append(position + joint.reference)
+                is_needed |= abs(position) > REST_TOLERANCE
+            elif joint.kind == "ball":  # MuJoCo counts it in the child's axes at position zero
+                frame = joint.frames[0 if node.is_swapped(joint) else 1][:3, :3]
+                turn = quaternion(frame @ (apart[:3, :3].T if node.is_swapped(joint) else apart[:3, :3]) @ frame.T)
+                qpos += [*turn]
+                is_needed |= bool(np.abs(turn[1:]).max() > REST_TOLERANCE)
+        return qpos, is_needed
+
+
+def _pose(pose: Matrix) -> dict[str, str]:
+    return {"pos": text_of(pose[:3, 3]), "quat": text_of(quaternion(pose))}
+
+
+def _friction(geom: Gprim) -> str | None:
+    """Return the frictions of a geom: sliding as its material says, the others as `tgdsl:friction`, or else its material."""
+    own = [float(value) for value in geom.mjcf_attributes.get("friction", "").split()]
+    sliding, *others = geom.friction
+    if not own and geom.friction == (None, None, None):
+        return None
+    values = [sliding if sliding is not None else (own or FRICTION)[0]]
+    for number, other in enumerate(others, start=1):
+        values.append(own[number] if len(own) > number else FRICTION[number] if other is None else other)
+    return text_of(values)

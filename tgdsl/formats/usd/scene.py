@@ -11,15 +11,22 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from tgdsl.formats.usd.custom_attributes import FLAGS, flag_names, read_option_flags, text_of
-from tgdsl.formats.usd.mjc.attributes import COMPILER, OPTIONS, Source, read_attributes
+from tgdsl.formats.usd.attributes import (
+    COMPILER,
+    FLAGS,
+    GRAVITY_FLAG,
+    OPTION,
+    flag_names,
+    read_attributes,
+    read_custom,
+    text_of,
+)
 from tgdsl.formats.usd.stage import Prim, Stage
 
 GRAVITY = 9.81
 """What a stage's scene means by earth gravity [m/s²]."""
 NEWTON_TIMESTEP = 0.001
 """NewtonSceneAPI's default [s]."""
-GRAVITY_FLAG = {"gravity": (Source("mjc:flag:gravity"), Source("newton:gravityEnabled"))}
 
 
 def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[str, str]:
@@ -33,7 +40,7 @@ def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[st
     if not stage.scenes:
         return {}
     scene = stage.scenes[0]
-    option.attrib |= {"gravity": _gravity(stage, scene), **read_attributes(stage, scene, OPTIONS)}
+    option.attrib |= {"gravity": _gravity(stage, scene), **read_attributes(stage, scene, OPTION)}
     if "timestep" not in option.attrib and "NewtonSceneAPI" in scene.GetPrimTypeInfo().GetAppliedAPISchemas():
         option.set("timestep", text_of(NEWTON_TIMESTEP))
     compiler.attrib |= read_attributes(stage, scene, COMPILER)
@@ -42,7 +49,7 @@ def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[st
 
 
 def _flags(stage: Stage, scene: Prim) -> dict[str, str]:
-    flags = read_option_flags(stage, scene)
+    flags = {str(name): key for key in FLAGS for name in read_custom(stage, scene, key) or ()}
     names = {name for key in FLAGS for name in flag_names(key)}
     found = {name: stage.authored(scene, f"mjc:flag:{name}") for name in sorted(names - {"gravity"})}
     gravity = read_attributes(stage, scene, GRAVITY_FLAG).get("gravity")

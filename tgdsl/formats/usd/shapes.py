@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import mujoco
 import numpy as np
 import trimesh
 from jaxtyping import Float
@@ -29,6 +30,7 @@ FLAT = 1e-6
 """A mesh whose thickness is at most this share of its length has no hull."""
 SCHEMAS = ("Mesh", "Cube", "Sphere", "Capsule", "Capsule_1", "Cylinder", "Cylinder_1", "Cone", "Plane")
 """Geometry that can be read."""
+MassProperties = tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,42 +72,50 @@ class Shape:
         own = trimesh.Trimesh(*merge_vertices(self.vertices, self.faces), process=False)
         return own if own.is_volume else None
 
-    def mass_properties(self, is_hull: bool) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
+    def mass_properties(self, is_hull: bool) -> MassProperties:
         """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame.
 
         Args:
             is_hull: Whether the hull of a mesh counts, rather than the mesh; that of an open mesh always does.
         """
-        volume, centre, inertia = self._mesh_properties(is_hull) if self.kind == "mesh" else self._primitive_properties()
-        rotation = self.pose[:3, :3]
-        return volume, rotation @ centre + self.pose[:3, 3], rotation @ inertia @ rotation.T
-
-    def _mesh_properties(self, is_hull: bool) -> tuple[float, np.ndarray, np.ndarray]:
+        if self.kind != "mesh":
+            return self.mujoco_mass_properties()
         solid = None if is_hull else self._closed
         solid = self.hull if solid is None else solid
         if solid is None:
             return 0.0, np.zeros(3), np.zeros((3, 3))
-        return float(solid.volume), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
+        rotation = self.pose[:3, :3]
+        return (
+            float(solid.volume),
+            rotation @ np.asarray(solid.center_mass) + self.pose[:3, 3],
+            rotation @ np.asarray(solid.moment_inertia) @ rotation.T,
+        )
 
-    def _primitive_properties(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Closed forms (any handbook): second moments ∫x², ∫y², ∫z² of each, from which the moments of inertia follow."""
-        if self.kind == "box":
-            x, y, z = self.size
-            volume, squares = 8 * x * y * z, np.array([x * x, y * y, z * z]) / 3
-        elif self.kind in ("sphere", "ellipsoid"):
-            x, y, z = self.size if self.kind == "ellipsoid" else self.size * 3
-            volume, squares = 4 / 3 * np.pi * x * y * z, np.array([x * x, y * y, z * z]) / 5
-        elif self.kind in ("cylinder", "capsule"):
-            r, h = self.size
-            volume, squares = 2 * np.pi * r * r * h, np.array([r * r / 4, r * r / 4, h * h / 3])
-            if self.kind == "capsule":
-                caps = 4 / 3 * np.pi * r**3  # ∫z² of a half ball on a plane at h: V (h² + 3/4 h r + r²/5)
-                own = np.array([r * r / 5, r * r / 5, h * h + 0.75 * h * r + r * r / 5])
-                squares = (volume * squares + caps * own) / (volume + caps)
-                volume += caps
+    def mujoco_mass_properties(self, model: str = "") -> MassProperties:
+        """Return the same as MuJoCo computes it, or of a shell its area [m²].
+
+        Args:
+            model: One of MuJoCo's ways to take a mesh, or `shell` of another shape; empty for its volume.
+
+        Raises:
+            ValueError: If MuJoCo cannot take the mesh so.
+        """
+        spec = mujoco.MjSpec()
+        geom = spec.worldbody.add_body().add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{self.kind.upper()}"), density=1.0)
+        geom.pos, geom.quat = self.pose[:3, 3], quaternion(self.pose)
+        if self.kind == "mesh":
+            assert self.vertices is not None and self.faces is not None
+            inertia = getattr(mujoco.mjtMeshInertia, f"mjMESH_INERTIA_{model.upper()}")
+            vertices, faces = self.vertices.ravel().tolist(), self.faces.ravel().tolist()
+            spec.add_mesh(name="mesh", uservert=vertices, userface=faces, inertia=inertia)
+            geom.meshname = "mesh"
         else:
-            return 0.0, np.zeros(3), np.zeros((3, 3))
-        return float(volume), np.zeros(3), volume * np.diag(squares.sum() - squares)
+            geom.size[: len(self.size)] = self.size
+            if model:
+                geom.typeinertia = mujoco.mjtGeomInertia.mjINERTIA_SHELL
+        made = spec.compile()
+        axes = Rotation.from_quat(made.body_iquat[1], scalar_first=True).as_matrix()
+        return float(made.body_mass[1]), made.body_ipos[1].copy(), axes @ np.diag(made.body_inertia[1]) @ axes.T
 
 
 def shape_of(stage: Stage, prim: Prim, place: Matrix) -> Shape:

@@ -90,6 +90,35 @@ class Stage:
         return float(self.pxr.UsdPhysics.GetStageKilogramsPerUnit(self.usd))
 
     @cached_property
+    def bodies(self) -> dict[str, Prim]:
+        """Prims of the rigid bodies, by path."""
+        prims = {str(prim.GetPath()): prim for prim in self.prims if self.has(prim, "PhysicsRigidBodyAPI")}
+        return {path: prim for path, prim in prims.items() if self.value(prim, "physics:rigidBodyEnabled")}
+
+    @cached_property
+    def owners(self) -> dict[str, str | None]:
+        """For the path of each prim, that of the rigid body which it moves with; None is the world."""
+        owners: dict[str, str | None] = {"/": None}
+        for prim in self.prims:
+            path = str(prim.GetPath())
+            owners[path] = path if path in self.bodies else owners[path.rpartition("/")[0] or "/"]
+        return owners
+
+    @cached_property
+    def kinematic(self) -> dict[str, bool]:
+        """Whether each body is kinematic."""
+        return {path: bool(self.value(prim, "physics:kinematicEnabled")) for path, prim in self.bodies.items()}
+
+    @cached_property
+    def body_frames(self) -> dict[str, Matrix]:
+        """World poses of the bodies [m]."""
+        return {path: self.frame(prim)[0] for path, prim in self.bodies.items()}
+
+    def in_body(self, pose: Matrix, body: str | None) -> Matrix:
+        """Return a pose in the world as one in a body's frame; None is the world."""
+        return pose if body is None else np.linalg.inv(self.body_frames[body]) @ pose
+
+    @cached_property
     def _schemas(self) -> dict[str, frozenset[str]]:
         return {}
 
@@ -299,6 +328,29 @@ def _check_composition(stage: Stage) -> None:
     )
     if problems:
         raise RobotError(f"{stage.file}: {listed(problems)}")
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names in MJCF of what a stage holds, by the paths of the prims.
+
+    Attributes:
+        bodies: Of bodies.
+        geoms: Of geoms.
+        sites: Of sites.
+        joints: Of all joints.
+        moving: Of the joints of the tree that are not fixed.
+        scalars: Of its hinges and slides.
+        tendons: Of tendons.
+    """
+
+    bodies: dict[str, str]
+    geoms: dict[str, str]
+    sites: dict[str, str]
+    joints: dict[str, str]
+    moving: dict[str, str]
+    scalars: dict[str, str]
+    tendons: dict[str, str] = field(default_factory=dict)
 
 
 def unique_names(stage: Stage, prims: Iterable[Prim], reserved: Iterable[str] = ()) -> dict[str, str]:

@@ -7,7 +7,7 @@ from pxr import Usd, UsdPhysics
 from usd_exports import twins_of, world_of
 
 from tgdsl.formats.robot import export_model, load_model
-from tgdsl.formats.usd.export.equalities import shifted
+from tgdsl.formats.usd.equalities import shifted
 
 HAND = """
 <mujoco model="closed">

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
 from tgdsl.formats.model import SHAPE_NAMES
-from tgdsl.formats.usd.custom_attributes import GEOM, MESH, SITE, AttributeTable, default_model, non_default
-from tgdsl.formats.usd.export.stage_writer import StageWriter, set_custom, set_number, set_pose
+from tgdsl.formats.usd.attributes import GEOM, MESH, SITE, Table, default_model, set_custom, set_customs, set_number
+from tgdsl.formats.usd.export.stage_writer import StageWriter, set_pose
 from tgdsl.formats.usd.stage import usd_modules
 
 MESH_GEOM = int(mujoco.mjtGeom.mjGEOM_MESH)
-MASKS = ("contype", "conaffinity")
+MASKS = {name: GEOM[name] for name in ("contype", "conaffinity")}
 """Custom attributes of visuals too."""
 AS_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 """How the importer takes meshes without the custom attribute `inertia`."""
@@ -24,13 +24,8 @@ PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)
 """MuJoCo's default colour of a geom: if a material is there too, the material's shows."""
 
 
-def add_geoms(writer: StageWriter, body: int, materials: str) -> None:
+def add_geoms(writer: StageWriter, body: int) -> None:
     """Write the geoms of a body below its prim.
-
-    Args:
-        writer: Where to write it.
-        body: MuJoCo's index.
-        materials: Path of the scope that holds the physics materials.
 
     Raises:
         RobotError: If USD has no such shape.
@@ -45,15 +40,14 @@ def add_geoms(writer: StageWriter, body: int, materials: str) -> None:
         set_custom(prim, "name", model.geom(geom).name)
         _colour(writer, geom, shape)
         is_colliding = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-        for key, value in _custom_attributes(writer, GEOM, geom).items():
-            if is_colliding or key in MASKS:
-                set_custom(prim, key, value)
+        _set_customs(writer, prim, GEOM if is_colliding else MASKS, geom)
         if is_colliding:
-            _add_collider(writer, geom, prim, materials)
+            _add_collider(writer, geom, prim)
 
 
-def _custom_attributes(writer: StageWriter, table: AttributeTable, index: int) -> dict[str, Any]:
-    return non_default(table, lambda name: getattr(writer.model, name)[index], lambda name: getattr(default_model(), name)[0])
+def _set_customs(writer: StageWriter, prim: Any, table: Table, index: int) -> None:
+    default = default_model()
+    set_customs(prim, table, lambda name: getattr(writer.model, name)[index], lambda name: getattr(default, name)[0])
 
 
 def _pose(writer: StageWriter, geom: int) -> tuple[np.ndarray, np.ndarray]:
@@ -111,8 +105,7 @@ def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
     shape.CreateSubdivisionSchemeAttr("none")
     set_custom(shape.GetPrim(), "mesh", model.mesh(mesh).name)
     own, usual = writer.spec.mesh(model.mesh(mesh).name), mujoco.MjSpec().add_mesh(inertia=AS_SHELL)
-    for key, value in non_default(MESH, lambda name: getattr(own, name), lambda name: getattr(usual, name)).items():
-        set_custom(shape.GetPrim(), key, value)
+    set_customs(shape.GetPrim(), MESH, lambda name: getattr(own, name), lambda name: getattr(usual, name))
 
 
 def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
@@ -143,20 +136,20 @@ def _colour(writer: StageWriter, geom: int, shape: Any) -> None:
         shape.CreateDisplayOpacityAttr([opacity])
 
 
-def _add_collider(writer: StageWriter, geom: int, prim: Any, materials: str) -> None:
+def _add_collider(writer: StageWriter, geom: int, prim: Any) -> None:
     u = usd_modules()
     u.UsdPhysics.CollisionAPI.Apply(prim)
     if prim.IsA(u.UsdGeom.Mesh):
         u.UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr("convexHull")  # as MuJoCo collides it
     friction = float(writer.model.geom_friction[geom, 0])
-    u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(_material(writer, friction, materials), materialPurpose="physics")
+    u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(_material(writer, friction), materialPurpose="physics")
 
 
-def _material(writer: StageWriter, friction: float, scope: str) -> Any:
+def _material(writer: StageWriter, friction: float) -> Any:
     """Return the physics material of a sliding friction; geoms of the same friction share it."""
     u = usd_modules()
     if friction not in writer.frictions:
-        material = u.UsdShade.Material.Define(writer.stage, writer.path(scope, f"friction_{friction!r}"))
+        material = u.UsdShade.Material.Define(writer.stage, writer.path(writer.materials, f"friction_{friction!r}"))
         surface = u.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
         set_number(surface.CreateStaticFrictionAttr(), friction)
         set_number(surface.CreateDynamicFrictionAttr(), friction)
@@ -174,5 +167,4 @@ def add_sites(writer: StageWriter, body: int) -> None:
         set_pose(prim, model.site_pos[site], model.site_quat[site])
         set_custom(prim, "site", True)
         set_custom(prim, "name", name)
-        for key, value in _custom_attributes(writer, SITE, site).items():
-            set_custom(prim, key, value)
+        _set_customs(writer, prim, SITE, site)

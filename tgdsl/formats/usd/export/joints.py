@@ -11,7 +11,6 @@ together, and `tgdsl:damping` says how much of it is the joint's. A damped joint
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -19,11 +18,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.usd.custom_attributes import JOINT, default_model, non_default
-from tgdsl.formats.usd.export.stage_writer import StageWriter, rounded, set_custom, set_number
+from tgdsl.formats.usd.attributes import JOINT, default_model, set_custom, set_customs, set_number
+from tgdsl.formats.usd.export.stage_writer import BALL, FREE, HINGE, SLIDE, StageWriter, rounded
+from tgdsl.formats.usd.joints import Drive
 from tgdsl.formats.usd.stage import usd_modules
 
-FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
 JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 NO_DYNAMICS, FIXED_GAIN = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
 AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -45,25 +44,23 @@ def joint_of(writer: StageWriter, body: int) -> int:
     return int(writer.model.body_jntadr[body]) if count else -1
 
 
-def add_joint(writer: StageWriter, body: int, scope: str, collides: bool) -> Any | None:
+def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
     """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap).
 
     Args:
         writer: Where to write it; all bodies are there.
         body: MuJoCo's index of the child.
-        scope: Path of the scope that holds the joints.
         collides: Whether the two bodies can collide with each other.
-
-    Returns:
-        The joint's schema, if USD has a joint there that can move.
     """
     model, joint = writer.model, joint_of(writer, body)
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
     if kind == FREE or model.body_mocapid[body] >= 0:
-        return None
+        if joint >= 0:
+            set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
+        return
     name = model.joint(joint).name if joint >= 0 else ""
     physics = usd_modules().UsdPhysics
-    path = writer.path(scope, name or f"{writer.body_name(body)}_{'fixed' if joint < 0 else 'joint'}")
+    path = writer.path(writer.scope, name or f"{writer.body_name(body)}_{'fixed' if joint < 0 else 'joint'}")
     made = getattr(physics, SCHEMAS.get(kind, "FixedJoint")).Define(writer.stage, path)
     set_custom(made.GetPrim(), "name", name)
     parent = int(model.body_parentid[body])
@@ -74,12 +71,12 @@ def add_joint(writer: StageWriter, body: int, scope: str, collides: bool) -> Any
         made.CreateCollisionEnabledAttr(True)
     _frames(writer, body, joint, made)
     if joint < 0:
-        return None
+        return
     if kind in (SLIDE, HINGE):
         made.CreateAxisAttr("X")
         _limit(model, joint, made)
     _passive(model, joint, made.GetPrim())
-    return made
+    writer.joints[joint] = made
 
 
 def _frames(writer: StageWriter, body: int, joint: int, made: Any) -> None:
@@ -123,11 +120,8 @@ def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
     """Write a joint's armature, dry friction and damping, in SI units; of the first two PhysX has attributes, USD has none."""
     first = int(model.jnt_dofadr[joint])
     index = {"jnt": joint, "dof": first}
-    notes = non_default(
-        JOINT, lambda name: getattr(model, name)[index[name[:3]]], lambda name: getattr(default_model(), name)[0]
-    )
-    for key, value in notes.items():
-        set_custom(prim, key, value)
+    default = default_model()
+    set_customs(prim, JOINT, lambda name: getattr(model, name)[index[name[:3]]], lambda name: getattr(default, name)[0])
     start = float(model.qpos0[model.jnt_qposadr[joint]])
     if start and model.jnt_type[joint] in (SLIDE, HINGE):
         set_custom(prim, "ref", start)
@@ -140,44 +134,18 @@ def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
         prim.AddAppliedSchema("PhysxJointAPI")  # Omniverse reads the attributes only of a prim that says so
     for key, value in known.items():
         if value:
-            set_number(prim.CreateAttribute(f"physxJoint:{key}", usd_modules().Sdf.ValueTypeNames.Float, custom=True), value)
+            attribute = prim.CreateAttribute(f"physxJoint:{key}", usd_modules().Sdf.ValueTypeNames.Float, custom=True)
+            set_number(attribute, value)
     damping = float(model.dof_damping[first])
     if damping:
         set_custom(prim, "damping", damping)
     if damping and model.jnt_type[joint] in (SLIDE, HINGE):
-        _drive(model, joint, Servo(0.0, 0.0, math.inf, None), prim)
+        _drive(model, joint, Drive(0.0, 0.0, math.inf), prim)
 
 
-@dataclass(frozen=True)
-class Servo:
-    """What an actuator does to its joint, seen from the joint: gears are folded in. SI units, radians.
-
-    Attributes:
-        stiffness: Effort per error of position; 0 for a velocity servo.
-        damping: Effort per error of velocity.
-        limit: Largest effort, either way.
-        control: Range of the target, or None if it is free.
-        gear: What the actuator's own control and effort are multiplied or divided by.
-    """
-
-    stiffness: float
-    damping: float
-    limit: float
-    control: tuple[float, float] | None
-    gear: float = 1.0
-
-
-def add_drives(writer: StageWriter, joints: dict[int, Any]) -> list[int]:
-    """Write the actuators that USD has drives for.
-
-    Args:
-        writer: Where to write them.
-        joints: The schema of each joint that can move, by MuJoCo's index.
-
-    Returns:
-        The other actuators, which need prims of their own.
-    """
-    model, driven = writer.model, dict[int, int]()
+def add_drives(writer: StageWriter) -> list[int]:
+    """Write the actuators that USD has drives for; return the others, which need prims of their own."""
+    model, joints, driven = writer.model, writer.joints, dict[int, int]()
     for actuator in range(model.nu):
         servo, joint = _servo(model, actuator), int(model.actuator_trnid[actuator, 0])
         if servo is None or joint in driven:
@@ -197,7 +165,7 @@ def add_drives(writer: StageWriter, joints: dict[int, Any]) -> list[int]:
     return left
 
 
-def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
+def _servo(model: mujoco.MjModel, actuator: int) -> Drive | None:
     """Return an actuator as a servo, or None if it is none."""
     kinds = (model.actuator_dyntype[actuator], model.actuator_gaintype[actuator], model.actuator_biastype[actuator])
     if kinds != (NO_DYNAMICS, FIXED_GAIN, AFFINE_BIAS) or model.actuator_trntype[actuator] not in JOINT_TRANSMISSIONS:
@@ -209,29 +177,29 @@ def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
     offset, stiffness, damping = (0.0 - model.actuator_biasprm[actuator, :3]).tolist()
     is_position, is_velocity = stiffness == gain, stiffness == 0 and damping == gain
     low, high = model.actuator_forcerange[actuator].tolist()
-    if (model.actuator_forcelimited[actuator] and low != -high) or has_more(model, actuator):
+    if (model.actuator_forcelimited[actuator] and low != -high) or _has_more(model, actuator):
         return None
     if offset or gain <= 0 or not gear or not (is_position or is_velocity):
         return None
     limits = [abs(gear) * np.abs(model.actuator_forcerange[actuator]).max()] if model.actuator_forcelimited[actuator] else []
     limits += [np.abs(model.jnt_actfrcrange[joint]).max()] if model.jnt_actfrclimited[joint] else []
     low, high = sorted((model.actuator_ctrlrange[actuator] / gear + 0.0).tolist())
-    return Servo(
+    return Drive(
         stiffness=stiffness * gear**2,
         damping=damping * gear**2,
-        limit=float(min(limits, default=math.inf)),
+        max_force=float(min(limits, default=math.inf)),
         control=(low, high) if model.actuator_ctrllimited[actuator] else None,
         gear=gear,
     )
 
 
-def has_more(model: mujoco.MjModel, actuator: int) -> bool:
+def _has_more(model: mujoco.MjModel, actuator: int) -> bool:
     """Return whether an actuator does more than act on its control as it is: it waits, or it weighs or damps."""
     arrays = (model.actuator_delay, model.actuator_history, model.actuator_armature, model.actuator_damping)
     return any(np.any(array[actuator]) for array in arrays)
 
 
-def _drive(model: mujoco.MjModel, joint: int, servo: Servo, prim: Any) -> None:
+def _drive(model: mujoco.MjModel, joint: int, servo: Drive, prim: Any) -> None:
     """Write a servo as a joint's drive, or write it over the drive that is there."""
     is_hinge = model.jnt_type[joint] == HINGE
     unit = math.radians(1.0) if is_hinge else 1.0  # an angular drive counts in degrees
@@ -239,7 +207,7 @@ def _drive(model: mujoco.MjModel, joint: int, servo: Servo, prim: Any) -> None:
     drive.CreateTypeAttr("force")
     set_number(drive.CreateStiffnessAttr(), servo.stiffness * unit)
     set_number(drive.CreateDampingAttr(), (servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
-    set_number(drive.CreateMaxForceAttr(), servo.limit)
+    set_number(drive.CreateMaxForceAttr(), servo.max_force)
     if servo.control:
         set_custom(prim, "ctrlrange", servo.control)
     if servo.gear != 1.0:

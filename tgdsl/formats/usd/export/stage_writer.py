@@ -1,4 +1,4 @@
-"""A USD stage that is being written: prim paths, transforms, attributes, and what is unsupported."""
+"""A USD stage that is being written: prim paths, transforms, and what is unsupported."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.formats.usd.stage import NAMESPACE, usd_modules
+from tgdsl.formats.usd.attributes import set_custom
+from tgdsl.formats.usd.stage import usd_modules
 
+FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
 DECIMALS = 14
 """Decimals of positions and rotations: those beyond are rounding, which differs from machine to machine."""
 
@@ -31,9 +33,13 @@ class StageWriter:
         model: MuJoCo's compiled model.
         stage: The `Usd.Stage`.
         root: Path of the default prim.
+        scope: Path of the scope that holds joints and what acts on them.
+        materials: Path of the scope that holds physics materials.
         bodies: Path of each body's prim by MuJoCo's index; the world's is there only if it holds something.
         sites: Path of each site's prim, by MuJoCo's index.
         geoms: Path of each geom's prim, by MuJoCo's index.
+        joints: Schema of each joint that can move, by MuJoCo's index.
+        tendons: Path of each tendon's prim, by MuJoCo's index.
         frictions: The physics material of each sliding friction that is in use.
         unsupported: One message for each thing that USD does not hold.
     """
@@ -43,9 +49,13 @@ class StageWriter:
     model: mujoco.MjModel
     stage: Any
     root: str = ""
+    scope: str = ""
+    materials: str = ""
     bodies: dict[int, str] = field(default_factory=dict)
     sites: dict[int, str] = field(default_factory=dict)
     geoms: dict[int, str] = field(default_factory=dict)
+    joints: dict[int, Any] = field(default_factory=dict)
+    tendons: dict[int, str] = field(default_factory=dict)
     frictions: dict[float, Any] = field(default_factory=dict)
     unsupported: list[str] = field(default_factory=list)
     _taken: set[str] = field(default_factory=set)
@@ -59,6 +69,12 @@ class StageWriter:
             result = f"{plain}_{number}"
         self._taken.add(result)
         return result
+
+    def define(self, kind: str, prim_name: str, name: str) -> Any:
+        """Define a prim of MuJoCo's schemas in `scope`; `name` is MuJoCo's."""
+        prim = self.stage.DefinePrim(self.path(self.scope, prim_name), kind)
+        set_custom(prim, "name", name)
+        return prim
 
     def body_name(self, body: int) -> str:
         """Return a body's name, or what a message and a prim call one that has none."""
@@ -85,36 +101,3 @@ def set_pose(
     xform.AddOrientOp(double).Set(u.Gf.Quatd(*rounded(quat).tolist()))
     if scale is not None:
         xform.AddScaleOp(double).Set(u.Gf.Vec3d(*scale.tolist()))
-
-
-def set_custom(prim: Any, key: str, value: str | bool | int | float | tuple[float, float] | list[float] | list[str]) -> None:
-    """Set a prim's custom attribute `tgdsl:<key>`; an empty string is not written."""
-    if value == "":
-        return
-    types = usd_modules().Sdf.ValueTypeNames
-    kinds = {str: types.String, bool: types.Bool, int: types.Int, float: types.Double, tuple: types.Double2}
-    kinds[list] = types.StringArray if isinstance(value, list) and isinstance(value[0], str) else types.DoubleArray
-    kind = kinds[type(value)]
-    prim.CreateAttribute(f"{NAMESPACE}{key}", kind, custom=True).Set(value)
-
-
-def set_number(attribute: Any, value: float | Float[np.ndarray, " number"]) -> None:
-    """Set an attribute to 15 digits; where it is float32, also its double-precision copy `tgdsl:<its name>`.
-
-    Args:
-        attribute: A number, a vector of three or a quaternion (w x y z).
-        value: Its value.
-    """
-    u, digits = usd_modules(), [float(f"{number:.15g}") + 0.0 for number in np.ravel(value).tolist()]
-    types, kind = u.Sdf.ValueTypeNames, attribute.GetTypeName().type.typeName
-    if kind == "GfQuatf":
-        exact, wide = u.Gf.Quatd(*digits), types.Quatd
-        attribute.Set(u.Gf.Quatf(exact))
-    elif kind == "GfVec3f":
-        exact, wide = u.Gf.Vec3d(*digits), types.Double3
-        attribute.Set(u.Gf.Vec3f(exact))
-    else:
-        exact, wide = digits[0], types.Double
-        attribute.Set(exact)
-    if type(exact)(attribute.Get()) != exact:
-        attribute.GetPrim().CreateAttribute(f"{NAMESPACE}{attribute.GetName()}", wide, custom=True).Set(exact)

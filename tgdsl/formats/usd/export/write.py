@@ -28,12 +28,21 @@ import numpy as np
 from tgdsl.errors import FileError, RobotError, listed
 from tgdsl.files.write import atomic_path
 from tgdsl.formats.model import Model
-from tgdsl.formats.usd.custom_attributes import OPTION, default_model, non_default, non_default_flags
-from tgdsl.formats.usd.export.actuators import add_actuators, add_keyframes, add_tendons
-from tgdsl.formats.usd.export.equalities import add_equalities
+from tgdsl.formats.usd.actuators import write_actuators, write_keyframes, write_tendons
+from tgdsl.formats.usd.attributes import (
+    FLAGS,
+    KNOWN_FLAGS,
+    OPTION,
+    default_model,
+    flag_names,
+    set_custom,
+    set_customs,
+    set_number,
+)
+from tgdsl.formats.usd.equalities import write_equalities
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
-from tgdsl.formats.usd.export.joints import FREE, add_drives, add_joint, joint_of
-from tgdsl.formats.usd.export.stage_writer import StageWriter, set_custom, set_number, set_pose
+from tgdsl.formats.usd.export.joints import add_drives, add_joint
+from tgdsl.formats.usd.export.stage_writer import FREE, StageWriter, set_pose
 from tgdsl.formats.usd.stage import usd_modules
 
 ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -53,9 +62,9 @@ def write_usd(model: Model, out: Path) -> None:
     """
     writer = StageWriter(model.file, model.spec, model.compiled, usd_modules().Usd.Stage.CreateInMemory())
     _add_scene(writer)
-    joints, materials = (writer.path(writer.root, name) for name in ("joints", "materials"))
-    _add_bodies(writer, materials)
-    _add_joints(writer, joints)
+    writer.scope, writer.materials = (writer.path(writer.root, name) for name in ("joints", "materials"))
+    _add_bodies(writer)
+    _add_joints(writer)
     _add_filters(writer)
     _write(writer, out)
     for message in (*writer.unsupported, *_unsupported_elements(writer)):
@@ -81,19 +90,23 @@ def _add_scene(writer: StageWriter) -> None:
     scene = u.UsdPhysics.Scene.Define(stage, writer.path("", "physicsScene"))
     set_number(scene.CreateGravityMagnitudeAttr(), strength)
     set_number(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
-    settings = non_default(OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(default_model().opt, name))
     # A scene of a stage that this one is layered into may have a schema with another default.
-    for key, value in ({"timestep": float(model.opt.timestep)} | settings | non_default_flags(model)).items():
-        set_custom(scene.GetPrim(), key, value)
+    set_custom(scene.GetPrim(), "timestep", float(model.opt.timestep))
+    default = default_model().opt
+    set_customs(scene.GetPrim(), OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(default, name))
+    for key in FLAGS:
+        bits = int(getattr(model.opt, f"{key}flags"))
+        if names := [name for name, bit in flag_names(key).items() if bits & bit and name not in KNOWN_FLAGS]:
+            set_custom(scene.GetPrim(), key, names)
 
 
-def _add_bodies(writer: StageWriter, materials: str) -> None:
+def _add_bodies(writer: StageWriter) -> None:
     """Write every body at its world pose at `qpos0`, with its mass, geoms and sites."""
     u, model = usd_modules(), writer.model
     state = mujoco.MjData(model)
     mujoco.mj_kinematics(model, state)
     if np.any(model.geom_contype | model.geom_conaffinity):
-        u.UsdGeom.Scope.Define(writer.stage, materials)
+        u.UsdGeom.Scope.Define(writer.stage, writer.materials)
     for body in range(model.nbody):
         path = writer.path(writer.root, writer.body_name(body))
         if body == 0 and not model.body_geomnum[0] and not np.any(model.site_bodyid == 0):
@@ -106,7 +119,7 @@ def _add_bodies(writer: StageWriter, materials: str) -> None:
                 set_custom(prim, "gravcomp", float(model.body_gravcomp[body]))
             set_pose(prim, state.xpos[body], state.xquat[body])
             _add_mass(writer, body, prim)
-        add_geoms(writer, body, materials)
+        add_geoms(writer, body)
         add_sites(writer, body)
 
 
@@ -127,22 +140,17 @@ def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
     set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
 
 
-def _add_joints(writer: StageWriter, scope: str) -> None:
-    model, moving = writer.model, {}
+def _add_joints(writer: StageWriter) -> None:
+    model = writer.model
     excluded = _excluded(model)
-    usd_modules().UsdGeom.Scope.Define(writer.stage, scope)
+    usd_modules().UsdGeom.Scope.Define(writer.stage, writer.scope)
     for body in range(1, model.nbody):
-        joint, parent = joint_of(writer, body), int(model.body_parentid[body])
-        collides = parent > 0 and (parent, body) not in excluded and not _never_collide(model, parent, body)
-        made = add_joint(writer, body, scope, collides)
-        if made is not None:
-            moving[joint] = made
-        elif joint >= 0:
-            set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
-    add_keyframes(writer, scope)
-    tendons = add_tendons(writer, scope, moving)
-    add_equalities(writer, scope, moving, tendons)
-    add_actuators(writer, add_drives(writer, moving), scope, moving, tendons)
+        parent = int(model.body_parentid[body])
+        add_joint(writer, body, parent > 0 and (parent, body) not in excluded and not _never_collide(model, parent, body))
+    write_keyframes(writer)
+    write_tendons(writer)
+    write_equalities(writer)
+    write_actuators(writer, add_drives(writer))
 
 
 def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:

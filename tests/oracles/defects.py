@@ -5,7 +5,6 @@ Each was measured on that implementation (release 1.4.5, on a CPU) or read from 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
 
@@ -46,12 +45,3 @@ DEFECTS = (
     Defect(25, "velocities of the origin and of the centre of mass are mixed up", "9 % of force, 8 mm apart", "oracles"),
 )
 """All findings."""
-
-
-def answers(entries: Iterable[tuple[str, str, tuple[int, ...]]]) -> dict[int, tuple[str, str]]:
-    """Return title and figure of the first entry that answers each finding, of titles, figures and numbers of findings."""
-    first: dict[int, tuple[str, str]] = {}
-    for title, figure, numbers in entries:
-        for number in numbers:
-            first.setdefault(number, (title, figure))
-    return first

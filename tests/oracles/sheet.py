@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -11,8 +11,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from oracles.defects import DEFECTS, Defect
 from tgdsl.console.tables import text_table
-from tgdsl.report.defects import DEFECTS, Defect, answers
 from tgdsl.report.files import page_of, svg_of, table_of, write_report_files
 
 
@@ -127,15 +127,19 @@ def _plot(entry: Entry, salt: str) -> str:
 def _findings(sheet: Sheet) -> str:
     rows = [
         (f"{defect.number}. {defect.about}", defect.measured, title or f"tgdsl bench --{defect.answered_in}", figure)
-        for defect, title, figure in _answered(sheet)
+        for defect, title, figure in findings(sheet.entries)
     ]
     about = "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
     table = table_of(("finding", "there", "answered by", "figure here"), rows)
     return f'<section id="findings"><h2>Findings</h2><p>{about}</p>\n{table}</section>'
 
 
-def _answered(sheet: Sheet) -> list[tuple[Defect, str, str]]:
-    first = answers((entry.title, entry.figure, entry.defects) for entry in sheet.entries)
+def findings(entries: Iterable[Entry]) -> list[tuple[Defect, str, str]]:
+    """Return each finding with title and figure of the first entry that answers it, or with empty ones."""
+    first: dict[int, tuple[str, str]] = {}
+    for entry in entries:
+        for number in entry.defects:
+            first.setdefault(number, (entry.title, entry.figure))
     return [(defect, *first.get(defect.number, ("", ""))) for defect in DEFECTS]
 
 
@@ -146,7 +150,7 @@ def sheet_text(sheet: Sheet) -> str:
         table = text_table(("", *sheet.header), [("" if e.holds else "✗", e.title, *e.cells) for e in section.entries])
         lines = [section.name, table, *(f"not to be had: {name}: {why}" for name, why in section.left_out)]
         parts.append("\n".join(lines))
-    rows = [(f"{d.number}", d.about, title or f"--{d.answered_in}", figure) for d, title, figure in _answered(sheet)]
+    rows = [(f"{d.number}", d.about, title or f"--{d.answered_in}", figure) for d, title, figure in findings(sheet.entries)]
     parts.append("findings about the paper's implementation\n" + text_table(("", "finding", "answered by", "figure"), rows))
     num = len(sheet.entries)
     parts.append(f"{num} of {num} hold" if not sheet.failed else f"{len(sheet.failed)} of {num} do not hold (✗)")

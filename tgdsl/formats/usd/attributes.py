@@ -1,0 +1,410 @@
+"""Attributes of MJCF elements: MuJoCo's arrays with their values, and the USD attributes; one table reads and writes them.
+
+Several schemas say the same: our own `tgdsl:`, MuJoCo's `mjc:`, Newton's `newton:`, PhysX's `physx…:` and UsdPhysics, in this
+order. The first that is authored is taken; one that says something else is dropped with a warning. A value that the schema
+calls its engine's choice (`-inf`, `-1`) says nothing.
+
+Names and units are those of the schemas MjcPhysics, as in mujoco-usd-converter 0.8, and of newton-usd-schemas 0.6: `newton:`
+counts in the stage's units and in degrees; `mjc:` holds MJCF's own values, in SI, of which `ref` and `springref` of a hinge are
+in the unit that `mjc:compiler:angle` names. Where MjcPhysics calls an attribute deprecated, its Newton successor is read too.
+
+`tgdsl:<MJCF's name>` is what MuJoCo has and USD has no schema for, in SI and radians whatever the stage's units; MuJoCo's
+defaults are not written. A value that USD keeps in float32 has a twin in double, `tgdsl:<USD's own name>`, in USD's unit. It
+counts as long as USD's value is what it rounds to: who edits the stage edits USD's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from tgdsl.formats.usd.stage import NAMESPACE, Prim, Stage, usd_modules
+
+AGREEMENT = 1e-5
+"""Relative difference up to which two sources say the same: some attributes are float32."""
+TOKENS = {"euler": "Euler", "rk4": "RK4", "pgs": "PGS", "cg": "CG", "newton": "Newton"}
+"""MjcPhysics' tokens that MJCF spells otherwise."""
+
+
+def _keywords(enum: Any) -> tuple[str, ...]:
+    return tuple(name.rpartition("_")[2].lower() for name, _ in sorted(enum.__members__.items(), key=lambda item: int(item[1])))
+
+
+KEYWORDS = {
+    "type": ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box"),
+    "inertia": ("convex", "exact", "legacy", "shell"),
+    "integrator": ("Euler", "RK4", "implicit", "implicitfast", "discrete"),
+    "cone": ("pyramidal", "elliptic"),
+    "jacobian": ("dense", "sparse", "auto"),
+    "solver": ("PGS", "CG", "Newton"),
+    "dyntype": _keywords(mujoco.mjtDyn),
+    "gaintype": _keywords(mujoco.mjtGain),
+    "biastype": _keywords(mujoco.mjtBias),
+    **dict.fromkeys(("actlimited", "ctrllimited", "forcelimited", "limited", "actuatorfrclimited"), ("false", "true")),
+}
+"""MJCF's keywords, in the order of MuJoCo's enumerations."""
+FLAGS = {"disable": (mujoco.mjtDisableBit, "mjDSBL_"), "enable": (mujoco.mjtEnableBit, "mjENBL_")}
+"""MuJoCo's flags that are written if set, as lists of MJCF's names, and their bits."""
+KNOWN_FLAGS = ("gravity", "filterparent")
+"""Flags that USD has attributes for."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A USD attribute that holds the value of an MJCF attribute.
+
+    Attributes:
+        name: The attribute's name; with `is_range`, what precedes `:min` and `:max`.
+        unit: Its unit, a key of `units`.
+        neutral: A value that says nothing.
+        is_range: Whether two attributes hold the ends of a range.
+        is_rate: Whether it is a whole number of steps per second, whose inverse is meant.
+    """
+
+    name: str
+    unit: str = "1"
+    neutral: float | None = None
+    is_range: bool = False
+    is_rate: bool = False
+
+    def value(self, stage: Stage, prim: Prim, is_angular: bool) -> Any:
+        """Return the value in MJCF's unit, or None if nothing is said."""
+        if self.is_range:
+            ends = [stage.authored(prim, f"{self.name}:{end}") for end in ("min", "max")]
+            return None if ends == [None, None] else [float(end or 0.0) for end in ends]
+        value = stage.authored(prim, self.name)
+        if value is None or (self.neutral is not None and value == self.neutral):
+            return None
+        if self.is_rate:
+            return None if value <= 0 else 1.0 / value
+        if isinstance(value, bool | str):
+            return value
+        factor = units(stage, is_angular)[self.unit]
+        if factor == 1.0:
+            return value
+        return value * factor if isinstance(value, int | float) else [float(number) * factor for number in value]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Where the value of an MJCF attribute is.
+
+    Attributes:
+        array: Array of `MjModel`, or field of `MjOption` or `MjsMesh`, from which it is written; empty if not by the table.
+        sources: USD attributes, most specific first; `tgdsl:<MJCF's name>` always comes before them.
+    """
+
+    array: str = ""
+    sources: tuple[Source, ...] = ()
+
+
+Table = Mapping[str, Row]
+"""Rows by the names of an MJCF element's attributes."""
+
+
+def mjc(
+    name: str, *more: Source, array: str = "", unit: str = "1", neutral: float | None = None, is_range: bool = False
+) -> Row:
+    """Return a row whose first source is a MuJoCo attribute."""
+    return Row(array, (Source(f"mjc:{name}", unit, neutral, is_range), *more))
+
+
+OPTION: Table = {
+    "timestep": mjc("option:timestep", Source("newton:timeStepsPerSecond", is_rate=True), array="timestep"),
+    **{
+        name: mjc(f"option:{name}", array=name)
+        for name in (
+            *("integrator", "cone", "impratio", "jacobian", "solver", "tolerance", "density", "viscosity"),
+            *("ls_iterations", "ls_tolerance", "noslip_iterations", "noslip_tolerance", "ccd_iterations", "ccd_tolerance"),
+            *("sdf_iterations", "sdf_initpoints", "wind", "magnetic", "o_margin", "o_solref", "o_solimp", "o_friction"),
+        )
+    },
+    "iterations": mjc("option:iterations", Source("newton:maxSolverIterations", neutral=-1.0), array="iterations"),
+    "actuatorgroupdisable": mjc("option:actuatorgroupdisable"),
+}
+COMPILER: Table = {
+    **{name.lower(): mjc(f"compiler:{name}") for name in ("alignFree", "balanceInertia", "boundInertia", "boundMass")},
+    **{name.lower(): mjc(f"compiler:{name}") for name in ("fitAABB", "fuseStatic")},
+    "settotalmass": mjc("compiler:setTotalMass", neutral=-1.0),
+}
+GRAVITY_FLAG: Table = {"gravity": Row("", (Source("mjc:flag:gravity"), Source("newton:gravityEnabled")))}
+SELF_COLLISION: Table = {
+    "self": Row("", (Source("newton:selfCollisionEnabled"), Source("physxArticulation:enabledSelfCollisions")))
+}
+JOINT: Table = {
+    "margin": mjc("margin", array="jnt_margin"),
+    "stiffness": mjc("stiffness", array="jnt_stiffness"),
+    "actuatorgravcomp": mjc("actuatorgravcomp", array="jnt_actgravcomp"),
+    "solreflimit": mjc("solreflimit", array="jnt_solref"),
+    "solimplimit": mjc("solimplimit", array="jnt_solimp"),
+    "solreffriction": mjc("solreffriction", array="dof_solref"),
+    "solimpfriction": mjc("solimpfriction", array="dof_solimp"),
+    "damping": mjc("damping", Source("newton:damping", "damping")),
+    "armature": mjc("armature", Source("newton:armature", "inertia"), Source("physxJoint:armature", "inertia")),
+    "frictionloss": mjc("frictionloss", Source("newton:friction", "effort"), Source("physxJoint:jointFriction", "effort")),
+    "springref": mjc("springref", unit="mjcf angle"),
+    "springdamper": mjc("springdamper"),
+    "ref": mjc("ref", unit="mjcf angle"),
+    "actuatorfrclimited": mjc("actuatorfrclimited"),
+    "actuatorfrcrange": mjc("actuatorfrcrange", is_range=True),
+    "group": mjc("group"),
+    "range": Row(),
+}
+BODY: Table = {"gravcomp": mjc("body:gravcomp")}
+GROUP: Table = {"group": mjc("group")}
+GEOM: Table = {
+    **{name: mjc(name, array=f"geom_{name}") for name in ("condim", "priority", "solmix", "solref", "solimp")},
+    **{name: Row(f"geom_{name}") for name in ("friction", "contype", "conaffinity")},
+    "margin": mjc("margin", Source("newton:contactMargin", "length"), array="geom_margin"),
+    "gap": mjc("gap", Source("newton:contactGap", "length", neutral=-math.inf), array="geom_gap"),
+    **GROUP,
+}
+SITE: Table = {
+    **{name: Row(f"site_{name}") for name in ("type", "size", "rgba")},
+    "group": mjc("group", array="site_group"),
+}
+FRICTION: Table = {
+    "torsional": mjc("torsionalfriction", Source("newton:torsionalFriction", "length")),
+    "rolling": mjc("rollingfriction", Source("newton:rollingFriction", "length")),
+}
+"""Of a material; `friction` of its geoms."""
+MESH: Table = {
+    "inertia": mjc("inertia", array="inertia"),
+    "maxhullvert": mjc("maxhullvert", Source("newton:maxHullVertices", neutral=-1.0), array="maxhullvert", neutral=-1.0),
+}
+EQUALITY: Table = {"solref": mjc("solref", array="eq_solref"), "solimp": mjc("solimp", array="eq_solimp")}
+WELD: Table = {**EQUALITY, "torquescale": mjc("torqueScale")}
+MIMIC: Table = {
+    "0": mjc("coef0", Source("newton:mimicCoef0", "position")),
+    "1": mjc("coef1", Source("newton:mimicCoef1")),
+    **{str(power): mjc(f"coef{power}") for power in (2, 3, 4)},
+}
+"""Coefficients of the polynomial of the leader's position. MJCF counts all in radians, whatever its compiler's angle."""
+LIMITS = ("act", "ctrl", "force")
+ACTUATOR: Table = {
+    **{
+        name.lower(): mjc(name, array=f"actuator_{name.lower()}")
+        for name in ("actEarly", "biasPrm", "biasType", "dynPrm", "dynType", "gainPrm", "gainType", "gear", "group")
+    },
+    **{name.lower(): mjc(name) for name in ("actDim", "crankLength", "inheritRange")},
+    **{f"{name}limited": mjc(f"{name}Limited", array=f"actuator_{name}limited") for name in LIMITS},
+    **{f"{name}range": mjc(f"{name}Range", array=f"actuator_{name}range", is_range=True) for name in (*LIMITS, "length")},
+    **{name: Row(f"actuator_{name}") for name in ("delay", "armature", "damping")},
+    "nsample": Row(),
+}
+"""What has no source, MjcPhysics does not have."""
+SERVO: Table = {
+    "kp": Row("", (Source("newton:kp", "inertia"),)),
+    "kd": Row("", (Source("newton:kd", "inertia"),)),
+    "constant": Row("", (Source("newton:constEffort", "effort"),)),
+    "most": Row("", (Source("newton:maxEffort", "effort", neutral=math.inf),)),
+}
+"""Of a NewtonActuator, whose gains are per radian: kg·m² or kg of the stage, over s² or s, as an inertia is."""
+TENDON: Table = {
+    **{
+        name: mjc(name, array=f"tendon_{name}")
+        for name in ("armature", "damping", "frictionloss", "stiffness", "margin", "group", "limited")
+    },
+    "springlength": mjc("springlength", array="tendon_lengthspring"),
+    **{f"sol{what}limit": mjc(f"sol{what}limit", array=f"tendon_sol{what}_lim") for what in ("ref", "imp")},
+    **{f"sol{what}friction": mjc(f"sol{what}friction", array=f"tendon_sol{what}_fri") for what in ("ref", "imp")},
+    "range": mjc("range", array="tendon_range", is_range=True),
+    "actuatorfrclimited": mjc("actuatorfrclimited", array="tendon_actfrclimited"),
+    "actuatorfrcrange": mjc("actuatorfrcrange", array="tendon_actfrcrange", is_range=True),
+}
+DRAWN: Table = {"rgba": mjc("rgba"), "width": mjc("width", array="tendon_width")}
+"""Of a spatial tendon; a fixed one is not drawn."""
+KEY: Table = {
+    "time": Row("key_time"),
+    **{name: mjc(name, array=f"key_{name}") for name in ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")},
+}
+
+
+def units(stage: Stage, is_angular: bool) -> dict[str, float]:
+    """Return units of USD attributes in SI and radians, for what turns or what slides."""
+    metre, kilogram = stage.metres_per_unit, stage.kilograms_per_unit
+    inertia = kilogram * (metre**2 if is_angular else 1.0)
+    angle = math.radians(1) if is_angular else metre
+    return {
+        "1": 1.0,
+        "length": metre,
+        "inertia": inertia,
+        "effort": kilogram * metre * (metre if is_angular else 1.0),
+        "damping": inertia / (math.radians(1) if is_angular else 1.0),
+        "position": angle,
+        "mjcf angle": math.radians(1) if is_angular and stage.is_mjcf_in_degrees else 1.0,
+    }
+
+
+def read_custom(stage: Stage, prim: Prim, key: str) -> Any:
+    """Return the value of a custom attribute `tgdsl:<key>`, or None."""
+    return stage.authored(prim, f"{NAMESPACE}{key}")
+
+
+def read_attributes(stage: Stage, prim: Prim, table: Table, is_angular: bool = False) -> dict[str, str]:
+    """Return what a prim says of an MJCF element, as its attributes, and take note of contradictions.
+
+    Args:
+        stage: The stage.
+        prim: The prim.
+        table: Which attributes, and where their values are.
+        is_angular: Whether the element turns, which decides on units.
+    """
+    result = {}
+    for attribute, row in table.items():
+        custom = read_custom(stage, prim, attribute)
+        values = [] if custom is None else [(f"{NAMESPACE}{attribute}", custom)]
+        for source in row.sources:
+            value = source.value(stage, prim, is_angular)
+            if value is not None and values and not _agree(values[0][1], value, source.is_rate):
+                stage.drop(f"{source.name} was dropped, which contradicts {values[0][0]}", prim)
+            if value is not None:
+                values.append((source.name, value))
+        if values:
+            name, value = values[0]
+            is_token = isinstance(value, str) and name.startswith("mjc:option:")
+            result[attribute] = text_of(TOKENS.get(value, value) if is_token else value)
+    return result
+
+
+def _agree(first: Any, other: Any, is_rate: bool) -> bool:
+    if isinstance(first, str) or isinstance(other, str):
+        return str(first).lower() == str(other).lower()
+    if is_rate:
+        return round(1.0 / first) == round(1.0 / other)
+    one, two = np.ravel(np.asarray(first, dtype=float)), np.ravel(np.asarray(other, dtype=float))
+    return one.shape == two.shape and bool(np.allclose(one, two, rtol=AGREEMENT, atol=1e-12))
+
+
+def with_limits(stage: Stage, attributes: dict[str, str], pairs: Iterable[str]) -> dict[str, str]:
+    """Return attributes with `…limited` resolved as `mjc:compiler:autoLimits` says.
+
+    Args:
+        stage: The stage.
+        attributes: Of an MJCF element.
+        pairs: What precedes `limited` and `range`.
+    """
+    for name in pairs:
+        if attributes.get(f"{name}limited", "auto") != "auto":
+            continue
+        attributes.pop(f"{name}limited", None)
+        if f"{name}range" in attributes and not stage.is_mjcf_autolimited:
+            attributes[f"{name}limited"] = "false"
+    return attributes
+
+
+def text_of(value: Any) -> str:
+    """Return a value as MJCF writes it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (str, int, float)):
+        return str(value)
+    return " ".join(str(number) if isinstance(number, int) else repr(float(number) + 0.0) for number in value)
+
+
+def author(prim: Any, name: str, value: Any, kind: str = "") -> None:
+    """Set an attribute of a prim; an empty string is not written.
+
+    Args:
+        prim: The prim.
+        name: The attribute's name.
+        value: A string, boolean, number, pair, or list of one of these.
+        kind: USD's name of its type, where that does not follow from the value.
+    """
+    if isinstance(value, str) and not value:
+        return
+    if not kind:
+        kinds = {str: "Token" if name.startswith("mjc:") else "String", bool: "Bool", int: "Int", float: "Double"}
+        if isinstance(value, list):
+            kind = {str: "StringArray", int: "IntArray"}.get(type(value[0]) if value else float, "DoubleArray")
+        else:
+            kind = "Double2" if isinstance(value, tuple) else kinds[type(value)]
+    u = usd_modules()
+    is_custom = not name.startswith(("mjc:", "newton:"))
+    prim.CreateAttribute(name, getattr(u.Sdf.ValueTypeNames, kind), custom=is_custom).Set(
+        u.Vt.IntArray(value) if kind == "IntArray" else value
+    )
+
+
+def set_custom(prim: Any, key: str, value: str | bool | int | float | tuple[float, float] | list[float] | list[str]) -> None:
+    """Set a prim's custom attribute `tgdsl:<key>`; an empty string is not written."""
+    author(prim, f"{NAMESPACE}{key}", value)
+
+
+def set_customs(prim: Any, table: Table, value: Callable[[str], Any], default: Callable[[str], Any]) -> None:
+    """Set the custom attributes of an element whose values are not MuJoCo's defaults.
+
+    Args:
+        prim: The element's prim.
+        table: Its attributes.
+        value: The element's value, by the name of the array that holds it.
+        default: The same of an element with MuJoCo's defaults.
+    """
+    for attribute, row in table.items():
+        if row.array and not np.array_equal(own := np.asarray(value(row.array)), default(row.array)):
+            set_custom(prim, attribute, KEYWORDS[attribute][int(own)] if attribute in KEYWORDS else own.tolist())
+
+
+def set_sources(prim: Any, table: Table, model: mujoco.MjModel, index: int) -> None:
+    """Set the MuJoCo attributes of an element by its index, and as custom ones what they do not include and is not zero.
+
+    Ranges are written only where they hold, and no empty vectors.
+    """
+    for attribute, row in table.items():
+        if not row.array:
+            continue
+        array = np.asarray(getattr(model, row.array)[index]).ravel()
+        value = array.tolist() if np.ndim(getattr(model, row.array)) > 1 else array.tolist()[0]
+        if attribute in KEYWORDS:
+            value = KEYWORDS[attribute][int(value)]
+        if not row.sources:
+            if np.any(array):
+                set_custom(prim, attribute, value)
+        elif row.sources[0].is_range:
+            limited = attribute.replace("range", "limited")
+            is_limited = getattr(model, table[limited].array)[index] if limited in table else array.any()
+            for end, number in zip(("min", "max"), value if is_limited else (), strict=False):
+                author(prim, f"{row.sources[0].name}:{end}", number)
+        elif array.size:
+            author(prim, row.sources[0].name, value)
+
+
+def set_number(attribute: Any, value: float | np.ndarray) -> None:
+    """Set an attribute to 15 digits; where it is float32, also its double-precision copy `tgdsl:<its name>`.
+
+    Args:
+        attribute: A number, a vector of three or a quaternion (w x y z).
+        value: Its value.
+    """
+    u, digits = usd_modules(), [float(f"{number:.15g}") + 0.0 for number in np.ravel(value).tolist()]
+    kind = attribute.GetTypeName().type.typeName
+    if kind == "GfQuatf":
+        exact, wide = u.Gf.Quatd(*digits), "Quatd"
+        attribute.Set(u.Gf.Quatf(exact))
+    elif kind == "GfVec3f":
+        exact, wide = u.Gf.Vec3d(*digits), "Double3"
+        attribute.Set(u.Gf.Vec3f(exact))
+    else:
+        exact, wide = digits[0], "Double"
+        attribute.Set(exact)
+    if type(exact)(attribute.Get()) != exact:
+        author(attribute.GetPrim(), f"{NAMESPACE}{attribute.GetName()}", exact, wide)
+
+
+@cache
+def default_model() -> mujoco.MjModel:
+    """Return a model with MuJoCo's default value of every attribute in the tables."""
+    inside = '<body><joint/><geom type="sphere" size="1"/><site/></body>'
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{inside}</worldbody></mujoco>")
+
+
+def flag_names(key: str) -> dict[str, int]:
+    """Return MJCF's names of the flags of `disable` or `enable`, and their bits."""
+    bits, prefix = FLAGS[key]
+    return {name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)}

@@ -1,1 +1,0 @@
-"""What MuJoCo's and Newton's schemas for USD hold, as MJCF."""
