@@ -346,7 +346,7 @@ def _response(
             falling += dt * np.moveaxis(np.tensordot(matrix, at_end.reshape(block.count), (1, axis)), 0, axis)
     whole, kept, average = (np.zeros(block.above.size) for _ in range(3))
     for own in sides:
-        left, on_average = (own @ part / own.sum() for part in (at_end, evenly - 0.5 * at_end - falling.ravel() / 12))
+        left, on_average = (own @ part / (own @ every) for part in (at_end, evenly - 0.5 * at_end - falling.ravel() / 12))
         whole, kept, average = whole + own, kept + own * left, average + own * on_average
     safe = np.where(whole > 0, whole, 1.0)
     return np.where(whole > 0, np.maximum(average / safe, kept / safe - block.capacity / (dt * safe)), 1.0)

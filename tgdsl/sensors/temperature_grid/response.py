@@ -3,13 +3,13 @@
 A contact's step is implicit in the cells that it touches (`conduction`). In a long one heat spreads from them while it comes
 in, so that a cell shows a larger heat capacity than its own, C/κ, with
 
-    κ_i = max(r_φ − ½ r_E − r_F/12, r_E − C/(Δt Σ g)),   r_f = w_sᵀ f(x) Σ_t w_t/|w_t|²                                  [1]
+    κ_i = max(r_φ − ½ r_E − r_F/12, r_E − C/(Δt Σ g)),   r_f = w_sᵀ f(x) q/(w_sᵀ q),   q = Σ_t w_t/|w_t|²                [1]
     E = e^(−x),   φ = (1 − e^(−x))/x,   F = x e^(−x)
 
 of a side s of a patch on a row, w the shares of the cells in its conductance, t all sides of that row that touch, x = Σ αμΔt/Δ²
 of the modes of the box (`diffusion`), and g what joins the cell with all that it touches [W/K]; of a cell in several patches
 their mean by conductance. r_E is what is left below the patch of heat that was there at the step's begin, r_φ of heat that came
-in evenly.
+in evenly. A cell's own capacity holds what all of its patches bring; so of sides on the same cells q counts once.
 
 The first number makes flows right: cells are taken at the step's begin, and what is left there of former steps' heat counts too
 much, as it falls. The sum of a falling kernel e over steps exceeds its integral by the terms of Euler and Maclaurin,
@@ -57,7 +57,9 @@ def response(
     whole = conductance.sum(dim=(-3, -2, -1), keepdim=True)
     is_any = whole > 0
     shares = conductance / torch.where(is_any, whole, 1.0)
-    over = torch.where(is_any, 1.0 / (shares * shares).sum(dim=(-3, -2, -1), keepdim=True).clamp(min=1e-30), 0.0)
+    squared = (shares * shares).sum(dim=(-3, -2, -1), keepdim=True)
+    over = torch.where(is_any, 1.0 / torch.where(is_any, squared, 1.0), 0.0)
+    meets = (shares * (shares * over).sum(dim=2, keepdim=True)).sum(dim=(-3, -2, -1))
     num_envs, _, sides = shares.shape[:3]
     own = shares.transpose(1, 2).flatten(0, 1)
     for axis, part in enumerate(modes):
@@ -71,6 +73,7 @@ def response(
         safe, kept = torch.where(x > 1e-3, x, 1.0), torch.exp(-x)
         average = torch.where(x > 1e-3, -torch.expm1(-safe) / safe, 1.0 - 0.5 * x * (1.0 - x / 3.0))
         on_average = average - kept * (0.5 + x / 12.0)
+    own = own / torch.where(meets > 0, meets, 1.0)[..., None, None, None]
     return Response(*((own * (every * part)[:, :, None]).sum(dim=(-3, -2, -1)) for part in (kept, on_average)))
 
 

@@ -175,6 +175,10 @@ def step_kernel(
             at_end, evenly = _left(
                 at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ
             )
+    if SIDES > 1:
+        every = tl.sum(shares * over[None, :, :, :], axis=3)
+        meets = tl.where(size > 0, tl.sum(shares * every[:, :, :, None], axis=0), 1.0)
+        at_end, evenly = at_end / meets, evenly / meets
     total = tl.sum(flow, axis=3)
     is_met = total > 0
     per_flow = 1.0 / tl.where(is_met, total, 1.0)
