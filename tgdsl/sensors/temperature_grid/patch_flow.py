@@ -20,7 +20,7 @@ from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
 from tgdsl.sensors.temperature_grid.response import Response, response
 from tgdsl.sensors.temperature_grid.rows import Rows, num_cells
-from tgdsl.sensors.temperature_grid.shares import of_squares, squares
+from tgdsl.sensors.temperature_grid.shares import conductances
 
 
 def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
@@ -49,9 +49,8 @@ def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants, x: Tenso
         pos = planes.where(is_object, planes.vec(_of_sides(patches, part) for part in patches.object_pos), pos)
         normal = planes.where(is_object, planes.vec(_of_sides(patches, part) for part in patches.object_normal), normal)
     of_sides = _of_sides(patches, area)
-    parts = squares(of_sides, pos, normal, rows.boxes, num_cells(rows))
-    result = of_squares(of_sides, normal, rows.conductivity, rows.boxes, parts)
-    responds = response(parts, of_sides > 0, x, rows.modes, "is_semi_implicit" in constants)
+    result = conductances(of_sides, pos, normal, rows.conductivity, rows.boxes, num_cells(rows))
+    responds = response(result, x, rows.modes, "is_semi_implicit" in constants)
     series = resistance(area, patches, patches.topology.lumped, constants)
     if series is None:
         return result, responds

@@ -38,8 +38,11 @@ class Block:
         """Sides of a cell [m]."""
         return self.size / np.array(self.count)
 
-    def operators(self, film: np.ndarray | None = None) -> list[np.ndarray]:
-        """Return −α∇² along each axis (cell, cell), with what exposed ends lose through a film by axis [W/(m²·K)], [1/s]."""
+    def operators(self, film: np.ndarray | None = None, is_smooth: bool = False) -> list[np.ndarray]:
+        """Return −α∇² along each axis (cell, cell), with what exposed ends lose through a film by axis [W/(m²·K)], [1/s].
+
+        Its modes decay as those of the cells, or as those of the continuous solid.
+        """
         assert self.count is not None
         alpha, result = self.conductivity * self.step.prod() / self.capacity, []
         for axis, n in enumerate(self.count):
@@ -49,6 +52,10 @@ class Block:
             if film is not None:
                 for end in self.ends(axis):
                     matrix[end, end] += film[axis] * self.step.prod() / self.step[axis] / self.capacity
+            if is_smooth:
+                values, basis = np.linalg.eigh(matrix)
+                wave = np.pi * np.arange(n) / n
+                matrix = basis * (values + rate * (wave**2 - 2 * (1 - np.cos(wave)))) @ basis.T
             result.append(matrix)
         return result
 
@@ -237,7 +244,7 @@ def _diffused(
     least: float = 0.0,
 ) -> np.ndarray:
     """Return temperatures after conduction within a box, linear losses and a constant source [K/s]."""
-    axes, size = block.operators(film), block.above.size
+    axes, size = block.operators(film, spec.scheme != "exact"), block.above.size
     made = source * np.ones(block.count)  # type: ignore[arg-type]
     if spec.scheme == "exact":
         from scipy.linalg import expm
@@ -256,10 +263,9 @@ def _diffused(
         values, basis = np.linalg.eigh(matrix)
         bases.append(basis)
         modes, made_of = (np.moveaxis(np.tensordot(basis.T, part, (1, axis)), 0, axis) for part in (modes, made_of))
-        rate, shape = alpha / block.step[axis] ** 2, [1, 1, 1]
+        shape = [1, 1, 1]
         shape[axis] = -1
-        wave = np.pi * np.arange(len(values)) / len(values)
-        decay = decay + (values + rate * (wave**2 - 2 * (1 - np.cos(wave)))).reshape(shape)
+        decay = decay + values.reshape(shape)
     decay = np.maximum(decay, alpha * least) * dt
     if spec.scheme == "spectral":
         safe = np.where(decay > 1e-9, decay, 1.0)
@@ -280,7 +286,7 @@ def _touch(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block
     gridded = {i: len(links) + n for n, i in enumerate(where.grids)} | {i: own for i, own in enumerate(where.links) if own >= 0}
     size = int(starts[-1]) + len(where.interfaces)
     heat, flow = np.zeros(size), np.zeros((size, size))
-    sides_of: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    sides_of: dict[int, list[np.ndarray]] = {}
     above = np.zeros(size)
     for block, start in zip(blocks, starts, strict=False):
         heat[start : start + block.above.size] = block.capacity
@@ -303,8 +309,7 @@ def _touch(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block
             at = slice(int(starts[block]), int(starts[block]) + own.size)
             flow[at, node] += own
             flow[node, at] += own
-            place = (patch.pos, patch.normal) if block == b else (patch.object_pos, patch.object_normal)
-            sides_of.setdefault(block, []).append((own, _shares(blocks[block], area, *place)))
+            sides_of.setdefault(block, []).append(own)
     shown = np.ones(size)
     for block, own_sides in sides_of.items():
         film = _film(spec, blocks[block]) if block < len(links) else None
@@ -328,17 +333,21 @@ def _response(
     block: Block,
     dt: float,
     film: np.ndarray | None,
-    sides: list[tuple[np.ndarray, np.ndarray]],
+    sides: list[np.ndarray],
 ) -> np.ndarray:
-    """Return κ of each cell: the equation of `response`, sides being conductances and shares of cells."""
-    every = np.sum([shares / (shares @ shares) for _, shares in sides], axis=0)
+    """Return κ of each cell: the equation of `response`, sides being conductances."""
+    every = np.sum([own * own.sum() / (own @ own) for own in sides], axis=0)
     assert block.count is not None
     at_end = _diffused(spec, _like(block, every), dt, film).ravel()
     evenly = _diffused(spec, _like(block, np.zeros(block.above.size)), dt, film, source=every.reshape(block.count) / dt).ravel()
+    falling = np.zeros(block.count)
+    if spec.scheme != "semi_implicit":
+        for axis, matrix in enumerate(block.operators(film, spec.scheme == "spectral")):
+            falling += dt * np.moveaxis(np.tensordot(matrix, at_end.reshape(block.count), (1, axis)), 0, axis)
     whole, kept, average = (np.zeros(block.above.size) for _ in range(3))
-    for own, shares in sides:
-        left = shares @ at_end
-        whole, kept, average = whole + own, kept + own * left, average + own * (shares @ evenly - 0.5 * left)
+    for own in sides:
+        left, on_average = (own @ part / (own @ every) for part in (at_end, evenly - 0.5 * at_end - falling.ravel() / 12))
+        whole, kept, average = whole + own, kept + own * left, average + own * on_average
     safe = np.where(whole > 0, whole, 1.0)
     return np.where(whole > 0, np.maximum(average / safe, kept / safe - block.capacity / (dt * safe)), 1.0)
 
@@ -346,13 +355,6 @@ def _response(
 def _like(block: Block, above: np.ndarray) -> Block:
     """Return a block at other temperatures."""
     return replace(block, above=above.reshape(block.above.shape))
-
-
-def _shares(block: Block, area: float, pos: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the shares of cells in a patch, in C order."""
-    half = 0.5 * np.sqrt(area) * np.sqrt(np.maximum(0.0, 1 - normal**2)) / block.step
-    axes = [_axis(c, h, n)[0] for c, h, n in zip((pos - block.corner) / block.step, half, block.count or (), strict=True)]
-    return np.einsum("i,j,k->ijk", *axes).ravel()
 
 
 def _area(

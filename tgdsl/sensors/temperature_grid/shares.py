@@ -66,24 +66,13 @@ def conductances(
         boxes: The rows' boxes.
         num_cells: Cells along each axis, padded.
     """
-    return of_squares(area, normal, conductivity, boxes, squares(area, pos, normal, boxes, num_cells))
-
-
-def squares(area: Tensor, pos: Vec, normal: Vec, boxes: Boxes, num_cells: tuple[int, int, int]) -> tuple[Axis, Axis, Axis]:
-    """Return what patches are along each axis, the arguments being those of `conductances`."""
-    side, parts = torch.sqrt(torch.where(area > 0, area, 1e-6)), []
-    for a in range(3):
-        corner, step, count = (value[..., None] for value in (boxes.corner[a], boxes.step[a], boxes.count[a]))
-        half = 0.5 * side * planes.safe_sqrt((1.0 - normal[a] * normal[a]).clamp(min=0.0))
-        parts.append(_along((pos[a] - corner) / step, half / step, count, num_cells[a]))
-    return parts[0], parts[1], parts[2]
-
-
-def of_squares(area: Tensor, normal: Vec, conductivity: Tensor, boxes: Boxes, parts: tuple[Axis, Axis, Axis]) -> Tensor:
-    """Return `conductances` of patches that are known along each axis."""
     is_any = area > 0
     safe = torch.where(is_any, area, 1e-6)
-    across = planes.vec((1.0 - n * n).clamp(min=0.0) for n in normal)
+    side, across, parts = torch.sqrt(safe), planes.vec((1.0 - n * n).clamp(min=0.0) for n in normal), []
+    for a in range(3):
+        corner, step, count = (value[..., None] for value in (boxes.corner[a], boxes.step[a], boxes.count[a]))
+        half = 0.5 * side * planes.safe_sqrt(across[a])
+        parts.append(_along((pos[a] - corner) / step, half / step, count, num_cells[a]))
     within = parts[0].within * parts[1].within * parts[2].within
     fit = safe * within
     k = conductivity[..., None]
@@ -100,7 +89,7 @@ def of_squares(area: Tensor, normal: Vec, conductivity: Tensor, boxes: Boxes, pa
     return _spread(cover, spot, across, parts)
 
 
-def _spread(cover: Tensor, spot: Tensor, across: Vec, parts: tuple[Axis, Axis, Axis]) -> Tensor:
+def _spread(cover: Tensor, spot: Tensor, across: Vec, parts: list[Axis]) -> Tensor:
     """Return conductances shared out: those of what is covered by the shares, those of the spot at its edges."""
     (x, y, z), (ex, ey, ez) = ([getattr(part, name) for part in parts] for name in ("shares", "edges"))
     x, ex = (part[..., :, None, None] for part in (x, ex))

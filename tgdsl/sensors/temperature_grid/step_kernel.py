@@ -145,7 +145,7 @@ def step_kernel(
     size = tl.load(area + at_side, is_at_side, 0.0)
     pos = (_at(pos_x, at_side, is_at_side), _at(pos_y, at_side, is_at_side), _at(pos_z, at_side, is_at_side))
     normal = (_at(normal_x, at_side, is_at_side), _at(normal_y, at_side, is_at_side), _at(normal_z, at_side, is_at_side))
-    found, shares, squared = _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there)
+    found = _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there)
     whole = tl.sum(found, axis=0)
     # What is no number stays none: minima and maxima lose it.
     rest = 0.0 * (size + pos[0] + pos[1] + pos[2] + normal[0] + normal[1] + normal[2])
@@ -162,7 +162,8 @@ def step_kernel(
     rates = (rate / (box_x[1] * box_x[1]), rate / (box_y[1] * box_y[1]), rate / (box_z[1] * box_z[1]))
     waves, powers = (mode_x, mode_y, mode_z), (exponent_x, exponent_y, exponent_z)
     sums = (total_x, total_y, total_z)
-    over = tl.where(size > 0, 1.0, 0.0) / tl.where(size > 0, squared, 1.0)
+    shares = found * (1.0 / tl.where(size > 0, whole, 1.0))[None, :, :, :]
+    over = tl.where(size > 0, 1.0, 0.0) / tl.where(size > 0, tl.sum(shares * shares, axis=0), 1.0)
     at_end, evenly = tl.zeros((ENVS, ROWS, SIDE), tl.float32), tl.zeros((ENVS, ROWS, SIDE), tl.float32)
     if NX * NY * NZ <= UNROLLED:
         for mode in tl.static_range(0, NX * NY * NZ):
@@ -174,10 +175,14 @@ def step_kernel(
             at_end, evenly = _left(
                 at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ
             )
+    if SIDES > 1:
+        every = tl.sum(shares * over[None, :, :, :], axis=3)
+        meets = tl.where(size > 0, tl.sum(shares * every[:, :, :, None], axis=0), 1.0)
+        at_end, evenly = at_end / meets, evenly / meets
     total = tl.sum(flow, axis=3)
     is_met = total > 0
     per_flow = 1.0 / tl.where(is_met, total, 1.0)
-    on_average = tl.sum(flow * (evenly - 0.5 * at_end)[None, :, :, :], axis=3)
+    on_average = tl.sum(flow * evenly[None, :, :, :], axis=3)
     kept = tl.sum(flow * at_end[None, :, :, :], axis=3) - capacity[None, None, :]
     larger = 1.0 / tl.where(is_met, tl.maximum(on_average, kept) * per_flow, 1.0)
     touched, own_touched = _touched(before, phi, capacity[None, None, :] * larger, inverse, flow, SIDES, ENVS, SIDE)
@@ -275,7 +280,7 @@ def _left(
     at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at,
     NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr,
 ):  # fmt: skip
-    """Return r_E and r_φ of each side (E, R, S) with what a mode has of them: see `response`."""
+    """Return r_E and r_φ − ½ r_E − r_F/12 of each side (E, R, S) with what a mode has of them: see `response`."""
     x, y, z = mode // (NY * NZ), (mode // NZ) % NY, mode % NZ
     wave = _wave(waves[0], row, x, place[0], NX, is_at)
     wave *= _wave(waves[1], row, y, place[1], NY, is_at) * _wave(waves[2], row, z, place[2], NZ, is_at)
@@ -285,8 +290,10 @@ def _left(
     own = tl.sum(shares * wave[:, None, :, None], axis=0)
     every = tl.sum(own * over, axis=2)
     decay = _expm1(-power)
-    at_end += own * (every * (1.0 + decay)[None, :])[:, :, None]
-    return at_end, evenly + own * (every * (1.0 + _delayed(power, decay))[None, :])[:, :, None]
+    left = 1.0 + decay
+    at_end += own * (every * left[None, :])[:, :, None]
+    average = 1.0 + _delayed(power, decay) - left * (0.5 + power * (1.0 / 12.0))
+    return at_end, evenly + own * (every * average[None, :])[:, :, None]
 
 
 @triton.jit
@@ -399,7 +406,7 @@ def _radiated(above, glow, around):
 
 @triton.jit
 def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there):
-    """Return conductances between sides and cells [W/K] and shares of cells (C, E, R, S), and Σ w² (E, R, S): see `shares`."""
+    """Return the conductances between sides and cells (C, E, R, S) [W/K]: see `shares`."""
     is_any = size > 0
     safe = tl.where(is_any, size, 1e-6)
     edge = 0.5 * tl.sqrt(safe)
@@ -418,9 +425,7 @@ def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, ther
     spot = tl.where(is_any, 2.0 * own * radius / (1.0 + 0.5 * rho) * fitted, 0.0)
     of_x, of_y, of_z = (spot * x[4])[None, :, :, :], (spot * y[4])[None, :, :, :], (spot * z[4])[None, :, :, :]
     result = x[0] * (y[0] * (cover[None, :, :, :] * z[0] + of_z * z[1]) + of_y * y[1] * z[0]) + of_x * x[1] * y[0] * z[0]
-    is_there = there[:, None, :, None]
-    shares = tl.where(is_there, x[0] * y[0] * z[0], 0.0)
-    return tl.where(is_there, result, 0.0), shares, x[2] * y[2] * z[2]
+    return tl.where(there[:, None, :, None], result, 0.0)
 
 
 @triton.jit
