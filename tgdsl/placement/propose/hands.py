@@ -131,6 +131,11 @@ class KinematicTree:
         """Return the centre of a body's surface in the world [m]."""
         return data.xpos[body] + data.xmat[body].reshape(3, 3) @ self.centroid[body]
 
+    def middle(self, segment: int, data: mujoco.MjData) -> Float[np.ndarray, " 3"]:
+        """Return the centre of the surfaces of a segment's bodies in the world [m]."""
+        own = self.bodies[segment]
+        return np.average([self.centre(body, data) for body in own], axis=0, weights=[self.area[body] for body in own])
+
     def points(self, body: int, data: mujoco.MjData) -> Float[np.ndarray, "corner 3"]:
         """Return the corners of a body's surface in the world [m]."""
         own = self.surface[body]
