@@ -88,7 +88,7 @@ class Flexion:
     def _moving_side(self, body: int) -> InnerSide:
         if (facing := self._meeting(body)) is not None:
             return InnerSide(facing, self._doubt(self.tree.segment[body]))
-        if (carried := self._carried(body)) is not None:
+        if (carried := self._carried(self.tree.segment[body])) is not None:
             joint, along = carried
             turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
             return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
@@ -101,9 +101,9 @@ class Flexion:
         if side.facing is None or not hinges:
             return False
         facing = data.xmat[body].reshape(3, 3) @ side.facing / np.linalg.norm(side.facing)
-        carried = np.cross(data.xaxis[hinges], self.tree.centre(body, data) - data.xanchor[hinges])
+        carried = np.cross(data.xaxis[hinges], self.tree.middle(segment, data) - data.xanchor[hinges])
         lever = np.linalg.norm(carried, axis=1)
-        has_lever = lever.min() >= MIN_LEVER * np.sqrt(self.tree.area[body])
+        has_lever = lever.min() >= MIN_LEVER * np.sqrt(self._area(segment))
         return bool(has_lever and (np.abs(carried @ facing) < ALONG * lever).all())
 
     def _bars(self) -> set[int]:
@@ -157,25 +157,27 @@ class Flexion:
                 result[joint] = min(depths)
         return sorted(result, key=lambda joint: (result[joint], joint))
 
-    def _carried(self, body: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
-        """Return the joint that carries a body, and where to in the world in the open pose."""
+    def _carried(self, segment: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
+        """Return the joint that carries a segment, with all that is fixed to it, and where to in the world in the open pose."""
         data = self._frames(self.open)
-        centre, rotation = self.tree.centre(body, data), data.xmat[body].reshape(3, 3).copy()
-        for joint in self._nearest(self.tree.segment[body]):
+        middle, rotation = self.tree.middle(segment, data), data.xmat[segment].reshape(3, 3).copy()
+        for joint in self._nearest(segment):
             data = self._frames(self.steps[joint])
-            along = self.tree.centre(body, data) - centre
-            cosine = 0.5 * (np.trace(data.xmat[body].reshape(3, 3) @ rotation.T) - 1.0)
+            along = self.tree.middle(segment, data) - middle
+            cosine = 0.5 * (np.trace(data.xmat[segment].reshape(3, 3) @ rotation.T) - 1.0)
             angle, size = float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(np.linalg.norm(along))
-            lever = MIN_LEVER * np.sqrt(self.tree.area[body]) if self.hand.jaw is None else 0.0
+            lever = MIN_LEVER * np.sqrt(self._area(segment)) if self.hand.jaw is None else 0.0
             if size > 1e-9 and size >= lever * angle:
                 return joint, along / size
         return None
 
+    def _area(self, segment: int) -> float:
+        return sum(self.tree.area[body] for body in self.tree.bodies[segment])
+
     def _taken_over(self, body: int) -> InnerSide:
         """Return the side of the nearest link beyond, as it faces in the open pose."""
-        start = self.tree.segment[body]
-        beyond = [b for s in self.tree.below(start) for b in self.tree.bodies[s]]
-        for other in sorted(beyond, key=lambda b: (len(self.tree.path(self.tree.segment[b])), b)):
+        beyond = [s for s in self.tree.below(self.tree.segment[body]) if self.tree.bodies[s]]
+        for other in sorted(beyond, key=lambda s: (len(self.tree.path(s)), s)):
             if (carried := self._carried(other)) is not None:
                 turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ carried[1]
                 return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[carried[0]].doubt)
@@ -207,7 +209,7 @@ class Flexion:
     def _fixed_side(self, body: int) -> InnerSide:
         """Return where a fixed jaw faces: against the moving one, as that comes to it."""
         tip = self.hand.tips[0]
-        if (carried := self._carried(tip)) is None:
+        if (carried := self._carried(self.tree.segment[tip])) is None:
             return InnerSide(None, UNCLEAR)
         joint, along = carried
         in_tip = self._frames(self.open).xmat[tip].reshape(3, 3).T @ along
@@ -233,7 +235,7 @@ class Flexion:
         """Return where most fingers, as they curl, carry their first links in the open pose; None if no majority does."""
         found = []
         for chain in self.hand.chains:
-            carried = [self._carried(body) for s in chain for body in self.tree.bodies[s]]
+            carried = [self._carried(s) for s in chain if self.tree.bodies[s]]
             found += [c[1] for c in carried if c is not None and self.closing.motions[c[0]].is_curling][:1]
         alike = [[other for other in found if one @ other > MIN_COSINE] for one in found]
         most = max(alike, key=len, default=[])

@@ -131,6 +131,11 @@ class KinematicTree:
         """Return the centre of a body's surface in the world [m]."""
         return data.xpos[body] + data.xmat[body].reshape(3, 3) @ self.centroid[body]
 
+    def middle(self, segment: int, data: mujoco.MjData) -> Float[np.ndarray, " 3"]:
+        """Return the centre of the surfaces of a segment's bodies in the world [m]."""
+        own = self.bodies[segment]
+        return np.average([self.centre(body, data) for body in own], axis=0, weights=[self.area[body] for body in own])
+
     def points(self, body: int, data: mujoco.MjData) -> Float[np.ndarray, "corner 3"]:
         """Return the corners of a body's surface in the world [m]."""
         own = self.surface[body]
@@ -256,7 +261,7 @@ def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None)
     else:
         palm = None
     middle = tree.centre(palm, tree.start) if palm is not None else tree.start.xpos[base]
-    ends = [s for chain in chains for s in _ends(tree, chain, middle)]
+    ends = [s for chain in chains for s in _ends(tree, base, chain, middle)]
     fingers = sorted(body for s in beyond for body in tree.bodies[s])
     tips = sorted(body for s in ends for body in _last(tree, s))
     first = [s for s in beyond if tree.parent[s] not in beyond]
@@ -303,9 +308,31 @@ def _chains(tree: KinematicTree, base: int, beyond: Sequence[int]) -> list[list[
     return [segments for segments in results if tree.carries.intersection(segments)]
 
 
-def _ends(tree: KinematicTree, chain: Sequence[int], middle: Float[np.ndarray, " 3"]) -> list[int]:
-    """Return the last segments of a chain; of one that is closed to loops, those that are in none, or the farthest."""
-    leaves = [s for s in chain if tree.bodies[s] and not tree.children(s)]
+def _ends(tree: KinematicTree, base: int, chain: Sequence[int], middle: Float[np.ndarray, " 3"]) -> list[int]:
+    """Return the last segments of a chain: none next to them is more joints away from the base; of those in loops the farthest.
+
+    Equalities that close loops count as joints: a link may hang in the tree on the link that it carries.
+    """
+    steps = _steps(tree, base, chain)
+    carrying = [s for s in chain if tree.bodies[s]]
+    last = [s for s in carrying if not any(steps[other] > steps[s] for other in _joined(tree, s) if other in steps)]
     bound = {s for pair in tree.loops for s in pair}
-    far = {s: max(float(np.linalg.norm(tree.centre(b, tree.start) - middle)) for b in tree.bodies[s]) for s in leaves}
-    return [s for s in leaves if s not in bound] or [s for s in leaves if far[s] > max(far.values()) - 1e-6]
+    far = {s: max(float(np.linalg.norm(tree.centre(b, tree.start) - middle)) for b in tree.bodies[s]) for s in last}
+    return [s for s in last if s not in bound] or [s for s in last if far[s] > max(far.values()) - 1e-6]
+
+
+def _joined(tree: KinematicTree, segment: int) -> list[int]:
+    """Return the segments that a joint or the equality of a loop binds to a segment, without those that carry no surface."""
+    across = [pair[1 - pair.index(segment)] for pair in tree.loops if segment in pair]
+    return [tree.parent[segment], *tree.children(segment), *across]
+
+
+def _steps(tree: KinematicTree, base: int, chain: Sequence[int]) -> dict[int, int]:
+    """Return the least number of joints between the base and each segment of a chain."""
+    of_base = [s for s in chain if tree.parent[s] not in chain or (s, base) in tree.loops or (base, s) in tree.loops]
+    steps, front = dict.fromkeys(of_base, 1), of_base
+    while front:
+        beyond = [other for s in front for other in _joined(tree, s) if other in chain and other not in steps]
+        steps |= dict.fromkeys(beyond, steps[front[0]] + 1)
+        front = list(dict.fromkeys(beyond))
+    return steps

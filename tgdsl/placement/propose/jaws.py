@@ -58,7 +58,7 @@ def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[i
     data.qpos[tree.model.jnt_qposadr[joint]] = value
     mujoco.mj_kinematics(tree.model, data)
     own, anchor, axis = tree.bodies[segment], data.xanchor[joint], data.xaxis[joint]
-    along = np.average([tree.centre(b, data) for b in own], axis=0, weights=[tree.area[b] for b in own]) - anchor
+    along = tree.middle(segment, data) - anchor
     along = along - (along @ axis) * axis
     above = tree.joints(parent)
     carried_at = data.xanchor[above[0]] if above else data.xpos[parent]
