@@ -35,7 +35,7 @@ COARSEST = 16
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors at random points of the band, none of which took part in the choice of the grid.
+    """Errors at random points of the band, which took no part in the choice of the grid.
 
     Points nearer to a sharp edge than one cell are counted apart: there no grid does better than O(cell).
 
@@ -87,7 +87,7 @@ def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int =
     The tolerance bounds the 99th percentile of the error at random points of the band |distance| ≤ margin, denser near the
     surface. An edge is sharp where its faces' normals differ by more than 30°, or where it does not join two faces: points
     nearer to one than a cell are reported apart and held to five times the tolerance (their error is a fraction of a cell).
-    At each cell size the cheaper trilinear lookup is tried first. Results are kept in the user's cache folder.
+    At each cell size the cheaper trilinear lookup is tried first. Results are cached on disk.
 
     Args:
         surface: The surface, in the frame that the grid is to have.
@@ -219,13 +219,13 @@ HULL_POINTS = 2000
 
 @dataclass(frozen=True, eq=False)
 class GeomDistance:
-    """How the distance to a geom is found.
+    """How the distance to a geom is computed.
 
     Attributes:
         geom: The geom.
         shape: What computes it: a primitive's type, an interpolation of a grid, or `raycast`.
-        arrays: What that needs besides the geom's size and pose, by name.
-        accuracy: What a grid costs, by name; empty for what is exact.
+        arrays: Further arrays that the method needs, by name.
+        accuracy: Errors of a grid, by name; empty for exact distances.
     """
 
     geom: SurfaceGeom
@@ -239,7 +239,7 @@ def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, na
 
     Args:
         felt: The geom.
-        options: How the distance to triangles is found.
+        options: How the distance to triangles is computed.
         margin: Largest distance from the surface that any sensor asks for [m].
         name: What warnings call the object or link: "object cube".
 
@@ -264,12 +264,12 @@ def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, na
 def geom_table(cases: Sequence[Sequence[GeomDistance]]) -> GeomTable[np.ndarray]:
     """Return the table of an object's variants, or of links: geoms of one shape share a column, in their order."""
     shapes, places = aligned([[part.shape for part in case] for case in cases])
-    rows = [[None if i is None else own[i] for i in table] for own, table in zip(cases, places, strict=True)]
+    rows = [[None if i is None else rows_of[i] for i in table] for rows_of, table in zip(cases, places, strict=True)]
     columns = list(zip(*rows, strict=True))
     of_geom = {}
     for key, absent in (("size", np.ones(3)), ("pos", np.zeros(3)), ("rotation", np.eye(3))):
-        found = [[absent if part is None else getattr(part.geom.geom, key) for part in row] for row in rows]
-        of_geom[key] = np.array(found).reshape(len(rows), len(rows[0]), -1)
+        values = [[absent if part is None else getattr(part.geom.geom, key) for part in row] for row in rows]
+        of_geom[key] = np.array(values).reshape(len(rows), len(rows[0]), -1)
     is_absent = np.array([[part is None for part in row] for row in rows]) if len(rows) > 1 else None
     return GeomTable(
         shapes=shapes,
@@ -312,26 +312,26 @@ def _surface(column: Sequence[GeomDistance | None]) -> GridTable[np.ndarray] | T
     like = next(part.arrays for part in column if part is not None)
     owned = [like if part is None else part.arrays for part in column]
     if "vertices" in like:
-        vertices, faces = (tuple(own[key] for own in owned) for key in ("vertices", "faces"))
+        vertices, faces = (tuple(grid[key] for grid in owned) for key in ("vertices", "faces"))
         return TriangleTable(vertices, faces, float(like["max_distance"]))
     if "values" not in like:
         return None
-    distinct = list({id(own): own for own in owned}.values())
-    place = [next(i for i, own in enumerate(distinct) if own is found) for found in owned]
-    starts = np.cumsum([0, *(own["values"].size for own in distinct)])
+    distinct = list({id(grid): grid for grid in owned}.values())
+    place = [next(i for i, grid in enumerate(distinct) if grid is each) for each in owned]
+    starts = np.cumsum([0, *(grid["values"].size for grid in distinct)])
     x, y, z = owned[0]["values"].shape
     return GridTable(
-        values=np.concatenate([own["values"].reshape(-1) for own in distinct]),
+        values=np.concatenate([grid["values"].reshape(-1) for grid in distinct]),
         first=starts[place],
-        num=np.array([own["values"].shape for own in owned]),
-        origin=np.array([own["origin"] for own in owned]),
-        cell=np.array([own["cell"] for own in owned]),
+        num=np.array([grid["values"].shape for grid in owned]),
+        origin=np.array([grid["origin"] for grid in owned]),
+        cell=np.array([grid["cell"] for grid in owned]),
         counts=(x, y, z),
     )
 
 
 def _outer(surface: Surface) -> Outer:
-    """Return the outer surface of a mesh; it is kept in the user's cache folder."""
+    """Return the outer surface of a mesh, cached on disk."""
 
     def unpacked(found: Mapping[str, np.ndarray]) -> Outer:
         return Outer(found["vertices"], found["faces"], found["uncut"], tuple(found["flaws"].tolist()))

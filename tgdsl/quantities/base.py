@@ -29,7 +29,7 @@ from tgdsl.surfaces.sensed import SensedObject
 
 Value = TypeVar("Value")
 Report = Callable[[Sequence[str | int], str, str], None]
-"""Notes a mistake: the place in the document, what is wrong, and a hint."""
+"""Notes a mistake: its place in the document, the problem, and a hint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Request(Generic[Value]):
     """What a kind asks of a scene; `Value` is what its `forward` gets.
 
     Attributes:
-        objects: Objects that it is asked of; none for what has nothing to do with objects.
+        objects: Objects that it concerns; empty where a request has nothing to do with objects.
         is_gated: Whether an object counts only while the simulator has it in contact with the link.
     """
 
@@ -77,10 +77,10 @@ class Request(Generic[Value]):
 
 @dataclass(frozen=True, eq=False)
 class Use:
-    """A request, and where it is made: one for all sensors that ask alike.
+    """A request and its taxels, shared by all sensors with equal requests.
 
     Attributes:
-        request: What is asked for.
+        request: The request.
         sensors: The sensors, by their names in the document.
         links: The links that carry them.
         taxels: Their taxels, rows of the layout.
@@ -106,12 +106,12 @@ class Planning:
         layout: The taxels of all sensors.
         sensed: What there is of each object that some sensor senses.
         pairs: The pairs that may meet, sorted by object and link.
-        contact_pairs: Those of them whose contacts are read, in the order of the state.
+        contact_pairs: The pairs whose contacts are read, in the order of the state.
         objects: The objects that have pairs, in the Plan's order.
         bodies: The bodies whose poses are read, in the order of the state.
         geoms_of: Returns the geoms that a link's taxels sit on, by its name: meshes as they are, not their convex hulls.
         report: Notes a mistake.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
         joints: The joints that are read, in the order of the state.
         anchors: Where the anchor of each is in the frame of the body that it moves, by its name [m].
     """
@@ -133,7 +133,7 @@ class Planning:
         return [self.layout.links[i].body for i in self.layout.link_id[taxels]]
 
     def object_id(self, name: str) -> int | None:
-        """Return the place of an object among those that have pairs; None if it has none."""
+        """Return the index of an object among the objects with pairs; None if it has none."""
         return next((i for i, target in enumerate(self.objects) if target.name == name), None)
 
     @property
@@ -149,15 +149,15 @@ class Planning:
         return [pair for pair in self.pairs if pair.object == name]
 
     def allowed(self, request: Request) -> set[Pair]:
-        """Return the pairs that a request is of: all, or those that can be in contact."""
+        """Return a request's pairs: all, or only pairs that can be in contact."""
         return set(self.contact_pairs if request.is_gated else self.pairs)
 
     def pair_table(self, names: Sequence[str], taxels: Int[np.ndarray, " taxel"]) -> Int[np.ndarray, "object taxel"]:
         """Return the index of each taxel's pair with each object among that object's pairs; 0 where there is none."""
         bodies, table = self.bodies_of(taxels), []
         for name in names:
-            own = {pair.link: i for i, pair in enumerate(self.own_pairs(name))}
-            table.append([own.get(body, 0) for body in bodies])
+            index = {pair.link: i for i, pair in enumerate(self.own_pairs(name))}
+            table.append([index.get(body, 0) for body in bodies])
         return np.array(table, dtype=np.int64).reshape(len(names), len(bodies))
 
 
@@ -170,7 +170,7 @@ class Scene:
         objects: The Plan's objects.
         pairs: Relative poses of all pairs, in the order of the Plan; None if there are none.
         radius_shifts: By how much the radii of sensors with such noise are off, by sensor: (env, taxel) [m].
-        dtype: Dtype of what is gathered.
+        dtype: Dtype of the gathered values.
     """
 
     tensors: Mapping[str, Tensor]
@@ -181,7 +181,7 @@ class Scene:
 
 
 def heated_objects(objects: Sequence[PairedObject], sensed: Mapping[str, SensedObject]) -> tuple[str, ...]:
-    """Return those of some objects of which the document says what they are made of."""
+    """Return the objects for which the document gives a material."""
     return tuple(target.name for target in objects if sensed[target.name].heat is not None)
 
 
@@ -200,7 +200,7 @@ class Quantity(ABC):
     """A quantity: how it is planned, gathered and explained. One instance of each is registered.
 
     Attributes:
-        name: Its name: that of its part of the Plan.
+        name: Its name, also of its part of the Plan.
         request: The type of its requests.
         part: The type of its part of the Plan: a frozen dataclass, generic in its arrays (NumPy's in the Plan, torch's at run
             time).
@@ -231,7 +231,7 @@ class Quantity(ABC):
         return set()
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        """Return the bodies whose poses are read besides those of pairs."""
+        """Return the bodies whose poses are read in addition to the pairs' bodies."""
         return ()
 
     def num_rows(self, part: Any, use: int) -> int:
@@ -247,7 +247,7 @@ class Quantity(ABC):
         return []
 
     def account(self, part: Any, objects: Sequence[PairedObject]) -> dict[str, list[str]]:
-        """Return by headline what was measured of what is computed beforehand."""
+        """Return measured errors and sizes of precomputed tables, by headline."""
         return {}
 
 
@@ -259,14 +259,14 @@ class Gathered(dict[type[Request], Any]):
         def __getitem__(self, request: type[Request[Value]]) -> Value: ...
 
     def __missing__(self, request: object) -> Any:
-        """Say what was not asked for.
+        """Refuse a request that was not made.
 
         Raises:
             TgdslError: Always.
         """
-        wanted = getattr(request, "__name__", repr(request))
-        asked = ", ".join(own.__name__ for own in self) or "none"
-        raise TgdslError(f"gathered[{wanted}] was not asked for: put it among `Lowered.requests`, which hold {asked}")
+        name = getattr(request, "__name__", repr(request))
+        names = ", ".join(key.__name__ for key in self) or "none"
+        raise TgdslError(f"gathered[{name}] was not asked for: put it among `Lowered.requests`, which hold {names}")
 
     def replaced(self, request: type[Request[Value]], value: Value) -> Gathered:
         """Return the same with another value for a request."""

@@ -63,7 +63,7 @@ class SearchPart(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class ProbeQuery(Generic[Array]):
-    """Probes whose distances are found once, whatever number of uses are made of them.
+    """Probes whose distances are computed once, however many uses share them.
 
     Attributes:
         objects: The objects that they are measured against: indices into the Plan's.
@@ -78,13 +78,13 @@ class ProbeQuery(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class DepthUse(Generic[Array]):
-    """One request: which of a query's objects are felt, and how.
+    """One request: the objects of a query that count, and how.
 
     Attributes:
         query: Number of its query.
         objects: Which of that one's objects.
-        is_gated: Whether they are felt only in contact.
-        wants: What is asked for beside the depth: "distance", "frame", "motion", "normal".
+        is_gated: Whether they count only in contact.
+        wants: Further results: "distance", "frame", "motion", "normal".
         radius_noise: The sensor whose noise disturbs the radii, if any.
         reach: How far each probe feels each object [m], (object, taxel); −∞ where it does not.
         search: What a search by a kernel is given; None where it is of no use.
@@ -135,8 +135,8 @@ def _searched(use: DepthUse[Tensor], probes: Probes, targets: list[Target], scen
     if use.search is None:
         return None
     tables = {name: value for name in ("pair", "spheres", "geoms") if (value := getattr(use.search, name)) is not None}
-    own = [targets[o] for o in use.objects]
-    return search(pairs_for(scene, use.is_gated), probes, own, tables, _reach(use, scene), use.wants)
+    searched = [targets[o] for o in use.objects]
+    return search(pairs_for(scene, use.is_gated), probes, searched, tables, _reach(use, scene), use.wants)
 
 
 def _reach(use: DepthUse[Tensor], scene: Scene) -> Tensor:
@@ -151,8 +151,8 @@ def _reach(use: DepthUse[Tensor], scene: Scene) -> Tensor:
 class ReferencePenetration:
     """What a sensor's probes feel, in their links' frames: the fields of `Penetration`, one row per taxel.
 
-    `distance` [m] and its gradient `outward` are those of `distances`, one column per object; `rotation` and `offset` [m]
-    those of `frames`.
+    `distance` [m] and its gradient `outward` have one column per object, as in `distances`; so have `rotation` and `offset`,
+    as in `frames`.
     """
 
     depth: Float[np.ndarray, " taxel"]
@@ -191,9 +191,9 @@ def _reference_penetration(
             felt.offset[j, k] = body.rotation.T @ (link.pos - body.pos)
             felt.distance[j, k], gradient = distance_to(geoms, body.rotation.T @ (q - body.pos))
             felt.outward[j, k] = into_link @ body.rotation @ gradient
-            depth, before = radius[j] - felt.distance[j, k], felt.depth[j]
-            felt.depth[j] = max(depth, before)
-            if depth > (before + TIE if before > 0 else 0.0):
+            depth, deepest = radius[j] - felt.distance[j, k], felt.depth[j]
+            felt.depth[j] = max(depth, deepest)
+            if depth > (deepest + TIE if deepest > 0 else 0.0):
                 felt.normal[j] = felt.outward[j, k]
                 felt.velocity[j] = into_link @ (body.velocity_at(q) - link.velocity_at(q))
                 felt.angular[j] = into_link @ (body.angvel - link.angvel)
@@ -223,15 +223,15 @@ class _ContactDepth(Quantity):
         queries: dict[int, list[Use]] = {}
         for use in uses:
             queries.setdefault(id(use.pos), []).append(use)
-        parts, made = [], {}
-        for number, own in enumerate(queries.values()):
-            query, found = _query(planning, number, own, tables)
+        parts, part_of = [], {}
+        for number, group in enumerate(queries.values()):
+            query, use_parts = _query(planning, number, group, tables)
             parts.append(query)
-            made |= {id(use): part for use, part in zip(own, found, strict=True)}
+            part_of |= {id(use): part for use, part in zip(group, use_parts, strict=True)}
         return ContactDepthPart(
             geoms=tuple(tables.get(target.name) for target in planning.objects),
             queries=tuple(parts),
-            uses=tuple(made[id(use)] for use in uses),
+            uses=tuple(part_of[id(use)] for use in uses),
         )
 
     def gather(self, part: ContactDepthPart[Tensor], scene: Scene) -> tuple[Penetration, ...]:
@@ -244,29 +244,29 @@ class _ContactDepth(Quantity):
         result, are_closed = [], _are_closed(scene)
         for use in part.uses:
             query = part.queries[use.query]
-            probes, own = Probes(vec(query.pos.unbind()), query.pair), [targets[o] for o in query.objects]
+            probes, felt = Probes(vec(query.pos.unbind()), query.pair), [targets[o] for o in query.objects]
             if are_closed and use.is_gated and not {"distance", "frame"} & {*use.wants}:  # as right after a reset
                 result.append(penetration(pairs_for(scene, True), probes, (), use.reach[:0], use.wants))
                 continue
-            answer = _searched(use, probes, own, scene)
+            answer = _searched(use, probes, felt, scene)
             if answer is None:
                 if use.query not in measured:
-                    measured[use.query] = measure(pairs_for(scene, True), probes, own)
+                    measured[use.query] = measure(pairs_for(scene, True), probes, felt)
                 near = [measured[use.query][o] for o in use.objects]
                 answer = penetration(pairs_for(scene, use.is_gated), probes, near, _reach(use, scene), use.wants)
             result.append(answer)
         return tuple(result)
 
     def reference(self, part: ContactDepthPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferencePenetration:
-        own, layout = part.uses[use], scene.layout
-        radius = own.reach[:, scene.rows].max(axis=0, initial=-np.inf)
+        use_part, layout = part.uses[use], scene.layout
+        radius = use_part.reach[:, scene.rows].max(axis=0, initial=-np.inf)
         results = []
         for i, link in enumerate(layout.links):
             objects: list[tuple[ReferenceBody, list[ReferenceGeom]] | None] = []
-            for o in (part.queries[own.query].objects[o] for o in own.objects):
+            for o in (part.queries[use_part.query].objects[o] for o in use_part.objects):
                 target, table = scene.objects[o], part.geoms[o]
                 assert table is not None
-                is_felt = target.body != link.body and (scene.is_touching(link.body, target.name) or not own.is_gated)
+                is_felt = target.body != link.body and (scene.is_touching(link.body, target.name) or not use_part.is_gated)
                 geoms = geoms_of(table, scene.variant(target), scene.size(target))
                 objects.append((scene.object_body(target), geoms) if is_felt else None)
             at = layout.link_id == i
@@ -284,12 +284,14 @@ class _ContactDepth(Quantity):
         return shapes <= SHAPES.keys() and all(set(use.wants) <= {"distance"} for use in part.uses)
 
     def explain(self, part: ContactDepthPart[np.ndarray], use: int, objects: Sequence[PairedObject]) -> list[str]:
-        own = part.uses[use]
-        query = part.queries[own.query]
-        gate = "where MuJoCo has the pair in contact" if own.is_gated else "wherever a probe reaches"
-        extra = " with " + " and ".join(own.wants) if own.wants else ""
-        felt = [_shown(part, query.objects[o], objects) for o in own.objects]
-        return [f"depth of {query.pos.shape[1]} probes (query {own.query}){extra} in {', '.join(felt) or 'nothing'}, {gate}"]
+        use_part = part.uses[use]
+        query = part.queries[use_part.query]
+        gate = "where MuJoCo has the pair in contact" if use_part.is_gated else "wherever a probe reaches"
+        extra = " with " + " and ".join(use_part.wants) if use_part.wants else ""
+        felt = [_shown(part, query.objects[o], objects) for o in use_part.objects]
+        return [
+            f"depth of {query.pos.shape[1]} probes (query {use_part.query}){extra} in {', '.join(felt) or 'nothing'}, {gate}"
+        ]
 
     def account(self, part: ContactDepthPart[np.ndarray], objects: Sequence[PairedObject]) -> dict[str, list[str]]:
         lines = []
@@ -339,22 +341,24 @@ def _table(planning: Planning, name: str, uses: Sequence[Use]) -> GeomTable[np.n
 def _query(
     planning: Planning, number: int, uses: Sequence[Use], tables: Tables
 ) -> tuple[ProbeQuery[np.ndarray], list[DepthUse[np.ndarray]]]:
-    """Return the query of uses at the same probes, and what is made of it."""
-    known = [target.name for target in planning.objects]
+    """Return the query of uses at the same probes, and the uses' parts."""
+    object_names = [target.name for target in planning.objects]
     measuring = [use for use in uses if _is_measuring(planning, use)]
-    names = dict.fromkeys(name for use in measuring for name in use.request.objects if name in known)
+    names = dict.fromkeys(name for use in measuring for name in use.request.objects if name in object_names)
     felt, taxels = list(names), uses[0].taxels
     pair = planning.pair_table(felt, taxels)
-    query = ProbeQuery(tuple(known.index(name) for name in felt), uses[0].pos, pair)
+    query = ProbeQuery(tuple(object_names.index(name) for name in felt), uses[0].pos, pair)
     bodies, result = planning.bodies_of(taxels), []
     for use in uses:
         request = _request(use)
-        chosen = [name for name in request.objects if name in known] if use in measuring else []
+        use_objects = [name for name in request.objects if name in object_names] if use in measuring else []
         allowed = {(p.link, p.object) for p in planning.allowed(request)}
-        can_meet = np.array([[(body, name) in allowed for body in bodies] for name in chosen], dtype=bool)
-        reach = np.where(can_meet.reshape(len(chosen), len(bodies)), request.reach(planning.layout.radius[taxels]), -np.inf)
-        objects = tuple(felt.index(name) for name in chosen)
-        search = _search(planning, chosen, request.wants, pair[list(objects)], tables)
+        can_meet = np.array([[(body, name) in allowed for body in bodies] for name in use_objects], dtype=bool)
+        reach = np.where(
+            can_meet.reshape(len(use_objects), len(bodies)), request.reach(planning.layout.radius[taxels]), -np.inf
+        )
+        objects = tuple(felt.index(name) for name in use_objects)
+        search = _search(planning, use_objects, request.wants, pair[list(objects)], tables)
         result.append(DepthUse(number, objects, request.is_gated, request.wants, use.radius_noise, reach, search))
     return query, result
 
@@ -365,15 +369,15 @@ def _search(
     """Return what a search by a kernel is given; None where it cannot answer."""
     if any(name not in tables for name in names):
         return None  # which has been reported
-    own = [tables[name] for name in names]
-    if not is_searchable([shape for table in own for shape in table.shapes], wants):
+    geom_parts = [tables[name] for name in names]
+    if not is_searchable([shape for table in geom_parts for shape in table.shapes], wants):
         return None
     targets = [target for name in names for target in planning.objects if target.name == name]
     first = np.array([target.first_pair for target in targets])
     pairs = (pair + first[:, None]).astype(np.int32)
     if any(target.num_variants > 1 or target.is_sized for target in targets):
         return SearchPart(pairs, None, None)
-    spheres, geoms = geom_tables([_geoms(table) for table in own])
+    spheres, geoms = geom_tables([_geoms(table) for table in geom_parts])
     return SearchPart(pairs, spheres.numpy(), geoms.numpy())
 
 

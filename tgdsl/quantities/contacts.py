@@ -37,7 +37,7 @@ class ContactPoints(NamedTuple):
         pos: Contact points [m].
         force: Force on the body at each [N].
         torque: Torque on the body at each [N·m].
-        normal: Unit normal out of the object at each; not-a-number where the state has none beside a force.
+        normal: Unit normal out of the object at each; NaN where the state has a force without one.
         net: Whole force on the body from the objects felt [N], contacts beyond the slots included.
     """
 
@@ -118,13 +118,13 @@ def _use(planning: Planning, use: Use) -> ContactsUse[np.ndarray]:
 
 
 def is_counted(planning: Planning, name: str, felt: Sequence[str]) -> bool:
-    """Return whether the contacts with an object are among those with another one that is felt too.
+    """Return whether another object already counts the contacts with this one.
 
-    Objects may be made of the same body, whose force is one. Of two that share all contacts the first one counts.
+    Several objects may stand for one body, whose force counts once. Of two with the same contacts the first one counts.
     """
-    own, before = planning.sensed[name].touched, list(felt).index(name)
-    others = [planning.sensed[other].touched for other in felt]
-    return any(own < other or (own == other and i < before) for i, other in enumerate(others) if own)
+    touched, index = planning.sensed[name].touched, list(felt).index(name)
+    all_touched = [planning.sensed[other].touched for other in felt]
+    return any(touched < other or (touched == other and i < index) for i, other in enumerate(all_touched) if touched)
 
 
 def contacts_of(
@@ -138,7 +138,7 @@ def contacts_of(
     Args:
         state: Fields of `SceneState`: body_pos, body_quat, contact_netforce and, unless the slots are not wanted, contact_pos,
             contact_force, contact_torque and contact_normal.
-        bodies: The bodies, among those of the state.
+        bodies: Indices of the bodies in the state.
         index: Pair of each body and object; their number where there is none.
         dtype: Dtype of the result.
     """
@@ -148,7 +148,7 @@ def contacts_of(
     net = x, y, z
     if not all(name in state for name in SLOT_FIELDS):  # some of them may be there for another quantity
         none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
-        own = [(none, none, none)] * 4
+        vectors = [(none, none, none)] * 4
     else:
         each = planes.rot(part[..., None] for part in rotation)
         names = ("contact_force", "contact_torque", "contact_normal", "contact_pos")
@@ -158,8 +158,8 @@ def contacts_of(
         force, torque, normal, pos = (planes.vec(part.flatten(2) for part in vector) for vector in (force, torque, normal, pos))
         origin = planes.split(state["body_pos"][:, bodies, None])
         away = planes.vec(torch.where(is_used.flatten(2), part, 0.0) for part in planes.sub(pos, origin))
-        own = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
-    pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*own, net))
+        vectors = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
+    pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*vectors, net))
     return ContactPoints(pos, force, torque, normal, net)
 
 
@@ -175,7 +175,7 @@ class PairContacts(NamedTuple):
     Attributes:
         pos: Contact points [m].
         force: Force on the body at each [N], what the slots lack of each pair's whole force shared out.
-        normal: Unit normal out of the object; not-a-number where the state has none beside a force.
+        normal: Unit normal out of the object; NaN where the state has a force without one.
         is_used: Which slots are contacts.
     """
 

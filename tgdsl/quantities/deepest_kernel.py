@@ -1,8 +1,8 @@
 """Which geom of all objects each probe is deepest in, on a GPU, in one kernel: one pass over the geoms, primitives only.
 
-It is what `query.measure` and `query.feel` find of objects made of planes, spheres, capsules, cylinders and boxes. The pass
-needs distances alone: which way is out is found at its end, of the winner. A program is one warp: an object that none of its
-probes can meet is passed over, by where it is and how large, and so is a geom with a frame of its own.
+It replaces `measure` and `penetration` for objects made of planes, spheres, capsules, cylinders and boxes. The pass
+needs distances alone; the gradient is computed at its end, for the winner. A program is one warp. It skips objects, and geoms
+with a frame, whose bounding sphere none of its probes can reach.
 
 Shapes: `env` environments, `taxel` probes, `pair` pairs, `object` felt objects, `geom` geoms of all of these, `case` 1, or
 `env` if an object differs between environments, `row` columns of a geom.
@@ -42,7 +42,7 @@ def find(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object *e
     Args:
         pairs: Relative poses of all pairs of the plan; the gate holds.
         pos: Positions of the probes in their links' frames [m].
-        tables: The objects that are felt.
+        tables: The objects.
         reach: Radius of each probe towards each of those felt [m]; −∞ where the probe is inactive or the pair cannot meet.
     """
     depth, normal, winner = _deepest([*pairs.rotation, *pairs.offset], list(pos), tables.pair, reach, pairs.gate, *tables[1:])
@@ -75,7 +75,7 @@ def launch(
         pos: Positions of the probes in their links' frames [m].
         pair: Index of each probe's pair among all.
         reach: As `deepest` has it.
-        gate: 0 where a pair may be felt, −∞ where it may not.
+        gate: 0 where a pair counts, −∞ where it does not.
         spheres: The objects, see `Tables`.
         geoms: Their geoms, in the same way.
     """
@@ -85,11 +85,11 @@ def launch(
     winner = torch.empty_like(depth, dtype=torch.int32)
     num_points = num_envs * num_taxels
     tables = [table.contiguous() for table in (reach, spheres, geoms)]
-    own = tables[0].stride()
+    strides = tables[0].stride()
     run[(triton.cdiv(num_points, BLOCK),)](
         depth, normal, winner, *pose, *pos, pair, *tables, pose[0] if gate is None else gate, num_points, num_objects,
-        *pose[0].stride(), *(gate if gate is not None else pose[0]).stride(), own[0],
-        own[1] if reach.ndim == 3 and reach.shape[1] != 1 else 0,
+        *pose[0].stride(), *(gate if gate is not None else pose[0]).stride(), strides[0],
+        strides[1] if reach.ndim == 3 and reach.shape[1] != 1 else 0,
         *(table.stride(0) if table.shape[0] != 1 else 0 for table in tables[1:]),
         NUM_TAXELS=num_taxels, IS_GATED=gate is not None, IS_ONE=geoms.shape[0] == 1, BLOCK=BLOCK, num_warps=1,
     )  # fmt: skip
@@ -106,7 +106,7 @@ def deepest_kernel(
     """Find what `BLOCK` probes are deepest in, counted through all environments; see `launch`."""
     start = tl.program_id(0).to(tl.int64) * BLOCK
     is_probe = start + tl.arange(0, BLOCK) < num_points
-    # All but the program's first environment is counted from it, in 32 bits. Lanes beyond the last probe work on that one.
+    # Environments after the program's first are counted from it, in 32 bits. Lanes beyond the last probe work on that one.
     first_env = start // NUM_TAXELS
     place = tl.minimum(start + tl.arange(0, BLOCK), num_points - 1) - first_env * NUM_TAXELS
     env, taxel = place.to(tl.int32) // NUM_TAXELS, place.to(tl.int32) % NUM_TAXELS
@@ -200,7 +200,7 @@ def deepest_kernel(
 
 @triton.jit
 def _begun(pair, radii, gates, gate_row, gate_pair, pose, row, pose_pair, IS_GATED: tl.constexpr):
-    """Return what tells whether probes can meet an object: their radii, where its links are, and what is 0 if it is somewhere.
+    """Return the radii, the link's origin in the object's frame, and 0 where the pose is finite.
 
     If an orientation is not a number, no part of the rotation is, and its object is never passed over.
     """

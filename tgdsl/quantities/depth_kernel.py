@@ -49,8 +49,8 @@ def meet(
     """
     frames, counts, values = grid_tables(links, g)
     where, is_cubic = torch.stack(points)[:, :, 0], links.shapes[g] == "tricubic"
-    found = _meet([*pairs.rotation, *pairs.offset], pairs.gate, pair, where, frames, counts, values, is_cubic)
-    x, y, z, distance, *gradient = found.unbind()
+    outputs = _meet([*pairs.rotation, *pairs.offset], pairs.gate, pair, where, frames, counts, values, is_cubic)
+    x, y, z, distance, *gradient = outputs.unbind()
     return (x, y, z), distance, vec(gradient)
 
 
@@ -94,7 +94,7 @@ def launch(
         run: The kernel.
         pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: nine planes
             that lie in memory alike, and three.
-        gate: Negative where a pair may not be felt.
+        gate: Negative where a pair does not count.
         pair: Index of each link's pair.
         points: Places in the object's frame [m].
         frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes [m].
@@ -159,7 +159,7 @@ def posed(planes, turn, offset):
 
 @triton.jit
 def is_felt(gates, at, IS_GATED: tl.constexpr):
-    """Return whether a pair may be felt; so may one whose gate is not a number."""
+    """Return whether a pair counts; one whose gate is NaN does."""
     is_open = tl.full((), 1, tl.int1)
     if IS_GATED:
         is_open = (tl.load(gates + at) < 0) == 0
@@ -188,7 +188,7 @@ def placed(pose, points, point_axis, point, is_point):
 
 @triton.jit
 def outside(here):
-    """Return what is read outside: distance and gradient."""
+    """Return distance and gradient outside the grid."""
     none = tl.zeros_like(here[0])
     return none + float("inf"), (none, none, none)
 
@@ -197,13 +197,13 @@ def outside(here):
 def cells(grid, here):
     """Return where a block of points in the link's frame is along the axes of the grid, in its cells."""
     place, turn, low, cell, _, _ = grid
-    own = rotate_back(turn, (here[0] - place[0], here[1] - place[1], here[2] - place[2]))
-    return (own[0] - low[0]) / cell, (own[1] - low[1]) / cell, (own[2] - low[2]) / cell
+    local = rotate_back(turn, (here[0] - place[0], here[1] - place[1], here[2] - place[2]))
+    return (local[0] - low[0]) / cell, (local[1] - low[1]) / cell, (local[2] - low[2]) / cell
 
 
 @triton.jit
 def is_within(grid, at):
-    """Return whether places in cells are inside the grid; what is no number is."""
+    """Return whether places in cells are inside the grid; NaN counts as inside."""
     num = grid[4]
     return (_is_beyond(at[0], num[0]) | _is_beyond(at[1], num[1]) | _is_beyond(at[2], num[2])) == 0
 
@@ -225,7 +225,7 @@ def measured(grid, here, is_point, IS_CUBIC: tl.constexpr):
 
 @triton.jit
 def _is_beyond(place, num):
-    """Return whether places along an axis are outside a grid; what is no number is not."""
+    """Return whether places along an axis are outside a grid; NaN is not."""
     return (place < 0) | (place > num - 1)
 
 

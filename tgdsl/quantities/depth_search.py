@@ -65,7 +65,7 @@ class ContactDepth(Request[Penetration]):
     """Asks how deep probes are in objects: the deepest object wins, the first among equals.
 
     Attributes:
-        radius: How far from each taxel objects are felt [m], (taxel,); None: the probes' own. Inactive probes feel nothing.
+        radius: Radius of each probe [m], (taxel,); None: the taxels'. Inactive probes have depth 0.
         range: Distance from an object's surface up to which it is needed [m], if more than the radius.
         normal: Whether the normal is asked for.
         motion: Whether the velocities are.
@@ -83,7 +83,7 @@ class ContactDepth(Request[Penetration]):
 
     @property
     def wants(self) -> tuple[str, ...]:
-        """What is asked for beside the depth."""
+        """Results that are requested in addition to the depth."""
         return tuple(name for name in ("distance", "frame", "motion", "normal") if getattr(self, name))
 
     def key(self) -> tuple[Any, ...]:
@@ -97,22 +97,22 @@ class ContactDepth(Request[Penetration]):
         return dataclasses.replace(self, range=max(self.range, other.range), **wants)
 
     def join_key(self) -> tuple[Any, ...]:
-        """Return what requests at different probes have in common if they can be joined: all but radii and range."""
+        """Return the key by which requests at different probes can be joined: everything except radii and range."""
         return type(self), self.objects, self.is_gated, self.wants, self.radius is None
 
     def joined(self, others: Sequence[Request]) -> ContactDepth:
         """Return one request for several sensors' probes, each with its own radii."""
         every = [self, *(other for other in others if isinstance(other, ContactDepth))]
-        radii = [own.radius for own in every if own.radius is not None]
+        radii = [request.radius for request in every if request.radius is not None]
         radius = np.concatenate(radii) if radii else None
-        return dataclasses.replace(self, radius=radius, range=max(own.range for own in every))
+        return dataclasses.replace(self, radius=radius, range=max(request.range for request in every))
 
     def wants_distance(self, radius: Float[np.ndarray, " taxel"]) -> bool:
         """Return whether distances are measured for it: not where no probe reaches anywhere, unless they are asked for."""
         return self.distance or bool((self.reach(radius) > -np.inf).any())
 
     def reach(self, radius: Float[np.ndarray, " taxel"]) -> Float[np.ndarray, " taxel"]:
-        """Return how far from each taxel objects are felt [m], for probes of these radii; −∞ for inactive ones."""
+        """Return the reach of each probe [m] for these radii; −∞ for inactive ones."""
         return np.where(radius > 0, radius if self.radius is None else self.radius, -np.inf)
 
 
@@ -177,7 +177,7 @@ def penetration(
     Args:
         pairs: Relative poses of all pairs of the plan.
         probes: The probes.
-        near: The objects that are felt, the first of equals first.
+        near: The objects; the first of equals wins.
         reach: Radius of each probe towards each of them [m]; −∞ where the probe is inactive or the pair cannot meet.
         wants: Which optional parts of the answer are wanted here: "normal", "motion", "distance", "frame".
     """
@@ -260,7 +260,7 @@ def search(
     Args:
         pairs: Relative poses of all pairs of the plan.
         probes: The probes.
-        targets: The targets that are felt, the first of equals first; they are searchable.
+        targets: The targets, which are searchable; the first of equals wins.
         known: Their tables by name, as `Tables` has them: `pair`, and the others where they are the same at all calls.
         reach: As `query.penetration` has it.
         wants: As `query.penetration` has them.
@@ -270,9 +270,9 @@ def search(
     result = DEEPEST.kernel(pairs, probes, targets, known, reach)
     velocity = angular = None
     if "motion" in wants and pairs.motion is not None:
-        own, is_met = result.pair.clamp(min=0).long(), result.pair >= 0
+        pair, is_met = result.pair.clamp(min=0).long(), result.pair >= 0
         motion = (*pairs.motion.linear, *pairs.motion.angular)
-        x, y, z, u, v, w = (torch.where(is_met, part.gather(1, own), 0.0) for part in motion)
+        x, y, z, u, v, w = (torch.where(is_met, part.gather(1, pair), 0.0) for part in motion)
         velocity, angular = planes.add((x, y, z), planes.cross((u, v, w), probes.pos)), (u, v, w)
     normal = result.normal if "normal" in wants else None
     return Penetration(probes.pos, result.depth, normal, velocity, angular, {}, {})
@@ -284,12 +284,12 @@ def deepest(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapp
     Args:
         pairs: Relative poses of all pairs of the plan; the gate holds.
         probes: The probes.
-        targets: The targets that are felt, the first of equals first.
+        targets: The targets; the first of equals wins.
         known: As `search` has it, as `reach`.
         reach: Radius of each probe towards each object [m].
     """
-    own = torch.stack([pair - target.object.first_pair for pair, target in zip(known["pair"], targets, strict=True)])
-    near = measure(pairs, Probes(probes.pos, own), targets)
+    pairs_of = torch.stack([pair - target.object.first_pair for pair, target in zip(known["pair"], targets, strict=True)])
+    near = measure(pairs, Probes(probes.pos, pairs_of), targets)
     # What moves along x by the number of its pair tells which pair is felt.
     number = torch.arange(1, pairs.offset[0].shape[1] + 1, dtype=reach.dtype, device=reach.device).expand_as(pairs.offset[0])
     still = torch.zeros_like(number)
@@ -310,7 +310,7 @@ def _by_kernel(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: M
 
 def _inputs(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapping[str, Tensor], reach: Reach) -> list[Tensor]:
     motion = () if pairs.motion is None else (*pairs.motion.linear, *pairs.motion.angular)
-    geoms = [part for _, own in targets for part in (own.size, own.pos, own.rotation)]
+    geoms = [part for _, geom in targets for part in (geom.size, geom.pos, geom.rotation)]
     return [*pairs.offset, *pairs.rotation, *motion, *probes.pos, reach, *geoms]
 
 

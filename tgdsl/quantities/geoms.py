@@ -29,7 +29,7 @@ from tgdsl.tensors.env_ids import is_cheap_to_read
 
 
 class RaycastSurface(NamedTuple):
-    """Triangles that are queried at run time, one mesh per variant, and the distance [m] up to which they are told apart."""
+    """Triangles that are queried at run time, one mesh per variant, and the distance [m] below which they count as one."""
 
     meshes: tuple[TriangleMesh, ...]
     max_distance: float
@@ -51,7 +51,7 @@ class Geoms(NamedTuple):
     """An object's geoms in its body's frame, as each environment has it.
 
     Attributes:
-        shapes: How the distance to each geom is found: see `tables.GeomTable`.
+        shapes: Method of the distance to each geom: see `GeomTable`.
         is_centred: Whether each geom's frame is the body's.
         size: Size of each geom as MuJoCo defines it [m].
         pos: Origin of each geom in the body frame [m].
@@ -172,7 +172,7 @@ class TriangleTable:
 
     @cached_property
     def prepared(self) -> RaycastSurface:
-        """What is queried; cases with the same triangles share a mesh."""
+        """Geoms that are queried; cases with the same triangles share a mesh."""
         meshes: dict[tuple[bytes, bytes], TriangleMesh] = {}
         results = []
         for vertices, faces in zip(self.vertices, self.faces, strict=True):
@@ -190,14 +190,14 @@ class GeomTable(Generic[Array]):
     A column stands for the geoms of one type that the cases have in its place; a case may lack it.
 
     Attributes:
-        shapes: How the distance to each column is found: a primitive's type, an interpolation of a grid, or `raycast`.
+        shapes: Method of the distance to each column: a primitive's type, an interpolation of a grid, or `raycast`.
         is_centred: Which of them share the body's frame in all cases.
         size: Size of each as MuJoCo defines it [m], (case, geom, 3).
         pos: Its origin in the body's frame [m], (case, geom, 3).
         rotation: Rotates its vectors into the body's frame, row by row, (case, geom, 9).
         is_absent: 1 where a case lacks it, (case, geom); None if there is one case.
         surfaces: Grids or triangles of each that is no primitive.
-        accuracy: What was measured of each case's geoms: see `bake.Errors`; empty where distances are exact.
+        accuracy: Measured errors of each case's geoms, see `bake.Errors`; empty where distances are exact.
     """
 
     shapes: tuple[str, ...]
@@ -211,7 +211,7 @@ class GeomTable(Generic[Array]):
 
 
 def account_of_geoms(table: GeomTable[np.ndarray], names: Sequence[str]) -> list[str]:
-    """Return what was measured of a table's grids, for users.
+    """Return the measured errors of a table's grids, for users.
 
     Args:
         table: The table.
@@ -241,8 +241,8 @@ def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -
     if variant is not None and table.is_absent is not None:
         is_absent = _chosen(table.is_absent, variant) > 0
     if target.is_sized:
-        own = scene.tensors["object_size"][:, target.varied, None].to(size.dtype).expand(-1, size.shape[1], -1)
-        size = own if is_absent is None else torch.where(is_absent[..., None], size, own)
+        sizes = scene.tensors["object_size"][:, target.varied, None].to(size.dtype).expand(-1, size.shape[1], -1)
+        size = sizes if is_absent is None else torch.where(is_absent[..., None], size, sizes)
     geoms = Geoms(
         shapes=table.shapes,
         is_centred=table.is_centred,
@@ -251,19 +251,19 @@ def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -
         rotation=_chosen(table.rotation, variant),
         is_absent=is_absent,
         variant=variant,
-        surfaces=tuple(_surface(own, variant) for own in table.surfaces),
+        surfaces=tuple(_surface(surface, variant) for surface in table.surfaces),
     )
     return geoms if is_absent is None or not is_cheap_to_read(is_absent) else _had_by_some(geoms, is_absent)
 
 
 def _had_by_some(geoms: Geoms, is_absent: Bool[Tensor, "env geom"]) -> Geoms:
     """Return those geoms that some environment has."""
-    own = [g for g, is_missing in enumerate(is_absent.all(dim=0).tolist()) if not is_missing]
-    if len(own) == len(geoms.shapes) or not own:
+    present = [g for g, is_missing in enumerate(is_absent.all(dim=0).tolist()) if not is_missing]
+    if len(present) == len(geoms.shapes) or not present:
         return geoms
-    ids = torch.tensor(own, device=is_absent.device)
+    ids = torch.tensor(present, device=is_absent.device)
     return geoms._replace(
-        **{name: tuple(getattr(geoms, name)[g] for g in own) for name in ("shapes", "is_centred", "surfaces")},
+        **{name: tuple(getattr(geoms, name)[g] for g in present) for name in ("shapes", "is_centred", "surfaces")},
         **{name: getattr(geoms, name).index_select(1, ids) for name in ("size", "pos", "rotation", "is_absent")},
     )
 
@@ -278,7 +278,7 @@ def link_geoms(table: GeomTable[Tensor], links: Tensor) -> Geoms:
         rotation=table.rotation[links],
         is_absent=None if table.is_absent is None else table.is_absent[links] > 0,
         variant=links,
-        surfaces=tuple(_surface(own, links) for own in table.surfaces),
+        surfaces=tuple(_surface(surface, links) for surface in table.surfaces),
     )
 
 
@@ -311,12 +311,12 @@ class ReferenceGeom:
 
 
 def geoms_of(table: GeomTable[np.ndarray], case: int, size: Float[np.ndarray, " 3"] | None = None) -> list[ReferenceGeom]:
-    """Return the geoms of a case of a table; with a size, that of its only geom [m]."""
+    """Return the geoms of a case of a table; a size replaces that of its only geom [m]."""
     results = []
     for g, shape in enumerate(table.shapes):
         if table.is_absent is None or not table.is_absent[case, g]:
-            own = np.asarray(table.size[case, g]) if size is None else size
-            results.append(ReferenceGeom(shape, own, table.pos[case, g], table.rotation[case, g].reshape(3, 3)))
+            lengths = np.asarray(table.size[case, g]) if size is None else size
+            results.append(ReferenceGeom(shape, lengths, table.pos[case, g], table.rotation[case, g].reshape(3, 3)))
     return results
 
 

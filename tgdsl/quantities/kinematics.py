@@ -209,9 +209,9 @@ class _Joints(Quantity):
         return tuple(values)
 
     def reference(self, part: JointsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceDrive:
-        own = part.uses[use]
-        velocity, effort = (scene.fields[name][own.joints] for name in ("joint_vel", "joint_effort"))
-        return ReferenceDrive(velocity, effort, _reference_places(scene, own.bodies, own.anchor))
+        use_part = part.uses[use]
+        velocity, effort = (scene.fields[name][use_part.joints] for name in ("joint_vel", "joint_effort"))
+        return ReferenceDrive(velocity, effort, _reference_places(scene, use_part.bodies, use_part.anchor))
 
     def fields(self, part: JointsPart) -> set[str]:
         return {"body_pos", "body_quat", "joint_vel", "joint_effort"}

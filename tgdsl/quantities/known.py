@@ -1,4 +1,4 @@
-"""The quantities that kinds may ask for: those of tgdsl, those that installed packages bring, and those that a caller gives.
+"""The quantities that kinds may request: tgdsl's, those of installed packages, and those a caller gives.
 
 A package brings a quantity by an entry point, in its pyproject.toml:
 
@@ -31,9 +31,9 @@ GROUP = "tgdsl.quantities"
 
 
 def known_quantities(given: Sequence[Quantity] = ()) -> tuple[Quantity, ...]:
-    """Return all quantities: those of tgdsl, of installed packages by package and name, and those that are given.
+    """Return all quantities: tgdsl's, then those of installed packages by package and name, then the given ones.
 
-    An installed quantity that cannot be had is left out, with a warning, the first time.
+    An installed quantity that cannot be imported is skipped; a warning says so once.
 
     Args:
         given: Quantities of the caller's own. One that an installed package brings too may be among them.

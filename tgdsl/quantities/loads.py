@@ -89,7 +89,7 @@ class LoadsUse(Generic[Array]):
         bodies: Indices of the sensors' bodies in the state, (body,).
         objects: Indices of the objects' bodies in the state, (object,).
         pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
-        center: In whose frame the centre of the contacts is found; empty: it is not wanted.
+        center: The frame of the centre of contacts; empty: no centre is computed.
     """
 
     bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
@@ -111,8 +111,8 @@ def _use(planning: Planning, use: Use) -> LoadsUse[np.ndarray]:
     names = request.objects
     bodies = tuple(dict.fromkeys(link.body for link in use.links))
     pairs = {pair: i for i, pair in enumerate(planning.contact_pairs)}
-    own = [name for name in names if request.of == "object" or not is_counted(planning, name, names)]
-    table = [[pairs.get(Pair(body, name), len(pairs)) if name in own else len(pairs) for name in names] for body in bodies]
+    counted = [name for name in names if request.of == "object" or not is_counted(planning, name, names)]
+    table = [[pairs.get(Pair(body, name), len(pairs)) if name in counted else len(pairs) for name in names] for body in bodies]
     return LoadsUse(
         bodies=_places(planning, bodies),
         objects=_places(planning, [planning.sensed[name].body for name in names]),
@@ -127,18 +127,20 @@ def _places(planning: Planning, bodies: Sequence[str]) -> np.ndarray:
 
 
 def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtype) -> PairLoads:
-    found = pair_contacts(state, use.pairs)
-    pressed = planes.dot(found.force, found.normal).clamp(min=0.0)
-    apart = planes.sub(_velocity(state, use.objects, found, _of_object), _velocity(state, use.bodies, found, _of_link))
-    across = planes.sub(apart, planes.scale(planes.dot(apart, found.normal), found.normal))
+    contacts = pair_contacts(state, use.pairs)
+    pressed = planes.dot(contacts.force, contacts.normal).clamp(min=0.0)
+    apart = planes.sub(_velocity(state, use.objects, contacts, _of_object), _velocity(state, use.bodies, contacts, _of_link))
+    across = planes.sub(apart, planes.scale(planes.dot(apart, contacts.normal), contacts.normal))
     speed = planes.safe_sqrt(planes.dot(across, across))
     force, sliding = pressed.sum(dim=-1), (pressed * speed).sum(dim=-1)
     center = along = None
     if use.center:
         bodies, spread = (use.bodies, _of_link) if use.center == "link" else (use.objects, _of_object)
         sign = 1.0 if use.center == "link" else -1.0
-        center, normal = _middle(state, bodies, found, pressed, spread)
-        center, along = (planes.vec(part.to(dtype) for part in own) for own in (center, planes.vec(sign * n for n in normal)))
+        center, normal = _middle(state, bodies, contacts, pressed, spread)
+        center, along = (
+            planes.vec(part.to(dtype) for part in vector) for vector in (center, planes.vec(sign * n for n in normal))
+        )
     return PairLoads(force.to(dtype), sliding.to(dtype), center, along)
 
 
@@ -174,7 +176,8 @@ def _middle(
     away = _away(found, planes.vec(map(spread, planes.split(state["body_pos"][:, bodies]))))
     rotation = planes.rot(map(spread, planes.rotation(state["body_quat"][:, bodies])))
     center, mean = (
-        planes.vec((share * part).sum(dim=-1) for part in planes.rotate_back(rotation, own)) for own in (away, found.normal)
+        planes.vec((share * part).sum(dim=-1) for part in planes.rotate_back(rotation, vector))
+        for vector in (away, found.normal)
     )
     return center, mean
 
@@ -215,13 +218,13 @@ class _Loads(Quantity):
         return tuple(_loads(use, scene.tensors, scene.dtype) for use in part.uses)
 
     def reference(self, part: LoadsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceLoads:
-        own, fields = part.uses[use], scene.fields
-        force, sliding, center, along = (np.zeros((*own.pairs.shape, *rest)) for rest in ((), (), (3,), (3,)))
-        for (b, o), pair in np.ndenumerate(own.pairs):
+        use_part, fields = part.uses[use], scene.fields
+        force, sliding, center, along = (np.zeros((*use_part.pairs.shape, *rest)) for rest in ((), (), (3,), (3,)))
+        for (b, o), pair in np.ndenumerate(use_part.pairs):
             if pair == len(scene.contact_pairs):
                 continue
-            link, target = scene.body(scene.bodies[own.bodies[b]]), scene.body(scene.bodies[own.objects[o]])
-            ringing, sign = (target, -1.0) if own.center == "object" else (link, 1.0)
+            link, target = scene.body(scene.bodies[use_part.bodies[b]]), scene.body(scene.bodies[use_part.objects[o]])
+            ringing, sign = (target, -1.0) if use_part.center == "object" else (link, 1.0)
             slots = [list(row) for row in zip(*(fields[name][pair] for name in SLOT_FIELDS), strict=True) if np.any(row[1:])]
             contacts = [[pos, on_link, np.zeros(3), normal] for pos, on_link, normal in slots]
             for pos, on_link, _, normal in completed(contacts, fields["contact_netforce"][pair]):

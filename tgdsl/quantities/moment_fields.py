@@ -44,7 +44,7 @@ SPACING, PIECES = 1e-3, 200.0
 
 @dataclass(frozen=True)
 class FieldErrors:
-    """Errors at random points within the radius of the surface, none of which took part in the choice of the lattice.
+    """Errors at random points within the radius of the surface, which took no part in the choice of the lattice.
 
     All are fractions of full scale, the largest magnitude at these points.
 
@@ -139,7 +139,7 @@ def bake_field(
 
 
 def moments_key(geoms: Sequence[SurfaceGeom], what: bytes, *limits: float | int) -> str:
-    """Return the key of what is computed of some geoms."""
+    """Return the cache key of the moments of some geoms."""
     arrays = [np.array(limits, float)]
     for felt in geoms:
         arrays += [np.frombuffer(felt.shape.encode(), np.uint8), felt.geom.size, felt.geom.pos, felt.geom.rotation]
@@ -213,7 +213,7 @@ def _bake(geoms: Sequence[SurfaceGeom], radius: float, limits: Limits, with_slop
 
 
 def _too_large(radius: float, limits: Limits, needed: int) -> str:
-    """Return what is wrong with limits that need so many bytes."""
+    """Return the message for limits that need so many bytes."""
     gradients = "" if limits.gradient_tolerance is None else f", and of {limits.gradient_tolerance:g} of its gradients,"
     return (
         f"a field of moments of a tolerance of {limits.tolerance:g}{gradients} at a radius of {1e3 * radius:g} mm needs about"
@@ -234,12 +234,12 @@ def gradient_sums(surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: fl
     With u the unit vector from q to p and r = |p − q| < R: ∇S0 = ∫ u dA [m²], ∇S1 = ∫ (r u uᵀ − (R − r) 1) dA [m³].
     """
     result = np.zeros((len(pos), 4, 3))
-    for own, near, q in zip(result, surface.tree.query_ball_point(pos, radius), pos, strict=True):
+    for row, near, q in zip(result, surface.tree.query_ball_point(pos, radius), pos, strict=True):
         way, area = surface.pos[near] - q, surface.area[near]
         r = np.linalg.norm(way, axis=1)
         unit = way / np.maximum(r, 1e-12)[:, None]
-        own[0] = area @ unit
-        own[1:] = (area[:, None] * way).T @ unit - (area @ (radius - r)) * np.eye(3)
+        row[0] = area @ unit
+        row[1:] = (area[:, None] * way).T @ unit - (area @ (radius - r)) * np.eye(3)
     return result
 
 
@@ -272,14 +272,14 @@ def moment_sums(
     """
     result = np.zeros((len(pos), channels))
     for start in range(0, len(pos), block):
-        own = pos[start : start + block]
-        middle = (own.min(axis=0) + own.max(axis=0)) / 2
-        reach = radius + np.linalg.norm(own - middle, axis=1).max()
+        block_pos = pos[start : start + block]
+        middle = (block_pos.min(axis=0) + block_pos.max(axis=0)) / 2
+        reach = radius + np.linalg.norm(block_pos - middle, axis=1).max()
         near = np.array(surface.tree.query_ball_point(middle, reach), dtype=np.int64)
         if not len(near):
             continue
         # About the middle, so that squares of small distances keep their digits.
-        points, here = torch.from_numpy(surface.pos[near] - middle), torch.from_numpy(own - middle)
+        points, here = torch.from_numpy(surface.pos[near] - middle), torch.from_numpy(block_pos - middle)
         weight = torch.relu(radius - torch.cdist(here, points))
         area = torch.from_numpy(surface.area[near])[:, None]
         parts = torch.cat([area, area * points], dim=1).T.contiguous()
@@ -335,27 +335,27 @@ def _errors(
     field = MomentField(flat, 0, (x, y, z), place, side, is_smooth=true.gradients is not None)
     pos = torch.from_numpy(true.pos).requires_grad_()
     mass, first = field_moments(split(pos), field)
-    found = torch.stack([mass, *first], dim=1)
+    estimate = torch.stack([mass, *first], dim=1)
     mass_error, first_error = (
-        np.linalg.norm(error, axis=1) / np.linalg.norm(own, axis=1).max()
-        for error, own in _halves(found.detach().numpy() - true.moments, true.moments)
+        np.linalg.norm(error, axis=1) / np.linalg.norm(scale, axis=1).max()
+        for error, scale in _halves(estimate.detach().numpy() - true.moments, true.moments)
     )
     rms = [float(np.sqrt(np.mean(error**2))) for error in (mass_error, first_error)]
     errors = FieldErrors(rms[0], float(mass_error.max()), rms[1], float(first_error.max()))
     if true.gradients is None:
         return errors
-    slopes = [torch.autograd.grad(found[:, c].sum(), pos, retain_graph=True)[0].numpy() for c in range(4)]
+    slopes = [torch.autograd.grad(estimate[:, c].sum(), pos, retain_graph=True)[0].numpy() for c in range(4)]
     error = np.stack(slopes, axis=1) - true.gradients
     of_mass, of_first = (
-        np.linalg.norm(own, axis=(1, 2)) / np.linalg.norm(all_of, axis=(1, 2)).max()
-        for own, all_of in _halves(error, true.gradients)
+        np.linalg.norm(part, axis=(1, 2)) / np.linalg.norm(all_of, axis=(1, 2)).max()
+        for part, all_of in _halves(error, true.gradients)
     )
     p999, first_p999 = (float(np.quantile(part, 0.999)) for part in (of_mass, of_first))
     return dataclasses.replace(errors, gradient_p999=p999, gradient_max=float(of_mass.max()), first_gradient_p999=first_p999)
 
 
 def _halves(*both: np.ndarray) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """Return the parts that belong to S0, and those that belong to S1."""
+    """Return the parts of S0 and the parts of S1."""
     return tuple(part[:, :1] for part in both), tuple(part[:, 1:4] for part in both)
 
 
@@ -474,9 +474,9 @@ def _lists(
     middle = origin + cell * (index + 0.5)
     tree = KDTree(points)
     results = []
-    for own in middle:
-        near = np.sort(np.array(tree.query_ball_point(own, reach + cell * np.sqrt(0.75)), dtype=np.int64))
-        gap = np.maximum(np.abs(points[near] - own) - cell / 2, 0)
+    for center in middle:
+        near = np.sort(np.array(tree.query_ball_point(center, reach + cell * np.sqrt(0.75)), dtype=np.int64))
+        gap = np.maximum(np.abs(points[near] - center) - cell / 2, 0)
         results.append(near[(gap**2).sum(axis=1) < reach**2])
         if 8 * len(middle) * len(results[-1]) > budget:
             return 8 * len(middle) * len(results[-1])

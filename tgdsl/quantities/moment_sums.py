@@ -42,7 +42,7 @@ class Moments(NamedTuple):
 
 
 class MomentField(NamedTuple):
-    """Moments at the nodes of a lattice; or of several, of which each point asks one.
+    """Moments at the nodes of one lattice, or of several; each point names the one it asks.
 
     They vanish on the outermost nodes, so points outside read zero. Counts that are the same for all points may be Python's: a
     compiler then makes them part of the code.
@@ -160,7 +160,7 @@ def cloud_moments(point: Vec, cloud: PointCloud, radius: Tensor) -> Moments:
     Args:
         point: Points in the object's frame [m].
         cloud: The cloud.
-        radius: Their sensing radius, not more than what the lists were made for [m].
+        radius: Their sensing radius, at most that of the lists [m].
     """
     base, rest = _cell_of(point, cloud.origin, cloud.cell, cloud.num, last=1)
     is_outside = (rest[0] < 0) | (rest[1] < 0) | (rest[2] < 0) | (rest[0] > 1) | (rest[1] > 1) | (rest[2] > 1)
@@ -171,7 +171,7 @@ def cloud_moments(point: Vec, cloud: PointCloud, radius: Tensor) -> Moments:
     step = num_slots if torch.compiler.is_compiling() else BLOCK
     for start in range(0, num_slots, step):
         rows = cloud.lists[bins, start : start + step]
-        way = vec(part[rows] - own[..., None] for part, own in zip(cloud.points, point, strict=True))
+        way = vec(part[rows] - center[..., None] for part, center in zip(cloud.points, point, strict=True))
         weight = torch.relu(radius[..., None] - planes.safe_sqrt(planes.dot(way, way)))
         parts = (weight, weight * way[0], weight * way[1], weight * way[2])
         total = [part + more.sum(dim=-1) for part, more in zip(total, parts, strict=True)]
@@ -180,14 +180,14 @@ def cloud_moments(point: Vec, cloud: PointCloud, radius: Tensor) -> Moments:
 
 
 def _cell_of(point: Vec, origin: Vec, cell: Tensor, num: tuple[Count, Count, Count], last: int) -> tuple[Tensor, Vec]:
-    """Return the index of each point's cell among those of its lattice, and the place in it, from 0 to 1 within the lattice.
+    """Return the index of each point's cell in its lattice, and the place in it, from 0 to 1 within the lattice.
 
     Of a lattice's nodes (`last` = 2) points outside count as at the border; of its cubes (`last` = 1) they do not.
     """
     place = [(part - start) / cell for part, start in zip(point, origin, strict=True)]
     if last == 2:
         place = [within(part, count - 1) for part, count in zip(place, num, strict=True)]
-    # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
+    # NaN becomes an arbitrary integer: only the integer's own clamp makes it an index.
     lower = [within(part.floor().long(), count - last) for part, count in zip(place, num, strict=True)]
     base = (lower[0] * num[1] + lower[1]) * num[2] + lower[2]
     return base, vec(part - corner for part, corner in zip(place, lower, strict=True))

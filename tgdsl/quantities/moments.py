@@ -31,7 +31,7 @@ FAR = 1e6
 """Coordinates of the point that fills lists [m]: out of reach of everything, its square still a float32."""
 Solid = Sequence[tuple[SurfaceGeom, ...]]
 Number = dict[tuple[Any, ...], int]
-"""Number of a table, by the way in which moments are found and the object."""
+"""Number of a table, by method and object."""
 
 
 Array = TypeVar("Array")
@@ -100,7 +100,7 @@ class MomentTable(Generic[Array]):
         plane_pos: Places of its planes in its body's frame [m], (plane, 3).
         plane_rotation: Rotates their vectors into it, (plane, 9).
         surface: The rest of its surface; None if there is no more to it.
-        accuracy: What was measured of each field, variant after variant, radius by radius: see `fields.FieldErrors`.
+        accuracy: Measured errors of each field, variant after variant, radius by radius: see `FieldErrors`.
     """
 
     object: int = field(metadata=indices(lambda table, part, plan: len(plan.objects)))
@@ -146,7 +146,7 @@ class MomentsPart(Generic[Array]):
 
 
 def _source(table: MomentTable[Tensor], use: MomentUse[Tensor], k: int, scene: Scene) -> MomentSource:
-    """Return an object of a use, and what its moments are found from."""
+    """Return an object of a use, and the table of its moments."""
     target = scene.objects[table.object]
     shift = scene.radius_shifts[use.radius_noise] if use.radius_noise else None
     variant, reach = variant_of(scene, target), use.reach[k]
@@ -157,7 +157,8 @@ def _source(table: MomentTable[Tensor], use: MomentUse[Tensor], k: int, scene: S
         shift=None if shift is None else torch.maximum(shift, -reach),
         surface=_surface(table, variant, use.radius_id[k]),
         planes=tuple(
-            Plane(rot(own.unbind()), vec(at.unbind())) for own, at in zip(table.plane_rotation, table.plane_pos, strict=True)
+            Plane(rot(rotation.unbind()), vec(at.unbind()))
+            for rotation, at in zip(table.plane_rotation, table.plane_pos, strict=True)
         ),
         area=(table.area if variant is None else table.area[variant])[:, None],
     )
@@ -165,22 +166,27 @@ def _source(table: MomentTable[Tensor], use: MomentUse[Tensor], k: int, scene: S
 
 def _surface(table: MomentTable[Tensor], variant: Tensor | None, radius_id: Tensor) -> MomentField | PointCloud | None:
     """Return the table that each probe asks: one for all, or by variant (env, 1), by radius (taxel,), or by both."""
-    own, num_radii = table.surface, len(table.radii)
-    if own is None:
+    surface, num_radii = table.surface, len(table.radii)
+    if surface is None:
         return None
     which = None if variant is None else variant[:, None]
-    if isinstance(own, FieldTable) and num_radii > 1:
+    if isinstance(surface, FieldTable) and num_radii > 1:
         which = radius_id if which is None else num_radii * which + radius_id
     start: Count = 0
     if which is None:
-        counts: tuple[Count, Count, Count] = own.counts
-        place, side = split(own.origin[0]), own.cell[0]
+        counts: tuple[Count, Count, Count] = surface.counts
+        place, side = split(surface.origin[0]), surface.cell[0]
     else:
-        start, counts, place, side = own.first[which], split(own.num[which]), split(own.origin[which]), own.cell[which]
-    if isinstance(own, FieldTable):
-        return MomentField(own.values, start, counts, place, side, own.is_smooth)
-    weight = own.weight[0] if which is None else own.weight[which]
-    return PointCloud(vec(own.points.unbind()), weight, own.lists, start, counts, place, side)
+        start, counts, place, side = (
+            surface.first[which],
+            split(surface.num[which]),
+            split(surface.origin[which]),
+            surface.cell[which],
+        )
+    if isinstance(surface, FieldTable):
+        return MomentField(surface.values, start, counts, place, side, surface.is_smooth)
+    weight = surface.weight[0] if which is None else surface.weight[which]
+    return PointCloud(vec(surface.points.unbind()), weight, surface.lists, start, counts, place, side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +265,7 @@ class ReferenceTable:
 
 
 def _gradients(accuracy: Mapping[str, float]) -> list[str]:
-    """Return what was measured of a field's gradients by place, if it was."""
+    """Return the measured errors of a field's gradients by place, if there are any."""
     if "gradient_p999" not in accuracy:
         return []
     p999, largest, first = (f"{100 * accuracy[key]:.2g} %" for key in ("gradient_p999", "gradient_max", "first_gradient_p999"))
@@ -303,11 +309,11 @@ class _Moments(Quantity):
         return tuple(results)
 
     def reference(self, part: MomentsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceMoments:
-        own, layout = part.uses[use], scene.layout
-        num = len(own.tables)
+        use_part, layout = part.uses[use], scene.layout
+        num = len(use_part.tables)
         mass, (first, velocity, angular) = np.zeros((layout.num_taxels, num)), np.zeros((3, layout.num_taxels, num, 3))
         turn, area = np.zeros((layout.num_taxels, 3)), np.zeros(num)
-        for k, table in enumerate(part.tables[i] for i in own.tables):
+        for k, table in enumerate(part.tables[i] for i in use_part.tables):
             target = scene.objects[table.object]
             moments, body = ReferenceTable(table, scene.variant(target)), scene.object_body(target)
             area[k] = moments.area
@@ -360,24 +366,31 @@ def _request(use: Use) -> MomentsRequest:
 
 
 def _way(use: Use) -> tuple[Any, ...]:
-    """Return what tables have in common that serve several uses: how moments are found, whatever of and by whom."""
-    own = _request(use)
-    result = own.backend, own.num_points, own.tolerance, own.gradient_tolerance, own.max_bytes, own.with_area
+    """Return the method of a request: uses with equal methods share a table."""
+    request = _request(use)
+    result = (
+        request.backend,
+        request.num_points,
+        request.tolerance,
+        request.gradient_tolerance,
+        request.max_bytes,
+        request.with_area,
+    )
     return *result, use.largest_shift
 
 
 def _radii(planning: Planning, uses: Sequence[Use], use: Use, name: str) -> list[float]:
     """Return the radii of all probes whose tables are this use's [m], ascending."""
-    own = [other for other in uses if _way(other) == _way(use) and name in other.request.objects]
-    return sorted({float(r) for other in own for r in planning.layout.radius[other.taxels] if r > 0})
+    alike = [other for other in uses if _way(other) == _way(use) and name in other.request.objects]
+    return sorted({float(r) for other in alike for r in planning.layout.radius[other.taxels] if r > 0})
 
 
 def _check_area(planning: Planning, use: Use, tables: Sequence[MomentTable], numbers: Number) -> None:
     request = _request(use)
-    own = [numbers[key] for name in request.objects if (key := (*_way(use), name)) in numbers]
-    if request.with_area and len(own) == len(request.objects) and not sum(tables[i].area.min() for i in own) > 0:
-        what = f"{', '.join(request.objects)}: planes alone have no area to share the density among"
-        planning.report(("sensors", use.sensors[0]), what, "give `reference_area`, or feel an object that is no plane")
+    counts = [numbers[key] for name in request.objects if (key := (*_way(use), name)) in numbers]
+    if request.with_area and len(counts) == len(request.objects) and not sum(tables[i].area.min() for i in counts) > 0:
+        problem = f"{', '.join(request.objects)}: planes alone have no area to share the density among"
+        planning.report(("sensors", use.sensors[0]), problem, "give `reference_area`, or feel an object that is no plane")
 
 
 def _use(planning: Planning, use: Use, tables: Sequence[MomentTable[np.ndarray]], numbers: Number) -> MomentUse[np.ndarray]:
@@ -386,10 +399,10 @@ def _use(planning: Planning, use: Use, tables: Sequence[MomentTable[np.ndarray]]
     number = [numbers[(*_way(use), name)] for name in names]
     index, reach, radius_id = np.zeros((3, len(names), len(bodies)))
     for o, name in enumerate(names):
-        own, radii = planning.own_pairs(name), tables[number[o]].radii
+        pairs, radii = planning.own_pairs(name), tables[number[o]].radii
         for t, body in enumerate(bodies):
-            if Pair(body, name) in own and radius[t] > 0:
-                index[o, t], reach[o, t] = own.index(Pair(body, name)), radius[t]
+            if Pair(body, name) in pairs and radius[t] > 0:
+                index[o, t], reach[o, t] = pairs.index(Pair(body, name)), radius[t]
                 radius_id[o, t] = radii.index(radius[t])
     ids = index.astype(np.int64), reach, radius_id.astype(np.int64)
     return MomentUse(tuple(number), use.pos, *ids, use.radius_noise, _request(use).motion)
@@ -402,7 +415,7 @@ def moment_table(
 
     Args:
         sensed: The object.
-        request: How they are to be found.
+        request: The request, which gives the method.
         radii: The sensing radii of its probes [m], ascending, each above 0.
         radius_noise: By how much radii may differ from these [m].
         number: The object's place in the Plan.
@@ -413,8 +426,8 @@ def moment_table(
     from tgdsl.quantities.moment_fields import surface_area  # compilers alone bake meshes
 
     if sensed.is_sized:
-        what = f'the size of body "{sensed.body}" is given per environment, and moments are computed beforehand'
-        raise LowerError(what, field="feels", hint="use `variants` for the sizes that it has, or feel other objects")
+        problem = f'the size of body "{sensed.body}" is given per environment, and moments are computed beforehand'
+        raise LowerError(problem, field="feels", hint="use `variants` for the sizes that it has, or feel other objects")
     solid = [tuple(geom for geom in geoms if geom.shape != "plane") for geoms in sensed.variants]
     planes = [part.geom for part in sensed.variants[0] if part.shape == "plane"]
     area = np.array([surface_area(geoms) if geoms else 0.0 for geoms in solid])
@@ -483,17 +496,17 @@ def _clouds(variants: Solid, request: MomentsRequest, radius: float, radius_nois
     budget = request.max_bytes // len(variants)
     clouds = [sample_cloud(geoms, radius, request.num_points, budget, radius_noise) for geoms in variants]
     slots, none = max(cloud.lists.shape[1] for cloud in clouds), sum(len(cloud.points) for cloud in clouds)
-    lists, before = [], 0
+    lists, first = [], 0
     for cloud in clouds:
-        rows = np.where(cloud.lists < len(cloud.points), cloud.lists + before, none)
+        rows = np.where(cloud.lists < len(cloud.points), cloud.lists + first, none)
         lists.append(np.pad(rows, ((0, 0), (0, slots - rows.shape[1])), constant_values=none))
-        before += len(cloud.points)
+        first += len(cloud.points)
     num = np.array([cloud.num for cloud in clouds])
     return CloudTable(
         points=np.concatenate([*(cloud.points for cloud in clouds), np.full((1, 3), FAR)]).T,
         weight=np.array([cloud.weight for cloud in clouds]),
         lists=np.concatenate(lists),
-        first=np.cumsum([0, *(len(own) for own in lists[:-1])]),
+        first=np.cumsum([0, *(len(points) for points in lists[:-1])]),
         num=num,
         origin=np.array([cloud.origin for cloud in clouds]),
         cell=np.array([cloud.cell for cloud in clouds]),

@@ -1,4 +1,4 @@
-"""What is near each probe: the moments of every object's surface, in the link's frame.
+"""Surfaces near each probe: the moments of every object's surface, in the link's frame.
 
 Shapes: `env` environments, `taxel` probes, `case` 1, or `env` if the object differs between environments.
 """
@@ -22,7 +22,7 @@ from tgdsl.tensors.operations import Operation
 
 
 class SurfaceMoments(NamedTuple):
-    """What is near each probe, in its link's frame; planes (env, taxel).
+    """Moments of surfaces near each probe, in its link's frame; planes (env, taxel).
 
     Attributes:
         pos: Where the probes are [m], planes (taxel,).
@@ -75,7 +75,7 @@ class Plane(NamedTuple):
 
 
 class MomentSource(NamedTuple):
-    """One object, and how its moments are found.
+    """One object, and the source of its moments.
 
     Attributes:
         target: The object.
@@ -83,7 +83,7 @@ class MomentSource(NamedTuple):
         radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on
             the object itself.
         shift: By how much that is more than the radius that a field is of [m], (env, taxel); None: nothing.
-        surface: Its outer surface but for planes; None if there is no more to it.
+        surface: Its outer surface without planes; None if it has planes alone.
         planes: Its planes.
         area: Area of its outer surface, planes left out [m²].
     """
@@ -108,10 +108,10 @@ def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> 
     result: dict[str, Moments] = {}
     motions: dict[str, Motion] = {}
     for source in sources:
-        name, own = source.target.name, source.target.pairs
-        result[name] = FELT_MOMENTS(pairs, own, pos, source)
+        name, object_pairs = source.target.name, source.target.pairs
+        result[name] = FELT_MOMENTS(pairs, object_pairs, pos, source)
         if pairs.motion is not None:
-            linear, angular, turn = (gathered(part, own, source.pair) for part in pairs.motion)
+            linear, angular, turn = (gathered(part, object_pairs, source.pair) for part in pairs.motion)
             motions[name] = Motion(linear, angular, turn)
     none = pairs.offset[0].new_zeros((pairs.offset[0].shape[0], pos[0].shape[0]))
     return SurfaceMoments(pos, none, result, motions, {source.target.name: source.area for source in sources})

@@ -57,8 +57,8 @@ def felt_moments(
         parts = (torch.as_tensor(part, device=lattice.device) for part in counts)
         numbers, table = [0] * 4, torch.stack(torch.broadcast_tensors(*parts), dim=-1).int()
     pose = [part[:, own] for part in (*pairs.rotation, *pairs.offset)]
-    found = _felt_moments(pose, list(pos), pair, radius, shift, field.values, lattice, table, numbers)
-    mass, first_x, first_y, first_z = found.unbind()
+    sums = _felt_moments(pose, list(pos), pair, radius, shift, field.values, lattice, table, numbers)
+    mass, first_x, first_y, first_z = sums.unbind()
     return Moments(mass, (first_x, first_y, first_z))
 
 
@@ -191,7 +191,7 @@ def nearby_kernel(
     """Write the moments of `BLOCK` probes, counted through all environments; see `launch`."""
     start = tl.program_id(0).to(tl.int64) * BLOCK
     is_probe = start + tl.arange(0, BLOCK) < num_points
-    # All but the program's first environment is counted from it, in 32 bits.
+    # Environments after the program's first are counted from it, in 32 bits.
     first_env = start // NUM_TAXELS
     offset = (start - first_env * NUM_TAXELS).to(tl.int32) + tl.arange(0, BLOCK)
     env, taxel = offset // NUM_TAXELS, offset % NUM_TAXELS

@@ -40,7 +40,7 @@ class PairedObject:
         num_pairs: Number of its pairs.
         num_variants: Number of its variants; 1 if it is the same in all environments.
         is_sized: Whether its size is part of the state.
-        varied: Its place among `inputs.objects`, those that differ between environments; −1 if it does not.
+        varied: Its index in `inputs.objects`, the objects that differ between environments; −1 if it does not differ.
     """
 
     name: str
@@ -93,7 +93,7 @@ class Pairs(NamedTuple):
         rotation: Rotates link vectors into the object's frame.
         offset: The link's origin in the object's frame [m].
         motion: Relative motion, if some sensor wants it.
-        gate: 0 where the pair may be felt, −∞ where it may not; None if nothing is gated.
+        gate: 0 where the pair counts, −∞ where it does not; None if nothing is gated.
     """
 
     rotation: Rot
@@ -122,14 +122,14 @@ def relate(
         dtype: Dtype of the result.
         linvel: World velocities of the bodies' frame origins [m/s], if motion is wanted.
         angvel: World angular velocities [rad/s], if motion is wanted.
-        gate: 0 where a pair may be felt, −∞ where it may not; None if nothing is gated.
+        gate: 0 where a pair counts, −∞ where it does not; None if nothing is gated.
 
     Returns:
         The pairs, in `dtype`.
     """
     velocities = () if linvel is None or angvel is None else (linvel, angvel)
     fields = (quat, pos, *velocities)
-    parts = on_host(_related, *(own.index_select(1, bodies) for bodies in (link, target) for own in fields))
+    parts = on_host(_related, *(field.index_select(1, bodies) for bodies in (link, target) for field in fields))
     is_moving = len(parts) > 12
     parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
     # Stacked, they are stored once per pair; a compiler that fuses would else form them again for every taxel.
@@ -153,13 +153,13 @@ def _related(*fields: Plane) -> list[Plane]:
     if motion:
         (link_linear, turn), (linear, spin) = map(planes.split, link_motion), map(planes.split, motion)
         slide = planes.sub(linear, link_linear)
-        for own in (planes.add(slide, planes.cross(spin, apart)), planes.sub(spin, turn), turn):
-            parts += planes.rotate_back(link_rotation, own)
+        for vector in (planes.add(slide, planes.cross(spin, apart)), planes.sub(spin, turn), turn):
+            parts += planes.rotate_back(link_rotation, vector)
     return parts
 
 
 def gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
-    """Return a vector of the pairs (env, pair) for each probe: those of an object, and which of them each probe's is."""
+    """Return a vector (env, pair) for each probe, given an object's pairs and the pair of each probe."""
     return planes.vec(at_probes(part, own, pair) for part in vector)
 
 
@@ -177,5 +177,5 @@ def gates(found: Tensor, place: Int[Tensor, " pair"], dtype: torch.dtype) -> Flo
         place: Where each pair stands in it.
         dtype: Dtype of the result.
     """
-    own = found[:, place]
-    return torch.where(own > 0, 0.0, torch.where(own.isnan(), torch.nan, -torch.inf)).to(dtype)
+    column = found[:, place]
+    return torch.where(column > 0, 0.0, torch.where(column.isnan(), torch.nan, -torch.inf)).to(dtype)

@@ -52,9 +52,9 @@ class Sides(NamedTuple):
 
     Attributes:
         bodies: Indices of the sensor's bodies (body,).
-        pairs: Of which pair each body's contacts with each object are (body, object); the number of pairs for none.
+        pairs: The pair of each body's contacts with each object (body, object); the number of pairs for none.
         are_all: Whether each body may meet each object.
-        is_star: Whether a patch's area is that of the paper's polygon: see `patch_area`.
+        is_star: Whether the area is the paper's polygon: see `patch_area`.
     """
 
     bodies: Tensor
@@ -88,7 +88,7 @@ class Touch(NamedTuple):
 
 
 def slots_of(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Slot]:
-    """Return each body's contacts with each object, of which some may meet.
+    """Return each body's contacts with each object, where they may meet.
 
     What the forces of a pair lack of its whole force is shared out as `contacts` does; the force of a contact without normal is
     not a number.
@@ -96,7 +96,7 @@ def slots_of(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Slot]
     Args:
         contacts: What there is.
         sides: Which of it counts.
-        dtype: Dtype of what is returned; sums are those of the contacts' dtype.
+        dtype: Dtype of the result; sums have the contacts' dtype.
     """
     fields = [_of_pairs(field, sides).flatten(3).unbind(-1) for field in contacts[:4]]
     touches = []
@@ -175,14 +175,14 @@ def patch_area(away: Sequence[Vec], normal: Vec, is_used: Sequence[Tensor], is_s
     (_, x0, y0), *rest = points
     swept = [torch.zeros_like(x0)]
     for k, (_, x, y) in enumerate(rest, start=1):
-        before = range(k - 1, k) if is_star else range(k)
-        swept.append(reduce(torch.maximum, [swept[j] + points[j][1] * y - points[j][2] * x for j in before]))
+        earlier = range(k - 1, k) if is_star else range(k)
+        swept.append(reduce(torch.maximum, [swept[j] + points[j][1] * y - points[j][2] * x for j in earlier]))
     closed = [total + x * y0 - y * x0 for total, (_, x, y) in zip(swept, points, strict=True)]
     return 0.5 * (closed[-1] if is_star else reduce(torch.maximum, closed)).clamp(min=0)
 
 
 def _with_angles(flat: Sequence[tuple[Tensor, Tensor]], is_used: Sequence[Tensor]) -> list[Point]:
-    """Return points with their angles from the one of largest x; those that do not count come last, at that one's place."""
+    """Return points with their angles from that of largest x; points that do not count come last, at its place."""
     start_x, start_y = torch.full_like(flat[0][0], -torch.inf), torch.zeros_like(flat[0][0])
     for (x, y), used in zip(flat, is_used, strict=True):
         is_farther = used & (x > start_x)
@@ -244,12 +244,12 @@ class Patch(NamedTuple):
 
 
 def patch(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> Patch:
-    """Return the patches, of bodies and objects of which some may meet.
+    """Return the patches of bodies and objects that may meet.
 
     Args:
         contacts: What the solver says.
         sides: Which of it makes a patch.
-        dtype: Dtype of what is returned.
+        dtype: Dtype of the result.
     """
     slots = slots_of(contacts, sides, dtype)
     force = [slot.force for slot in slots]

@@ -34,7 +34,7 @@ def contact_patch(contacts: list[Tensor], pairs: Tensor, bodies: Tensor, cancell
 
     Args:
         contacts: The fields of `Contacts`.
-        pairs: Those of `Sides`.
+        pairs: As in `Sides`.
         bodies: The same.
         cancelled: Length of the mean of unit normals below which it has no direction.
     """
@@ -102,19 +102,19 @@ def patch_kernel(
     )
     squared = dot(mean, mean)
     inverse = tl.where(squared > 0, 1.0 / tl.sqrt(tl.where(squared > 0, squared, 1.0)), 0.0)
-    # What is no number stays none.
+    # NaN stays NaN.
     inverse = tl.where(squared == squared, inverse, squared)
     axis = (mean[0] * inverse, mean[1] * inverse, mean[2] * inverse)
     area = _hull(away, centre, axis, counts, slot, SLOTS)
     # In the link's frame.
     w, x = tl.load(body_quat + 4 * body, is_at, 1.0), _at(body_quat, 4 * body + 1, is_at)
     y, z = _at(body_quat, 4 * body + 2, is_at), _at(body_quat, 4 * body + 3, is_at)
-    own, own_axis = _turned_back(w, x, y, z, centre), _turned_back(w, x, y, z, axis)
+    local, own_axis = _turned_back(w, x, y, z, centre), _turned_back(w, x, y, z, axis)
     tl.store(found + at, total, is_at)
     tl.store(found + num + at, area, is_at)
-    tl.store(found + 2 * num + at, own[0], is_at)
-    tl.store(found + 3 * num + at, own[1], is_at)
-    tl.store(found + 4 * num + at, own[2], is_at)
+    tl.store(found + 2 * num + at, local[0], is_at)
+    tl.store(found + 3 * num + at, local[1], is_at)
+    tl.store(found + 4 * num + at, local[2], is_at)
     tl.store(found + 5 * num + at, own_axis[0], is_at)
     tl.store(found + 6 * num + at, own_axis[1], is_at)
     tl.store(found + 7 * num + at, own_axis[2], is_at)

@@ -34,7 +34,7 @@ class Topology:
     Attributes:
         num_bodies: Number of bodies.
         cells: How many cells each object has along each axis; all 1 if it has one temperature.
-        grids: The objects that are rows of their own.
+        grids: The objects that are rows themselves.
         lumped: The objects that are nodes.
         links: For each object the body that it is, if it is a link of the sensor; else −1.
         met: The (body, object) pairs that may meet.
@@ -64,7 +64,7 @@ class Topology:
 
     @property
     def interfaces(self) -> tuple[tuple[int, int], ...]:
-        """The pairs whose patch is a node of its own."""
+        """The pairs whose patch is a node."""
         return tuple(pair for pair in self.met if pair[1] not in self.lumped)
 
     @property
@@ -105,28 +105,28 @@ class Topology:
         at: list[list[int]] = [[] for _ in range(self.num_nodes)]
         coupled: dict[tuple[int, int], list[int]] = {}
         for r, row in enumerate(rows):
-            for s, (own, is_objects, n) in enumerate(row):
-                pair[r, s], is_object[r, s], node[r, s] = own, is_objects, n
+            for s, (entry, is_objects, n) in enumerate(row):
+                pair[r, s], is_object[r, s], node[r, s] = entry, is_objects, n
                 at[n].append(r * count + s)
                 for t, (_, _, m) in enumerate(row):
                     if m != n:
                         coupled.setdefault((n, m), []).append((r * count + s) * count + t)
-        shares = max([len(own) for own in at] + [1])
+        shares = max([len(entry) for entry in at] + [1])
         at_node = np.full((self.num_nodes, shares), pair.size, dtype=np.int64)
-        for n, own in enumerate(at):
-            at_node[n, : len(own)] = own
-        shares = max([len(own) for own in coupled.values()] + [0])
+        for n, entry in enumerate(at):
+            at_node[n, : len(entry)] = entry
+        shares = max([len(entry) for entry in coupled.values()] + [0])
         between = np.full((self.num_nodes, self.num_nodes, shares), pair.size * count, dtype=np.int64)
-        for (n, m), own in coupled.items():
-            between[n, m, : len(own)] = own
+        for (n, m), entry in coupled.items():
+            between[n, m, : len(entry)] = entry
         return {"pair": pair, "is_object": is_object, "node": node, "at_node": at_node, "coupled": between}
 
 
 class HeatOfObjects(NamedTuple):
-    """What objects are made of, planes (env, object).
+    """Materials of objects, planes (env, object).
 
     Attributes:
-        start: Temperature at which an episode begins [°C]; without meaning where the object has none of its own.
+        start: Temperature at which an episode begins [°C]; ignored where the object has none.
         has_start: 1 where it has.
         conductivity: k [W/(m·K)].
         volumetric_heat: ρc [J/(m³·K)].
@@ -134,7 +134,7 @@ class HeatOfObjects(NamedTuple):
         compliance: (1 − ν²)/E [1/Pa].
         volume: [m³]; infinite for what keeps its temperature, such as a plane.
         area: Outer surface [m²].
-        curvature: 1/R of the surface where it is touched [1/m]; 0 for what is flat.
+        curvature: 1/R of the touched surface [1/m]; 0 where it is flat.
         size: Sides of the box of one that is divided into cells, planes (object,) each [m].
         corner: Lowest corner of that box in the object's frame [m].
     """
@@ -166,7 +166,7 @@ class ContactPatch(NamedTuple):
         normal: Unit normal out of the object, in the link's frame.
         object_pos: Centre in the object's frame [m]; None if no object there is divided into cells.
         object_normal: Normal in the object's frame.
-        objects: What the objects are made of.
+        objects: Materials of the objects.
         topology: Which patch joins what.
         sides: `topology`'s tables.
         cells: What a step needs of the boxes of objects with cells, see `cells.tables`.
@@ -193,8 +193,8 @@ class ContactPatches(Request[ContactPatch]):
     Attributes:
         slots: Contacts per body and object that make a patch.
         boxes: Lowest and highest corner of each body's box in its frame, handed on (body, 2, 3) [m].
-        is_star: Whether the area is that of the paper's polygon, through all points in the order of their angles about the
-            centre, in place of their convex hull.
+        is_star: Whether the area is the paper's polygon, through all points in the order of their angles about the
+            centre, instead of their convex hull.
         needs_stiffness: Whether each object has to be of a material whose Young's modulus is known.
     """
 
@@ -230,7 +230,7 @@ class PatchesUse(Generic[Array]):
         is_star: See `ContactPatches`.
         bodies: Indices of the sensor's bodies in the state, (body,); empty without objects.
         pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
-        relations: The same pair among those of the Plan, or their number, (body, object).
+        relations: The same pair by its number in the Plan, or the number of pairs, (body, object).
         boxes: Lowest and highest corner of each body's box (body, 2, 3) [m].
         start: Temperature at which each object begins (object,) [°C], and `has_start` 1 where it has one.
         has_start: See `start`.
@@ -284,7 +284,7 @@ def tables(
     """Return what a step needs of boxes.
 
     `count`, `number` and `volume` of cells; by axis `ends`, how many exposed faces across it a cell has, `mode`, the modes,
-    their eigenvalues `square`, `smooth` with (kπ/n)² in place of 4 sin²(kπ/2n) in them, and the modes' sums over the cells
+    their eigenvalues `square`, `smooth` with (kπ/n)² instead of 4 sin²(kπ/2n) in them, and the modes' sums over the cells
     `total`.
 
     Args:
@@ -297,14 +297,14 @@ def tables(
     result = {"count": count.astype(np.float64)}
     result |= {"number": result["count"].prod(axis=1), "volume": (size / count).prod(axis=1)}
     for axis, name in enumerate("xyz"):
-        own = exposed_ends(count[:, axis], [face[0] for face in faces if face[1] == name])
-        vectors, values = modes(count[:, axis], own * loss[:, axis, None])
+        ends = exposed_ends(count[:, axis], [face[0] for face in faces if face[1] == name])
+        vectors, values = modes(count[:, axis], ends * loss[:, axis, None])
         k = np.arange(values.shape[1])[None, :] / count[:, axis, None]
         smooth = np.where(k < 1, values + (np.pi * k) ** 2 - 4.0 * np.sin(0.5 * np.pi * k) ** 2, 0.0)
         sums = vectors.sum(axis=2)
-        if not (own * loss[:, axis, None]).any():
+        if not (ends * loss[:, axis, None]).any():
             sums[:, 1:] = 0.0  # exactly: what insulated cells hold stays
-        result |= {f"ends_{name}": own, f"mode_{name}": vectors}
+        result |= {f"ends_{name}": ends, f"mode_{name}": vectors}
         result |= {f"square_{name}": values, f"smooth_{name}": smooth, f"total_{name}": sums}
     return result
 
@@ -353,15 +353,15 @@ def modes(
     for row, n in enumerate(count.tolist()):
         if loss[row, :n].any():
             coupled = np.diff(np.eye(n), axis=0)
-            found = np.linalg.eigh(coupled.T @ coupled + np.diag(loss[row, :n]))[1].T
-            found *= np.where(found.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+            cosines = np.linalg.eigh(coupled.T @ coupled + np.diag(loss[row, :n]))[1].T
+            cosines *= np.where(cosines.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
             # By Rayleigh's quotient, a sum of positive numbers: a small loss keeps its digits.
-            values[row, :n] = (np.diff(found, axis=1) ** 2).sum(axis=1) + (loss[row, :n] * found**2).sum(axis=1)
+            values[row, :n] = (np.diff(cosines, axis=1) ** 2).sum(axis=1) + (loss[row, :n] * cosines**2).sum(axis=1)
         else:
             m, i = np.arange(n)[:, None], np.arange(n)[None, :] + 0.5
-            found = np.sqrt(np.where(m == 0, 1.0, 2.0) / n) * np.cos(np.pi * m * i / n)
+            cosines = np.sqrt(np.where(m == 0, 1.0, 2.0) / n) * np.cos(np.pi * m * i / n)
             values[row, :n] = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2
-        vectors[row, :n, :n] = found
+        vectors[row, :n, :n] = cosines
     return vectors, values
 
 
@@ -369,11 +369,11 @@ HINT = "give it `material`, and `temperature` if it does not begin at the sensor
 
 
 def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
-    """Return whether the objects of a use have heat that is this use's alone; note what is wrong."""
+    """Return whether the objects of a use have heat that is this use's alone; note mistakes."""
     assert isinstance(use.request, ContactPatches)
     is_well = True
     for name in use.request.objects:
-        heat, others = planning.sensed[name].heat, [*([held[name]] if name in held else []), *use.sensors]
+        heat, holders = planning.sensed[name].heat, [*([held[name]] if name in held else []), *use.sensors]
         if heat is None:
             planning.report(("objects", name), "it has no `material`, and a sensor of temperature feels it", HINT)
         elif heat.cells and not np.isfinite(heat.volume).all():
@@ -382,19 +382,19 @@ def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
             )
         elif planning.sensed[name].body in {link.body for link in use.links} and (heat.cells or heat.temperature is not None):
             which = "cells" if heat.cells else "temperature"
-            what = f"it is a link of the sensor, whose own {which} counts; its `material` says how stiff it is to touch"
-            planning.report(("objects", name, which), what, f"leave `{which}` out")
-        elif use.request.needs_stiffness and any(own.youngs_modulus is None for own in heat.materials):
-            what = "neither it nor a link that feels it has a `youngs_modulus`, from which the area of a contact follows"
-            planning.report(("objects", name, "material"), what, "give one, or the sensor's `contact_area`")
+            problem = f"it is a link of the sensor, whose own {which} counts; its `material` says how stiff it is to touch"
+            planning.report(("objects", name, which), problem, f"leave `{which}` out")
+        elif use.request.needs_stiffness and any(material.youngs_modulus is None for material in heat.materials):
+            problem = "neither it nor a link that feels it has a `youngs_modulus`, from which the area of a contact follows"
+            planning.report(("objects", name, "material"), problem, "give one, or the sensor's `contact_area`")
         elif heat.cells and len(heat.volume) > 1:
             planning.report(("objects", name, "cells"), "an object with variants has one temperature", "leave `cells` out")
         elif is_counted(planning, name, use.request.objects):
-            planning.report(("objects", name), "it shares its geoms with another object that is felt", "one body has one heat")
-        elif len(others) > 1:
+            planning.report(("objects", name), "it shares its geoms with another object of the sensor", "one body has one heat")
+        elif len(holders) > 1:
             hint = "put their links into one sensor, with `materials` by link"
-            what = f'the sensors "{others[0]}" and "{others[1]}" both hold the heat of object "{name}"'
-            planning.report(("sensors", others[1], "feels"), what, hint)
+            problem = f'the sensors "{holders[0]}" and "{holders[1]}" both hold the heat of object "{name}"'
+            planning.report(("sensors", holders[1], "feels"), problem, hint)
         else:
             held[name] = use.sensors[0]
             continue
@@ -407,7 +407,7 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
     names = use.request.objects
     bodies = tuple(dict.fromkeys(link.body for link in use.links))
     heats = [heat for name in names if (heat := planning.sensed[name].heat) is not None]
-    objects = [next((own for own in planning.objects if own.name == name), None) for name in names]
+    objects = [next((target for target in planning.objects if target.name == name), None) for name in names]
     gate = {pair: i for i, pair in enumerate(planning.contact_pairs)}
     order = {pair: i for i, pair in enumerate(planning.pairs)}
     topology = _topology(planning, bodies, names, heats)
@@ -420,7 +420,7 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
         ]
         return np.array(rows, dtype=np.int64).reshape(len(bodies), len(names))
 
-    choices, variants = (max([len(own) for own in part] + [1]) for part in _parts(heats))
+    choices, variants = (max([len(options) for options in part] + [1]) for part in _parts(heats))
     return PatchesUse(
         topology=topology,
         is_star=use.request.is_star,
@@ -433,7 +433,7 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
         materials=np.array([_padded([_thermal(m) for m in heat.materials], choices) for heat in heats]).reshape(-1, choices, 4),
         shapes=np.array([_padded(_shapes(heat), variants) for heat in heats]).reshape(-1, variants, 3),
         grids=np.array([_grid(heat) for heat in heats]).reshape(-1, 2, 3),
-        variants=tuple(-1 if own is None or own.num_variants == 1 else own.varied for own in objects),
+        variants=tuple(-1 if target is None or target.num_variants == 1 else target.varied for target in objects),
         heated=tuple(_place(planning, name, heat) for name, heat in zip(names, heats, strict=True)),
         has_own_start=tuple(heat.is_per_env for heat in heats),
         num_materials=tuple(len(heat.materials) for heat in heats),
@@ -530,19 +530,21 @@ def _pairs_of(relations: Tensor, plane: Tensor) -> Tensor:
 
 
 def _objects(use: PatchesUse[Tensor], scene: Scene) -> HeatOfObjects:
-    """Return what the objects are made of, where they differ between environments."""
+    """Return the objects' materials where they differ between environments."""
     materials, shapes = use.materials.to(scene.dtype)[None], use.shapes.to(scene.dtype)[None]
     start = use.start.to(scene.dtype)[None]
     if any(use.has_own_start):
-        given = scene.tensors["object_temperature"].to(scene.dtype)
-        columns = [given[:, place] if own else None for place, own in zip(use.heated, use.has_own_start, strict=True)]
-        start = torch.stack([start[:, i].expand(len(given)) if c is None else c for i, c in enumerate(columns)], dim=1)
-    chosen = _chosen(materials, scene.tensors.get("object_material"), use.heated, use.num_materials)
+        temperatures = scene.tensors["object_temperature"].to(scene.dtype)
+        columns = [
+            temperatures[:, place] if is_own else None for place, is_own in zip(use.heated, use.has_own_start, strict=True)
+        ]
+        start = torch.stack([start[:, i].expand(len(temperatures)) if c is None else c for i, c in enumerate(columns)], dim=1)
+    material_id = _chosen(materials, scene.tensors.get("object_material"), use.heated, use.num_materials)
     counts = tuple(2 if place >= 0 else 1 for place in use.variants)
     shaped = _chosen(shapes, scene.tensors.get("variant"), use.variants, counts)
     grids = use.grids.to(scene.dtype)
     corner, size = (planes.vec(grids[:, i, axis] for axis in range(3)) for i in range(2))
-    conductivity, volumetric_heat, emissivity, compliance = chosen.unbind(-1)
+    conductivity, volumetric_heat, emissivity, compliance = material_id.unbind(-1)
     volume, area, curvature = shaped.unbind(-1)
     made_of = (conductivity, volumetric_heat, emissivity, compliance, volume, area, curvature)
     return HeatOfObjects(start, use.has_start.to(scene.dtype)[None], *made_of, size, corner)
@@ -573,7 +575,7 @@ class ReferencePatch:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceObject:
-    """What an object is made of, see `HeatOfObjects`; `start` is None where it has no temperature of its own."""
+    """An object's material, see `HeatOfObjects`; `start` is None where the object has no temperature."""
 
     start: float | None
     conductivity: float
@@ -599,7 +601,7 @@ class ReferencePatches:
 
 def _reference_patch(scene: ReferenceScene, b: int, name: str, pair: int, is_star: bool) -> ReferencePatch | None:
     link = scene.body(scene.layout.bodies[b])
-    target = scene.object_body(next(own for own in scene.objects if own.name == name))
+    target = scene.object_body(next(each for each in scene.objects if each.name == name))
     slots = zip(*(scene.fields[field][pair] for field in SLOT_FIELDS), strict=True)
     used = completed([list(row) for row in slots if np.any(row[1:])], scene.fields["contact_netforce"][pair])
     pressing = [(pos, float(force @ normal), normal) for pos, force, _, normal in used if not force @ normal <= 0]
@@ -662,35 +664,37 @@ class _Patches(Quantity):
         return tuple(_patches(use, scene) for use in part.uses)
 
     def reference(self, part: PatchesPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferencePatches:
-        own, result = part.uses[use], {}
-        for b, o in own.topology.met:
-            patch = _reference_patch(scene, b, scene.contact_pairs[own.pairs[b, o]].object, int(own.pairs[b, o]), own.is_star)
+        use_part, result = part.uses[use], {}
+        for b, o in use_part.topology.met:
+            patch = _reference_patch(
+                scene, b, scene.contact_pairs[use_part.pairs[b, o]].object, int(use_part.pairs[b, o]), use_part.is_star
+            )
             if patch is not None:
                 result[b, o] = patch
-        objects = tuple(_reference_object(own, i, scene) for i in range(own.topology.num_objects))
-        return ReferencePatches(result, objects, own.topology, own.boxes)
+        objects = tuple(_reference_object(use_part, i, scene) for i in range(use_part.topology.num_objects))
+        return ReferencePatches(result, objects, use_part.topology, use_part.boxes)
 
     def fields(self, part: PatchesPart) -> set[str]:
-        wanted = (
+        fields = (
             {"contact_found", "contact_netforce", *SLOT_FIELDS} if any(use.topology.num_objects for use in part.uses) else set()
         )
         if any(any(use.has_own_start) for use in part.uses):
-            wanted.add("object_temperature")
+            fields.add("object_temperature")
         if any(count > 1 for use in part.uses for count in use.num_materials):
-            wanted.add("object_material")
-        return wanted
+            fields.add("object_material")
+        return fields
 
     def bodies(self, use: Use) -> tuple[str, ...]:
         return tuple(dict.fromkeys(link.body for link in use.links)) if use.request.objects else ()
 
     def num_rows(self, part: PatchesPart, use: int) -> int:
         cells = part.uses[use].topology.cells
-        most = [max(own[axis] for own in cells) if cells else 1 for axis in range(3)]
+        most = [max(shape[axis] for shape in cells) if cells else 1 for axis in range(3)]
         return len(cells) * most[0] * most[1] * most[2]
 
     def explain(self, part: PatchesPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
-        own = part.uses[use].topology
-        return [f"contact patches with {own.num_objects} objects"] if own.num_objects else []
+        topology = part.uses[use].topology
+        return [f"contact patches with {topology.num_objects} objects"] if topology.num_objects else []
 
 
 PATCHES = _Patches()

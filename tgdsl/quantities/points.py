@@ -30,7 +30,7 @@ from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.operations import Operation
 
 LINKS = DistanceOptions()
-"""How the distance to links' own surfaces is found."""
+"""How the distance to links' own surfaces is computed."""
 
 
 SMALLEST_TILE, LARGEST_TILE = 32, 128
@@ -200,7 +200,7 @@ class MetObject(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class PointsUse(Generic[Array]):
-    """One request: its objects, and whether they are felt only in contact."""
+    """One request: its objects, and whether they count only in contact."""
 
     is_gated: bool
     objects: tuple[MetObject[Array], ...]
@@ -290,10 +290,10 @@ class _Points(Quantity):
         return tuple(results)
 
     def reference(self, part: PointsPart[np.ndarray], use: int, scene: ReferenceScene) -> tuple[ReferencePoints, ...]:
-        own, layout = part.uses[use], scene.layout
+        use_part, layout = part.uses[use], scene.layout
         numbers = {link.name: (i, link.body) for i, link in enumerate(layout.links)}
         results = []
-        for met in own.objects:
+        for met in use_part.objects:
             cloud = part.clouds[met.cloud]
             target = scene.objects[cloud.object]
             body, variant = scene.object_body(target), scene.variant(target)
@@ -305,7 +305,7 @@ class _Points(Quantity):
                 link, geoms = scene.body(name), geoms_of(part.surfaces, row)
                 pos = (world - link.pos) @ link.rotation
                 phi, gradient = (np.array(one) for one in zip(*(distance_to(geoms, z) for z in pos), strict=True))
-                if own.is_gated and not scene.is_touching(name, target.name):
+                if use_part.is_gated and not scene.is_touching(name, target.name):
                     phi = np.full(len(pos), np.inf)
                 results.append(ReferencePoints(np.flatnonzero(layout.link_id == i), pos, phi, gradient, area))
         return tuple(results)
@@ -362,11 +362,13 @@ def cloud(sensed: SensedObject, num_points: int, number: int) -> CloudPart[np.nd
     from tgdsl.quantities.moment_fields import sample_points
 
     if sensed.is_sized:
-        what = f'the size of body "{sensed.body}" is given per environment, and points are sampled beforehand'
-        raise LowerError(what, "feels", "use `variants` for the sizes that it has, or `anchors: taxels`")
+        problem = f'the size of body "{sensed.body}" is given per environment, and points are sampled beforehand'
+        raise LowerError(problem, "feels", "use `variants` for the sizes that it has, or `anchors: taxels`")
     if any(geom.shape == "plane" for geoms in sensed.variants for geom in geoms):
-        what = f'body "{sensed.body}" has a plane, which has no end, so no points can be sampled on it'
-        raise LowerError(what, "feels", "use `anchors: taxels`, which take hold of any surface, or a box instead of the plane")
+        problem = f'body "{sensed.body}" has a plane, which has no end, so no points can be sampled on it'
+        raise LowerError(
+            problem, "feels", "use `anchors: taxels`, which take hold of any surface, or a box instead of the plane"
+        )
     try:
         sampled = [sample_points(geoms, num_points) for geoms in sensed.variants]
     except BakeError as error:
@@ -376,7 +378,7 @@ def cloud(sensed: SensedObject, num_points: int, number: int) -> CloudPart[np.nd
 
 
 def _links(planning: Planning, uses: Sequence[Use]) -> dict[str, list[Any]]:
-    """Return how the distance to each link's own surface is found."""
+    """Return how the distance to each link's own surface is computed."""
     from tgdsl.quantities.bake import geom_distance
 
     result: dict[str, list[Any]] = {}
@@ -412,14 +414,14 @@ def _use(planning: Planning, use: Use, clouds: dict[tuple[int, str], int], links
     active = [i for i in range(len(layout.links)) if (layout.radius[layout.link_id == i] > 0).any()]
     allowed, result = planning.allowed(request), []
     for name in request.objects:
-        own = [i for i in active if Pair(layout.links[i].body, name) in allowed and layout.links[i].name in links]
+        rows = [i for i in active if Pair(layout.links[i].body, name) in allowed and layout.links[i].name in links]
         number = clouds.get((request.num_points, name))
-        if not own or number is None:
+        if not rows or number is None:
             continue
-        pair = [planning.pairs.index(Pair(layout.links[i].body, name)) for i in own]
-        places = [np.flatnonzero(layout.link_id == i) for i in own]
+        pair = [planning.pairs.index(Pair(layout.links[i].body, name)) for i in rows]
+        places = [np.flatnonzero(layout.link_id == i) for i in rows]
         taxels = tuple((int(part[0]), int(part[-1]) + 1) for part in places)
-        met = tuple(links.index(layout.links[i].name) for i in own)
+        met = tuple(links.index(layout.links[i].name) for i in rows)
         tiles = np.array(point_tiles(taxels, len(use.taxels)), dtype=np.int32).reshape(-1, 3)
         result.append(MetObject(number, met, taxels, np.array(pair), np.array(met), tiles))
     return PointsUse(request.is_gated, tuple(result))

@@ -74,8 +74,8 @@ class ReferenceScene:
 
     def object_body(self, target: PairedObject) -> ReferenceBody:
         """Return an object's body, shifted."""
-        own = self.body(target.body)
-        return ReferenceBody(own.pos + self.shift, own.quat, own.linvel, own.angvel)
+        body = self.body(target.body)
+        return ReferenceBody(body.pos + self.shift, body.quat, body.linvel, body.angvel)
 
     def is_touching(self, link: str, target: str) -> bool:
         """Return whether the simulator has a link's body in contact with an object."""

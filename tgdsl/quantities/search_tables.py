@@ -39,13 +39,13 @@ POS, ROTATION, BOUND, KIND, ROW = 3, 6, 15, 16, 17
 
 
 class Tables(NamedTuple):
-    """The objects that are felt.
+    """The objects of a search.
 
     Attributes:
         pair: Index of each probe's pair with each object among all pairs.
         spheres: Radius of a sphere about each object's origin that holds it [m], −∞ if it is absent, and how many geoms it has.
         geoms: Each geom's size, place and rotation in its body's frame, row by row, the radius of a sphere about its own origin
-            that holds it [m], and its kind, which is negative if it has a frame of its own.
+            that holds it [m], and its kind, which is negative if it has a frame.
     """
 
     pair: Int[Tensor, "object taxel"]
@@ -70,7 +70,7 @@ class Deepest(NamedTuple):
 def geom_tables(objects: Sequence[Geoms]) -> tuple[Tensor, Tensor]:
     """Return the tables of objects and of their geoms, `Tables.spheres` and `Tables.geoms`.
 
-    They are made of few operations, as each is a kernel of a microsecond where objects differ between environments.
+    They take few operations: each is a kernel of a microsecond where objects differ between environments.
     """
     parts = [part for target in objects for part in (target.size, target.pos, target.rotation, target.is_absent)]
     num_cases = next((part.shape[0] for part in parts if part is not None and part.shape[0] != 1), 1)
@@ -98,7 +98,7 @@ def geom_tables(objects: Sequence[Geoms]) -> tuple[Tensor, Tensor]:
     if len(set(counts)) == 1:
         held = held.unflatten(1, (len(objects), counts[0])).amax(dim=2)
     else:
-        held = torch.stack([own.amax(dim=1) for own in held.split(counts, dim=1)], dim=1)
+        held = torch.stack([part.amax(dim=1) for part in held.split(counts, dim=1)], dim=1)
     return torch.stack([held, _filled(held, [float(count) for count in counts]).expand(num_cases, -1)], dim=-1), geoms
 
 
