@@ -124,8 +124,8 @@ def time_offset(
     size = np.linalg.norm(counts - np.median(counts, axis=0), axis=1)
     known_size = np.linalg.norm(known_force - np.median(known_force, axis=0), axis=1)
     if not size.any() or not known_size.any():
-        what = "the known forces" if size.any() else "the counts"
-        raise FitError(f"{what} are always the same: no time offset fits them")
+        constant = "the known forces" if size.any() else "the counts"
+        raise FitError(f"{constant} are always the same: no time offset fits them")
     step = max(_GRID_S, max_offset_s / 5000)
     offsets = np.arange(-max_offset_s, max_offset_s + step, step)
     scores = [_correlation(time, size, known_time + offset, known_size) for offset in offsets]
@@ -134,9 +134,9 @@ def time_offset(
     best = float(offsets[int(np.nanargmax(scores))])
 
     def misfit(offset: float) -> float:
-        known, is_inside = forces_at(time, known_time + offset, known_force)
+        forces, is_inside = forces_at(time, known_time + offset, known_force)
         terms = np.column_stack([counts[is_inside], np.ones(int(is_inside.sum()))])
-        error = known[is_inside] - terms @ np.linalg.lstsq(terms, known[is_inside], rcond=None)[0]
+        error = forces[is_inside] - terms @ np.linalg.lstsq(terms, forces[is_inside], rcond=None)[0]
         return float(np.mean(error**2))
 
     width = 5 * step
@@ -172,12 +172,14 @@ def _expect_loads(force: Forces, has_tare: bool) -> None:
         return
     along = np.sqrt(np.mean(force**2, axis=0))
     missing = [name for name, size in zip("xyz", along, strict=True) if size <= limit]
-    what = f"no load along {' or '.join(missing)} of the link"
+    problem = f"no load along {' or '.join(missing)} of the link"
     if not missing:
         weak = directions[int(np.argmin(strength))]
-        what = f"no load in the direction ({', '.join(f'{value:.2f}' for value in weak)}) of the link: all loads lie in a plane"
+        problem = (
+            f"no load in the direction ({', '.join(f'{value:.2f}' for value in weak)}) of the link: all loads lie in a plane"
+        )
     than = "" if has_tare else ", and no load as one of them, or keep the tare"
-    raise FitError(f"{what}; expected loads along x, y and z{than}")
+    raise FitError(f"{problem}; expected loads along x, y and z{than}")
 
 
 def _expect_response(counts: Forces) -> None:
@@ -186,8 +188,8 @@ def _expect_response(counts: Forces) -> None:
         return
     weak = directions[int(np.argmin(strength))]
     which = "xyz"[int(np.argmax(abs(weak)))]
-    what = f"the fingertip's counts along its {which}"
-    raise FitError(f"{what} say nothing of the loads: they do not change, or follow the others")
+    problem = f"the fingertip's counts along its {which}"
+    raise FitError(f"{problem} say nothing of the loads: they do not change, or follow the others")
 
 
 def _spread(vectors: Forces) -> tuple[np.ndarray, np.ndarray]:

@@ -138,9 +138,9 @@ def samples_under_loads(record: TipRecord, finger: str, loads: tuple[Load, ...])
     Raises:
         FitError: If a load holds no reading, two overlap, or all of them are at the end of the range.
     """
-    own = [load for load in loads if load.finger == finger]
+    finger_loads = [load for load in loads if load.finger == finger]
     force = np.full((len(record.time), 3), np.nan)
-    for load in own:
+    for load in finger_loads:
         is_during = (record.time >= load.start) & (record.time <= load.end)
         when = f"{finger}: from {load.start:g} s to {load.end:g} s"
         if not is_during.any():
@@ -166,8 +166,8 @@ def samples_under_forces(
     Raises:
         FitError: If they have no time in common, or all samples are at the end of the range.
     """
-    known, is_inside = forces_at(record.time, time, force)
-    return _samples(record, finger, np.where(is_inside[:, None], known, np.nan))
+    forces, is_inside = forces_at(record.time, time, force)
+    return _samples(record, finger, np.where(is_inside[:, None], forces, np.nan))
 
 
 def known_tip_forces(path: Path) -> tuple[Float[np.ndarray, " step"], dict[str, Float[np.ndarray, "step 3"]]]:
@@ -214,8 +214,8 @@ def simulated_tip_forces(
         force = depth_scale * reading[:, env, :, :1].astype(np.float64) * taxels["normal"]
     else:
         raise TgdslError(f"{name} has channels {', '.join(output.channels)}, expected forces or depths")
-    found = {finger: np.char.endswith(bodies.astype(np.str_), body) for finger, body in zip(FINGERS, TIP_BODIES, strict=True)}
-    forces = {finger: force[:, is_own].sum(axis=1) for finger, is_own in found.items() if is_own.any()}
+    is_tip = {finger: np.char.endswith(bodies.astype(np.str_), body) for finger, body in zip(FINGERS, TIP_BODIES, strict=True)}
+    forces = {finger: force[:, is_own].sum(axis=1) for finger, is_own in is_tip.items() if is_own.any()}
     if not forces:
         raise TgdslError(f"{name} is on {', '.join(dict.fromkeys(bodies))}: none of them is a fingertip of an XHand1")
     return time, forces
@@ -233,8 +233,8 @@ def _samples(record: TipRecord, finger: str, force: Forces) -> Samples:
     is_used = is_known & ~is_left_out
     if not is_used.any():
         where = f"its sum or a taxel ({', '.join(map(str, saturated))}) is" if saturated else "its sum is"
-        what = f"{finger}: in all {int(is_known.sum())} readings {where} at the end of the range"
-        raise FitError(f"{what}; expected smaller loads, or taxels that are always there left out of this")
+        problem = f"{finger}: in all {int(is_known.sum())} readings {where} at the end of the range"
+        raise FitError(f"{problem}; expected smaller loads, or taxels that are always there left out of this")
     return Samples(record.counts[is_used, i], force[is_used], int(is_left_out.sum()), saturated)
 
 
@@ -243,9 +243,9 @@ def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             missing = [name for name in names if name not in archive]
             result = {} if missing else {name: archive[name] for name in names}
-            known = sorted(name for name in archive.files if ":" not in name)
+            body_names = sorted(name for name in archive.files if ":" not in name)
     except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
         raise TgdslError(f"{path}: expected an .npz file with arrays {' and '.join(names)}: {error}") from error
     if missing:
-        raise TgdslError(f"{path}: there is no array {' and '.join(missing)}; it holds {', '.join(known)}")
+        raise TgdslError(f"{path}: there is no array {' and '.join(missing)}; it holds {', '.join(body_names)}")
     return result

@@ -39,8 +39,8 @@ def calibrated(base: Calibration, fits: Mapping[str, FingerFit], others: str | N
         raise FitError(f"the other fingers cannot be like {others}, which was not fitted; fitted: {', '.join(fits)}")
     left = [name for name in FINGERS if name not in fits]
     if left and others is None and base.units != "N":
-        what = f"{', '.join(left)}: no load was on them, so what their counts are in N is not known"
-        raise FitError(f"{what}; load them too, start from a calibration in N, or say --others {next(iter(fits))}")
+        problem = f"{', '.join(left)}: no load was on them, so what their counts are in N is not known"
+        raise FitError(f"{problem}; load them too, start from a calibration in N, or say --others {next(iter(fits))}")
     scale, rotation, bias, tare = (np.array(values) for values in (base.scale, base.rotation, base.bias, base.tare))
     for i, name in enumerate(FINGERS):
         fit = fits.get(name) or (fits[others] if others is not None else None)
@@ -56,14 +56,16 @@ def report(fits: Mapping[str, FingerFit], samples: Mapping[str, Samples]) -> lis
     """Return a line per fit and axis: residuals, and what was left out."""
     lines = []
     for name, fit in fits.items():
-        own = samples[name]
-        lines.append(f"{name}: {len(own.counts)} readings; {fit_text(fit)}")
+        finger_samples = samples[name]
+        lines.append(f"{name}: {len(finger_samples.counts)} readings; {fit_text(fit)}")
         for i, axis in enumerate("xyz"):
             size = f"RMS {fit.rms[i]:.4f} N, at most {fit.max_error[i]:.4f} N, R² {fit.r_squared[i]:.5f}"
             lines.append(f"  {axis}: loads {fit.force[:, i].min():.2f} to {fit.force[:, i].max():.2f} N; {size}")
-        if own.num_left_out:
-            taxels = f"; taxels {', '.join(map(str, own.saturated_taxels))}" if own.saturated_taxels else ""
-            lines.append(f"  left out at the end of the range: {own.num_left_out} readings{taxels}")
+        if finger_samples.num_left_out:
+            taxels = (
+                f"; taxels {', '.join(map(str, finger_samples.saturated_taxels))}" if finger_samples.saturated_taxels else ""
+            )
+            lines.append(f"  left out at the end of the range: {finger_samples.num_left_out} readings{taxels}")
     return lines
 
 

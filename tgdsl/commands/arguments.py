@@ -53,10 +53,10 @@ def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
         return path
     if hand not in names and not is_file(path):
         raise TgdslError(f'there is no document, artefact or robot "{hand}"; {did_you_mean(hand, names, "robots")}')
-    own = layout or layout_of(hand)
-    if own is None:
+    layout_file = layout or layout_of(hand)
+    if layout_file is None:
         raise TgdslError(f"{hand}: there is no layout.yaml beside this robot; name its layout with --layout")
-    return {"tgdsl": 1, "robot": {"model": hand, "layout": str(own)}}
+    return {"tgdsl": 1, "robot": {"model": hand, "layout": str(layout_file)}}
 
 
 def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
@@ -82,8 +82,8 @@ def joined_overrides(before: Mapping[str, Any], new: Mapping[str, Any]) -> dict[
         before: The older ones, of which those at or below a newer one's key are left out.
         new: The newer ones.
     """
-    kept = {key: value for key, value in before.items() if not any(f"{key}.".startswith(f"{other}.") for other in new)}
-    return kept | dict(new)
+    unchanged = {key: value for key, value in before.items() if not any(f"{key}.".startswith(f"{other}.") for other in new)}
+    return unchanged | dict(new)
 
 
 def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progress | None = None) -> TactileModule:

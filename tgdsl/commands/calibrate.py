@@ -83,10 +83,10 @@ class Calibrate:
         base = load_calibration(self.calibration) if self.calibration else log.calibration or Calibration.none()
         samples = self._samples(TipRecord.of(log, self.ignore_taxels))
         fits = {}
-        for name, own in samples.items():
+        for name, finger_samples in samples.items():
             tare = base.tare[FINGERS.index(name)] if self.keep_tare else None
             try:
-                fits[name] = fit_finger(own.counts, own.force, axes=self.axes, tare=tare)
+                fits[name] = fit_finger(finger_samples.counts, finger_samples.force, axes=self.axes, tare=tare)
             except FitError as error:
                 raise FitError(f"{name}: {error}") from error
         result = calibrated(base, fits, self.others)
@@ -102,8 +102,8 @@ class Calibrate:
         """Return the samples to fit to, by finger."""
         from tgdsl.calibrate.loads import load_loads, samples_under_loads
 
-        given = [self.loads is not None, bool(self.load), self.simulation is not None]
-        if sum(given) != 1:
+        sources = [self.loads is not None, bool(self.load), self.simulation is not None]
+        if sum(sources) != 1:
             raise TgdslError("expected the known forces as one of --loads FILE, --finger with --load, or --simulation FILE")
         if self.simulation is not None:
             return self._simulated_samples(record, self.simulation)
@@ -141,8 +141,8 @@ class Calibrate:
         columns = [FINGERS.index(name) for name in loaded]
         is_within = ~record.is_saturated[:, columns].any(axis=1)
         counts = record.counts[is_within][:, columns].reshape(int(is_within.sum()), -1)
-        known = np.concatenate([forces[name] for name in loaded], axis=1)
-        offset = time_offset(record.time[is_within], counts, time, known, self.max_offset)
+        known_forces = np.concatenate([forces[name] for name in loaded], axis=1)
+        offset = time_offset(record.time[is_within], counts, time, known_forces, self.max_offset)
         print(f"the log's clock is {offset:.4f} s ahead of the simulation's; fingertips with loads: {', '.join(loaded)}")
         return {name: samples_under_forces(record, name, time + offset, forces[name]) for name in loaded}
 

@@ -41,9 +41,9 @@ class Grasps:
 
         if self.out is not None:
             check_writable(self.out)
-        own = {"grasps.num": self.num, "grasps.seed": self.seed}
-        chosen = parsed_overrides(self.set) | {name: value for name, value in own.items() if value is not None}
-        loaded = load_task(self.document, chosen)
+        options = {"grasps.num": self.num, "grasps.seed": self.seed}
+        overrides = parsed_overrides(self.set) | {name: value for name, value in options.items() if value is not None}
+        loaded = load_task(self.document, overrides)
         spec = grasp_spec(loaded.spec)
         if spec is None:
             raise TgdslError(f"{self.document}: episodes of the task {loaded.spec.task} do not begin with grasps")
@@ -61,5 +61,5 @@ class Grasps:
         if self.out is not None:
             write_grasps(grasps, self.out)
             print(f"file: {self.out}")
-        elif own != dict.fromkeys(own):
+        elif options != dict.fromkeys(options):
             print("the task finds these where its document, or --set, has the same `grasps: {num, seed}`")

@@ -28,7 +28,7 @@ class Links:
         except SpecError as error:
             if self.layout is not None:
                 raise
-            what = "this layout lies beside the robot but does not fit it, so no groups are shown"
-            warnings.warn(f"{error.problems[0]}; {what}", stacklevel=2)
+            problem = "this layout lies beside the robot but does not fit it, so no groups are shown"
+            warnings.warn(f"{error.problems[0]}; {problem}", stacklevel=2)
             lines = links_table(robot)
         print("\n".join(lines))

@@ -111,8 +111,8 @@ class Play:
         from tgdsl.view.trace import TouchTrace
 
         live, tally = LiveTable(), Tally(env)
-        on_taxels = [own for own in env.touch.outputs if own.rows == "taxel" and own.kind != "surface_distance"]
-        felt = {own.name: env.now.readings[own.name] for own in on_taxels}  # a distance is read without touch too
+        on_taxels = [output for output in env.touch.outputs if output.rows == "taxel" and output.kind != "surface_distance"]
+        felt = {output.name: env.now.readings[output.name] for output in on_taxels}  # a distance is read without touch too
         trace = TouchTrace(env.touch, chosen_output(env.touch, felt), steps) if felt else None
         with tqdm(total=steps, desc="playing", unit="step", disable=None, leave=False) as bar:
             for played in play(env, actor, steps, self.seed):

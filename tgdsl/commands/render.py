@@ -47,9 +47,9 @@ class Render:
             progress("drawing the picture")
             path = render(model, layouts, out, keyframe=self.keyframe, view=self.view, size=self.size, unfelt=unfelt)
         print(", ".join(f"{name}: {layout.num_taxels} taxels" for name, layout in layouts.items()))
-        for name, found in unfelt.items():
-            if found:
-                print(f"{name}: {len(unfelt_ids(found))} taxels cannot feel: {by_reason(found)}")
+        for name, taxels in unfelt.items():
+            if taxels:
+                print(f"{name}: {len(unfelt_ids(taxels))} taxels cannot feel: {by_reason(taxels)}")
         print(f"picture: {path}")
 
     def _placed(self, progress: StatusLine) -> Placed:

@@ -73,9 +73,9 @@ class Run:
         if touch.plan.objects and not touching:
             print("at the end nothing touches an object")
         for name, bodies in silent_readings(touch, sim, readings, touching).items():
-            what = f'an object touches {listed(bodies)}, and "{name}" is 0 on all taxels'
-            print(f"at the end {what}: do they face it? A grid along [0, 0, -1] is on the side that faces +z")
-        print("".join(f"at the end {what}: see {name}\n" for name, what in missed_loads(touch, readings).items()), end="")
+            problem = f'an object touches {listed(bodies)}, and "{name}" is 0 on all taxels'
+            print(f"at the end {problem}: do they face it? A grid along [0, 0, -1] is on the side that faces +z")
+        print("".join(f"at the end {problem}: see {name}\n" for name, problem in missed_loads(touch, readings).items()), end="")
         recorder.write(with_folder(files["readings"]), controls)
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)
@@ -104,8 +104,8 @@ class Run:
         from tgdsl.view.table import table
 
         live, readings = LiveTable(), {}
-        what = "compiling kernels" if self.compiled else "stepping"
-        with tqdm(total=len(controls), desc=what, unit="step", disable=None, leave=False) as bar:
+        task = "compiling kernels" if self.compiled else "stepping"
+        with tqdm(total=len(controls), desc=task, unit="step", disable=None, leave=False) as bar:
             for step in rollout(touch, sim, controls):
                 recorder.add(step)
                 readings = step.readings

@@ -36,7 +36,7 @@ def listing(entries: Iterable[tuple[str, str]], indent: str = "  ") -> str:
 def shapes(value: Any) -> str:
     """Return dtype and shape of a tensor, or those of all tensors of a mapping by name; of anything else its type's name."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {shapes(own)}" for name, own in value.items())
+        return ", ".join(f"{name} {shapes(part)}" for name, part in value.items())
     return f"{value.dtype} {tuple(value.shape)}".removeprefix("torch.") if hasattr(value, "dtype") else type(value).__name__
 
 
@@ -80,9 +80,9 @@ class TaxelTable(np.ndarray):
         names = self.dtype.names
         if names is None or self.ndim != 1:
             return repr(self.view(np.ndarray))
-        shown = self[:MAX_ROWS]
-        rows = [(str(i), *(_cell(row[name]) for name in names)) for i, row in enumerate(shown)]
-        return text_table(("", *names), rows, len(self) - len(shown))
+        shown_rows = self[:MAX_ROWS]
+        rows = [(str(i), *(_cell(row[name]) for name in names)) for i, row in enumerate(shown_rows)]
+        return text_table(("", *names), rows, len(self) - len(shown_rows))
 
     __str__ = __repr__
 
@@ -107,10 +107,10 @@ def _links(table: TaxelTable) -> str:
     """Return a row per link: its body, how many taxels it has, their radius or range of radii, and their area."""
     rows = []
     for link in dict.fromkeys(table["link"].tolist()):
-        own = table[table["link"] == link]
-        radii = own["radius"][own["radius"] > 0]
+        link_rows = table[table["link"] == link]
+        radii = link_rows["radius"][link_rows["radius"] > 0]
         ends = dict.fromkeys(f"{1e3 * end:.3g}" for end in (radii.min(), radii.max())) if len(radii) else ["0"]
-        rows.append((link, own["body"][0], str(len(own)), "–".join(ends), f"{1e6 * own['area'].sum():.4g}"))
+        rows.append((link, link_rows["body"][0], str(len(link_rows)), "–".join(ends), f"{1e6 * link_rows['area'].sum():.4g}"))
     return text_table(("link", "body", "taxels", "radius [mm]", "area [mm²]"), rows)
 
 

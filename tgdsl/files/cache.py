@@ -34,8 +34,8 @@ _ABANDONED = 3600.0
 
 def folder() -> Path:
     """Return the cache folder: `TGDSL_CACHE`, or `tgdsl` in `XDG_CACHE_HOME` or in `~/.cache`."""
-    if own := os.environ.get("TGDSL_CACHE"):
-        return Path(own)
+    if folder := os.environ.get("TGDSL_CACHE"):
+        return Path(folder)
     shared = os.environ.get("XDG_CACHE_HOME")
     return (Path(shared) if shared else Path(os.path.expanduser("~/.cache"))) / "tgdsl"
 
@@ -46,10 +46,10 @@ def max_bytes() -> int:
     Raises:
         TgdslError: If that is no number of bytes.
     """
-    own = os.environ.get("TGDSL_CACHE_BYTES", "")
-    if own and not own.isdecimal():
-        raise TgdslError(f'TGDSL_CACHE_BYTES is "{own}", expected a number of bytes such as {MAX_BYTES}')
-    return int(own) if own else MAX_BYTES
+    limit = os.environ.get("TGDSL_CACHE_BYTES", "")
+    if limit and not limit.isdecimal():
+        raise TgdslError(f'TGDSL_CACHE_BYTES is "{limit}", expected a number of bytes such as {MAX_BYTES}')
+    return int(limit) if limit else MAX_BYTES
 
 
 @dataclass(frozen=True, order=True)
@@ -75,9 +75,9 @@ def entries() -> list[Entry]:
 
 def evict(limit: int) -> list[Entry]:
     """Remove the least recently used files until the cache is no larger than a limit [bytes]; return what was removed."""
-    known = entries()
-    size, removed = sum(entry.size for entry in known), []
-    for entry in known:
+    cached = entries()
+    size, removed = sum(entry.size for entry in cached), []
+    for entry in cached:
         if size <= limit:
             break
         size -= entry.size  # also if another process has removed it: that one counted it too
@@ -116,8 +116,8 @@ def cached(
     """
     file, limit = folder() / f"{key}.npz", max_bytes()
     try:
-        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as found:
-            value = unpack(found)
+        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
+            value = unpack(archive)
         _touch(file)
         return value
     except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):

@@ -34,8 +34,8 @@ def robot_names() -> dict[str, Path]:
 
 def robot_file(model: str, folder: Path) -> Path | None:
     """Return the file of a robot given by name or by a path relative to the document's folder; None if there is none."""
-    if model in (known := robot_names()):
-        return known[model]
+    if model in (names := robot_names()):
+        return names[model]
     path = folder / model
     return path if is_file(path) else None
 

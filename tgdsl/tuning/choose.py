@@ -70,9 +70,9 @@ def _reasons(sensor: str, shared: Shared) -> dict[str, str]:
     """Return why objects are finer than a sensor by itself would have them."""
     result = {}
     for target, place in shared.alone[sensor].items():
-        others = [name for name, own in shared.alone.items() if own.get(target) == shared.places[target]]
+        tied = [name for name, places in shared.alone.items() if places.get(target) == shared.places[target]]
         if place < shared.places[target]:
-            result[target] = f"as fine as {listed(others)} needs"
+            result[target] = f"as fine as {listed(tied)} needs"
         elif shared.floors.get(target) == place:
             result[target] = "no coarser than written, as sensors without an accuracy feel it too"
     return result
@@ -149,7 +149,7 @@ def _names_accuracy(value: object, depth: int = 3) -> bool:
         return "accuracy" in value
     if not isinstance(value, Mapping) or depth == 0:
         return False
-    return "accuracy" in value or any(_names_accuracy(own, depth - 1) for own in value.values())
+    return "accuracy" in value or any(_names_accuracy(part, depth - 1) for part in value.values())
 
 
 def task_of(
@@ -165,8 +165,8 @@ def task_of(
         SpecError: If so much is wrong with the document that it cannot be looked at.
     """
     loaded = load(document, overrides, known_kinds(kinds), sensors=sensors)
-    wanted = {name: spec.accuracy for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None}
-    return Task(document, overrides or {}, kinds, sensors, loaded, wanted, progress or silent)
+    accuracies = {name: spec.accuracy for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None}
+    return Task(document, overrides or {}, kinds, sensors, loaded, accuracies, progress or silent)
 
 
 def key_of(task: Task) -> str:
@@ -176,14 +176,14 @@ def key_of(task: Task) -> str:
         SpecError: What is wrong with the document.
     """
     unchosen = Choice(notes=dict.fromkeys(task.wanted, ()))
-    own = compile_plan(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen)
-    blank = dataclasses.replace(own.origin, document_sha256="")
+    plan = compile_plan(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen)
+    blank = dataclasses.replace(plan.origin, document_sha256="")
     specs = {"sensors": task.loaded.spec.sensors, "objects": task.loaded.spec.objects}
     written = {f"{part}.{name}": sorted(spec.model_fields_set) for part, each in specs.items() for name, spec in each.items()}
     kinds = {kind.name: kind for kind in known_kinds(task.kinds)}
-    asked = {name: task.loaded.spec.sensors[name] for name in task.wanted}
-    known = {name: kinds[spec.kind].alternatives(spec) for name, spec in asked.items()}  # type: ignore[attr-defined]
-    parts = [FORMAT, ENVS, STEPS, dataclasses.replace(own, origin=blank).to_json(), repr(task.wanted), written, known]
+    tuned = {name: task.loaded.spec.sensors[name] for name in task.wanted}
+    alternatives = {name: kinds[spec.kind].alternatives(spec) for name, spec in tuned.items()}  # type: ignore[attr-defined]
+    parts = [FORMAT, ENVS, STEPS, dataclasses.replace(plan, origin=blank).to_json(), repr(task.wanted), written, alternatives]
     parts += [query_alternatives(), {name: version(name) for name in ("tgdsl", "torch", "mujoco")}]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=repr).encode()).hexdigest()
 
@@ -222,7 +222,7 @@ def _chosen(task: Task) -> Choice:
         return Found(trial, *cheapest(trial, trial.fields(), trial.levels(floors)))
 
     result = _each(task, list(task.wanted), by_itself)
-    alone = {name: own.level.places for name, own in result.items()}
+    alone = {name: sensor_result.level.places for name, sensor_result in result.items()}
     places: dict[str, int] = {}
     for own in alone.values():
         places |= {target: max(place, places.get(target, place)) for target, place in own.items()}
@@ -231,11 +231,15 @@ def _chosen(task: Task) -> Choice:
         trial, level = result[name].trial, level_of({target: places[target] for target in alone[name]})
         return Found(trial, *cheapest(trial, trial.fields(), [level]))
 
-    moved = [name for name, own in alone.items() if any(places[target] != place for target, place in own.items())]
+    moved = [
+        name for name, sensor_places in alone.items() if any(places[target] != place for target, place in sensor_places.items())
+    ]
     result |= _each(task, moved, with_others)
-    changes = {key: value for own in result.values() for key, value in own.outcome.variant.changes.items()}
+    changes = {key: value for result_of in result.values() for key, value in result_of.outcome.variant.changes.items()}
     shared = Shared(places, alone, floors)
-    return Choice(changes, {name: account(own.trial, own.outcome, shared) for name, own in result.items()})
+    return Choice(
+        changes, {name: account(sensor_result.trial, sensor_result.outcome, shared) for name, sensor_result in result.items()}
+    )
 
 
 def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dict[str, Found]:
@@ -261,8 +265,8 @@ def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
     alternatives = query_alternatives()
     result = {}
     for target in sorted(felt & loaded.spec.objects.keys()):
-        own = [i for i, other in enumerate(alternatives) if is_taken(loaded.spec.objects[target], other)]
-        result |= {target: own[0]} if own else {}
+        ways = [i for i, other in enumerate(alternatives) if is_taken(loaded.spec.objects[target], other)]
+        result |= {target: ways[0]} if ways else {}
     return result
 
 
@@ -281,8 +285,8 @@ def _states(task: Task) -> Recording:
             TactileModule(plan, known_kinds(task.kinds), torch.float32), num_envs, steps=STEPS, progress=task.progress
         )
     except TgdslError as error:
-        what = f"there are no states to measure errors on: {error}"
+        problem = f"there are no states to measure errors on: {error}"
         at = [("sensors", name, "accuracy") for name in task.wanted]
         raise SpecError(
-            [task.loaded.problem(path, what, "take it out, or give a scene that can be run") for path in at]
+            [task.loaded.problem(path, problem, "take it out, or give a scene that can be run") for path in at]
         ) from error

@@ -74,6 +74,6 @@ def compile(
     dtype, device = dtype_of(dtype), device_of(device)
     if not isinstance(overrides, Mapping | None):
         raise TgdslError(f"overrides are a mapping from dotted paths to values, found {type(overrides).__name__}")
-    chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
-    plan = compile_plan(document, chosen, kinds, progress, sensors)
+    all_overrides = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
+    plan = compile_plan(document, all_overrides, kinds, progress, sensors)
     return TactileModule(plan, known_kinds(kinds), dtype).to(device)

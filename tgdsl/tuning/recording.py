@@ -118,11 +118,11 @@ def record(
     """
     if num_envs < LEAST_ENVS or steps < 1:
         raise TgdslError(f"{num_envs} environments of {steps} steps: expected at least {LEAST_ENVS}, and at least one step")
-    own = substeps_of(touch, substeps)
+    num_substeps = substeps_of(touch, substeps)
     script = script or script_of(touch, progress=progress)
     phases = 1 if script.keyframes is None and script.closing is None else 3
-    seconds = steps / phases * max(own, substeps) * scene_model(touch.plan.scene).opt.timestep
-    sim, controls = script.begin(touch, num_envs, own, seconds)
+    seconds = steps / phases * max(num_substeps, substeps) * scene_model(touch.plan.scene).opt.timestep
+    sim, controls = script.begin(touch, num_envs, num_substeps, seconds)
     results = []
     model = sim.model
     ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
@@ -132,8 +132,8 @@ def record(
         results.append(_copy(sim.state()))
     sim.close()
     touch.free()
-    what = f"{len(results)} steps of {1e3 * sim.control_step:g} ms in {num_envs} environments, seed {seed}"
-    return Recording(tuple(results), touch.inputs.names, f"scripted run: {what}")
+    description = f"{len(results)} steps of {1e3 * sim.control_step:g} ms in {num_envs} environments, seed {seed}"
+    return Recording(tuple(results), touch.inputs.names, f"scripted run: {description}")
 
 
 def _copy(state: SceneState) -> SceneState:
@@ -185,5 +185,5 @@ def load_recording(path: Path) -> Recording:
     tensors = {name: torch.from_numpy(arrays[name]) for name in fields}
     dt: Sequence[float | None] = arrays["dt"].tolist() if "dt" in arrays else [None] * steps
     states = [SceneState(**{name: value[i] for name, value in tensors.items()}, dt=dt[i]) for i in range(steps)]  # type: ignore[arg-type]
-    names = {name.removeprefix("names:"): own.tolist() for name, own in arrays.items() if name.startswith("names:")}
+    names = {name.removeprefix("names:"): array.tolist() for name, array in arrays.items() if name.startswith("names:")}
     return Recording(tuple(states), names, f"{path}: {steps} steps in {envs} environments")

@@ -84,17 +84,17 @@ class Trial:
 
     def channels(self, quantity: str) -> list[int]:
         """Return which channels are components of a quantity."""
-        return [i for i, own in enumerate(self.exact.quantities) if own == quantity]
+        return [i for i, other in enumerate(self.exact.quantities) if other == quantity]
 
     def fields(self) -> list[Variant]:
         """Return the choices of the sensor's fields whose errors can be measured and that change nothing that is written."""
-        known = [own for own in self.sensor.variants.fields if own.label not in self.left_out]
-        finest = known[-1] if known else None
+        candidates = [choice for choice in self.sensor.variants.fields if choice.label not in self.left_out]
+        finest = candidates[-1] if candidates else None
         if finest is not None and not finest.is_exact:
-            known = known[:-1]
-        results = [own for own in known if own.is_free]
+            candidates = candidates[:-1]
+        results = [choice for choice in candidates if choice.is_free]
         is_finest = finest is not None and finest.is_own and not finest.is_exact
-        if not any(own.is_own for own in results) and not is_finest:
+        if not any(choice.is_own for choice in results) and not is_finest:
             results.insert(0, Variant("as written", is_own=True))
         if not results:
             self._refuse_finest(self.sensor.variants.own.label)
@@ -107,20 +107,20 @@ class Trial:
             floors: Of objects that sensors without an accuracy feel too, which of the ways they have: none coarser is taken.
         """
         alternatives = query_alternatives()
-        known = [i for i, own in enumerate(alternatives) if own.label not in self.left_out]
-        finest, queried = alternatives[known[-1]], self.sensor.queried
+        candidates = [i for i, choice in enumerate(alternatives) if choice.label not in self.left_out]
+        finest, queried = alternatives[candidates[-1]], self.sensor.queried
         if not finest.is_exact:
-            known = known[:-1]
+            candidates = candidates[:-1]
             if any(is_taken(spec, finest) for spec in queried.values()):
                 self._refuse_finest(finest.label)
         free = {
-            name: [i for i in known if i >= floors.get(name, 0) and is_free(spec, alternatives[i])]
+            name: [i for i in candidates if i >= floors.get(name, 0) and is_free(spec, alternatives[i])]
             for name, spec in queried.items()
         }
-        free = {name: own for name, own in free.items() if own}
+        free = {name: ways for name, ways in free.items() if ways}
         result: dict[tuple[int, ...], Level] = {}
-        for i in known:
-            places = {name: next((j for j in own if j >= i), own[-1]) for name, own in free.items()}
+        for i in candidates:
+            places = {name: next((j for j in ways if j >= i), ways[-1]) for name, ways in free.items()}
             result.setdefault(tuple(places.values()), level_of(places))
         return list(result.values())
 
@@ -157,28 +157,28 @@ class Trial:
     def _errors(self, variant: Variant) -> Iterator[dict[str, Errors]]:
         """Yield the errors of each quantity, in the environments that choose and in those that verify."""
         touch, exact = self.sensor.module(self.sensor.plan(variant), torch.float32), self.exact
-        found = readings_of(touch, self.recording.for_module(touch.inputs), self.sensor.name)
-        found = common_of(exact.module, touch, self.sensor.name).of_other(found)
+        readings = readings_of(touch, self.recording.for_module(touch.inputs), self.sensor.name)
+        readings = common_of(exact.module, touch, self.sensor.name).of_other(readings)
         for envs in halves(self.recording.num_envs):
             errors = {}
             for name, bound in self.bounds.items():
-                own = self.channels(name)
-                pair = (found[:, envs][..., own], exact.readings[:, envs][..., own])
-                errors[name] = errors_of(*pair, exact.magnitude.of(envs, own), is_relative=not bound.unit)
+                channels = self.channels(name)
+                pair = (readings[:, envs][..., channels], exact.readings[:, envs][..., channels])
+                errors[name] = errors_of(*pair, exact.magnitude.of(envs, channels), is_relative=not bound.unit)
             yield errors
 
     def _check_states(self) -> None:
         for envs in halves(self.recording.num_envs):
             for name in self.bounds:
                 if not self.exact.magnitude.of(envs, self.channels(name)).active.any():
-                    what = f"its {name} never changes on these states ({self.recording.source}), so no error can be measured"
+                    problem = f"its {name} never changes on these states ({self.recording.source}), so no error can be measured"
                     hint = "give the scene keyframes `rest` and `squeeze` between which its links meet what they feel"
-                    raise LowerError(what, "accuracy", hint)
+                    raise LowerError(problem, "accuracy", hint)
 
     def _refuse_finest(self, label: str) -> None:
         lacking = "".join(f"; {label}: {why}" for label, why in self.left_out.items())
-        what = f"what is written, {label}, is the finest there is: nothing is known that its error could be measured against"
-        raise LowerError(f"{what}{lacking}", "accuracy", "write a coarser one, or none")
+        problem = f"what is written, {label}, is the finest there is: nothing is known that its error could be measured against"
+        raise LowerError(f"{problem}{lacking}", "accuracy", "write a coarser one, or none")
 
 
 def level_of(places: Places) -> Level:
@@ -208,10 +208,10 @@ def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -
     fields, levels = list(fields), list(levels)
     if len(fields) > 1 and len(levels) > 1:
         fine = levels[-1]
-        fields = [own for own in fields if _is_near(trial, joined(own, fine))] or fields
+        fields = [choice for choice in fields if _is_near(trial, joined(choice, fine))] or fields
         finest = fields[-1]
-        levels = [own for own in levels if _is_near(trial, joined(finest, own))] or levels
-    options = [(joined(own, level), level) for own in fields for level in levels]
+        levels = [choice for choice in levels if _is_near(trial, joined(finest, choice))] or levels
+    options = [(joined(choice, level), level) for choice in fields for level in levels]
     costs = {option[0].label: cost for option in options if (cost := trial.cost(option[0])) is not None}
     options = [option for option in options if option[0].label in costs]
     options.sort(key=lambda option: (costs[option[0].label].operations or 0, costs[option[0].label].constants))
@@ -229,10 +229,10 @@ def _is_near(trial: Trial, variant: Variant) -> bool:
 
 def _missed(trial: Trial) -> LowerError:
     best = min(trial.outcomes.values(), key=lambda own: max(own.excess, own.verified_excess))
-    what = f"nothing that is free to choose holds {trial.accuracy}; best: {best.variant.label}, {shown_errors(trial, best)}"
+    problem = f"nothing that is free to choose holds {trial.accuracy}; best: {best.variant.label}, {shown_errors(trial, best)}"
     lacking = [f"{label} cannot be had: {why}" for label, why in trial.left_out.items()]
     return LowerError(
-        what, "accuracy", "; ".join([*_pinned(trial), *lacking, f"errors are against {trial.exact.variant.label}"])
+        problem, "accuracy", "; ".join([*_pinned(trial), *lacking, f"errors are against {trial.exact.variant.label}"])
     )
 
 
@@ -254,10 +254,10 @@ def shown_errors(trial: Trial, outcome: Outcome) -> str:
     """Return the errors of each quantity, in their bounds' units."""
     parts = []
     for name, bound in trial.bounds.items():
-        own = outcome.chosen[name].rms
+        rms = outcome.chosen[name].rms
         apart = shown(outcome.verified[name].rms.value, bound)
         parts.append(
-            f"RMS error of {name} {shown(own.value, bound)}, up to {shown(own.high, bound)} with 95 % confidence; "
+            f"RMS error of {name} {shown(rms.value, bound)}, up to {shown(rms.high, bound)} with 95 % confidence; "
             f"{apart} in environments that took no part"
         )
     return "; ".join(parts)

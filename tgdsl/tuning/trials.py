@@ -84,16 +84,16 @@ class Sensor:
         Raises:
             SpecError: What is wrong with the document.
         """
-        changed, known = {**overrides, **bare(name)}, known_kinds(kinds)
+        changed, all_kinds = {**overrides, **bare(name)}, known_kinds(kinds)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            loaded = load(document, changed, known)
-        own, by_name = quiet_plan(document, changed, name, kinds), {kind.name: kind for kind in known}
-        others = {s.sensor: (by_name[s.kind], loaded.spec.sensors[s.sensor]) for s in own.sensors}
+            loaded = load(document, changed, all_kinds)
+        plan, by_name = quiet_plan(document, changed, name, kinds), {kind.name: kind for kind in all_kinds}
+        others = {s.sensor: (by_name[s.kind], loaded.spec.sensors[s.sensor]) for s in plan.sensors}
         kind, spec = others[name]
-        queried = {target: loaded.spec.objects[target] for target in queried_objects(own)}
+        queried = {target: loaded.spec.objects[target] for target in queried_objects(plan)}
         variants = variants_of(kind, name, spec, queried, query_alternatives())
-        return Sensor(document, changed, name, kind, spec, others, queried, own, variants, kinds)
+        return Sensor(document, changed, name, kind, spec, others, queried, plan, variants, kinds)
 
     @property
     def reading(self) -> PlannedReading:
@@ -160,12 +160,12 @@ def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Pr
         StateError: If the states are of another document.
     """
     progress(f"{sensor.name}: {finest.label}, float64")
-    own = sensor.module(sensor.own, torch.float64)
+    exact = sensor.module(sensor.own, torch.float64)
     fine = sensor.module(sensor.plan(finest), torch.float64)
     found = readings_of(fine, recording.for_module(fine.inputs), sensor.name)
-    readings = common_of(own, fine, sensor.name).of_other(found)
+    readings = common_of(exact, fine, sensor.name).of_other(found)
     quantities = tuple(quantity(channel) for channel in sensor.reading.channels)
-    return Exact(finest, own, readings, magnitude_of(readings, quantities), quantities, tuple(sensor.reading.units))
+    return Exact(finest, exact, readings, magnitude_of(readings, quantities), quantities, tuple(sensor.reading.units))
 
 
 def finest_of(sensor: Sensor, left_out: dict[str, str]) -> Variant:
@@ -175,7 +175,7 @@ def finest_of(sensor: Sensor, left_out: dict[str, str]) -> Variant:
         sensor: The sensor.
         left_out: Is told why finer ones cannot be had, by their labels.
     """
-    results = [own for axis in (sensor.variants.fields, sensor.variants.queries) if (own := _last(sensor, axis, left_out))]
+    results = [last for axis in (sensor.variants.fields, sensor.variants.queries) if (last := _last(sensor, axis, left_out))]
     if not results:
         return Variant(sensor.variants.own.label, is_own=True, is_exact=True)
     return results[0] if len(results) == 1 else results[0].joined(results[1])
@@ -204,11 +204,11 @@ def cost_of(touch: TactileModule, size: int) -> Cost:
     state = touch.example_state(2)
     with torch.no_grad():
         touch(state)
-    kept = sum(buffer.numel() * buffer.element_size() for buffer in touch.memory.buffers()) // 2
+    state_bytes = sum(buffer.numel() * buffer.element_size() for buffer in touch.memory.buffers()) // 2
     touch.free()
     return Cost(
         operations=touch.operations_per_env(),
         constants=sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers()),
-        state=kept,
+        state=state_bytes,
         output=size * sum(int(np.prod(output.shape)) for output in touch.outputs),
     )

@@ -19,10 +19,10 @@ class Probe:
         from tgdsl.runtime.xhand1.identity import identify
         from tgdsl.runtime.xhand1.wire.ports import ask_ports
 
-        asked = ask_ports(self.port, self.hand_id)
-        if not asked:
+        ports = ask_ports(self.port, self.hand_id)
+        if not ports:
             print("this computer has no serial port")
-        for port in asked:
+        for port in ports:
             print(port)
-            for found in port.hands:
-                print(f"  {identify(found)}")
+            for hand in port.hands:
+                print(f"  {identify(hand)}")

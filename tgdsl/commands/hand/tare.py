@@ -51,8 +51,8 @@ class Tare:
             if spread > self.max_spread
         ]
         if spreads:
-            what = f"the fingertips were not still over {self.frames} readings: {', '.join(spreads)} counts"
-            raise TgdslError(f"{what}, expected at most {self.max_spread:g}; leave the hand untouched, or see --max-spread")
+            problem = f"the fingertips were not still over {self.frames} readings: {', '.join(spreads)} counts"
+            raise TgdslError(f"{problem}, expected at most {self.max_spread:g}; leave the hand untouched, or see --max-spread")
         atomic_write(with_folder(self.out), base.with_tare(tare).text().encode())
         for name, mean, spread in zip(FINGERS, tare.mean, tare.spread, strict=True):
             print(f"{name:<7} tare {mean[0]:7.2f} {mean[1]:7.2f} {mean[2]:7.2f}   spread {max(spread):g} counts")

@@ -71,7 +71,7 @@ class Deploy:
         if self.out is not None:
             check_writable(self.out)
         with StatusLine() as progress:
-            found = Deployment(
+            deployment = Deployment(
                 self.task,
                 self.policy,
                 self.source,
@@ -85,9 +85,9 @@ class Deploy:
                 lockstep=self.lockstep,
                 progress=progress,
             )
-        for line in found.prepared.changes:
+        for line in deployment.prepared.changes:
             print(f"changed since the policy was learned: {line}")
-        self._act(found)
+        self._act(deployment)
 
     def _act(self, found: Deployment) -> None:
         """Make all steps; Ctrl-C ends them, and what was done is told."""
@@ -121,12 +121,12 @@ class Deploy:
         Raises:
             TgdslError: If some are missing.
         """
-        given = {name: getattr(self, name) for name in _MOVING}
-        missing = [f"--{name.replace('_', '-')}" for name, value in given.items() if value is None]
-        if len(missing) == len(given):
+        limits = {name: getattr(self, name) for name in _MOVING}
+        missing = [f"--{name.replace('_', '-')}" for name, value in limits.items() if value is None]
+        if len(missing) == len(limits):
             return None
         if missing:
             raise TgdslError(f"{', '.join(missing)}: missing; a hand moves only with a speed, a current limit and a gain")
         from tgdsl.runtime.xhand1.motion import MotionLimits
 
-        return partial(MotionLimits.of_robot, **given)
+        return partial(MotionLimits.of_robot, **limits)

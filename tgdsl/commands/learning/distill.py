@@ -82,14 +82,14 @@ class Distill:
         if self.resume is not None and self.out is not None:
             raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
         folder = self.resume or self.out or Path("out") / f"{self.task.stem}_students"
-        before = _read(folder) if self.resume else {}
+        last_start = _read(folder) if self.resume else {}
         given = parsed_overrides(self.set)
-        overrides = joined_overrides(before.get("overrides", {}), given)
+        overrides = joined_overrides(last_start.get("overrides", {}), given)
         loaded = load_task(self.task, overrides)
-        self._check(given, before.get("overrides", {}))
-        asked = self._asked(loaded, before, folder)
-        prepared = [_Part(self, name, asked, overrides, folder / name) for name in asked["resolutions"]]
-        asked["envs"] = prepared[0].envs
+        self._check(given, last_start.get("overrides", {}))
+        settings = self._asked(loaded, last_start, folder)
+        prepared = [_Part(self, name, settings, overrides, folder / name) for name in settings["resolutions"]]
+        settings["envs"] = prepared[0].envs
         with RunFolder(folder).held():
             self._teach(loaded, folder, prepared)
 
@@ -107,8 +107,8 @@ class Distill:
         unit = ""
         table = folder / "table.csv"
         for part in prepared:
-            own, unit = part.taught(folder / "distill.json" if part is prepared[0] else None)
-            rows += own
+            part_result, unit = part.taught(folder / "distill.json" if part is prepared[0] else None)
+            rows += part_result
         _warn_unlike(rows)
         if rows:
             write_table(rows, table)
@@ -139,7 +139,7 @@ class Distill:
             TgdslError: If a run that goes on shall teach others, there is no teacher, or no resolution, or one is named twice.
         """
         spec = loaded.spec
-        given: dict[str, Any] = {
+        options: dict[str, Any] = {
             "teacher": self._teacher(before, folder),
             "types": _names(self.types),
             "placements": _names(self.placements),
@@ -149,23 +149,23 @@ class Distill:
             "envs": self.envs,
             "seed": self.seed,
         }
-        for name, value in given.items():
+        for name, value in options.items():
             if before and name != "teacher" and value is not None and value != before[name]:
                 raise TgdslError(f"--{name} {_text(value)}: this run began with {_text(before[name])}; begin another one")
         default = {"types": ["all"], "placements": [spec.placement], "noise": [spec.noise], "seeds": 3, "seed": 0}
         default |= {"resolutions": [spec.resolution or "default"], "envs": None, "teacher": None}
-        asked = {name: value if value is not None else before.get(name, default[name]) for name, value in given.items()}
-        if asked["teacher"] is None:
+        settings = {name: value if value is not None else before.get(name, default[name]) for name, value in options.items()}
+        if settings["teacher"] is None:
             raise TgdslError("--teacher FILE is missing: a policy, as tgdsl train writes it")
-        names = asked["resolutions"]
+        names = settings["resolutions"]
         if not names:
             raise TgdslError("--resolutions: expected one at least")
         if self.resolutions is not None and "default" in names:
-            what = "that is what a run calls the document's own; leave it out, and --set resolution=default"
-            raise TgdslError(f"--resolutions {_text(names)}: {what}")
+            problem = "that is what a run calls the document's own; leave it out, and --set resolution=default"
+            raise TgdslError(f"--resolutions {_text(names)}: {problem}")
         if len(set(names)) < len(names):
             raise TgdslError(f"--resolutions {_text(names)}: one is named twice")
-        return asked
+        return settings
 
     def _teacher(self, before: dict[str, Any], folder: Path) -> str | None:
         """Return the teacher's name; of a run that goes on the one that it began with, wherever that is now: told by its bytes.
@@ -180,8 +180,8 @@ class Distill:
         if self.teacher.resolve() == Path(before["teacher"]).resolve():
             return before["teacher"]
         parts = [RunFolder(folder / name) for name in before["resolutions"]]
-        known = {part.last_start().get("teacher_sha256") for part in parts if part.run.is_file()}
-        if self.teacher.is_file() and known == {hashlib.sha256(self.teacher.read_bytes()).hexdigest()}:
+        teacher_hashes = {part.last_start().get("teacher_sha256") for part in parts if part.run.is_file()}
+        if self.teacher.is_file() and teacher_hashes == {hashlib.sha256(self.teacher.read_bytes()).hexdigest()}:
             return str(self.teacher)
         raise TgdslError(f"--teacher {self.teacher}: this run began with {before['teacher']}; begin another one")
 
@@ -202,8 +202,8 @@ class _Part:
         from tgdsl.rl.train.folder import RunFolder
 
         self._command, self.resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
-        own = {} if resolution == "default" else {"resolution": resolution}
-        self._given, self._overrides = overrides, overrides | own
+        override = {} if resolution == "default" else {"resolution": resolution}
+        self._given, self._overrides = overrides, overrides | override
         self._loaded = load_task(command.task, self._overrides)
         types = _known(self._loaded, asked["types"])
         self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
@@ -263,15 +263,15 @@ class _Part:
             for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():
                 print(f"changed since the run began: {line}")
             if file is not None:
-                own = os.path.relpath(Path(self._asked["teacher"]).resolve(), file.parent.resolve())
-                _write(file, self._asked | {"overrides": self._given, "teacher_from_here": own})
+                relative_path = os.path.relpath(Path(self._asked["teacher"]).resolve(), file.parent.resolve())
+                _write(file, self._asked | {"overrides": self._given, "teacher_from_here": relative_path})
             folder.begin(origin | taught, loaded, env)
             run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
             total = command.iterations or loaded.spec.distill.iterations
             limit = float("inf") if command.minutes is None else 60.0 * command.minutes
             print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self.envs} environments: {folder.path}")
-            shown = total if command.minutes is None or command.iterations else None  # else time ends the run
-            bar = ProgressBar(shown, distiller.iteration, env.task.score_unit)
+            shown_total = total if command.minutes is None or command.iterations else None  # else time ends the run
+            bar = ProgressBar(shown_total, distiller.iteration, env.task.score_unit)
             try:
                 run.learn(total, limit, bar.show)
             finally:
@@ -284,9 +284,9 @@ class _Part:
         """Return what is otherwise than when the run was started last, a line each."""
         from tgdsl.rl.train.folder import changes
 
-        before = self._folder.last_start()
-        other = before.get("teacher_sha256", origin["teacher_sha256"]) != origin["teacher_sha256"]
-        return [*changes(before, origin, model), *(["the teacher's file"] if other else [])]
+        last_start = self._folder.last_start()
+        other = last_start.get("teacher_sha256", origin["teacher_sha256"]) != origin["teacher_sha256"]
+        return [*changes(last_start, origin, model), *(["the teacher's file"] if other else [])]
 
     def _finish(self, distiller: Any, origin: dict[str, Any], run: Run) -> list[Row]:
         """Evaluate the students unless the run was stopped, write them, and return the table's rows."""
@@ -307,7 +307,7 @@ class _Part:
         if not result:
             self._folder.evaluation.unlink(missing_ok=True)  # of what they were before
             return []
-        plain = {key.name: own.plain() for key, own in zip(keys, result, strict=True)}
+        plain = {key.name: evaluation.plain() for key, evaluation in zip(keys, result, strict=True)}
         _write(self._folder.evaluation, plain)
         return rows_of(keys, result, self.resolution, distiller.samples // len(keys), round(run.seconds / 60.0, 2))
 
@@ -316,8 +316,10 @@ def _warn_unlike(rows: list[Row]) -> None:
     """Say of resolutions that had unlike numbers of control steps: their scores do not compare."""
     steps = {row.resolution: row.samples for row in rows}
     if steps and max(steps.values()) > 1.1 * min(steps.values()):
-        found = ", ".join(f"{name} {number:,}" for name, number in steps.items())
-        warnings.warn(f"students had unlike numbers of control steps, {found}: `--iterations` makes them alike", stacklevel=3)
+        step_counts = ", ".join(f"{name} {number:,}" for name, number in steps.items())
+        warnings.warn(
+            f"students had unlike numbers of control steps, {step_counts}: `--iterations` makes them alike", stacklevel=3
+        )
 
 
 def _check_new(folder: Path, resolutions: list[str]) -> None:
@@ -326,11 +328,14 @@ def _check_new(folder: Path, resolutions: list[str]) -> None:
     Raises:
         TgdslError: If it does.
     """
-    kept = folder / "distill.json"
-    others = [folder / "table.csv", *(folder / name / file for name in resolutions for file in ("run.json", "checkpoint.pt"))]
-    if kept.exists():
+    results_file = folder / "distill.json"
+    other_files = [
+        folder / "table.csv",
+        *(folder / name / file for name in resolutions for file in ("run.json", "checkpoint.pt")),
+    ]
+    if results_file.exists():
         raise TgdslError(f"{folder}: this folder holds a run; go on with --resume {folder}, or give another --out")
-    for file in others:
+    for file in other_files:
         if file.exists():
             raise TgdslError(f"{folder}: this folder holds {file.relative_to(folder)} of a run; give another --out")
 
@@ -367,6 +372,6 @@ def _read(folder: Path) -> dict[str, Any]:
     names = ("teacher", "types", "placements", "noise", "seeds", "resolutions", "envs", "seed", "overrides")
     if missing := [name for name in names if not isinstance(result, dict) or name not in result]:
         raise TgdslError(f"{file}: it has no {missing[0]}: this is not what tgdsl distill writes")
-    own = (folder.resolve() / result.get("teacher_from_here", "")).resolve()
-    is_elsewhere = own.is_file() and own != Path(result["teacher"]).resolve()
-    return result | {"teacher": os.path.relpath(own)} if is_elsewhere else result
+    teacher_file = (folder.resolve() / result.get("teacher_from_here", "")).resolve()
+    is_elsewhere = teacher_file.is_file() and teacher_file != Path(result["teacher"]).resolve()
+    return result | {"teacher": os.path.relpath(teacher_file)} if is_elsewhere else result

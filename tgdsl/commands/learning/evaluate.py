@@ -72,14 +72,14 @@ class Evaluate:
             for line in actor.changes:
                 print(f"changed since the policy was learned: {line}")
             with StatusLine() as progress:
-                found = evaluate(env, actor, self.episodes, seed, progress)
+                evaluation = evaluate(env, actor, self.episodes, seed, progress)
         finally:
             env.close()
-        print(found)
-        print(f"\n{found.gait}")
+        print(evaluation)
+        print(f"\n{evaluation.gait}")
         if self.out is not None:
-            atomic_write(with_folder(self.out), (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
-        failures = [failure for one in required if (failure := one.failure(found)) is not None]
+            atomic_write(with_folder(self.out), (json.dumps(evaluation.plain(), indent=2, allow_nan=False) + "\n").encode())
+        failures = [failure for one in required if (failure := one.failure(evaluation)) is not None]
         if failures:
             print("\n".join(failures), file=sys.stderr)
             sys.exit(1)

@@ -42,23 +42,25 @@ class Sweep:
         try:
             largest = {name: max(node["Resources"].get(name, 0.0) for node in ray.nodes()) for name in ("CPU", "GPU")}
             if spec.cpus > largest["CPU"] or spec.gpus > largest["GPU"]:
-                what = f"a run takes {spec.cpus:g} processors and {spec.gpus:g} GPUs"
-                raise TgdslError(f"{self.document}: {what}, no machine has more than {largest['CPU']:g} and {largest['GPU']:g}")
-            asked = {"num_cpus": spec.cpus, "num_gpus": spec.gpus, "max_retries": spec.retries, "max_calls": 1}
-            work = ray.remote(**asked)(run_trial)
+                requirement = f"a run takes {spec.cpus:g} processors and {spec.gpus:g} GPUs"
+                raise TgdslError(
+                    f"{self.document}: {requirement}, no machine has more than {largest['CPU']:g} and {largest['GPU']:g}"
+                )
+            resources = {"num_cpus": spec.cpus, "num_gpus": spec.gpus, "max_retries": spec.retries, "max_calls": 1}
+            work = ray.remote(**resources)(run_trial)
             waiting = {work.remote(trial, str(out / trial.name)): trial for trial in trials}
             failed = []
             while waiting:
                 (done, *_), _ = ray.wait(list(waiting))
                 trial = waiting.pop(done)
                 try:
-                    told = ray.get(done)
+                    outcome = ray.get(done)
                 except (LocalRayletDiedError, NodeDiedError, OutOfMemoryError, WorkerCrashedError) as error:
-                    told = f"failed: its worker died {spec.retries + 1} times ({type(error).__name__})"
+                    outcome = f"failed: its worker died {spec.retries + 1} times ({type(error).__name__})"
                 except RayError as error:
-                    told = f"failed: {type(error).__name__}: {(str(error).splitlines() or [''])[-1]}"
-                failed += [trial.name] if told.startswith("failed") else []
-                print(f"{len(trials) - len(waiting)}/{len(trials)} {trial.name}: {told}", flush=True)
+                    outcome = f"failed: {type(error).__name__}: {(str(error).splitlines() or [''])[-1]}"
+                failed += [trial.name] if outcome.startswith("failed") else []
+                print(f"{len(trials) - len(waiting)}/{len(trials)} {trial.name}: {outcome}", flush=True)
         finally:
             ray.shutdown()
         if failed:

@@ -106,8 +106,8 @@ def _check_below(source: Source, spec: SweepSpec) -> None:
             if (place, other) == ("matrix", "fixed") and name == above:
                 problems.append(source.problem((place, name), f"{name} stands under {other} too", on_key=True))
             if name.startswith(f"{above}."):
-                what = f"lies below {other}.{above}, which would replace it: write it there, or single values here"
-                problems.append(source.problem((place, name), f"{name} {what}", on_key=True))
+                problem = f"lies below {other}.{above}, which would replace it: write it there, or single values here"
+                problems.append(source.problem((place, name), f"{name} {problem}", on_key=True))
     if problems:
         raise SpecError(problems)
 
@@ -118,26 +118,26 @@ def _check_names(source: Source, trials: list[Trial]) -> None:
     Raises:
         SpecError: If not.
     """
-    found: dict[str, Trial] = {}
+    trial_of: dict[str, Trial] = {}
     for trial in trials:
         if len(trial.name) > LONGEST:
-            what = (
+            problem = (
                 f"the name of a run's folder has {len(trial.name)} characters, expected {LONGEST} at most: {trial.name[:60]}…"
             )
-            raise SpecError([source.problem(("matrix",), what)])
-        if (other := found.setdefault(trial.name, trial)) is not trial:
+            raise SpecError([source.problem(("matrix",), problem)])
+        if (other := trial_of.setdefault(trial.name, trial)) is not trial:
             alike = "two combinations are the same" if other.words == trial.words else "two combinations have one name"
             raise SpecError([source.problem(("matrix",), f"{alike}: {trial.name}")])
 
 
 def _check_options(source: Source, spec: SweepSpec) -> None:
-    known = {"--" + own.name for own in fields(COMMANDS[spec.command]) if own.name not in OWN}
+    options = {"--" + option.name for option in fields(COMMANDS[spec.command]) if option.name not in OWN}
     for place in ("fixed", "matrix"):
         for name in getattr(spec, place):
-            if name.startswith("--") and name not in known:
-                what = f"`tgdsl {spec.command}` has no option {name} that a sweep may set"
-                raise SpecError([source.problem((place, name), what, did_you_mean(name, known, "options"), on_key=True)])
-    if "--teacher" in known - spec.fixed.keys() - spec.matrix.keys():
+            if name.startswith("--") and name not in options:
+                problem = f"`tgdsl {spec.command}` has no option {name} that a sweep may set"
+                raise SpecError([source.problem((place, name), problem, did_you_mean(name, options, "options"), on_key=True)])
+    if "--teacher" in options - spec.fixed.keys() - spec.matrix.keys():
         raise SpecError([source.problem(("command",), f"`tgdsl {spec.command}` needs a --teacher, under fixed or matrix")])
 
 

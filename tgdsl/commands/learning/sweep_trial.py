@@ -23,13 +23,13 @@ def run_trial(trial: Trial, folder: str) -> str:
     from tgdsl.files.write import atomic_write
 
     place = Path(folder)
-    asked, end, words = place / "trial.json", place / "ended.json", [*trial.words, "--out", folder]
-    if asked.is_file() and (before := json.loads(asked.read_text())) != list(trial.words):
-        return f"failed: its folder holds a run of other settings, `tgdsl {shlex.join(before)}`; give another --out"
+    words_file, end, words = place / "trial.json", place / "ended.json", [*trial.words, "--out", folder]
+    if words_file.is_file() and (last_words := json.loads(words_file.read_text())) != list(trial.words):
+        return f"failed: its folder holds a run of other settings, `tgdsl {shlex.join(last_words)}`; give another --out"
     if end.is_file():
         return "was made before"
     place.mkdir(parents=True, exist_ok=True)
-    atomic_write(asked, json.dumps(trial.words).encode())
+    atomic_write(words_file, json.dumps(trial.words).encode())
     with (place / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):
         try:
             if (place / "checkpoint.pt").is_file() or (place / "distill.json").is_file():
@@ -43,10 +43,10 @@ def run_trial(trial: Trial, folder: str) -> str:
             traceback.print_exc(file=log)
             return f"failed: {type(error).__name__}: {error}"
     atomic_write(end, json.dumps(trial.settings).encode())
-    found = place / "evaluation.json"
-    if not found.is_file():
+    result_file = place / "evaluation.json"
+    if not result_file.is_file():
         return "done"
-    score = json.loads(found.read_text())
+    score = json.loads(result_file.read_text())
     low, high = ("–" if end is None else f"{end:.3g}" for end in score["score_interval"])  # of one episode there is none
     return f"score {score['score']:.3g} [{low}, {high}] {score['unit']}"
 
@@ -58,9 +58,9 @@ def left(words: list[str], folder: Path) -> list[str]:
     """
     from tgdsl.rl.train.checkpoint import read_checkpoint
 
-    found = [*folder.glob("checkpoint.pt"), *folder.glob("*/checkpoint.pt")]
-    if "--minutes" not in words or not found:
+    checkpoints = [*folder.glob("checkpoint.pt"), *folder.glob("*/checkpoint.pt")]
+    if "--minutes" not in words or not checkpoints:
         return words
     at = words.index("--minutes") + 1
-    left = max(0.0, float(words[at]) - read_checkpoint(found[0])["seconds"] / 60.0)
+    left = max(0.0, float(words[at]) - read_checkpoint(checkpoints[0])["seconds"] / 60.0)
     return [*words[:at], str(left), *words[at + 1 :]]

@@ -73,9 +73,9 @@ class Train:
         device = ranks.device(self.device)
         folder = RunFolder(self.out or self.resume or Path("out") / self.task.stem)
         source = RunFolder(self.resume) if self.resume else None
-        before = source.last_start() if source else {}
+        last_start = source.last_start() if source else {}
         is_same = source is not None and folder.path.resolve() == source.path.resolve()
-        overrides = joined_overrides(before.get("overrides", {}) if is_same else {}, parsed_overrides(self.set))
+        overrides = joined_overrides(last_start.get("overrides", {}) if is_same else {}, parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
         self._check()
         with folder.held() if ranks.is_first else nullcontext():
@@ -84,7 +84,7 @@ class Train:
             state = read_checkpoint(source.checkpoint) if source else None
             ranks.join(device)
             try:
-                self._learn(loaded, folder, ranks, device, overrides, before, state)
+                self._learn(loaded, folder, ranks, device, overrides, last_start, state)
             finally:
                 ranks.leave()
 
@@ -138,8 +138,8 @@ class Train:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
             total = self.iterations or loaded.spec.train.iterations
             limit = float("inf") if self.minutes is None else 60.0 * self.minutes
-            shown = total if self.minutes is None or self.iterations else None  # else time ends the run
-            bar = ProgressBar(shown, learner.iteration, env.task.score_unit) if ranks.is_first else None
+            shown_total = total if self.minutes is None or self.iterations else None  # else time ends the run
+            bar = ProgressBar(shown_total, learner.iteration, env.task.score_unit) if ranks.is_first else None
             try:
                 run.learn(total, limit, bar.show if bar is not None else None)
             finally:
@@ -162,14 +162,14 @@ class Train:
         card = card_of(learner, origin, run.seconds, command)
         write_policy(learner, card, folder.policy)
         folder.evaluation.unlink(missing_ok=True)  # of what the policy was before
-        made = f"{learner.iteration} iterations, {learner.samples:,} steps, {run.seconds / 60:.1f} min"
-        print(f"policy: {folder.policy}, after {made}")
+        summary = f"{learner.iteration} iterations, {learner.samples:,} steps, {run.seconds / 60:.1f} min"
+        print(f"policy: {folder.policy}, after {summary}")
         again = ["tgdsl", "train", str(self.task), "--device", self.device, "--resume", str(folder.path)]
         end_if_stopped(run, shlex.join(again))
         if self.episodes:
             with StatusLine() as progress:
                 actor = policy_for(learner.env, read_policy(folder.policy))
-                found = evaluate(learner.env, actor, self.episodes, progress=progress)
-            write_policy(learner, card | {"score": found.plain()}, folder.policy)
-            atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
-            print(found)
+                evaluation = evaluate(learner.env, actor, self.episodes, progress=progress)
+            write_policy(learner, card | {"score": evaluation.plain()}, folder.policy)
+            atomic_write(folder.evaluation, (json.dumps(evaluation.plain(), indent=2, allow_nan=False) + "\n").encode())
+            print(evaluation)

@@ -25,9 +25,9 @@ class Doctor:
 
         from tgdsl.report.doctor import examine
 
-        found = examine()
-        print(json.dumps(asdict(found), indent=2, ensure_ascii=False) if self.json else _text(found))
-        if not found.is_sound:
+        examination = examine()
+        print(json.dumps(asdict(examination), indent=2, ensure_ascii=False) if self.json else _text(examination))
+        if not examination.is_sound:
             sys.exit(1)
 
 
