@@ -160,7 +160,7 @@ def test_mistakes(base, fails):
             "--groups",
             "goals",
         ): 'tgdsl: there is no group of observations "goals"; did you mean',
-        ("task.yaml", "--groups", "goal"): "tgdsl: --groups are those of a policy; give one with --policy\n",
+        ("task.yaml", "--groups", "goal"): "tgdsl: --groups belong to a policy; give one with --policy\n",
         (
             "task.yaml",
             "--policy",

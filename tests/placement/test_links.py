@@ -102,7 +102,7 @@ def test_links_shows_the_groups_of_the_layout_beside_a_file(shapes, here):
         warnings.simplefilter("always")
         code, said, error = here(shapes, "links", "shapes.xml")
     assert code == 0 and "ball unlimited" in said and "first" not in said
-    what = "this layout lies beside the robot but does not fit it, so no groups are shown"
+    what = "the layout next to this robot does not fit it, so no groups are shown"
     assert error.startswith('tgdsl: warning: layout.yaml:1:17: groups.first: no link matches "bux"') and error.endswith(
         f"; {what}\n"
     )

@@ -369,7 +369,7 @@ def test_mistakes_of_the_command(command, folder: Path, tmp_path: Path) -> None:
         ("none.yaml",): "none.yaml: cannot read this file: No such file or directory\n1 mistake\n",
         (
             f"{tmp_path}/lone.xml",
-        ): f"tgdsl: {tmp_path}/lone.xml: there is no layout.yaml beside this robot; name its layout with --layout\n",
+        ): f"tgdsl: {tmp_path}/lone.xml: there is no layout.yaml next to this robot; name its layout with --layout\n",
         (
             "bare.yaml",
             "--layout",

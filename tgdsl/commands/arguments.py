@@ -55,7 +55,7 @@ def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
         raise TgdslError(f'there is no document, artefact or robot "{hand}"; {did_you_mean(hand, names, "robots")}')
     layout_file = layout or layout_of(hand)
     if layout_file is None:
-        raise TgdslError(f"{hand}: there is no layout.yaml beside this robot; name its layout with --layout")
+        raise TgdslError(f"{hand}: there is no layout.yaml next to this robot; name its layout with --layout")
     return {"tgdsl": 1, "robot": {"model": hand, "layout": str(layout_file)}}
 
 
@@ -79,7 +79,7 @@ def joined_overrides(before: Mapping[str, Any], new: Mapping[str, Any]) -> dict[
     """Return older overrides and newer ones, in the order in which they are set.
 
     Args:
-        before: The older ones, of which those at or below a newer one's key are left out.
+        before: The older ones; those at or below a newer one's key are dropped.
         new: The newer ones.
     """
     unchanged = {key: value for key, value in before.items() if not any(f"{key}.".startswith(f"{other}.") for other in new)}
@@ -92,10 +92,10 @@ def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progres
     Args:
         document: The file.
         overrides: `KEY=VALUE` arguments.
-        progress: Is told what is being done.
+        progress: Called with a line of text for each long job.
 
     Raises:
-        TgdslError: If an artefact shall be overridden, or what is wrong with the document or artefact.
+        TgdslError: If the document or artefact has mistakes, or an artefact is overridden.
     """
     from tgdsl.module.artifact import load
     from tgdsl.tuning.compile import compile
@@ -108,7 +108,7 @@ def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progres
 
 
 def in_working_folder(source: str | Path, suffix: str) -> Path:
-    """Return what a command writes by default: the name of what it is made from, with another ending, in the working folder."""
+    """Return a command's default output: the input's name with another ending, in the working folder."""
     return Path(Path(source).with_suffix(suffix).name)
 
 

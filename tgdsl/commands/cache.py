@@ -1,4 +1,4 @@
-"""`tgdsl cache`: what is kept of earlier compilations."""
+"""`tgdsl cache`: cached results of earlier compilations."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cache:
-    """Show where baked distances, moments and modes are kept, how many and how large they are; or remove them all."""
+    """Show the folder, number and size of cached distances, moments and modes; or remove them all."""
 
     clear: bool = False
     """Remove all of it; it is recomputed when it is wanted."""
 
     def run(self) -> None:
-        """Say what there is, or what was removed."""
+        """Print the cache's contents, or how much was removed."""
         from tgdsl.files import cache
 
         if self.clear:

@@ -26,7 +26,7 @@ Intervals = Annotated[
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Fit scale, rotation and tare of fingertips to a log under known loads, or beside a simulation of the same motion."""
+    """Fit scale, rotation and tare of fingertips to a log under known loads, or to a simulation of the same motion."""
 
     what: Annotated[tyro.conf.Positional[Literal["hand"]], tyro.conf.arg(metavar="hand")]
     """What to calibrate."""

@@ -104,5 +104,5 @@ def _run() -> None:
 
 
 def _forget_output() -> None:
-    """Have what is still to be printed go nowhere."""
+    """Discard further output."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -13,7 +13,7 @@ from tgdsl.commands.arguments import OUT, in_working_folder
 
 @dataclass(frozen=True)
 class Import:
-    """Turn a USD stage into MJCF, with its meshes as .obj files in a folder beside it."""
+    """Turn a USD stage into MJCF, with its meshes as .obj files in a folder next to it."""
 
     stage: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STAGE")]
     """The stage: .usd, .usda, .usdc or .usdz."""

@@ -15,7 +15,7 @@ class Links:
 
     robot: Robot
     layout: OptionalFile = None
-    """A layout whose groups are shown; default: the robot's own, which lies beside it."""
+    """A layout whose groups are shown; default: the one next to the robot's file."""
 
     def run(self) -> None:
         """Print the table."""
@@ -28,7 +28,7 @@ class Links:
         except SpecError as error:
             if self.layout is not None:
                 raise
-            problem = "this layout lies beside the robot but does not fit it, so no groups are shown"
+            problem = "the layout next to this robot does not fit it, so no groups are shown"
             warnings.warn(f"{error.problems[0]}; {problem}", stacklevel=2)
             lines = links_table(robot)
         print("\n".join(lines))

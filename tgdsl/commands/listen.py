@@ -62,7 +62,7 @@ class Listen:
         """Return the sensors to listen to.
 
         Raises:
-            TgdslError: If the document has none, or not those that are named.
+            TgdslError: If the document has none, or lacks a named one.
         """
         from tgdsl.view.sound import sounding
 
@@ -76,7 +76,7 @@ class Listen:
         return [able[name] for name in self.sensors] or list(able.values())
 
     def _sounds(self, touch: TactileModule, chosen: list[PlannedSensor]) -> list[Sound]:
-        """Make all steps, and return what was heard."""
+        """Make all steps, and return the sound."""
         import numpy as np
         from tqdm import tqdm
 

@@ -31,7 +31,7 @@ class Play:
     policy: OptionalFile = None
     """A learned policy that acts: a TorchScript file, as tgdsl train and rsl_rl's export_policy_to_jit write it."""
     groups: tuple[str, ...] = ()
-    """Groups of observations that the policy takes, in its order; default: those of its card; of one that has none, those of
+    """Groups of observations that the policy takes, in its order; default: as in its card; without a card, as in
     proprio, tactile_sensors and goal that the task has."""
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
     """Who acts where there is no policy: zero, random, script (the task's own, if it has one), or FILE.py:FUNCTION, which takes
@@ -39,7 +39,7 @@ class Play:
     envs: int = 16
     """Environments; the video shows the first."""
     seconds: float | None = None
-    """Duration [s]; default: that of an episode."""
+    """Duration [s]; default: an episode's."""
     seed: int = 0
     """What all that is random follows from."""
     device: str = "cpu"
@@ -49,7 +49,7 @@ class Play:
     video: bool = True
     """Whether to draw the video."""
     camera: str | None = None
-    """Camera of the scene that the video is seen from; default: the first, or MuJoCo's free camera where there is none."""
+    """The scene's camera of the video; default: the first, or MuJoCo's free camera where there is none."""
     set: Overrides = ()
 
     def run(self) -> None:
@@ -64,7 +64,7 @@ class Play:
         if self.policy is not None and self.actions != "zero":
             raise TgdslError(f"--policy {self.policy} and --actions {self.actions}: expected one of them")
         if self.groups and self.policy is None:
-            raise TgdslError("--groups are those of a policy; give one with --policy")
+            raise TgdslError("--groups belong to a policy; give one with --policy")
         check_actions(self.actions)
         policy = None if self.policy is None else read_policy(self.policy)
         with StatusLine() as progress:

@@ -23,7 +23,7 @@ class Render:
     hand: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HAND")]
     """A YAML document, an artefact (.safetensors), the name of a robot, such as `xhand1`, or a robot's file."""
     layout: OptionalFile = None
-    """Layout of a robot; default: its own, which lies beside it."""
+    """Layout of a robot; default: the one next to its file."""
     resolutions: tuple[str, ...] = ()
     """Resolutions to draw; default: the document's own, or all of the layout."""
     keyframe: str | None = None
@@ -53,7 +53,7 @@ class Render:
         print(f"picture: {path}")
 
     def _placed(self, progress: StatusLine) -> Placed:
-        """Return the model and the layouts to draw by resolution: an artefact's own, or those that its document would have."""
+        """Return the model and the layouts to draw by resolution: an artefact's, or those of a document."""
         from tgdsl.compiler.pipeline import Placed, placed
 
         if not self.hand.endswith(".safetensors"):

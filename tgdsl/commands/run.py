@@ -23,7 +23,7 @@ _FILES = {"readings": "npz", "picture": "png", "overview": "png"}
 
 @dataclass(frozen=True)
 class Run:
-    """Step a document's scene on the CPU, show what is felt, and write readings and a picture."""
+    """Step a document's scene on the CPU, show the readings, and write them and a picture."""
 
     document: DocumentOrArtefact
     keyframes: tuple[str, ...] | None = None
@@ -42,8 +42,8 @@ class Run:
     compiled: bool = False
     """Fuse the module with torch.compile first."""
     view: str | None = None
-    """From where the pictures are seen: front (what the taxels face), back, left, right, top (from beyond the fingertips),
-    bottom, iso, or AZIMUTH,ELEVATION in degrees, front being about 0,0; default: the one that shows most of what is touched."""
+    """Viewpoint of the pictures: front (what the taxels face), back, left, right, top (from beyond the fingertips),
+    bottom, iso, or AZIMUTH,ELEVATION in degrees, front being about 0,0; default: the one that shows most of the touch."""
     temperatures: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
     """Ends of the colours of temperatures [°C]; default: the lowest and the highest that are read."""
     set: Overrides = ()

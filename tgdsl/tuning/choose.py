@@ -37,7 +37,7 @@ class Shared(NamedTuple):
     """How sensors share objects.
 
     Attributes:
-        places: How distances to each object are found.
+        places: Index of the way in which distances to each object are computed.
         alone: The same as each sensor would have it by itself.
         floors: Of objects that sensors without an accuracy feel too, what they have.
     """
@@ -48,7 +48,7 @@ class Shared(NamedTuple):
 
 
 def account(trial: Trial, own: Outcome, shared: Shared) -> tuple[str, ...]:
-    """Return what an account of a sensor says of what was chosen, what was measured, and why, line by line."""
+    """Return the account of a sensor: the choice, its measured errors, and the reason, line by line."""
     exact, written = trial.exact, written_fields(trial)
     lines = [shown_errors(trial, own)]
     for (name, errors), bound in zip(own.chosen.items(), trial.bounds.values(), strict=True):
@@ -83,9 +83,9 @@ def _cost(outcome: Outcome) -> tuple[int, int]:
 
 
 FORMAT = 2
-"""Version of how choices are made."""
+"""Version of the choosing."""
 ENVS, STEPS = 16, 90
-"""Environments of the run, of which half choose and half verify (more where objects have more variants), and control steps."""
+"""Environments of the run, half of which choose and half verify (more where objects have more variants), and control steps."""
 
 
 class Task(NamedTuple):
@@ -107,26 +107,26 @@ def choose(
     progress: Progress | None = None,
     sensors: Collection[str] | None = None,
 ) -> Choice:
-    """Return what is chosen for the sensors of a document that have an `accuracy`.
+    """Return the choice for the sensors of a document that have an `accuracy`.
 
     A variant holds it if the RMS error of each quantity, against the finest variant in float64, is within the bound: with 95 %
     confidence in one half of the environments of a scripted run, and as measured in the other half, which takes no part. Of
-    those the one of fewest counted operations is taken, then of fewest bytes. What is chosen is kept in the cache.
+    those the one with the fewest counted operations wins, then the one with the fewest bytes. The choice is cached.
 
     Args:
         document: The document.
-        overrides: By dotted path YAML text, or a plain value. What is set there counts as written.
-        kinds: Kinds beside tgdsl's and those of installed packages.
-        progress: Is told what is done.
+        overrides: By dotted path YAML text, or a plain value. Values set there count as written.
+        kinds: Kinds in addition to tgdsl's and those of installed packages.
+        progress: Called with a line of text for each long job.
         sensors: Names of the sensors that are wanted; default: all.
 
     Raises:
-        SpecError: What is wrong with the document, or an `accuracy` that nothing holds.
+        SpecError: If the document has mistakes, or nothing meets an `accuracy`.
     """
     if not _is_asked(document, overrides):
         return Choice()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
+        warnings.simplefilter("ignore")  # its warnings appear when it is compiled
         task = task_of(document, overrides, kinds, progress, sensors)
         return cached(key_of(task), lambda: _chosen(task), packed, unpacked) if task.wanted else Choice()
 
@@ -159,7 +159,7 @@ def task_of(
     progress: Progress | None = None,
     sensors: Collection[str] | None = None,
 ) -> Task:
-    """Return what is to be chosen: see `choose`.
+    """Return the choices to make: see `choose`.
 
     Raises:
         SpecError: If so much is wrong with the document that it cannot be looked at.
@@ -170,10 +170,10 @@ def task_of(
 
 
 def key_of(task: Task) -> str:
-    """Return a hash of all that a choice follows from: what the document computes now, what is asked for, and what is free.
+    """Return a hash of everything that decides a choice: the document's plan, the requested accuracies, and the free choices.
 
     Raises:
-        SpecError: What is wrong with the document.
+        SpecError: If the document has mistakes.
     """
     unchosen = Choice(notes=dict.fromkeys(task.wanted, ()))
     plan = compile_plan(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen)
@@ -201,7 +201,7 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> Choice:
 
 
 class Found(NamedTuple):
-    """What was chosen for a sensor."""
+    """The choice for a sensor."""
 
     trial: Trial
     outcome: Outcome
@@ -260,7 +260,7 @@ def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dic
 
 
 def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
-    """Return of objects that sensors without an accuracy feel which way they have: no coarser one is taken."""
+    """Return the way of each object that sensors without an accuracy feel too: no coarser one is taken."""
     felt = {target for name, spec in loaded.spec.sensors.items() if name not in wanted for target in spec.objects}
     alternatives = query_alternatives()
     result = {}

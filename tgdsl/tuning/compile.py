@@ -30,7 +30,7 @@ def compile_plan(
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
-        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        RobotError: If a robot or scene file cannot be read, or has something unsupported.
     """
     choice = choose(document, overrides, kinds, progress, sensors)
     return pipeline.compile_plan(document, overrides, kinds, progress, sensors, choice)
@@ -54,12 +54,12 @@ def compile(
         resolution: Instead of the document's own.
         sensors: Names of the document's sensors that are wanted: of the others nothing is computed; default: all.
         overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
-        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
-        dtype: Dtype of the readings, and of what is computed on the way: float32 or float64; its name will do. Narrower floats
+        kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
+        dtype: Dtype of the readings and of all computation: float32 or float64; its name will do. Narrower floats
             are refused, as their rounding of places is as large as the depths; cast the readings instead,
             `readings["s"].to(torch.bfloat16)`.
         device: Where the module lives.
-        progress: Is told in a line what is being done, such as "object mug: distances", each time that something begins; meshes
+        progress: Called with a line for each long job, such as "object mug: distances", each time that something begins; meshes
             that are met for the first time take seconds, sensors with an `accuracy` a run of the scene.
 
     Returns:
@@ -67,7 +67,7 @@ def compile(
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column; an `accuracy` that nothing holds.
-        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        RobotError: If a robot or scene file cannot be read, or has something unsupported.
         TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides are
             no mapping.
     """

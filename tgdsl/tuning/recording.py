@@ -30,7 +30,7 @@ from tgdsl.scene.scene import scene_model
 LEAST_ENVS = 2
 """Half of the environments choose, the others verify."""
 SWAY, PERIODS = 0.03, (0.05, 0.4)
-"""Amplitude of what is added to the controls, as a fraction of their range, and its periods, as fractions of a run."""
+"""Amplitude of the motion added to the controls, as a fraction of their range, and its periods, as fractions of a run."""
 REACH = (0.5, 1.1)
 """How far each environment's controls go from their start, of the script's own."""
 
@@ -110,7 +110,7 @@ def record(
             fewer, it makes more control steps, so that the run lasts as long.
         seed: Of what differs between environments.
         script: How it is run; default: as `tgdsl run` does.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         TgdslError: If there are fewer than two environments or no steps.

@@ -60,16 +60,16 @@ class Trial:
 
     Attributes:
         sensor: The sensor.
-        accuracy: What is asked for.
+        accuracy: The requested accuracy.
         bounds: The same for each quantity.
         recording: The states.
-        left_out: Why variants cannot be had, by their labels.
+        left_out: Why variants are unavailable, by their labels.
         exact: What errors are measured against.
-        outcomes: What was measured, by the variants' labels.
+        outcomes: Measurements, by the variants' labels.
     """
 
     def __init__(self, sensor: Sensor, accuracy: Accuracy, recording: Recording, progress: Progress):
-        """Raise `LowerError` if the reading does not change on the states, or what is written is the finest there is."""
+        """Raise `LowerError` if the reading does not change on the states, or the document has the finest variant already."""
         self.sensor, self.accuracy, self.recording, self._progress = sensor, accuracy, recording, progress
         self.left_out: dict[str, str] = {}
         self.exact: Exact = exact_of(sensor, finest_of(sensor, self.left_out), recording, progress)
@@ -104,7 +104,7 @@ class Trial:
         """Return the ways to find distances to meshes, from coarse to fine, that change nothing that is written.
 
         Args:
-            floors: Of objects that sensors without an accuracy feel too, which of the ways they have: none coarser is taken.
+            floors: The way of each object that sensors without an accuracy feel too: no coarser one is taken.
         """
         alternatives = query_alternatives()
         candidates = [i for i, choice in enumerate(alternatives) if choice.label not in self.left_out]
@@ -125,7 +125,7 @@ class Trial:
         return list(result.values())
 
     def outcome(self, variant: Variant) -> Outcome | None:
-        """Return a variant's errors; None if it cannot be had."""
+        """Return a variant's errors; None if it is unavailable."""
         if variant.label not in self.outcomes:
             cost = self.cost(variant)
             if cost is None:
@@ -143,7 +143,7 @@ class Trial:
         return self.outcomes[variant.label]
 
     def cost(self, variant: Variant) -> Cost | None:
-        """Return what a variant takes, counted; None if it cannot be had."""
+        """Return the counted cost of a variant; None if it is unavailable."""
         if variant.label not in self._costs:
             self._progress(f"{self.sensor.name}: {variant.label}")
             try:
@@ -155,7 +155,7 @@ class Trial:
         return self._costs[variant.label]
 
     def _errors(self, variant: Variant) -> Iterator[dict[str, Errors]]:
-        """Yield the errors of each quantity, in the environments that choose and in those that verify."""
+        """Yield the errors of each quantity, first in the environments that choose, then in the ones that verify."""
         touch, exact = self.sensor.module(self.sensor.plan(variant), torch.float32), self.exact
         readings = readings_of(touch, self.recording.for_module(touch.inputs), self.sensor.name)
         readings = common_of(exact.module, touch, self.sensor.name).of_other(readings)
@@ -177,7 +177,7 @@ class Trial:
 
     def _refuse_finest(self, label: str) -> None:
         lacking = "".join(f"; {label}: {why}" for label, why in self.left_out.items())
-        problem = f"what is written, {label}, is the finest there is: nothing is known that its error could be measured against"
+        problem = f"the document's own {label} is the finest variant: there is nothing to measure its error against"
         raise LowerError(f"{problem}{lacking}", "accuracy", "write a coarser one, or none")
 
 
@@ -200,7 +200,7 @@ def joined(fields: Variant, level: Level) -> Variant:
 def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -> tuple[Outcome, Level]:
     """Return the cheapest variant that holds an accuracy, and how it finds distances: fewest operations, then fewest bytes.
 
-    Where there are choices of both, those that do not hold it beside the finest of the other kind are left out first.
+    Where both can be chosen, variants that miss it even with the finest of the other kind are dropped first.
 
     Raises:
         LowerError: If none does: it names the best.

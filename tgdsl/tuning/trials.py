@@ -53,16 +53,16 @@ class Sensor:
 
     Attributes:
         document: The document.
-        overrides: What is other than in it, imperfections left out.
+        overrides: Changes to it, imperfections left out.
         name: The sensor's name.
         kind: Its kind.
         spec: Its fields.
-        others: Kind and fields of all sensors that its Plan has: those that it reads, and itself.
+        others: Kind and fields of all sensors of its Plan: itself and the sensors it reads.
         queried: Of the objects with meshes that it feels, their fields.
         own: The Plan of the document's own variant.
         variants: The variants.
-        kinds: Kinds beside tgdsl's and those of installed packages.
-        plans: Plans that were made, by what they change.
+        kinds: Kinds in addition to tgdsl's and those of installed packages.
+        plans: Plans so far, by their changes.
     """
 
     document: Document
@@ -82,7 +82,7 @@ class Sensor:
         """Return a sensor of a document.
 
         Raises:
-            SpecError: What is wrong with the document.
+            SpecError: If the document has mistakes.
         """
         changed, all_kinds = {**overrides, **bare(name)}, known_kinds(kinds)
         with warnings.catch_warnings():
@@ -104,7 +104,7 @@ class Sensor:
         """Return the Plan of a variant.
 
         Raises:
-            TgdslError: If it cannot be had.
+            TgdslError: If it is unavailable.
         """
         if not variant.changes:
             return self.own
@@ -131,7 +131,7 @@ class Exact(NamedTuple):
     """What errors of a sensor are measured against.
 
     Attributes:
-        variant: The finest variant that can be had.
+        variant: The finest available variant.
         module: The document's own variant in float64, whose rows readings are compared at.
         readings: The finest variant's, in float64, at those rows.
         magnitude: What errors are relative to.
@@ -154,7 +154,7 @@ def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Pr
         sensor: The sensor.
         finest: Its finest variant: see `finest_of`.
         recording: States of the document's scene.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         StateError: If the states are of another document.
@@ -169,11 +169,11 @@ def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Pr
 
 
 def finest_of(sensor: Sensor, left_out: dict[str, str]) -> Variant:
-    """Return the finest variant: of its fields and of its queries the last that can be had.
+    """Return the finest variant: the last available one of its fields and of its queries.
 
     Args:
         sensor: The sensor.
-        left_out: Is told why finer ones cannot be had, by their labels.
+        left_out: Filled with the reasons why finer ones are unavailable, by their labels.
     """
     results = [last for axis in (sensor.variants.fields, sensor.variants.queries) if (last := _last(sensor, axis, left_out))]
     if not results:
@@ -195,7 +195,7 @@ def _last(sensor: Sensor, axis: Sequence[Variant], left_out: dict[str, str]) -> 
 
 
 def cost_of(touch: TactileModule, size: int) -> Cost:
-    """Return what a module takes, counted; its state is that of a single call.
+    """Return the counted cost of a module; its state is that of a single call.
 
     Args:
         touch: The module.

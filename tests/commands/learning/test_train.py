@@ -256,7 +256,7 @@ def test_an_evaluation_is_written_into_a_folder_that_is_made(base, here, fails):
     code, _, error = here(base, "evaluate", "task.yaml", "--episodes", "2", "--envs", "2", "--out", "no/such/found.json")
     assert code == 0, error
     assert json.loads((base / "no" / "such" / "found.json").read_text())["episodes"] == 2
-    assert "--groups are those of a policy" in fails("evaluate", "task.yaml", "--groups", "proprio")
+    assert "--groups belong to a policy" in fails("evaluate", "task.yaml", "--groups", "proprio")
 
 
 def test_an_evaluation_is_of_the_policy_beside_it(base, here, monkeypatch):

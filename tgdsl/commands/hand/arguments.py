@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 Port = Annotated[
     str | None,
-    tyro.conf.arg(help="The hand's serial port; default: that of the only hand found. `emulator`: a hand at rest, emulated."),
+    tyro.conf.arg(
+        help="The hand's serial port; default: the port of the only hand found. `emulator`: an emulated hand at rest."
+    ),
 ]
 HandId = Annotated[int | None, tyro.conf.arg(help="The hand's id, where several are on one port.")]
 
@@ -24,7 +26,7 @@ def calibration_of(path: Path | None) -> Calibration | None:
     """Return the calibration of a file, if there is one.
 
     Raises:
-        SpecError: What is wrong with the file.
+        SpecError: If the file has mistakes.
     """
     from tgdsl.runtime.xhand1.calibration import load_calibration
 
@@ -33,7 +35,7 @@ def calibration_of(path: Path | None) -> Calibration | None:
 
 @contextmanager
 def until_ctrl_c(view: HandView) -> Iterator[None]:
-    """End what is done within at Ctrl-C, as if it were over; then draw the view's last state."""
+    """End the block at Ctrl-C as if it had finished; then draw the view's last state."""
     try:
         yield
     except KeyboardInterrupt:

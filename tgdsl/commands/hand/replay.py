@@ -21,7 +21,7 @@ class Replay:
     speed: float = 1.0
     """How much faster than it was; `inf` is as fast as possible."""
     calibration: OptionalFile = None
-    """A calibration file; default: what is in the log."""
+    """A calibration file; default: the log's."""
 
     def run(self) -> None:
         """Draw the table over itself; at the end, once more."""

@@ -25,7 +25,7 @@ class Tare:
     port: Port = None
     hand_id: HandId = None
     calibration: OptionalFile = None
-    """A calibration file from which all but the tare is taken; default: counts."""
+    """A calibration file that gives everything except the tare; default: counts."""
     frames: int = 20
     """Readings to average, at least 5."""
     max_spread: float = 4.0

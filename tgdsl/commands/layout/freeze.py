@@ -23,17 +23,17 @@ from tgdsl.commands.arguments import (
 class Freeze:
     """Write down where a layout's taxels are, to the last bit, so that their rows stay when robot, layout or tgdsl change.
 
-    Makes a layout with the same links and groups, and beside it a table (CSV) of the taxels for each resolution.
+    Makes a layout with the same links and groups, and next to it a table (CSV) of the taxels for each resolution.
     """
 
     hand: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HAND")]
     """A YAML document, the name of a robot, such as `xhand1`, or a robot's file."""
     layout: OptionalFile = None
-    """Layout of a robot; default: its own, which lies beside it."""
+    """Layout of a robot; default: the one next to its file."""
     resolutions: tuple[str, ...] = ()
     """Resolutions to write down; default: all of the layout."""
     out: Annotated[Path, OUT] = Path("layout_frozen.yaml")
-    """The layout to write; its tables are beside it, layout_frozen.med.csv and so on."""
+    """The layout to write; its tables go next to it, layout_frozen.med.csv and so on."""
     force: Annotated[Replace, tyro.conf.arg(help="Replace the files if they are there.")] = False
     set: Overrides = ()
 

@@ -37,9 +37,9 @@ class Deploy:
     source: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "simulation"
     """simulation, warp, emulator, xhand1:PORT, or a log (.npz)."""
     episodes: int = 1
-    """Episodes; of a scene, those that tgdsl evaluate begins with."""
+    """Number of episodes; in a scene, the first ones of tgdsl evaluate."""
     seconds: float | None = None
-    """Longest duration of each [s]; default: that of an episode, of a log all of it."""
+    """Longest duration of each [s]; default: an episode's, or the whole log."""
     goal: tuple[float, ...] = ()
     """What the policy is asked for, in the task's units, such as a force [N]; default: what the scene's task asks for."""
     groups: tuple[str, ...] = ()
@@ -57,7 +57,7 @@ class Deploy:
     kp: int | None = None
     """Proportional gain [hand's unit]."""
     seed: int | None = None
-    """What is random in a scene follows from it; default: that of tgdsl evaluate."""
+    """Seed of the scene; default: that of tgdsl evaluate."""
     out: Annotated[Path | None, OUT] = None
     """An .npz file to write: observations, actions, targets, latencies and scores of each control step."""
     set: Overrides = ()
@@ -90,7 +90,7 @@ class Deploy:
         self._act(deployment)
 
     def _act(self, found: Deployment) -> None:
-        """Make all steps; Ctrl-C ends them, and what was done is told."""
+        """Make all steps and report them; Ctrl-C ends them early."""
         from tqdm import tqdm
 
         from tgdsl.rl.deploying.record import DeployRecord
@@ -104,7 +104,7 @@ class Deploy:
                     bar.update()
             except KeyboardInterrupt:
                 bar.write("interrupted")
-            except TgdslError as error:  # a hand that no longer answers: what was done is told nevertheless
+            except TgdslError as error:  # a hand that no longer answers: report the steps so far
                 failed = error
         if failed is None or record.num_steps:
             print(found.report())
@@ -116,7 +116,7 @@ class Deploy:
             raise failed
 
     def _motion(self) -> Callable[[MjModel], MotionLimits] | None:
-        """Return what gives leave to move, if all three limits are given; joint ranges are those of the task's scene.
+        """Return the limits of motion, if all three are given; joint ranges come from the task's scene.
 
         Raises:
             TgdslError: If some are missing.

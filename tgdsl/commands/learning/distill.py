@@ -29,7 +29,7 @@ Folder = tyro.conf.arg(metavar="FOLDER")
 Names = tyro.conf.arg(metavar="A,B,…")
 ENVS = 13824
 OPTIONS = {"touch": "types", "placement": "placements", "noise": "noise", "resolution": "resolutions"}
-"""Keys of a task's document of which an option of the command says what students have."""
+"""Keys of a task's document that an option of the command replaces."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Distill:
     minutes: float | None = None
     """Time to learn from now on in each simulation [min], start-up not counted; default: no limit."""
     seed: int | None = None
-    """What is random in the environments follows from it; default: 0."""
+    """Seed of the environments; default: 0."""
     resume: Annotated[Path | None, Folder] = None
     """Folder of a run that goes on from its last checkpoints, with the same students and overrides."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
@@ -74,7 +74,7 @@ class Distill:
         """Teach.
 
         Raises:
-            TgdslError: What is wrong, before anything runs.
+            TgdslError: If something is wrong; nothing has run then.
         """
         from tgdsl.rl.load import load_task
         from tgdsl.rl.train.folder import RunFolder
@@ -281,7 +281,7 @@ class _Part:
             env.close()
 
     def _changes(self, origin: dict[str, Any], model: type[TaskSpec]) -> list[str]:
-        """Return what is otherwise than when the run was started last, a line each."""
+        """Return the changes since the run was last started, a line each."""
         from tgdsl.rl.train.folder import changes
 
         last_start = self._folder.last_start()

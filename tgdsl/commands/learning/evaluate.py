@@ -33,7 +33,7 @@ class Evaluate:
     device: str = "cpu"
     """Where physics and touch are computed: cpu, or cuda."""
     seed: int | None = None
-    """What is random in the episodes follows from it; default: one that is the same for all policies."""
+    """Seed of the episodes; default: one that is the same for all policies."""
     out: Annotated[Path | None, OUT] = None
     """A JSON file to write."""
     require: Annotated[str | None, tyro.conf.arg(metavar="BOUNDS")] = None
@@ -53,7 +53,7 @@ class Evaluate:
         if self.episodes < 1 or self.envs < 1:
             raise TgdslError(f"--episodes {self.episodes} --envs {self.envs}: expected at least 1 of each")
         if self.groups and self.policy is None:
-            raise TgdslError("--groups are those of a policy; give one with --policy")
+            raise TgdslError("--groups belong to a policy; give one with --policy")
         required = [] if self.require is None else parse_requirements(self.require)
         if self.out is not None:
             check_writable(self.out)

@@ -34,7 +34,7 @@ class SweepSpec(SpecModel):
     tgdsl: Literal[1]
     """Version of the grammar."""
     command: Literal["train", "distill"] = "train"
-    """What is run: `tgdsl train` or `tgdsl distill`."""
+    """The command to run: `tgdsl train` or `tgdsl distill`."""
     task: str
     """The task's document, relative to this one."""
     fixed: dict[str, Any] = {}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def run_trial(trial: Trial, folder: str) -> str:
     """Run a trial in this process, in which nothing else runs; go on where its folder holds a checkpoint; say how it ended.
 
-    `trial.json` has its words, by which a run of other settings is told from it; `ended.json` is there once it is whole.
+    `trial.json` has its words, which identify its settings; `ended.json` is there once it is complete.
     """
     from tgdsl.files.write import atomic_write
 
@@ -54,7 +54,7 @@ def run_trial(trial: Trial, folder: str) -> str:
 def left(words: list[str], folder: Path) -> list[str]:
     """Return a command's words with those minutes alone that a run had not learned at its last checkpoint.
 
-    That of students is in the folder of their resolution; beside `--minutes` there is one alone.
+    Students keep theirs in the folder of their resolution; with `--minutes` there is only one.
     """
     from tgdsl.rl.train.checkpoint import read_checkpoint
 

@@ -35,7 +35,7 @@ class Train:
 
     task: Task
     envs: int | None = None
-    """Environments of each process; default: 8192, or those of the run that goes on."""
+    """Environments per process; default: 8192, or as in the run that is resumed."""
     device: str = "cuda"
     """Where physics, touch and networks are computed: cuda, or cpu. With torchrun each process takes a GPU."""
     iterations: int | None = None
@@ -43,12 +43,12 @@ class Train:
     minutes: float | None = None
     """Time to learn from now on [min], start-up not counted; default: no limit."""
     seed: int | None = None
-    """What all that is random follows from; default: 0, or that of the run that goes on."""
+    """Random seed; default: 0, or as in the run that is resumed."""
     resume: Annotated[Path | None, Folder] = None
     """Folder of a run that goes on from its last checkpoint, with its overrides; with another --out a run of its own begins
     from there, with those that are given now alone."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
-    """Folder of the run; default: out/NAME of the document, or that of the run that goes on."""
+    """Folder of the run; default: out/NAME of the document, or that of the run that is resumed."""
     episodes: int = 1000
     """Episodes of the evaluation at the end; 0: none."""
     set: Overrides = ()

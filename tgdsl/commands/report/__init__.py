@@ -1,1 +1,1 @@
-"""Commands that tell of an installation."""
+"""Commands about an installation."""

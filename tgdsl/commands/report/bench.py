@@ -62,7 +62,7 @@ class Bench:
     compiled: bool = False
     """Fuse the modules with torch.compile first."""
     seed: int = 0
-    """Of what differs between environments, of bootstraps, and of which states are timed."""
+    """Seed of the environments, the bootstraps and the states that are timed."""
     set: Overrides = ()
 
     def run(self) -> None:
@@ -128,7 +128,7 @@ def _measured(work: Work) -> Report:
 
 
 def _text(report: Report) -> str:
-    """Return what is printed."""
+    """Return the printed text."""
     from tgdsl.console.tables import text_table
     from tgdsl.report.bench.page import cells_of
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Show versions, devices, compilers, OpenGL, caches, what is at fault, and what is done instead; exit code 1 at a fault."""
+    """Show versions, devices, compilers, OpenGL and caches, with faults and their fallbacks; exit code 1 at a fault."""
 
     json: bool = False
     """Print JSON, for a report."""
