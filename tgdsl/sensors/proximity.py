@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import Field, StrictInt
 from torch import Tensor
 
-from tgdsl.fields.models import Area, NonNegative, Positive, Quantity, Usual
+from tgdsl.fields.models import Area, NonNegative, Positive, PositiveLength, Quantity, Usual
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
@@ -58,6 +58,8 @@ class ProximitySpec(ProbeSpec):
 
     kind: Literal["proximity"]
     """Force [N] and torque [N·m] of each taxel from the surfaces near it."""
+    radius: Annotated[PositiveLength | None, Usual("length", low=1e-5, high=0.1)] = None
+    """R, sensing radius of all of the sensor's taxels [m]; default: that of each taxel in the layout."""
     backend: Literal["field", "points"] = "field"
     """`field`: interpolated from a field that is computed beforehand; `points`: a sum over sampled points (the paper). Planes
     are exact in both."""
@@ -130,6 +132,7 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants |= {"about_link": scalar(1.0)} if spec.torque_about == "link" else {}
     request = MomentsRequest(
         objects=spec.objects,
+        radius=spec.radius,
         backend=spec.backend,
         num_points=spec.points,
         tolerance=spec.tolerance,
