@@ -26,7 +26,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, StrictInt
+from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 
 from tgdsl.fields.models import Area, NonNegative, Positive, PositiveLength, Quantity, Usual
@@ -86,6 +86,17 @@ class ProximitySpec(ProbeSpec):
     """What the torque is about: the taxel (the paper), or the link's origin."""
     model: Literal["tgdsl", "paper"] = "tgdsl"
     """`paper` keeps the paper's sign of the normal part, and its slip with the object's absolute angular velocity."""
+
+    @model_validator(mode="after")
+    def _is_used(self) -> ProximitySpec:
+        unused = {"points"} if self.backend == "field" else {"tolerance", "gradient_tolerance"}
+        for name in sorted(unused & self.model_fields_set):
+            raise ValueError(f"`{name}` has no effect with `backend: {self.backend}`; remove it")
+        if "torque" not in self.outputs and "torque_about" in self.model_fields_set:
+            raise ValueError("`torque_about` has no effect without the output `torque`; remove it")
+        if self.outputs == ("torque",) and self.torque_about == "taxel" and "shear_damping" in self.model_fields_set:
+            raise ValueError("`shear_damping` has no effect on torque about the taxel; remove it")
+        return self
 
     @property
     def normal_sign(self) -> float:
