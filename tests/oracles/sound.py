@@ -157,8 +157,8 @@ def scraping(num_envs: int = 400, num_steps: int = 90):
 
 
 @contact(
-    "Scraping drives modes independently, {apart} Hz apart", "E|z|² = m_s W/2d, E z₁z₂* = E z₁z₂ = 0",
-    "Campbell's theorem of shot noise", "mean square over m_s W/2d, correlation [1]",
+    "Scraping is white noise to modes {apart} Hz apart", "E|z|² = m_s W/2d, E z₁z₂* = m_s W/(2d − i(ω₁ − ω₂))",
+    "Campbell's theorem of shot noise", "mean square, correlations, over m_s W/2d [1]",
     at=["mode 1", "mode 2", "z₁z₂*", "z₁z₂"], atol=0.07, each=[4000.0, 2800.0], also=[250.0, 1000.0],
 )  # fmt: skip
 def independent_modes(apart: float, num_envs: int = 4000, num_steps: int = 60):
@@ -171,7 +171,8 @@ def independent_modes(apart: float, num_envs: int = 4000, num_steps: int = 60):
     one, other = (real + 1j * imag).T
     power = scrape * force * speed / (2 * decay)
     means = (one * one.conj(), other * other.conj(), one * other.conj(), one * other)
-    return [1.0, 1.0, 0.0, 0.0], [abs(mean.mean()) / power for mean in means]
+    turns = 2 * np.pi * np.array([0.0, 0.0, apart, 1200.0 + apart])
+    return 2 * decay / np.hypot(2 * decay, turns), [abs(mean.mean()) / power for mean in means]
 
 
 @contact(

@@ -160,7 +160,11 @@ def test_a_radius_replaces_that_of_the_layout_for_one_sensor():
     plane = {"kind": "proximity", "links": "pad", "feels": ["floor"], "reference_area": AREA}
     with folder() as where:
         whole = document(where, [{**POINT, "radius": 0.004}, {**POINT, "radius": 0.0}])
-        whole["sensors"] = {"s": plane, "wide": {**plane, "radius": "10 mm"}, "points": {**plane, "radius": 0.007, "backend": "points"}}
+        whole["sensors"] = {
+            "s": plane,
+            "wide": {**plane, "radius": "10 mm"},
+            "points": {**plane, "radius": 0.007, "backend": "points"},
+        }
         touch = tgdsl.compile(whole, dtype=torch.float64)
     above = state(touch)
     above.body_pos[0, touch.inputs.bodies.index("pad"), 2] = 0.003
