@@ -40,6 +40,10 @@ class UnfeltWarning(UserWarning):
     """A document has taxels that cannot feel what their sensors are to feel."""
 
 
+class CoarseCellsWarning(UserWarning):
+    """Cells of a temperature grid are too large for what their faces lose."""
+
+
 class FileError(TgdslError, OSError):
     """A file that cannot be written; also caught as the system's own error.
 

@@ -162,7 +162,7 @@ def two_bodies(steps: int, dt: float = 0.0005):
 
 @oracle(
     "Heat between two solids, αΔt/Δ² = {fourier:.2g}", "Q = A √(kρc) (T₂ − T₁) √(t/π)", "Carslaw and Jaeger 2.14", "heat [J]",
-    at=["after {seconds:g} s"], rtol=0.01, defects=(13,), each=[(1e-3, 80), (2.5e-4, 200), (1.25e-4, 320)],
+    at=["after {seconds:g} s"], rtol=0.002, defects=(13,), each=[(1e-3, 80), (2.5e-4, 200), (1.25e-4, 320)],
 )  # fmt: skip
 def two_solids(cell: float, num: int, dt: float = 0.005, seconds: float = 0.4):
     area, steps, sides = 4e-4, round(seconds / dt), [0.02, 0.02, num * cell]
@@ -178,7 +178,7 @@ def two_solids(cell: float, num: int, dt: float = 0.005, seconds: float = 0.4):
 
 @oracle(
     "Heat through a spot in long steps, αΔt/Δ² = {fourier:.2g}", "Q", "the same cells in steps of 2 ms", "heat [J]",
-    at=["after {seconds:g} s"], rtol=0.05, defects=(13,), each=[(8, 0.2)], also=[(4, 1.0), (12, 1.0)],
+    at=["after {seconds:g} s"], rtol=0.01, defects=(13,), each=[(8, 0.2)], also=[(4, 1.0), (12, 1.0)],
 )  # fmt: skip
 def spot_in_long_steps(num: int, dt: float, seconds: float = 2.0):
     sensor = {"cells": [num] * 3, "material": "aluminium", "contact_area": "10 mm2"}

@@ -25,7 +25,7 @@ CHANNELS = (*FORCES, "torque_x", "torque_y", "torque_z")
 law = partial(oracle, source=SOURCE, quantity="force [N], torque [N·m] []", rtol=1e-12, atol=1e-12)
 SIX = [(x, y, 0.0) for x in (-0.01, 0, 0.01) for y in (0, 0.012)]
 """Probes under the box."""
-STILL: dict[str, Any] = {"normal_damping": 0, "shear_damping": 0, "spin_damping": 0, "outputs": ["force"]}
+STILL: dict[str, Any] = {"normal_damping": 0, "shear_damping": 0, "outputs": ["force"]}
 
 
 def read(probe: Any = (0.0, 0.0, 0.0), sensor: dict[str, Any] | None = None, **item: Any) -> np.ndarray:

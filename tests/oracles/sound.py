@@ -157,6 +157,25 @@ def scraping(num_envs: int = 400, num_steps: int = 90):
 
 
 @contact(
+    "Scraping is white noise to modes {apart} Hz apart", "E|z|² = m_s W/2d, E z₁z₂* = m_s W/(2d − i(ω₁ − ω₂))",
+    "Campbell's theorem of shot noise", "mean square, correlations, over m_s W/2d [1]",
+    at=["mode 1", "mode 2", "z₁z₂*", "z₁z₂"], atol=0.07, each=[4000.0, 2800.0], also=[250.0, 1000.0],
+)  # fmt: skip
+def independent_modes(apart: float, num_envs: int = 4000, num_steps: int = 60):
+    decay, scrape, force, speed = 60.0, 1e-3, 2.0, 0.5
+    modes = [{"frequency": f, "decay": decay, "gain": 1.0} for f in (600.0, 600.0 + apart)]
+    touch = temporary(plate, modes=modes, samples=20, scrape=scrape)
+    for _ in range(num_steps):
+        touch(pressed(touch, [force] * num_envs, speed))
+    real, imag = touch.memory.get_buffer("s:phasors").double().numpy().reshape(num_envs, 2, 2).swapaxes(0, 1)
+    one, other = (real + 1j * imag).T
+    power = scrape * force * speed / (2 * decay)
+    means = (one * one.conj(), other * other.conj(), one * other.conj(), one * other)
+    turns = 2 * np.pi * np.array([0.0, 0.0, apart, 1200.0 + apart])
+    return 2 * decay / np.hypot(2 * decay, turns), [abs(mean.mean()) / power for mean in means]
+
+
+@contact(
     "Third octaves have the mean squares of their modes", "E = ½ (g J)² e^(−2dt)",
     "mean square of a damped sine; IEC 61260-1 for the bands", "energy [m²/s²]", "band", rtol=1e-12,
     series=[f"after {i} ms" for i in range(1, 5)],

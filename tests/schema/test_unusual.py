@@ -73,6 +73,12 @@ CASES = {
         DOCUMENT.replace(CONTACT, "kind: kinematic_taxel").replace(TOUCH, TOUCH + "    normal_stiffness: 1e9\n"),
         "12:23: sensors.touch.normal_stiffness: found 1e+09, usually at most 1e+07",
     ),
+    "the stiffness of a skin": (
+        DOCUMENT.replace(CONTACT, "kind: elastomer").replace(
+            TOUCH, TOUCH + "    kernel: half_space\n    normal_stiffness: 1e17\n    youngs_modulus: 1e5\n"
+        ),
+        "13:23: sensors.touch.normal_stiffness: found 1e+17, usually at most 1e+12",
+    ),
     "the stiffness of proximity": (
         DOCUMENT.replace(CONTACT, "kind: proximity").replace(TOUCH, TOUCH + "    normal_stiffness: 1e9\n"),
         "12:23: sensors.touch.normal_stiffness: found 1e+09, usually at most 1e+07",

@@ -7,7 +7,7 @@ import torch
 from oracles import proximity
 from oracles.proximity import AREA, COARSE, R, read
 from oracles.proximity import DENSITY as RHO
-from oracles.setups.scenes import BOX, module, state
+from oracles.setups.scenes import BOX, folder, module, state
 
 import tgdsl
 from tgdsl.errors import SpecError
@@ -39,6 +39,13 @@ class TestProximityOverPointsAsInThePaper(KindConformance):
     parameters = {"backend": "points", "points": 600, "max_bytes": 2**22, "model": "paper", "torque_about": "link"}
     gates = ()
     num_envs = 7
+
+
+class TestProximityOfOneRadius(KindConformance):
+    kind = PROXIMITY
+    parameters = {"tolerance": 0.1, "radius": 0.006}
+    test_compiled_equals_eager = None  # its graph is that of the first of these kinds
+    gates = ()
 
 
 class TestProximityAsInThePaper(KindConformance):
@@ -146,6 +153,26 @@ def test_each_radius_has_its_own_field(tmp_path):
         (alone if len(radii) == 1 else touch).append(readings)
     torch.testing.assert_close(touch[0], torch.cat(alone))
     assert (touch[0][:, 2] < 0).all()
+
+
+def test_a_radius_replaces_that_of_the_layout_for_one_sensor():
+    """Over a plane each sensor has the closed form of its own radius; a taxel that is inactive in the layout reads nothing."""
+    plane = {"kind": "proximity", "links": "pad", "feels": ["floor"], "reference_area": AREA}
+    with folder() as where:
+        whole = document(where, [{**POINT, "radius": 0.004}, {**POINT, "radius": 0.0}])
+        whole["sensors"] = {
+            "s": plane,
+            "wide": {**plane, "radius": "10 mm"},
+            "points": {**plane, "radius": 0.007, "backend": "points"},
+        }
+        touch = tgdsl.compile(whole, dtype=torch.float64)
+    above = state(touch)
+    above.body_pos[0, touch.inputs.bodies.index("pad"), 2] = 0.003
+    readings = touch(above)
+    for name, radius in (("s", 0.004), ("wide", 0.01), ("points", 0.007)):
+        s0 = 2 * np.pi * (radius**3 / 6 - radius * 0.003**2 / 2 + 0.003**3 / 3)
+        assert readings[name][0, 0, 2].item() == pytest.approx(-300 * RHO * s0, rel=1e-12)
+        assert (readings[name][0, 1] == 0).all()
 
 
 SCENE = (

@@ -319,11 +319,11 @@ class _Moments(Quantity):
             area[k] = moments.area
             for t, link_id in enumerate(layout.link_id):
                 name = layout.links[link_id].body
-                if layout.radius[t] <= 0 or name == target.body:
+                if own.reach[k, t] <= 0 or name == target.body:
                     continue
                 link = scene.body(name)
                 q = link.pos + link.rotation @ layout.pos[t]
-                mass[t, k], about_q = moments.at(body.rotation.T @ (q - body.pos), float(layout.radius[t]))
+                mass[t, k], about_q = moments.at(body.rotation.T @ (q - body.pos), float(own.reach[k, t]))
                 first[t, k] = link.rotation.T @ body.rotation @ about_q
                 velocity[t, k] = link.rotation.T @ (body.velocity_at(q) - link.velocity_at(q))
                 angular[t, k] = link.rotation.T @ (body.angvel - link.angvel)
@@ -369,6 +369,7 @@ def _way(use: Use) -> tuple[Any, ...]:
     """Return the method of a request: uses with equal methods share a table."""
     request = _request(use)
     result = (
+        request.radius,
         request.backend,
         request.num_points,
         request.tolerance,
@@ -382,7 +383,13 @@ def _way(use: Use) -> tuple[Any, ...]:
 def _radii(planning: Planning, uses: Sequence[Use], use: Use, name: str) -> list[float]:
     """Return the radii of all probes whose tables are this use's [m], ascending."""
     alike = [other for other in uses if _way(other) == _way(use) and name in other.request.objects]
-    return sorted({float(r) for other in alike for r in planning.layout.radius[other.taxels] if r > 0})
+    return sorted({float(r) for other in alike for r in _radius(planning, other) if r > 0})
+
+
+def _radius(planning: Planning, use: Use) -> Float[np.ndarray, " taxel"]:
+    """Return the sensing radius of each probe [m]; at most 0 where it is inactive."""
+    radius, of_all = planning.layout.radius[use.taxels], _request(use).radius
+    return radius if of_all is None else np.where(radius > 0, of_all, radius)
 
 
 def _check_area(planning: Planning, use: Use, tables: Sequence[MomentTable], numbers: Number) -> None:
@@ -395,7 +402,7 @@ def _check_area(planning: Planning, use: Use, tables: Sequence[MomentTable], num
 
 def _use(planning: Planning, use: Use, tables: Sequence[MomentTable[np.ndarray]], numbers: Number) -> MomentUse[np.ndarray]:
     names = [name for name in use.request.objects if (*_way(use), name) in numbers]
-    bodies, radius = planning.bodies_of(use.taxels), planning.layout.radius[use.taxels]
+    bodies, radius = planning.bodies_of(use.taxels), _radius(planning, use)
     number = [numbers[(*_way(use), name)] for name in names]
     index, reach, radius_id = np.zeros((3, len(names), len(bodies)))
     for o, name in enumerate(names):

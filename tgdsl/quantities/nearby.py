@@ -41,9 +41,10 @@ class SurfaceMoments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MomentsRequest(Request[SurfaceMoments]):
-    """Asks for moments of objects' surfaces, within the probes' own radii. They are never gated.
+    """Asks for moments of objects' surfaces around probes. They are never gated.
 
     Attributes:
+        radius: Sensing radius of all active probes [m]; None: that of each in the layout.
         backend: "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
         num_points: Points of each object.
         tolerance: Root mean square error of a field as a fraction of full scale.
@@ -53,6 +54,7 @@ class MomentsRequest(Request[SurfaceMoments]):
         motion: Whether the objects' motions are asked for.
     """
 
+    radius: float | None = None
     backend: Literal["field", "points"] = "field"
     num_points: int = 5000
     tolerance: float = 0.005

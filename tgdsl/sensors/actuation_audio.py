@@ -100,6 +100,11 @@ class ActuationAudioSpec(OnJointsSpec):
     def _is_heard(self) -> ActuationAudioSpec:
         if not (self.load or self.power or self.friction or self.hum):
             raise ValueError("`load`, `power`, `friction` and `hum` are all 0: expected one that makes a sound")
+        if not (self.load or self.power):
+            for name in sorted(self.model_fields_set & {"pitch", "partials"}):
+                raise ValueError(f"`{name}` has no effect without `load` or `power`; remove it")
+        if not self.hum and "hum_frequency" in self.model_fields_set:
+            raise ValueError("`hum_frequency` has no effect without `hum`; remove it")
         return self
 
 

@@ -102,8 +102,9 @@ class KinematicTaxelSpec(ContactProbeSpec):
     def _is_used(self) -> KinematicTaxelSpec:
         if self.balance == "none" and "slots" in self.model_fields_set:
             raise ValueError("`slots` is used by `balance: solver` alone, expected it to be left out")
-        if "torque" not in self.outputs and "torque_about" in self.model_fields_set:
-            raise ValueError("`torque_about` is not used without torque, expected it to be left out")
+        if "torque" not in self.outputs:
+            for name in sorted(self.model_fields_set & {"spin_damping", "torque_about"}):
+                raise ValueError(f"`{name}` has no effect without the output `torque`; remove it")
         return self
 
     @property

@@ -66,6 +66,8 @@ class LinkContactSpec(ProbeSpec):
     def _is_used(self) -> LinkContactSpec:
         if "slots" in self.model_fields_set and "normal_force" not in self.outputs:
             raise ValueError("`slots` is used by the output `normal_force` alone, expected it to be left out")
+        if "threshold" in self.model_fields_set and "contact" not in self.outputs:
+            raise ValueError("`threshold` has no effect without the output `contact`; remove it")
         return self
 
 

@@ -26,10 +26,10 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, StrictInt
+from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 
-from tgdsl.fields.models import Area, NonNegative, Positive, Quantity, Usual
+from tgdsl.fields.models import Area, NonNegative, Positive, PositiveLength, Quantity, Usual
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
@@ -58,6 +58,8 @@ class ProximitySpec(ProbeSpec):
 
     kind: Literal["proximity"]
     """Force [N] and torque [N·m] of each taxel from the surfaces near it."""
+    radius: Annotated[PositiveLength | None, Usual("length", low=1e-5, high=0.1)] = None
+    """R, sensing radius of all of the sensor's taxels [m]; default: that of each taxel in the layout."""
     backend: Literal["field", "points"] = "field"
     """`field`: interpolated from a field that is computed beforehand; `points`: a sum over sampled points (the paper). Planes
     are exact in both."""
@@ -84,6 +86,17 @@ class ProximitySpec(ProbeSpec):
     """What the torque is about: the taxel (the paper), or the link's origin."""
     model: Literal["tgdsl", "paper"] = "tgdsl"
     """`paper` keeps the paper's sign of the normal part, and its slip with the object's absolute angular velocity."""
+
+    @model_validator(mode="after")
+    def _is_used(self) -> ProximitySpec:
+        unused = {"points"} if self.backend == "field" else {"tolerance", "gradient_tolerance"}
+        for name in sorted(unused & self.model_fields_set):
+            raise ValueError(f"`{name}` has no effect with `backend: {self.backend}`; remove it")
+        if "torque" not in self.outputs and "torque_about" in self.model_fields_set:
+            raise ValueError("`torque_about` has no effect without the output `torque`; remove it")
+        if self.outputs == ("torque",) and self.torque_about == "taxel" and "shear_damping" in self.model_fields_set:
+            raise ValueError("`shear_damping` has no effect on torque about the taxel; remove it")
+        return self
 
     @property
     def normal_sign(self) -> float:
@@ -130,6 +143,7 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants |= {"about_link": scalar(1.0)} if spec.torque_about == "link" else {}
     request = MomentsRequest(
         objects=spec.objects,
+        radius=spec.radius,
         backend=spec.backend,
         num_points=spec.points,
         tolerance=spec.tolerance,

@@ -18,7 +18,7 @@ MODES = [
     {"frequency": 845.0, "decay": 40.0, "gain": -1.0},
     {"frequency": 1520.0, "decay": 90.0, "gain": 0.5},
 ]
-COMMON = {"modes": MODES, "timestep": 0.002, "samples": 8, "scrape": 0.05, "settling": 0.02}
+COMMON = {"modes": MODES, "timestep": 0.002, "samples": 8, "scrape": 0.05}
 
 
 class TestSamples(KindConformance):

@@ -24,7 +24,7 @@ HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 1
             "it needs `samples: 67`",
         ),
         ({"bodies": {"lid": MODES}}, 'sensors.s.bodies: `bodies`: no link of the sensor matches "lid"; it has plate'),
-        ({"scale": "decibel"}, "`scale` is used by `outputs: bands` alone, expected it to be left out"),
+        ({"scale": "decibel"}, "`scale` has no effect without `outputs: bands`; remove it"),
         ({"modes": []}, "sensors.s.modes: found a list of 0, expected at least 1 entry"),
         ({"modes": [{"frequency": 100, "decay": 0}]}, "0 is out of range, expected more than 0"),
         ({"modes": [{"frequency": "100 kg", "decay": 1}]}, '"kg" is not a unit of frequency'),

@@ -56,7 +56,8 @@ RADIUS_ERRORS = {"points": 1e-12, "field": 0.1}
 
 @pytest.mark.parametrize("backend", ["points", "field"])
 def test_radius_noise_of_proximity(tmp_path, monkeypatch, backend):
-    made = document(tmp_path, {"s": {"kind": "proximity", "backend": backend, "tolerance": 0.02, "points": 1000}})
+    fields = {"points": 1000} if backend == "points" else {"tolerance": 0.02}
+    made = document(tmp_path, {"s": {"kind": "proximity", "backend": backend, **fields}})
     (tmp_path / "scene.xml").write_text(SCENE.replace('type="sphere" size=".025"', 'type="box" size=".01 .01 .01"'))
 
     def of_radius(radius: float, noise: dict) -> TactileModule:

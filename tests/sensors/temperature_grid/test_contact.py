@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from oracles import heat
-from oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
+from oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state, heated
 from scipy.linalg import expm
 
 from tgdsl.fields.materials import MATERIALS
@@ -100,6 +100,38 @@ def test_two_solids_exchange_what_their_cells_equations_say(tmp_path, dt):
     rate = own.conductivity / (own.density * own.specific_heat * cell**2)
     after = expm(-0.4 * rate * coupled.T @ coupled) @ np.repeat([0.0, 23.0], num)
     assert found == pytest.approx(after[:num].sum() * own.density * own.specific_heat * cell * area, rel=0.003)
+
+
+@pytest.mark.parametrize("fourier", [0.5, 8.0, 30.0])
+def test_two_solids_exchange_what_their_cells_equations_say_in_long_steps(tmp_path, fourier):
+    """Twice 60 cells of 1 mm, from the second of eight steps on."""
+    own, cell, num, area = MATERIALS["aluminium"], 0.001, 60, 4e-4
+    rate = own.conductivity / (own.density * own.specific_heat * cell**2)
+    dt, sides = fourier / rate, [0.02, 0.02, num * cell]
+    slab = {"material": "aluminium", "temperature": 45.0, "cells": [1, 1, num]}
+    sensor = {"cells": [1, 1, num], "material": "aluminium", "contact_area": area}
+    contacts = {("tip", "slab"): face_contacts(sides, -0.5 * sides[2])}
+    stream = heated({"tip": sides}, sensor, dt, 8, {"slab": (sides, slab)}, contacts, {"slab": -sides[2]})
+    found = np.cumsum([float(readings["heat/heat"][0, 0, 4]) for readings in stream])
+    coupled = np.diff(np.eye(2 * num), axis=0)
+    begun, step = np.repeat([0.0, 23.0], num), expm(-dt * rate * coupled.T @ coupled)
+    exact = [(np.linalg.matrix_power(step, n) @ begun)[:num].sum() for n in range(1, 9)]
+    exact = np.array(exact) * own.density * own.specific_heat * cell * area
+    np.testing.assert_allclose(found[1:], exact[1:], rtol=0.007)
+
+
+def test_two_contacts_on_one_cell_count_each_other_once():
+    """Two hot bodies on a link of one cell, in steps of a tenth of the time that heat takes through it: as in short steps."""
+    bodies = {name: (None, {"material": "copper", "temperature": 80.0}) for name in ("one", "other")}
+    contacts = {("tip", name): [((0, 0, z), (0, 0, -z / abs(z)), 1.0)] for name, z in (("one", 0.005), ("other", -0.005))}
+    sensor = {"cells": [1, 1, 1], "material": "copper", "contact_area": 1e-4, "temperature": 30.0}
+    copper = MATERIALS["copper"]
+    dt = 0.1 * 1e-4 * copper.density * copper.specific_heat / copper.conductivity
+    first = []
+    for parts in (1, 50):
+        stream = heated({"tip": [0.01] * 3}, sensor, dt / parts, parts, bodies, contacts)
+        first.append(sum(float(readings["heat/heat"][0, 0, 4]) for readings in stream))
+    assert first[0] == pytest.approx(first[1], rel=0.005)
 
 
 @pytest.mark.parametrize("area", [1e-6, 1e-4])

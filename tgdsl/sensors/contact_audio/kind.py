@@ -9,9 +9,11 @@ with its frequency f [Hz], the decay rate d of its amplitude [1/s], and its gain
 J Σ g e^(−dt) sin(2πft): the pseudo-velocity of the surface, see `modal.modes`. Sample k = 1 … K of a physics step is s at
 k Δt/K after its start, so that the rate is K/Δt, and samples at common times are the same for all K.
 
-Impulses u act at four times of each step, t_n = (0, ¼, ½, ¾) Δt:
+Five impulses u act in each step:
 
-    u_n = J [n = 0] + ξ_n √(m_s W Δt/4),   ξ_n ~ N(0, 1)                                      [N·s]
+    u_0 = J, t_0 = 0;   u_n = ξ_n √(m_s W Δt/4), t_n = (n − 1 + j_n/16) Δt/4, n = 1 … 4        [N·s], [s]
+
+with ξ_n ~ N(0, 1) and j_n one of 0 … 15, all alike probable and drawn anew in each step:
 
 - J is the impulse of a collision, over all steps that it takes the solver, once it has been passed on: see `impulses`. It is
   summed over what touches the body.
@@ -61,8 +63,7 @@ between samples, Nigam and Jennings, *Bull. Seism. Soc. Am.* 59 (1969); noise by
 and Pai, *FoleyAutomatic* (SIGGRAPH 2001). Departures: the response and the impulses above, see `model: paper`.
 
 Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it. A load that is
-spread over a body's surface strikes at its centre alone; friction strikes along the normal, as pressing does. The
-noise drives alike modes whose frequencies differ by a multiple of 4/Δt.
+spread over a body's surface strikes at its centre alone; friction strikes along the normal, as pressing does.
 """
 
 from __future__ import annotations
@@ -163,52 +164,68 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     else:
         impulse, new = impulses(loads.force, constants, state, share)
         drive = of_rows(impulse, constants)
-    driven = drive.unsqueeze(2)
-    if "noise" in constants:
-        driven = torch.cat([driven, _noise(of_rows(sliding, constants), context, constants)], dim=2)
     phasors, turn = state["phasors"], turn_of(constants, context.step[0] + context.substep)
-    new["phasors"] = after = _turned(phasors, driven, turn, constants)
+    after, grains = _turned(phasors, drive, turn, constants), []
+    if "noise" in constants:
+        grains = _grains(of_rows(sliding, constants), context, constants)
+    row = torch.arange(phasors.shape[1], device=phasors.device)
+    for n, (size, slot) in enumerate(grains):
+        both = torch.cat([size, size], dim=-1) if size.ndim == 3 else size[..., None]
+        after = torch.addcmul(after, both.expand_as(after), constants["grain_left"][n][slot, row])
+    new["phasors"] = after = torch.nn.functional.hardshrink(after, least())
     if "heard" in constants:  # environments last: libraries multiply few rows by many columns faster
-        parts = torch.cat([phasors, driven.flatten(2)], dim=-1).permute(1, 2, 0)
-        made = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 1, 0)
+        parts = torch.cat([phasors, drive if drive.ndim == 3 else drive[..., None]], dim=-1).permute(1, 2, 0)
+        made = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 0, 1)
+        for n, (size, slot) in enumerate(grains):
+            own = size[..., None] * constants["grain_heard"][n][slot, row]
+            made = made + (own.sum(dim=2) if size.ndim == 3 else own)
+        made = made.transpose(1, 2)
         return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
 
 
-def _turned(phasors: Tensor, driven: Tensor, turn: Tensor, constants: Constants) -> Tensor:
-    """Return the phasors at the end of a step, (env, row, part · mode) [N·s].
+def _turned(phasors: Tensor, drive: Tensor, turn: Tensor, constants: Constants) -> Tensor:
+    """Return the phasors at the end of a step without noise, (env, row, part · mode) [N·s].
 
     By products alone, not of a matrix: matrices may be multiplied in TF32, and phasors would then grow or decay by it.
 
     Args:
         phasors: Those at its start, real parts first [N·s].
-        driven: Impulse [N·s] or rise of the force [N], then noise [N·s], (env, row, drive); or of each mode, (env, row, drive,
-            mode).
+        drive: Impulse [N·s] or rise of the force [N], (env, row); or of each mode, (env, row, mode).
         turn: What is left of each part, and what it has of the other, (2, row, part · mode).
         constants: The sensor's.
     """
     along, across = turn.unbind()
     crossed = phasors.roll(phasors.shape[-1] // 2, dims=-1)
     after = torch.addcmul(phasors * along, crossed, across)
-    for i, own in enumerate(constants["driven"].unbind()):
-        one = driven[:, :, i]
-        # Eager, tensors that are alike are multiplied faster than those that broadcast.
-        spread = torch.cat([one, one], dim=-1) if one.ndim == 3 else one[..., None].expand_as(after).contiguous()
-        after = torch.addcmul(after, spread, own)
-    return torch.nn.functional.hardshrink(after, least())
+    # Eager, tensors that are alike are multiplied faster than those that broadcast.
+    spread = torch.cat([drive, drive], dim=-1) if drive.ndim == 3 else drive[..., None].expand_as(after).contiguous()
+    return torch.addcmul(after, spread, constants["driven"])
 
 
-def _noise(sliding: Tensor, context: Context, constants: Constants) -> Tensor:
-    """Return the impulses of sliding (env, row, grain, *mode) [N·s], of its power (env, row, *mode) [W]."""
+def _grains(sliding: Tensor, context: Context, constants: Constants) -> list[tuple[Tensor, Tensor]]:
+    """Return each impulse of sliding (env, row, *mode) [N·s], and the slot in which it arrives (env, row).
+
+    Args:
+        sliding: Its power (env, row, *mode) [W].
+        context: The stream that they are drawn from.
+        constants: The sensor's.
+    """
     assert context.stream is not None
-    rows, grains = sliding.shape[1], constants["driven"].shape[0] - 1
+    rows, (grains, slots) = sliding.shape[1], constants["grain_left"].shape[:2]
     count = (grains + 1) // 2
-    index = torch.arange(rows * count, dtype=torch.int32, device=sliding.device)
-    pair = random.normal_pair(random.words(context.stream, index), sliding.dtype)
-    normals = torch.stack(pair, dim=-1).view(-1, rows, 2 * count)[..., :grains]
-    size = (constants["noise"] * planes.safe_sqrt(sliding)).unsqueeze(2)
-    return size * (normals if size.ndim == 3 else normals[..., None])
+    index = torch.arange(rows * (count + 1), dtype=torch.int32, device=sliding.device)
+    words = random.words(context.stream, index)
+    normals = torch.stack(random.normal_pair(words[:, : rows * count], sliding.dtype), dim=-1).view(-1, rows, 2 * count)
+    size, last = constants["noise"] * planes.safe_sqrt(sliding), words[:, rows * count :]
+    result = []
+    for n in range(grains):
+        normal = normals[..., n]
+        # The paper's have one slot each, whatever is drawn.
+        slot = ((last >> (4 * n % 32)) & (slots - 1)).long()
+        result.append((size * (normal if size.ndim == 2 else normal[..., None]), slot))
+    return result
 
 
 def _level(energy: Tensor) -> Tensor:

@@ -1,16 +1,17 @@
 """A step of the modes, and a block of samples as one matrix: what of it depends on the time step, in float64.
 
-    heard = Hᵀ (Re z, Im z, u),   z′ = p z + Bᵀ u
+    heard = Hᵀ (Re z, Im z, u) + Σ_n ξ_n h(t_n),   z′ = p z + b u + Σ_n ξ_n e(t_n)
 
-with the phasors z of the modes at the start of a step [N·s] and what drives them in it, u: an impulse at its start [N·s], or
-with `model: force` the rise of the force [N], and impulses of noise at `GRAINS` times [N·s]; H holds the samples' sines, p and
-B what is left of phasors and drives at the end. All are exact, whatever the step. A phasor that is turned by the same rounded
+with the phasors z of the modes at the start of a step [N·s] and what drives them in it: u, an impulse at its start [N·s], or
+with `model: force` the rise of the force [N], and `GRAINS` impulses of noise ξ_n [N·s], each at one of `SLOTS` times t_n of its
+part of the step. H and h hold the samples' sines, p, b and e what is left of phasors and drives at the end. All are exact,
+whatever the step. A phasor that is turned by the same rounded
 factor at every step drifts by 3e-8 a step. So in float32 p is rounded down at some steps and up at others, such that its mean
 is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the last place by which it is
 above the lower number. What is left are roundings that do not add up.
 
 Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `both` the real parts of all
-modes, then their imaginary ones, `sample` samples of a block, `band` bands, `grain` times of noise, `drive` what drives a mode.
+modes, then their imaginary ones, `sample` samples of a block, `band` bands, `grain` impulses of noise, `slot` times of each.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from torch import Tensor
 from tgdsl.tensors.fusion import materialised
 
 GRAINS = 4
-"""Times within a physics step at which noise strikes: the same for any number of samples, so that the noise is."""
+"""Impulses of noise in a physics step, one in each of as many equal parts: the same for any number of samples."""
+SLOTS = 16
+"""Times in its part of the step at which one of them may arrive."""
 HIGHEST = 0.45
 """Largest frequency that is heard, in sample rates."""
 Arrays = Mapping[str, np.ndarray]
@@ -82,7 +85,7 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
     is_heard = (frequency > 0) & (frequency <= highest(samples, step) * (1 + 1e-12))
     rate, gain = -constants["decay"] + 2j * math.pi * frequency, np.where(is_heard, constants["gain"], 0.0)
     times = np.arange(1, samples + 1) * step / samples
-    grains = np.zeros(0) if scrape == 0 else times if is_paper else np.arange(GRAINS) * step / GRAINS
+    arrival = times[:, None] if is_paper else (np.arange(GRAINS * SLOTS) * step / (GRAINS * SLOTS)).reshape(GRAINS, SLOTS)
     begun = strike_phasors(frequency, samples, step, is_paper)
     over = rate.real / np.where(is_heard, rate.imag, 1.0)
     seen = gain * (1.0 - 1j * over) if is_force else -1j * gain  # heard is Re(seen z)
@@ -101,28 +104,29 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
 
     kept = math.exp(-step / float(constants["settling"]))
     turn = factors(np.array(step))
-    added = np.concatenate([struck(np.array([step])), begun[..., None] * factors(step - grains)], axis=2).transpose(2, 0, 1)
+    added = struck(np.array([step]))[..., 0]
     result = {
         "kept": np.asarray(kept),
         "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
-        "driven": np.concatenate([np.real(added), np.imag(added)], axis=2),
+        "driven": np.concatenate([np.real(added), np.imag(added)], axis=1),
         **{name: _by_parts(name, part) for name, part in _rounded("turn", np.stack([np.real(turn), np.imag(turn)])).items()},
     }
     if scrape > 0:
-        result["noise"] = np.asarray(math.sqrt(scrape * step / len(grains)))
+        result["noise"] = np.asarray(math.sqrt(scrape * step / len(arrival)))
+        left = (begun[..., None, None] * factors(step - arrival)).transpose(2, 3, 0, 1)
+        result["grain_left"] = np.concatenate([np.real(left), np.imag(left)], axis=3)
     if "band" in constants:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
         return result | {"energy": np.concatenate([energy, energy], axis=1)}
-    of_grains = begun[..., None, None] * factors(times - grains[:, None])
-    free, drives = seen[..., None] * factors(times), np.concatenate([struck(times)[:, :, None], of_grains], axis=2)
-    heard = np.real(seen[..., None, None] * drives)
-    by_mode = heard.swapaxes(1, 2).reshape(len(heard), -1, samples)  # drive by drive
-    return result | {
-        "heard": np.concatenate(
-            [np.real(free), -np.imag(free), by_mode if "shape_value" in constants else heard.sum(axis=1)], axis=1
-        )
-    }
+    free, heard = seen[..., None] * factors(times), np.real(seen[..., None] * struck(times))
+    has_each = "shape_value" in constants
+    parts = [np.real(free), -np.imag(free), heard if has_each else heard.sum(axis=1, keepdims=True)]
+    result["heard"] = np.concatenate(parts, axis=1)
+    if scrape > 0:
+        own = np.real((seen * begun)[..., None, None, None] * factors(times - arrival[..., None])).transpose(2, 3, 0, 1, 4)
+        result["grain_heard"] = own if has_each else own.sum(axis=3)
+    return result
 
 
 def _rounded(name: str, exact: np.ndarray) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
 from tgdsl.sensors.contact_audio.bands import middle
 from tgdsl.sensors.contact_audio.impulses import reference_impulses
-from tgdsl.sensors.contact_audio.operators import GRAINS, highest, least, quiet, radiated
+from tgdsl.sensors.contact_audio.operators import GRAINS, SLOTS, highest, least, quiet, radiated
 from tgdsl.sensors.contact_audio.rows import Ringing, ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise.reference import normal_pair
@@ -60,7 +60,7 @@ def reference(
     for row in range(num):
         for m in range(half):
             of = m if spec.gains == "contact" else 0
-            drive, strikes = float(struck[row, of]), _noise(spec, context, row, float(rubbed[row, of]))
+            drive, strikes = float(struck[row, of]), _noise(spec, context, row, num, float(rubbed[row, of]))
             frequency, decay, gain = (float(table[row, m]) for table in (modes.frequency, modes.decay, modes.gain))
             if not 0 < frequency <= below * (1 + 1e-12):
                 phasors[row, [m, half + m]] = 0.0
@@ -96,8 +96,8 @@ def _no_surface(name: str) -> Surface:
     raise NotImplementedError(f"the reference of contact audio knows listed modes alone, not those of the shape of {name}")
 
 
-def _noise(spec: ContactAudioSpec, context: ReferenceContext, row: int, rubbed: float) -> Strikes:
-    """Return the noise on a row: impulses of variance m_s W Δt/G each."""
+def _noise(spec: ContactAudioSpec, context: ReferenceContext, row: int, num_rows: int, rubbed: float) -> Strikes:
+    """Return the noise on a row: impulses of variance m_s W Δt/G, each at one of its slots; the paper's at each sample."""
     if spec.scrape == 0:
         return []
     is_paper = spec.model == "paper"
@@ -106,7 +106,9 @@ def _noise(spec: ContactAudioSpec, context: ReferenceContext, row: int, rubbed: 
     index = np.arange(row * words, (row + 1) * words, dtype=np.uint64)
     normals = np.stack(normal_pair(context.words(index)), axis=-1).ravel()
     size = math.sqrt(spec.scrape * rubbed * context.dt / grains)
-    return [((g + is_paper) * context.dt / grains, size * normals[g]) for g in range(grains)]
+    last = int(context.words(np.array([num_rows * words + row], dtype=np.uint64))[0])
+    parts = [1.0 if is_paper else (last >> (4 * g) & 15) / SLOTS for g in range(grains)]
+    return [((g + part) * context.dt / grains, size * normals[g]) for g, part in enumerate(parts)]
 
 
 def _driven(

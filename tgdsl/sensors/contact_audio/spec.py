@@ -62,7 +62,7 @@ class ContactAudioSpec(ProbeSpec):
     timestep: Annotated[Time | None, Usual("time", low=1e-5, high=0.1)] = None
     """Time that a physics step takes [s]; default: that of the scene."""
     settling: Annotated[Time, Usual("time", low=1e-4, high=1.0)] = 0.02
-    """Time in which a load counts as steady, τ [s]: what presses more slowly makes no sound. Of `physical`."""
+    """Time in which a load counts as steady, τ [s]: what presses more slowly makes no sound. For `model: physical` alone."""
     loudest: Annotated[StrictInt, Field(ge=1)] | None = None
     """Most modes of each body that are computed, those that ring with most energy, g²/4d; default: all that are heard."""
     scrape: NonNegative = 1e-5
@@ -82,7 +82,9 @@ class ContactAudioSpec(ProbeSpec):
     @model_validator(mode="after")
     def _is_used(self) -> ContactAudioSpec:
         if self.scale is not None and self.outputs != "bands":
-            raise ValueError("`scale` is used by `outputs: bands` alone, expected it to be left out")
+            raise ValueError("`scale` has no effect without `outputs: bands`; remove it")
+        if self.model != "physical" and "settling" in self.model_fields_set:
+            raise ValueError(f"`settling` has no effect with `model: {self.model}`; remove it")
         return self
 
 

@@ -76,7 +76,7 @@ class ElastomerSpec(ContactProbeSpec):
     """ν [1]; for the Gaussian it only sets the tangential against the normal stiffness under friction."""
     youngs_modulus: Annotated[Pressure | None, Usual("pressure", low=1e3, high=5e8)] = None
     """E [Pa], also as `0.2 MPa` (half_space, bonded_layer)."""
-    normal_stiffness: Positive | None = None
+    normal_stiffness: Annotated[Positive | None, Usual("number", low=1e5, high=1e12)] = None
     """K_n, pressure per depth [Pa/m] (half_space, bonded_layer)."""
     marker_depth: Annotated[Radius, Usual("length", high=0.1)] = 0.0
     """Depth of the markers below the skin's surface [m] (half_space, bonded_layer)."""

@@ -55,6 +55,7 @@ from tgdsl.sensors.temperature_grid import grids
 from tgdsl.sensors.temperature_grid.advance import Heat, advanced
 from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
 from tgdsl.sensors.temperature_grid.reference import reference
+from tgdsl.sensors.temperature_grid.resolution import warn_of_coarse
 from tgdsl.sensors.temperature_grid.spec import TemperatureGridSpec, alternatives
 
 HEAT = tuple(Channel(name, "J") for name in ("stored", "source", "radiation", "convection", "contact"))
@@ -67,6 +68,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
     count, size = grids.counts(spec, boxes), boxes[:, 1] - boxes[:, 0]
     there = is_cell(count)
     made_of = [spec.material_of(link.name) for link in layout.links]
+    conductivity = np.array([own.conductivity for own in made_of])
     for pattern in spec.materials:
         if not any(fnmatchcase(link.name, pattern) for link in layout.links):
             known = ", ".join(link.name for link in layout.links)
@@ -74,7 +76,9 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
                 f'`materials`: no link of the sensor matches "{pattern}"', field="materials", hint=f"it has {known}"
             )
     film, radiated = _films(spec, made_of, size / count, count)
-    conductivity = np.array([own.conductivity for own in made_of])
+    if film.any():
+        names, total = [link.name for link in layout.links], _radiated(spec, made_of) + (spec.convection or 0.0)
+        warn_of_coarse(names, count, size, spec.exposed, conductivity, total)
     constants = tables(count, size, spec.exposed, film * (size / count) / conductivity[:, None]) | {
         "box": np.concatenate([boxes[:, 0], size / count, count], axis=1),
         "conductivity": conductivity,
@@ -147,11 +151,16 @@ def _films(
     if spec.model == "paper":
         return np.zeros(step.shape), np.zeros(len(step))
     k = np.array([own.conductivity for own in made_of])[:, None]
-    radiated = 4.0 * stefan_boltzmann() * _emissivities(spec, made_of) * (spec.ambient + zero_celsius()) ** 3
+    radiated = _radiated(spec, made_of)
     total = radiated + (spec.convection or 0.0)
     num_ends = np.array([sum(face[1] == axis for face in spec.exposed) for axis in "xyz"])
     resistance = step / (2.0 * k) * (1.0 - num_ends / (3.0 * count))
     return total[:, None] / (1.0 + total[:, None] * resistance), radiated / np.where(total > 0, total, 1.0)
+
+
+def _radiated(spec: TemperatureGridSpec, made_of: list[Material]) -> Float[np.ndarray, " row"]:
+    """Return 4εσ T_a³ of each link [W/(m²·K)]."""
+    return 4.0 * stefan_boltzmann() * _emissivities(spec, made_of) * (spec.ambient + zero_celsius()) ** 3
 
 
 def _needs_stiffness(spec: TemperatureGridSpec, made_of: list[Material]) -> bool:

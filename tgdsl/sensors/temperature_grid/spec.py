@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
@@ -91,13 +92,23 @@ class TemperatureGridSpec(LinkSpec):
     def _check(self) -> TemperatureGridSpec:
         if (self.cells is None) == (self.spacing is None):
             raise ValueError("expected one of `cells` and `spacing`")
-        if self.model == "paper" and (self.scheme != "exact" and "scheme" in self.model_fields_set):
-            raise ValueError("`model: paper` has a scheme of its own, expected `scheme` to be left out")
-        if self.model == "paper" and self.contact_conductance is not None:
-            raise ValueError("`model: paper` knows no film, expected `contact_conductance` to be left out")
+        for name, where in self._without_effect:
+            raise ValueError(f"`{name}` has no effect {where}; remove it")
         if self.model == "paper" and self.source is not None and self.source.flux is None:
             raise ValueError("the source of `model: paper` is a `flux`, found `power`")
         return self
+
+    @property
+    def _without_effect(self) -> Iterator[tuple[str, str]]:
+        """Fields that others make meaningless, and by which."""
+        idle: list[tuple[bool, set[str], str]] = [
+            (self.model == "paper", {"scheme", "contact_conductance"}, "with `model: paper`"),
+            (not self.feels, {"contact_area", "contact_conductance", "curvature_radius", "slots"}, "without `feels`"),
+            (self.contact_area != "manifold", {"curvature_radius"}, "with a given `contact_area`"),
+            (self.emissivity is None and self.convection is None, {"exposed"}, "without `emissivity` or `convection`"),
+        ]
+        for is_idle, names, where in idle:
+            yield from ((name, where) for name in sorted(names & self.model_fields_set) if is_idle)
 
     @property
     def objects(self) -> tuple[str, ...]:
