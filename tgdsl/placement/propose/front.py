@@ -26,7 +26,7 @@ GAP = 2e-4
 MIN_SHARE = 0.1
 """Least share of what faces an inner side, and of a link's surface, to be believed."""
 MARGIN, LEVEL, TOWER = 0.15, 0.2, 0.25
-"""Shares of a finger's length: how far beside its fingers a hand ends, by how much parts of a palm differ in height, and how high
+"""Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, and how high
 above the joints of the fingers a tower is."""
 HALF = 0.5
 """A part of a palm is in front by this share, and has this share of the largest part's area."""
