@@ -54,6 +54,7 @@ TENDON = """
 </mujoco>
 """
 # A gripper of two four-bars: driver and rocker are children of the base, the finger of the driver, and a connect closes the loop.
+# The bracket is behind the base.
 _SIDE = """
       <body name="{0}_driver" pos="{1} 0 .02" euler="0 0 {2}"><joint axis="0 1 0" range="0 45"/>
         <geom type="capsule" fromto="0 0 0 0 0 .03" size=".004"/>
@@ -144,7 +145,6 @@ HANDS = {
         tips=("left_pad", "right_pad"),
         palm=("base",),
         fingers=tuple(f"{side}_{part}" for side in ("left", "right") for part in ("driver", "finger", "pad", "rocker")),
-        others=("bracket",),
         facing=(("left_pad", (1, 0, 0)), ("right_pad", (1, 0, 0)), ("base", (0, 0, 1))),
     ),
     "capsules": OddHand(

@@ -1,12 +1,11 @@
 """Contacts of the tasks' objects with the hand resist twisting, and the policies that are kept still act in these scenes."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 from tgdsl.rl.load import load_task
-from tgdsl.rl.playing.policy import check_card
+from tgdsl.rl.playing.policy import check_card, read_policy
 from tgdsl.rl.sensed import compile_sensed
 from tgdsl.scene.scene import Choice, SceneModels
 
@@ -44,6 +43,6 @@ def test_every_variant_of_an_object_resists_twisting(task):
 
 @pytest.mark.parametrize("policy", ["in_palm_rotate_cube", "grip_force"])
 def test_kept_policies_act_in_them(policy):
-    card = json.loads((ROOT / "policies" / f"{policy}.json").read_text(encoding="utf-8"))
-    sensed = compile_sensed(load_task(TASKS / f"{policy}.yaml"), "cpu")
-    check_card(card, ROOT / "policies" / f"{policy}.pt", card["joints"], sensed.touch.taxels_id)
+    saved = read_policy(ROOT / "policies" / f"{policy}.pt")
+    assert saved.card is not None
+    check_card(saved, saved.card["joints"], compile_sensed(load_task(TASKS / f"{policy}.yaml"), "cpu").touch)

@@ -5,7 +5,7 @@ Selections of names are looked up here: what they mean, and what is wrong with t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from tgdsl.fields.regions import OnGeoms
 from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders
+from tgdsl.placement.sample.poisson import Pool
 from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.loaded import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement, Points
@@ -24,6 +25,9 @@ from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
 from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
+
+Pools = dict[Hashable, dict[Hashable, Pool | None]]
+"""Points that were drawn on links, by the geoms that are sampled and by how."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,7 @@ def sampled(
     colliders: Colliders,
     patches: list[Patch],
     objects: Sequence[int],
+    pools: Pools,
     progress: Progress,
 ) -> Layout:
     """Return the taxels of links.
@@ -152,6 +157,7 @@ def sampled(
         colliders: What the simulator collides of the robot.
         patches: The links.
         objects: Bodies of the robot's file that are no links, but objects.
+        pools: Points that were drawn on the links before; those that are drawn are added.
         progress: Is told what is done.
 
     Raises:
@@ -163,7 +169,8 @@ def sampled(
         try:
             covered = colliders.cover_of(patch.link.body, patch.geoms, objects)
             surface, name = _surface(colliders.robot, patch), patch.link.name
-            parts.append(sample(surface, patch.placement, layout.folder, name, covered))
+            drawn = pools.setdefault((patch.as_collided, *(geom.id for geom in patch.geoms)), {})
+            parts.append(sample(surface, patch.placement, layout.folder, name, covered, drawn))
         except SampleError as error:
             what = f'link "{patch.link.name}": {error.what}'
             loaded.problems.append(layout.problem(patch.path, what, error.hint))

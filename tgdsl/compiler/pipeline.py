@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import mujoco
 
 from tgdsl.compiler import lower
-from tgdsl.compiler.resolve import resolve
+from tgdsl.compiler.resolve import models_of, resolve
 from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean, listed
@@ -165,8 +165,13 @@ def placed(
     for name in resolutions:
         if name not in names:
             raise TgdslError(f'the layout has no resolution "{name}"; {did_you_mean(name, names, "resolutions")}')
-    texts = {name: chosen if name == own else {**chosen, "resolution": name} for name in wanted}
-    each = {name: resolve(load(document, text, known, needs_sensors=False), progress) for name, text in texts.items()}
+    parsed = {
+        name: loaded if name == own else load(document, {**chosen, "resolution": name}, known, needs_sensors=False)
+        for name in wanted
+    }
+    progress("reading robot and scene")
+    models = models_of(parsed[wanted[0]])
+    each = {name: resolve(parsed[name], progress, models) for name in wanted}
     result = {name: unfelt(own.colliders, own.layout, own.reach) for name, own in each.items()}
     return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, result)
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from tgdsl.compiler.links import LinkBodies, check_named_bodies, link_bodies, sensor_joints
-from tgdsl.compiler.patches import Patch, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
+from tgdsl.compiler.patches import Patch, Pools, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
 from tgdsl.compiler.sensed import sensed_object
 from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.console.progress import Progress, silent
@@ -122,6 +123,27 @@ def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, S
 
 
 @dataclass(frozen=True, eq=False)
+class Models:
+    """What a document's files hold, at whatever resolution.
+
+    Attributes:
+        robot: The robot; None if a mistake of the document says why there is none.
+        scene: The model that holds robot and objects, or None.
+        pools: Points that were drawn on links, to choose taxels from.
+    """
+
+    robot: Model | None
+    scene: Model | None
+    pools: Pools = field(default_factory=dict)
+
+    @cached_property
+    def colliders(self) -> Colliders:
+        """What the simulator collides of the robot."""
+        assert self.robot is not None
+        return Colliders(self.robot)
+
+
+@dataclass(frozen=True, eq=False)
 class Resolved:
     """A spec's meaning on one robot.
 
@@ -220,19 +242,21 @@ class Resolved:
         return taxels, self.layout.take(taxels)
 
 
-def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
+def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None = None) -> Resolved:
     """Place a document's sensors on its robot.
 
     Args:
         loaded: The document.
         progress: Is told what is done.
+        models: Robot and scene of the same document, read before; default: they are read.
 
     Raises:
         SpecError: All mistakes found so far, those of reading included.
         RobotError: If a model file cannot be read.
     """
     progress("reading robot and scene")
-    robot, scene = _models(loaded)
+    models = models_of(loaded) if models is None else models
+    robot, scene = models.robot, models.scene
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, SensedObject] = {}
@@ -260,11 +284,11 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     assert robot is not None and scene is not None
     needed = {link for name, own in links.items() for link in own if name not in on_links}
     needed = needed if links else {patch.link.name for patch in patches}
-    colliders, felt = Colliders(robot), _object_bodies(loaded, robot)
+    colliders, felt = models.colliders, _object_bodies(loaded, robot)
     layout = Layout.of_links((), {})
     if loaded.layout is not None:
         placed = [patch for patch in patches if patch.link.name in needed]
-        layout = sampled(loaded, loaded.layout, colliders, placed, felt, progress)
+        layout = sampled(loaded, loaded.layout, colliders, placed, felt, models.pools, progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on its taxels") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
@@ -285,14 +309,16 @@ def taxels_of_all_links(loaded: Loaded) -> Layout:
         SpecError: All mistakes found so far, those of reading included.
         RobotError: If a model file cannot be read.
     """
-    robot, _ = _models(loaded)
+    models = models_of(loaded)
+    robot = models.robot
     patches: list[Patch] = []
     if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
         check_groups(loaded.layout, robot, loaded.problems)
         patches = patches_of(loaded, loaded.layout, robot, loaded.layout.spec.resolutions.get(loaded.resolution or "", {}))
     loaded.raise_problems()
     assert robot is not None and loaded.layout is not None
-    return sampled(loaded, loaded.layout, Colliders(robot), patches, _object_bodies(loaded, robot), silent)
+    objects = _object_bodies(loaded, robot)
+    return sampled(loaded, loaded.layout, models.colliders, patches, objects, models.pools, silent)
 
 
 def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:
@@ -319,7 +345,7 @@ def _unlisted(robot: Model, scene: Model, listed: Collection[str], rigid: Collec
             yield name, "not listed under `objects`" if model.body(i).name else "no name, so `objects` cannot list it"
 
 
-def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
+def models_of(loaded: Loaded) -> Models:
     """Load the robot, and the scene if there is one; a file that does not exist is a mistake of the document."""
     wanted = loaded.spec.robot.model
     robot = scene = None
@@ -330,14 +356,14 @@ def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
         robot = load_model(loaded.robot_file)
     if loaded.spec.scene is None:
         is_faulty = loaded.raw(("scene",)) is not None  # and its mistake is reported already
-        return robot, None if is_faulty else robot
+        return Models(robot, None if is_faulty else robot)
     scene_file = loaded.folder / loaded.spec.scene.model
     if is_file(scene_file):
         scene = load_model(scene_file)
     else:
         what = f'there is no file "{loaded.spec.scene.model}"'
         loaded.problems.append(loaded.problem(("scene", "model"), what, "paths are relative to this document"))
-    return robot, scene
+    return Models(robot, scene)
 
 
 def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:

@@ -10,7 +10,10 @@ from torch import nn
 
 import tgdsl
 from tgdsl.errors import ArtifactError, TaxelError, TgdslError
+from tgdsl.formats.robot import export_model, load_model
 from tgdsl.module.artifact import load_plan
+from tgdsl.placement.propose.propose import propose
+from tgdsl.placement.propose.text import layout_text
 from tgdsl.runtime.rollout import Recorder, held_controls, rollout
 
 ROBOT = """
@@ -149,3 +152,39 @@ def test_connections(three, monkeypatch):
     with pytest.raises(TaxelError) as caught:
         tgdsl.connect(touch, "xhand1:/dev/nowhere", taxels=other.taxels)  # the port is not looked for
     assert str(caught.value) == "this module" + OTHER_ORDER
+
+
+HAND = """<mujoco><worldbody><body name="palm" euler="11 23 37"><geom type="box" size=".04 .03 .01"/>
+  <body name="a" pos=".03 .01 .01" euler="3 5 190"><joint name="a" axis="0 1 0" range="0 60"/><geom type="capsule" fromto="0 0 .01 .002 .001 .05" size=".007"/></body>
+  <body name="b" pos="-.03 .01 .01" euler="3 5 7"><joint name="b" axis="0 1 0" range="0 60"/><geom type="box" size=".007 .009 .03" pos=".001 0 .03" euler="1 2 3"/></body>
+</body></worldbody></mujoco>"""
+URDF = """<robot name="hand"><link name="palm"><collision><geometry><box size=".08 .06 .02"/></geometry></collision></link>
+  <link name="a"><collision><origin xyz=".001 0 .03" rpy=".1 .2 .3"/><geometry><box size=".014 .018 .06"/></geometry></collision></link>
+  <link name="b"><collision><origin xyz=".001 0 .03"/><geometry><cylinder radius=".008" length=".05"/></geometry></collision></link>
+  <joint name="a" type="revolute"><parent link="palm"/><child link="a"/><origin xyz=".03 .01 .02" rpy=".1 .2 3.2"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="b" type="revolute"><parent link="palm"/><child link="b"/><origin xyz="-.03 .01 .02" rpy=".1 .2 .3"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(("name", "text"), [("hand.xml", HAND), ("hand.urdf", URDF)])
+def test_a_robot_that_was_exported_has_the_same_taxels(tmp_path, name, text):
+    """USD keeps frames and vertices in float32; the proposed layout samples the surfaces of both."""
+    (tmp_path / name).write_text(text)
+    export_model(tmp_path / name, tmp_path / "twin.usda")
+    robot = load_model(tmp_path / name)
+    (tmp_path / "layout.yaml").write_text(layout_text(propose(robot, 4e4), name))
+    modules = [
+        tgdsl.compile(
+            {
+                "tgdsl": 1,
+                "robot": {"model": str(tmp_path / model), "layout": str(tmp_path / "layout.yaml")},
+                "objects": {"ball": {"geom": {"type": "sphere", "size": [0.02]}, "pos": [0, 0, 0.3]}},
+                "sensors": {"touch": {"kind": "contact_depth", "links": "hand", "feels": ["ball"]}},
+                "resolution": "high",
+            }
+        )
+        for model in (name, "twin.usda")
+    ]
+    assert modules[0].taxels_id != modules[1].taxels_id
+    tgdsl.check_taxels(modules[0], modules[1])

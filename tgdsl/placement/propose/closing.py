@@ -14,7 +14,7 @@ The evidence, in the order in which it decides:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import mujoco
@@ -36,6 +36,8 @@ MIN_BEND = np.radians(29.9)
 """A hinge that turns by less than this does not close a finger, but shapes a palm."""
 PARALLEL = 0.7
 """Least cosine of the angle between two axes about which a finger curls."""
+EVENLY = 0.4
+"""Mean squared cosine of axes to the second direction of their plane from which on they are spokes: 1/2 if evenly spread."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
@@ -187,20 +189,24 @@ class Closing:
         return results
 
     def _spreading(self, free: Set[int], one_way: Set[int]) -> set[int]:
-        """Return the joints that spread two fingers or more: about parallel axes, across those of hinges that bend one way.
+        """Return the joints that spread fingers: about axes across those of the hinges beyond, which bend one way or alike.
 
-        A thumb's, which no other finger has, may bring it before the palm.
+        They are those of two fingers or more with parallel axes, and those of all fingers around a palm. A thumb's, which no
+        other finger has, may bring it before the palm.
 
         Args:
             free: Hinges that bend to neither side.
             one_way: Joints that bend one way only.
         """
-        path = {other: self.tree.path(self.segment(other)) for other in one_way}
+        alike = {one for one in free for other in free if any(abs(cosine) > PARALLEL for cosine in self._cosines(one, other))}
+        path = {other: self.tree.path(self.segment(other)) for other in one_way | alike}
         axes = []
         for joint in sorted(free):
-            beyond = [other for other in one_way if other != joint and self.segment(joint) in path[other][1:]]
+            beyond = [other for other in path if other != joint and self.segment(joint) in path[other][1:]]
             if beyond and not any(abs(cosine) > PARALLEL for other in beyond for cosine in self._cosines(joint, other)):
                 axes += [(joint, self.chain[self.segment(i)], axis) for i, axis in self.turned[joint].items()]
+        if {chain for _, chain, _ in axes} == set(self.chain.values()) and _are_around([axis for _, _, axis in axes]):
+            return {one for one, _, _ in axes}
         return {
             one
             for one, chain, axis in axes
@@ -248,3 +254,9 @@ def _is_clear(half: float, whole: float) -> bool:
     """Return whether two gains, with the other joints half closed and closed, agree, or one by far outweighs the other."""
     small, large = sorted((abs(half), abs(whole)))
     return large > MIN_CLOSING and (half * whole > 0 or small < 0.5 * large)
+
+
+def _are_around(axes: Sequence[Float[np.ndarray, " 3"]]) -> bool:
+    """Return whether axes, as lines, are spread evenly around a third direction, as spokes are."""
+    spread = np.linalg.eigvalsh(np.mean([np.outer(axis, axis) for axis in axes], axis=0))
+    return bool(spread[1] > EVENLY)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.placement.propose.closing import Closing
-from tgdsl.placement.propose.hands import Hand, KinematicTree, length_of
+from tgdsl.placement.propose.hands import Hand, KinematicTree, anchor, length_of
 
 MIN_LEVER = 0.25
 """A link whose centre is nearer to its hinge than this share of the square root of its surface turns in place, unless it is a
@@ -57,6 +57,8 @@ class Flexion:
         self.tree, self.hand = tree, hand
         self.closing = Closing(tree, hand)
         self.open, self.shut = self.closing.posed(0.0), self.closing.posed(1.0)
+        bent = {joint: m.opened for joint, m in self.closing.motions.items() if self.closing.lean[joint]}
+        self.straight = self.closing.poses.posed(bent)
         self.steps = {joint: self._stepped(joint) for joint in self.closing.motions}
         self.bars = self._bars()
 
@@ -81,7 +83,7 @@ class Flexion:
     def inner_side(self, body: int) -> InnerSide:
         """Return where the inner side of a body faces."""
         if body in self.hand.mounts:
-            return self._palm_side(body) if self.hand.jaw is None else self._fixed_side(body)
+            return self.palm_side(body) if self.hand.jaw is None else self._fixed_side(body)
         side = self._moving_side(body)
         return replace(side, doubt=ACROSS) if not side.doubt and self._is_across(body, side) else side
 
@@ -175,11 +177,13 @@ class Flexion:
         return sum(self.tree.area[body] for body in self.tree.bodies[segment])
 
     def _taken_over(self, body: int) -> InnerSide:
-        """Return the side of the nearest link beyond, as it faces in the open pose."""
+        """Return the side of the nearest link beyond, as it faces while joints that bend both ways are as at the start."""
         beyond = [s for s in self.tree.below(self.tree.segment[body]) if self.tree.bodies[s]]
         for other in sorted(beyond, key=lambda s: (len(self.tree.path(s)), s)):
             if (carried := self._carried(other)) is not None:
-                turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ carried[1]
+                facing = self._frames(self.open).xmat[other].reshape(3, 3).T @ carried[1]
+                data = self._frames(self.straight)
+                turned = data.xmat[body].reshape(3, 3).T @ data.xmat[other].reshape(3, 3) @ facing
                 return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[carried[0]].doubt)
         return InnerSide(None, UNCLEAR)
 
@@ -217,7 +221,8 @@ class Flexion:
         facing = -data.xmat[body].reshape(3, 3).T @ data.xmat[tip].reshape(3, 3) @ in_tip
         return InnerSide(_snapped(facing, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
 
-    def _palm_side(self, body: int) -> InnerSide:
+    def palm_side(self, body: int) -> InnerSide:
+        """Return where a palm's inner side faces, in the frame of it or of a body that is fixed to it."""
         turned = self._frames(self.open).xmat[body].reshape(3, 3).copy()
         curled = self._curled()
         if curled is not None and (direction := _snapped(turned.T @ curled, PALM_SNAP, keeps_oblique=False)) is not None:
@@ -225,11 +230,15 @@ class Flexion:
         tips = [tip for tip in self.hand.tips if self._nearest(self.tree.segment[tip])]
         if self.hand.palm is None or not tips or 2 * len(tips) < len(self.hand.tips):
             return InnerSide(None, UNCLEAR)
-        half, nearly, whole = (self._toward(body, tips, share) for share in (0.5, 0.75, 1.0))
-        direction = _snapped(nearly, PALM_SNAP, keeps_oblique=False)
-        # Fingers that curl around cross the palm's plane where no palm is modelled in their way: no side is clear then.
-        is_clear = direction is not None and min(half @ direction, whole @ direction) > 0.5
-        return InnerSide(direction) if is_clear else InnerSide(None, UNCLEAR)
+        # What stands on a palm, such as a camera's tower, shifts its centre: the joints of the fingers may see better.
+        joints = [anchor(self.tree, chain[0]) for chain in self.hand.chains]
+        for start in (self.tree.centre(self.hand.palm, self._frames(self.open)), np.mean(joints, axis=0)):
+            half, nearly, whole = (self._toward(start, body, tips, share) for share in (0.5, 0.75, 1.0))
+            direction = _snapped(nearly, PALM_SNAP, keeps_oblique=False)
+            # Fingers that curl around cross the palm's plane where no palm is modelled in their way: no side is clear then.
+            if direction is not None and min(half @ direction, whole @ direction) > 0.5:
+                return InnerSide(direction)
+        return InnerSide(None, UNCLEAR)
 
     def _curled(self) -> Float[np.ndarray, " 3"] | None:
         """Return where most fingers, as they curl, carry their first links in the open pose; None if no majority does."""
@@ -241,12 +250,10 @@ class Flexion:
         most = max(alike, key=len, default=[])
         return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 
-    def _toward(self, body: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
-        """Return the direction from the palm to the middle of tips in a body's frame, all joints closed by a share."""
-        palm = self.hand.palm
-        assert palm is not None
+    def _toward(self, start: Float[np.ndarray, " 3"], body: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
+        """Return the direction from a place to the middle of tips in a body's frame, all joints closed by a share."""
         data = self._frames(self.closing.posed(share))
-        toward = np.mean([self.tree.centre(tip, data) for tip in tips], axis=0) - self.tree.centre(palm, data)
+        toward = np.mean([self.tree.centre(tip, data) for tip in tips], axis=0) - start
         return data.xmat[body].reshape(3, 3).T @ toward / max(float(np.linalg.norm(toward)), 1e-9)
 
 

@@ -131,6 +131,14 @@ class KinematicTree:
         """Return the centre of a body's surface in the world [m]."""
         return data.xpos[body] + data.xmat[body].reshape(3, 3) @ self.centroid[body]
 
+    def within(self, segment: int, body: int) -> list[int]:
+        """Return a body of a segment and those above it in the same segment, upward."""
+        results = []
+        while body and self.segment[body] == segment:
+            results.append(body)
+            body = int(self.model.body_parentid[body])
+        return results
+
     def middle(self, segment: int, data: mujoco.MjData) -> Float[np.ndarray, " 3"]:
         """Return the centre of the surfaces of a segment's bodies in the world [m]."""
         own = self.bodies[segment]
@@ -149,7 +157,7 @@ class Hand:
     Attributes:
         base: Segment from which the chains part; 0 if that is the world.
         mounts: Bodies of it that have surface; where chains part, without those before the one that carries them.
-        palm: The largest of these, or None if there is none or only one chain.
+        palm: The largest of these, of those that carry all chains if any does; None if there is none or only one chain.
         chains: Segments of each chain.
         tips: Bodies at the ends of the chains.
         fingers: All bodies that move against the base, tips included.
@@ -231,23 +239,24 @@ def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
 def _parts_within(tree: KinematicTree, base: int, other: int) -> bool:
     """Return whether chains part at another segment within a hand that begins at a base."""
     stem = tree.path(other)[: tree.path(other).index(base)]
-    starts = [_anchor(tree, child) for child in tree.children(other)]
-    points = [*(_anchor(tree, s) for s in reversed(stem)), np.mean(starts, axis=0)]
+    starts = [anchor(tree, child) for child in tree.children(other)]
+    points = [*(anchor(tree, s) for s in reversed(stem)), np.mean(starts, axis=0)]
     longest = max(length_of(tree, child) for child in tree.children(other))
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()) <= MAX_STEM * longest
 
 
 def length_of(tree: KinematicTree, segment: int) -> float:
     """Return the length from where a segment moves against its parent to the end of what it carries [m]."""
-    own = [float(np.linalg.norm(tree.centre(b, tree.start) - _anchor(tree, segment))) for b in tree.bodies[segment]]
+    own = [float(np.linalg.norm(tree.centre(b, tree.start) - anchor(tree, segment))) for b in tree.bodies[segment]]
     reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(own, tree.bodies[segment], strict=True)]
     for child in tree.children(segment):
-        stem = float(np.linalg.norm(_anchor(tree, child) - _anchor(tree, segment)))
+        stem = float(np.linalg.norm(anchor(tree, child) - anchor(tree, segment)))
         reach.append(stem + length_of(tree, child))
     return max(reach, default=0.0)
 
 
-def _anchor(tree: KinematicTree, segment: int) -> Float[np.ndarray, " 3"]:
+def anchor(tree: KinematicTree, segment: int) -> Float[np.ndarray, " 3"]:
+    """Return where a segment moves against its parent, in the world [m]."""
     joints = tree.joints(segment)
     return tree.start.xanchor[joints[0]] if joints else tree.start.xpos[segment]
 
@@ -257,7 +266,9 @@ def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None)
     mounts = _mounts(tree, base) if base else []
     chains = _chains(tree, base, beyond)
     if len(tree.children(base)) > 1 or not base:
-        palm = max(mounts, key=lambda body: (tree.area[body], -body), default=None)
+        above = [tree.within(base, int(tree.model.body_parentid[child])) for child in tree.children(base) if base]
+        common = [body for body in mounts if all(body in path for path in above)]
+        palm = max(common or mounts, key=lambda body: (tree.area[body], -body), default=None)
     else:
         palm = None
     middle = tree.centre(palm, tree.start) if palm is not None else tree.start.xpos[base]
@@ -270,29 +281,20 @@ def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None)
 
 def _mounts(tree: KinematicTree, base: int) -> list[int]:
     """Return the bodies with surface of a segment that are not before the one that carries its chains."""
-    above = [_within(tree, base, int(tree.model.body_parentid[child])) for child in tree.children(base)]
+    above = [tree.within(base, int(tree.model.body_parentid[child])) for child in tree.children(base)]
     if len(above) < 2:
         return tree.bodies[base]
     common = [body for body in above[0] if all(body in path for path in above)]
     for body in common:  # upward, to the first with surface
-        if own := [b for b in tree.bodies[base] if body in _within(tree, base, b)]:
+        if own := [b for b in tree.bodies[base] if body in tree.within(base, b)]:
             return own
     return []
-
-
-def _within(tree: KinematicTree, segment: int, body: int) -> list[int]:
-    """Return a body of a segment and those above it in the same segment, upward."""
-    results = []
-    while body and tree.segment[body] == segment:
-        results.append(body)
-        body = int(tree.model.body_parentid[body])
-    return results
 
 
 def _last(tree: KinematicTree, segment: int) -> list[int]:
     """Return the bodies with surface of a segment that have no other such below them."""
     own = tree.bodies[segment]
-    above = {over for body in own for over in _within(tree, segment, body)[1:]}
+    above = {over for body in own for over in tree.within(segment, body)[1:]}
     return [body for body in own if body not in above]
 
 

@@ -18,21 +18,21 @@ from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
 from tgdsl.placement.propose.exposure import Options
 from tgdsl.placement.propose.flexion import UNCLEAR, Flexion, InnerSide
+from tgdsl.placement.propose.front import MIN_SHARE, WITHIN_DEG, PalmFront, hidden, palm_parts
 from tgdsl.placement.propose.hands import kinematic_tree
 from tgdsl.placement.propose.limits import RADIANS_AS_DEGREES, angles_are_misread
 from tgdsl.placement.propose.scope import chosen_hands, included, outside
-from tgdsl.placement.propose.surfaces import LinkSurface, Sampler, link_meshes
+from tgdsl.placement.propose.surfaces import HIDDEN, LinkSurface, Sampler, link_meshes
 
 FACTORS = {"low": 0.25, "med": 1.0, "high": 4.0}
 """Each resolution's share of the density."""
-WITHIN_DEG = 75
-"""Largest angle between a taxel's normal and the inner side of its link [deg]."""
-MIN_SHARE = 0.1
-"""Least share of a link's surface that its inner side must hold to be believed."""
 COVERING = 0.75
 """Radius over the square root of the area per taxel: discs on a triangular grid cover it from 0.62 on."""
 MAX_COUNT = 1_000_000
 """The most taxels that the grammar lets a link have."""
+ROOM = 1e-3
+"""A box is larger than a link's surface by this [m]."""
+Box = tuple[()] | tuple[tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class LinkProposal:
         doubt: What speaks against that side, or why there is none; empty if nothing does.
         counts: Number of taxels at each resolution.
         options: Options by which taxels are where they can feel.
+        box: Lower and upper corner of what is no tower beside the hand, in the link's frame [m]; empty if it is all of it.
     """
 
     name: str
@@ -54,6 +55,7 @@ class LinkProposal:
     doubt: str
     counts: dict[str, int]
     options: Options
+    box: Box = ()
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,9 @@ class Proposal:
         result: dict[str, Any] = {"method": "poisson", "count": link.counts[resolution]}
         result |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
         if link.facing is not None:
-            result["region"] = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
+            facing = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
+            box = dict(zip(("min", "max"), map(list, link.box), strict=False))
+            result["region"] = [facing, {"box": box}] if link.box else facing
         return result
 
     def mapping(self) -> dict[str, Any]:
@@ -126,7 +130,12 @@ def propose(
     names = {int(robot.compiled.body(name).id): name for name in surfaces}
     sides = {names[b]: flexion.inner_side(b) for flexion in found for b in (*flexion.hand.mounts, *flexion.hand.fingers)}
     asked_for = InnerSide(None, "asked for with --include")
-    links = tuple(_link(name, surfaces[name], sides.get(name, asked_for), density) for name in robot.bodies if name in surfaces)
+    boxes = {names[b]: box for flexion in found for b, box in _boxes(flexion).items()}
+    links = tuple(
+        _link(name, surfaces[name], sides.get(name, asked_for), boxes.get(name, ()), density)
+        for name in robot.bodies
+        if name in surfaces
+    )
     groups = _groups(found, names, tuple(surfaces)) if with_groups else {}
     shared, is_misread = _shared(robot, tuple(surfaces)), angles_are_misread(robot.compiled)
     return Proposal(density, groups, links, left_out, shared, sampler.is_collided, is_misread)
@@ -158,6 +167,11 @@ def _sampled_hands(
         tree = kinematic_tree(sampler.robot, sampler.meshes)
         result = chosen_hands(tree)
         outer = {sampler.robot.compiled.body(body).name: why for body, why in outside(tree, result).items()}
+        behind = {sampler.robot.compiled.body(body).name for flexion in result for body in hidden(flexion)} - asked
+        for name in behind:
+            sampler.drop(name, HIDDEN)
+        if behind:
+            continue
         wanted = [name for name in sampler.meshes if name not in outer or name in asked]
         fresh: dict[str, LinkSurface | str] = {}
         for i, name in enumerate(wanted):
@@ -173,20 +187,38 @@ def _sampled_hands(
             return result, {name: surfaces[name] for name in wanted}
 
 
-def _link(name: str, surface: LinkSurface, side: InnerSide, density: float) -> LinkProposal:
+def _boxes(flexion: Flexion) -> dict[int, Box]:
+    """Return the boxes of the mounts of a hand that hold a tower beside it: they end where this rises above the rest."""
+    result: dict[int, Box] = {}
+    front = PalmFront(flexion) if flexion.hand.palm is not None else None
+    for body in flexion.hand.mounts if front is not None else []:
+        if (limit := front.limit(body)) is not None:
+            facing = np.array(flexion.palm_side(body).facing)
+            corners = flexion.tree.surface[body].corners.reshape(-1, 3)
+            low, high = corners.min(axis=0) - ROOM, corners.max(axis=0) + ROOM
+            axis = int(np.abs(facing).argmax())
+            (high if facing[axis] > 0 else low)[axis] = facing[axis] * limit
+            result[body] = tuple(low.round(4).tolist()), tuple(high.round(4).tolist())
+    return result
+
+
+def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box, density: float) -> LinkProposal:
     share, facing, doubt = 1.0, side.facing, side.doubt
     if facing is not None:
         pool = surface.pool
-        share = float(pool.point_area[_faces(pool.normal, facing)].sum()) / pool.area
+        is_in = _faces(pool.normal, facing)
+        if box:
+            is_in &= ((pool.pos >= box[0]) & (pool.pos <= box[1])).all(axis=1)
+        share = float(pool.point_area[is_in].sum()) / pool.area
         if share < MIN_SHARE:
-            share, facing, doubt = 1.0, None, UNCLEAR
+            share, facing, doubt, box = 1.0, None, UNCLEAR, ()
     area = share * surface.area
     counts = {resolution: max(1, _rounded(area * density * factor)) for resolution, factor in FACTORS.items()}
     if max(counts.values()) > MAX_COUNT:
         raise TgdslError(
             f'link "{name}" would have {max(counts.values())} taxels, expected at most {MAX_COUNT}; lower the density'
         )
-    return LinkProposal(name, area, facing, doubt, counts, surface.options)
+    return LinkProposal(name, area, facing, doubt, counts, surface.options, box)
 
 
 def _rounded(number: float) -> int:
@@ -206,7 +238,7 @@ def _groups(found: Sequence[Flexion], names: dict[int, str], links: tuple[str, .
     """Return the groups that have members; `fingers` and `hand` name those that they contain."""
     order = {name: i for i, name in enumerate(links)}
     tips = {names[body] for flexion in found for body in flexion.tips}
-    palms = {names[flexion.hand.palm] for flexion in found if flexion.hand.palm is not None}
+    palms = {names[body] for flexion in found for body in palm_parts(flexion)}
     fingers = {names[body] for flexion in found for body in flexion.hand.fingers}
     mounts = {names[body] for flexion in found for body in flexion.hand.mounts} - palms
     known = {name for name, members in (("tips", tips), ("palm", palms), ("fingers", fingers), ("hand", links)) if members}

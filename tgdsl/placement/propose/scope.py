@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.placement.propose.flexion import Flexion
+from tgdsl.placement.propose.front import PalmFront
 from tgdsl.placement.propose.hands import KinematicTree, free_standing, hands
 from tgdsl.placement.propose.jaws import with_jaws
 from tgdsl.schema.select import matching
@@ -18,15 +20,21 @@ SCENERY = "stands or floats by itself: taken for scenery or an object; --include
 def chosen_hands(tree: KinematicTree) -> list[Flexion]:
     """Return the hands of a robot: those of which two chains or a jaw are known to close, or else all that may be one."""
     results = [Flexion(tree, own) for hand in hands(tree) for own in with_jaws(tree, hand)]
-    return [flexion for flexion in results if flexion.num_closing > (flexion.hand.jaw is None)] or results
+    closing = [flexion for flexion in results if flexion.num_closing > (flexion.hand.jaw is None)]
+    for flexion in closing:
+        if flexion.hand.palm is not None:
+            flexion.hand = replace(flexion.hand, mounts=PalmFront(flexion).mounts())
+    return closing or results
 
 
 def outside(tree: KinematicTree, found: Sequence[Flexion]) -> dict[int, str]:
     """Return the bodies with surface that are in no hand, and why a layout leaves them out."""
     within = {body for flexion in found for body in (*flexion.hand.mounts, *flexion.hand.fingers)}
-    before = {s for flexion in found for s in tree.path(flexion.hand.base)}
+    before = {s for flexion in found for s in tree.path(flexion.hand.base)[1:]}
+    carrying = {b for flexion in found for m in flexion.hand.mounts for b in tree.within(flexion.hand.base, m)}
     scenery = set(free_standing(tree))
-    reasons = {body: BEFORE if tree.segment[body] in before else BESIDE for body in sorted(tree.area)}
+    is_before = {body: tree.segment[body] in before or body in carrying for body in sorted(tree.area)}
+    reasons = {body: BEFORE if own else BESIDE for body, own in is_before.items()}
     return {body: SCENERY if body in scenery else why for body, why in reasons.items() if body not in within}
 
 

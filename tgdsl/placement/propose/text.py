@@ -31,7 +31,7 @@ _HEADER = """\
 """
 _ABOUT = {
     "tips": "guessed: the last links of all chains, and what a single jaw closes on",
-    "palm": "guessed: the largest link from which the chains part",
+    "palm": "guessed: the largest link from which the chains part, and parts of it",
     "fingers": "all that moves against it",
     "hand": "the fingers, the palm and what is fixed to it",
 }

@@ -81,7 +81,7 @@ def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: fl
     """
     face, corners = _pieces(shell.surface, region)
     area = float(_areas(corners).sum())
-    limit = 4 * max(MAX_POOL, CANDIDATES * (count or 0))
+    limit = MAX_POOL * 4 if count is None else size(count)[1]
     point_area, drawn = area / _wanted(0.0, count, spacing), None
     while len(face):
         num = area / point_area
@@ -94,12 +94,17 @@ def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: fl
     return drawn if drawn is not None and len(drawn.pos) else None
 
 
+def size(count: int) -> tuple[int, int]:
+    """Return how many points the pool for a count should have, and the most: pools of the same size are the same."""
+    return max(min(PER_SAMPLE * count, MAX_POOL), 2 * CANDIDATES * count, MIN_POOL), 4 * max(MAX_POOL, CANDIDATES * count)
+
+
 def _wanted(area: float, count: int | None, spacing: float | None) -> float:
     """Return how many points the pool of a region of some area [m²] should have."""
     if count is None:
         assert spacing is not None
         return max(PER_SAMPLE * area / spacing**2, float(MIN_POOL))
-    return float(max(min(PER_SAMPLE * count, MAX_POOL), 2 * CANDIDATES * count, MIN_POOL))
+    return float(size(count)[0])
 
 
 def _pieces(surface: Surface, region: Region) -> tuple[Int[np.ndarray, " piece"], Float[np.ndarray, "piece 3 3"]]:

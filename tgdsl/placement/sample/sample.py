@@ -5,6 +5,7 @@ Shapes: `taxel` samples, `f` faces, `cell` cells of a grid. Everything is in the
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,7 +50,14 @@ class Samples:
     cell: Int[np.ndarray, "taxel 2"]
 
 
-def sample(surface: Surface, placement: Placement, folder: Path, link: str = "", is_covered: Covered | None = None) -> Samples:
+def sample(
+    surface: Surface,
+    placement: Placement,
+    folder: Path,
+    link: str = "",
+    is_covered: Covered | None = None,
+    pools: dict[Hashable, poisson.Pool | None] | None = None,
+) -> Samples:
     """Return the taxels that a placement puts on a link's surface; the same input gives the same bytes.
 
     Args:
@@ -58,6 +66,7 @@ def sample(surface: Surface, placement: Placement, folder: Path, link: str = "",
         folder: Where a file of points is looked up.
         link: The link's name, by which its points are found in a file of several links.
         is_covered: Returns which points other solids cover; an `exposed` placement leaves them out.
+        pools: Points to choose from on the same surface, drawn for other placements; those that are drawn are added.
 
     Raises:
         SampleError: If the surface, or the file of points, cannot satisfy the placement.
@@ -65,7 +74,7 @@ def sample(surface: Surface, placement: Placement, folder: Path, link: str = "",
     if isinstance(placement, Grid):
         return _grid(surface, placement, is_covered if placement.exposed else None)
     if isinstance(placement, Poisson):
-        return _poisson(surface, placement, is_covered if placement.exposed else None)
+        return _poisson(surface, placement, is_covered if placement.exposed else None, {} if pools is None else pools)
     return _points(point_table(placement, folder, link))
 
 
@@ -139,14 +148,20 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
     return np.sort(np.lexsort((cell[:, 1], cell[:, 0], tier))[: placement.count])
 
 
-def _poisson(surface: Surface, placement: Poisson, is_covered: Covered | None) -> Samples:
+def _poisson(
+    surface: Surface, placement: Poisson, is_covered: Covered | None, pools: dict[Hashable, poisson.Pool | None]
+) -> Samples:
     """Poisson-disk samples: an exact count, or as many as fit at a spacing."""
-    try:
-        shell = meshlab.outer_shell(surface)
-    except ImportError as error:
-        raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
-    region = Region.of(surface, placement.region, is_covered)
-    pool = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing)
+    size = placement.spacing if placement.count is None else poisson.size(placement.count)
+    drawn = (placement.region, placement.exposed, placement.seed, size)
+    if drawn not in pools:
+        try:
+            shell = meshlab.outer_shell(surface)
+        except ImportError as error:
+            raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
+        region = Region.of(surface, placement.region, is_covered)
+        pools[drawn] = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing)
+    pool = pools[drawn]
     part, hint = "exposed outer surface" if placement.exposed else "outer surface", "widen `region`"
     hint = "other links cover it: place none here" if placement.exposed and not placement.region else hint
     if pool is None:

@@ -18,6 +18,7 @@ from jaxtyping import Int
 
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, SimulationError, TgdslError, listed
+from tgdsl.module.module import TactileModule
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.playing.policy import (
@@ -147,7 +148,7 @@ def prepare(
     sensed = compile_sensed(loaded, device, progress, feels=feels, also=also)
     moved, model = moved_joints(loaded, sensed), SceneModels(sensed.touch.plan.scene).model({})
     if card is not None:
-        check_card(card, policy, moved, _taxels(loaded, sensed, feels))
+        check_card(saved, moved, _alone(loaded, sensed, feels))
         changes = [*changes, *changes_around(card, loaded, model)]
     joints = sensed.touch.inputs.joints
     try:
@@ -205,11 +206,9 @@ def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple
     return dataclasses.replace(loaded, spec=spec), tuple(goal)
 
 
-def _taxels(loaded: LoadedTask, sensed: Sensed, feels: Sequence[Felt]) -> str:
-    """Return the hash of the taxels of environments in which the policy acts alone."""
-    if len(feels) < 2:
-        return sensed.touch.taxels_id
-    return compile_sensed(loaded, "cpu", feels=feels[:1]).touch.taxels_id
+def _alone(loaded: LoadedTask, sensed: Sensed, feels: Sequence[Felt]) -> TactileModule:
+    """Return the module of environments in which the policy acts alone."""
+    return sensed.touch if len(feels) < 2 else compile_sensed(loaded, "cpu", feels=feels[:1]).touch
 
 
 def _size(

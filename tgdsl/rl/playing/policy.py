@@ -11,6 +11,7 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import warnings
@@ -21,12 +22,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from pydantic import ValidationError
 from torch import Tensor
 
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.errors import TaxelError, TgdslError, did_you_mean
+from tgdsl.layout.identity import Columns
+from tgdsl.module.taxels.identity import HasPlan, check_taxels
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
 from tgdsl.rl.playing.differences import is_close, spec_differences
@@ -44,6 +48,8 @@ POLICY = "policy.pt"
 """Name of a run's policy in its folder."""
 CARD = "card.json"
 """Name of the card in the file."""
+TAXELS = "taxels.csv"
+"""Name of the table of taxels in the file."""
 
 
 class PolicyError(TgdslError):
@@ -58,11 +64,13 @@ class PolicyFile:
         file: The file.
         content: Its bytes.
         card: Its card; None: it has none.
+        taxels: The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none.
     """
 
     file: Path
     content: bytes
     card: dict[str, Any] | None
+    taxels: Mapping[str, Columns]
 
     def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
         """Return the network, with a memory of its own."""
@@ -83,7 +91,7 @@ def read_policy(file: Path) -> PolicyFile:
         content = file.read_bytes()
     except OSError as error:
         raise PolicyError(f"{file}: cannot read this file: {error.strerror or error}") from error
-    extra: dict[str, Any] = {CARD: ""}
+    extra: dict[str, Any] = {CARD: "", TAXELS: ""}
     try:
         _module(content, "cpu", extra)
         card = json.loads(extra[CARD]) if extra[CARD] else None
@@ -95,7 +103,20 @@ def read_policy(file: Path) -> PolicyFile:
         raise PolicyError(f"{file}: {what}: {str(error).strip().splitlines()[0]}") from error
     if card is not None:
         _check_fields(card, file)
-    return PolicyFile(file, content, card)
+    return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
+
+
+def taxel_tables(text: str) -> dict[str, Columns]:
+    """Return the taxels of each sensor of a table as `tgdsl train` writes it, vectors joined of their components."""
+    rows, tables = list(csv.DictReader(io.StringIO(text))), dict[str, Columns]()
+    for sensor in dict.fromkeys(row["sensor"] for row in rows):
+        columns = {name: np.array([row[name] for row in rows if row["sensor"] == sensor]) for name in rows[0]}
+        table = {name: columns[name] for name in ("link", "body")}
+        for name in ("pos", "normal", "tangent"):
+            table[name] = np.stack([columns[f"{name}_{i}"] for i in range(3)], axis=1).astype(np.float64)
+        table |= {name: columns[name].astype(np.float64) for name in ("radius", "area")}
+        tables[sensor] = table | {name: columns[name].astype(np.int64) for name in ("row", "column")}
+    return tables
 
 
 def _is_checkpoint(content: bytes) -> bool:
@@ -198,7 +219,7 @@ def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> P
     card, file = saved.card, saved.file
     if card is not None:
         check_learned(card, file, env.spec)
-        check_card(card, file, env.joint_names, env.touch.taxels_id)
+        check_card(saved, env.joint_names, env.touch)
         felt = card["spec"].get("touch", env.spec.touch)
         if GROUP in card["groups"] and felt != env.spec.touch:
             raise PolicyError(f"{file}: this policy feels {felt}, not {env.spec.touch}; try --set touch={felt}")
@@ -260,22 +281,31 @@ def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
     )
 
 
-def check_card(card: Mapping[str, Any], file: Path, joints: Sequence[str], taxels: str) -> None:
-    """See that a policy is for what the environments have.
+def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None:
+    """See that a policy with a card is for what the environments have.
+
+    Taxels may differ by rounding, as those of a robot that was exported do: where their ids are not the same, the tables are
+    compared.
 
     Args:
-        card: The policy's card.
-        file: Its file, for errors.
+        saved: The policy's file.
         joints: The joints that the environments' actions move.
-        taxels: The hash of their taxels.
+        touch: The module that senses with their taxels.
 
     Raises:
         PolicyError: If joints are others, or taxels are, and it feels with them.
     """
+    card, file = saved.card, saved.file
+    assert card is not None
     if list(joints) != list(card["joints"]):
         raise PolicyError(f"{file}: this policy moves {', '.join(card['joints'])}, not {', '.join(joints)}")
-    if GROUP in card["groups"] and card["taxels"] != taxels:
-        raise PolicyError(f"{file}: this policy feels with other taxels: its taxels.csv lists them")
+    if GROUP in card["groups"] and card["taxels"] != touch.plan.taxels_id:
+        if not saved.taxels:
+            raise PolicyError(f"{file}: this policy feels with other taxels")
+        try:
+            check_taxels(touch, saved.taxels)
+        except TaxelError as error:
+            raise PolicyError(f"{file}: this policy feels with other taxels: {error}") from error
 
 
 def _module(content: bytes, device: torch.device | str, extra_files: dict[str, Any] | None = None) -> torch.jit.ScriptModule:

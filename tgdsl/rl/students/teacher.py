@@ -66,7 +66,7 @@ class Teacher:
         if self.felt is None:
             return
         loaded = own_task(self._loaded, self.felt)
-        check_card(self.card, self.saved.file, self.card["joints"], compile_sensed(loaded, "cpu").touch.taxels_id)
+        check_card(self.saved, self.card["joints"], compile_sensed(loaded, "cpu").touch)
 
     def bound(self, env: TouchEnv) -> BoundTeacher:
         """Return it for some environments.

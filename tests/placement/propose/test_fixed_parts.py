@@ -1,0 +1,125 @@
+"""Linkages whose tree hangs a finger on its tip, and what is fixed to links and palms: covers, towers, halves of a palm."""
+
+import numpy as np
+import pytest
+from closing_hands import INNER, finger, palm_and_fingers, slides, thumb, world
+
+from tgdsl.compiler.pipeline import placed
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.propose.propose import Proposal, propose
+from tgdsl.placement.propose.text import layout_text
+
+DENSITY = 1e4
+HIDDEN = "behind what is fixed in front of it; --include adds it"
+
+
+def proposal_of(tmp_path, text: str, density: float = DENSITY) -> Proposal:
+    (tmp_path / "hand.xml").write_text(text)
+    return propose(load_model(tmp_path / "hand.xml"), density)
+
+
+def facing_of(proposal: Proposal) -> dict[str, tuple[float, ...] | None]:
+    return {link.name: link.facing for link in proposal.links}
+
+
+def lever_finger(name: str, x: float, turn: int) -> str:
+    """Return a lever, on it the outer link of a finger, and on that the inner link, which a connect holds to the base."""
+    hinge = '<joint {} axis="0 1 0" range="{}"/>'
+    return f"""<body name="{name}_lever" pos="{x} 0 .01" euler="0 0 {turn}">{hinge.format(f'name="{name}_drive"', "0 60")}
+      <geom type="box" size=".003 .006 .018" pos="0 0 .02"/>
+      <body name="{name}_outer" pos="0 0 .04">{hinge.format("", "-90 90")}<geom type="box" size=".004 .008 .02" pos=".006 0 .02"/>
+        <body name="{name}_inner" pos=".012 0 0">{hinge.format("", "-90 90")}
+          <geom type="box" size=".003 .006 .018" pos="0 0 -.02"/></body></body></body>"""
+
+
+def test_a_tip_that_carries_the_rest_of_its_finger_in_the_tree_is_the_tip(tmp_path):
+    """Levers of 4 cm and inner links of 4 cm, 12 mm apart, are parallelograms: all their links are carried inward alike."""
+    fingers = lever_finger("left", 0.04, 180) + lever_finger("right", -0.04, 0)
+    loops = "".join(f'<connect body1="{side}_inner" body2="base" anchor="0 0 -.04"/>' for side in ("left", "right"))
+    text = f'<body name="base"><geom type="box" size=".05 .02 .01"/>{fingers}</body>'
+    proposal = proposal_of(tmp_path, f"<mujoco><worldbody>{text}</worldbody><equality>{loops}</equality></mujoco>")
+    assert set(proposal.groups["tips"]) == {"left_outer", "right_outer"}
+    parts = {f"{side}_{part}": INNER for side in ("left", "right") for part in ("lever", "inner", "outer")}
+    assert facing_of(proposal) == {"base": (0, 0, 1), **parts}
+
+
+TOWER = '<geom type="box" size=".02 .03 .05" pos="0 .07 .05"/>'
+"""It stands beside the gripper and is as high as its jaws, 0.1 m."""
+
+
+def test_a_tower_on_a_palm_has_no_taxels(tmp_path):
+    """The gripper's top has 4 · 6 · 2 cm²; the tower's top would have 24 cm² more, and shifts the palm's centre."""
+    text = world(slides().replace("<geom", f"{TOWER}<geom", 1))
+    proposal = proposal_of(tmp_path, text)
+    link = next(link for link in proposal.links if link.name == "gripper")
+    assert link.facing == (0, 0, 1)
+    assert link.counts["med"] == pytest.approx(48, abs=3)
+    (tmp_path / "layout.yaml").write_text(layout_text(proposal, "hand.xml"))
+    layout = placed(
+        {"tgdsl": 1, "robot": {"model": str(tmp_path / "hand.xml"), "layout": str(tmp_path / "layout.yaml")}}
+    ).layouts["med"]
+    taxels = layout.pos[layout.taxels_of(("gripper",))]
+    assert len(taxels) == link.counts["med"] and np.abs(taxels[:, 2] - 0.02).max() < 1e-6
+
+
+def test_a_tower_that_is_a_body_is_no_part_of_the_hand(tmp_path):
+    tower = f'<body name="tower">{TOWER}</body>'
+    proposal = proposal_of(tmp_path, world(slides().replace('<body name="jaw0"', f'{tower}<body name="jaw0"')))
+    assert facing_of(proposal).keys() == {"gripper", "jaw0", "jaw1"}
+    assert dict(proposal.left_out)["tower"] == "no part of a hand; --include adds it"
+
+
+def halves(order: str) -> str:
+    """Return a palm in two halves, fixed to one another, of which the second carries the fingers."""
+    text = palm_and_fingers(thumb(1))
+    whole = '<geom type="box" size=".012 .04 .04" pos="0 0 .04"/>'
+    half = '<geom type="box" size=".012 .02 .04" pos="0 {} .04"/>'
+    one, two = (half.format(y) for y in ((0.02, -0.02) if order == "thumb_first" else (-0.02, 0.02)))
+    assert whole in text
+    return (
+        text.replace('<body name="palm" pos="0 0 .2">', f'<body name="first" pos="0 0 .2">{one}<body name="palm">').replace(
+            whole, two
+        )
+        + "</body>"
+    )
+
+
+@pytest.mark.parametrize("order", ["thumb_first", "thumb_last"])
+def test_both_halves_of_a_palm_are_the_palm(tmp_path, order):
+    proposal = proposal_of(tmp_path, world(halves(order)))
+    assert set(proposal.groups["palm"]) == {"first", "palm"}
+    assert set(facing_of(proposal).values()) == {INNER}
+
+
+def test_covers_of_a_link(tmp_path):
+    """Behind a link, in front of another, and beside a third: the last faces as the link does, though it lies off its middle."""
+    text = palm_and_fingers(thumb(1))
+    parts = {
+        "f0_2": '<body name="back"><geom type="box" size=".002 .008 .014" pos="-.008 0 .016"/></body>',
+        "f1_3": '<body name="pad"><geom type="box" size=".002 .008 .014" pos=".0081 0 .016"/></body>',
+        "f2_2": '<body name="side"><geom type="box" size=".003 .002 .004" pos=".02 .012 .01"/></body>',
+    }
+    geom = '<geom type="box" size=".006 .008 .014" pos="0 0 .016"/>'
+    for name, part in parts.items():
+        place = text.index(geom, text.index(f'name="{name}"')) + len(geom)
+        text = text[:place] + part + text[place:]
+    proposal = proposal_of(tmp_path, world(text))
+    left_out = {name for name, why in proposal.left_out if why == HIDDEN}
+    assert left_out == {"back", "f1_3"}
+    assert set(facing_of(proposal).values()) == {INNER}
+    assert "pad" in proposal.groups["tips"] and "side" in proposal.groups["fingers"]
+
+
+def test_joints_that_spread_fingers_around_a_palm(tmp_path):
+    """Three fingers a third of a turn apart, straight at the start, bend both ways; their first joints swing them sideways."""
+    fingers = ""
+    for i in range(3):
+        knuckle = finger(f"f{i}_", "0 0 .02", num=2, span="-90 90")
+        fingers += (
+            f'<body name="k{i}" pos="{-0.05 * np.cos(2.0944 * i):.5f} {-0.05 * np.sin(2.0944 * i):.5f} .01" euler="0 0 {120 * i}">'
+            f'<joint name="spread{i}" axis="1 0 0" range="-75 30"/><geom type="box" size=".006 .006 .009" pos="0 0 .01"/>{knuckle}</body>'
+        )
+    proposal = proposal_of(tmp_path, world(f'<body name="palm"><geom type="cylinder" size=".06 .01"/>{fingers}</body>'))
+    assert facing_of(proposal) == {"palm": (0, 0, 1)} | {
+        f"{link}{i}{n}": INNER for i in range(3) for link, n in (("k", ""), ("f", "_1"), ("f", "_2"))
+    }

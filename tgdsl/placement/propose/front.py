@@ -1,0 +1,152 @@
+"""What an object in front of a palm or a link can come to: not what is behind other bodies fixed to it, or beside the hand.
+
+Lengths are in metres. Heights are along the palm's inner side; a place is beside the hand if it is outside the convex outline
+of all that the fingers sweep as they close, seen from in front of the palm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull
+
+from tgdsl.placement.propose.flexion import Flexion
+from tgdsl.placement.propose.hands import KinematicTree, anchor
+from tgdsl.surfaces.rays import OrthographicView, first_hits, frame
+from tgdsl.surfaces.surface import Surface
+
+WITHIN_DEG = 75
+"""Largest angle between a normal and the inner side of its link [deg]."""
+RASTER = 40
+"""Rays along the longer side of a surface."""
+GAP = 2e-4
+"""What is closer in front of a surface than this is not in front of it [m]."""
+MIN_SHARE = 0.1
+"""Least share of what faces an inner side, and of a link's surface, to be believed."""
+MARGIN, LEVEL, TOWER = 0.15, 0.2, 0.25
+"""Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, and how high
+above the joints of the fingers a tower is."""
+HALF = 0.5
+"""A part of a palm is in front by this share, and has this share of the largest part's area."""
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """Points of a body that face a direction, and what is in front of them.
+
+    Attributes:
+        pos: The points, in the body's frame.
+        is_free: Whether no other body of the segment is in front.
+    """
+
+    pos: Float[np.ndarray, "point 3"]
+    is_free: Bool[np.ndarray, " point"]
+
+
+def front_of(tree: KinematicTree, body: int, facing: tuple[float, ...]) -> Front:
+    """Return evenly spaced points of a body, as seen against the direction in its frame in which it faces."""
+    direction = np.array(facing) / np.linalg.norm(facing)
+    axes, view = frame(-direction), OrthographicView.of(tree.surface[body], frame(-direction))
+    corners = view.corners[..., :2].reshape(-1, 2)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    num = np.maximum(np.ceil(RASTER * (high - low) / (high - low).max()), 1.0)
+    grid = [lowest + (np.arange(n) + 0.5) * (highest - lowest) / n for lowest, highest, n in zip(low, high, num, strict=True)]
+    uv = np.stack(np.meshgrid(*grid), axis=-1).reshape(-1, 2)
+    hits = first_hits(view, uv)
+    is_facing = (hits.face >= 0) & (-view.normals[hits.face] @ axes[2] >= np.cos(np.radians(WITHIN_DEG)))
+    pos = np.column_stack([uv, hits.depth])[is_facing] @ axes
+    others = [_seen_from(tree, body, other) for other in tree.bodies[tree.segment[body]] if other != body]
+    ahead = first_hits(OrthographicView.of(Surface.joined(others), axes), uv[is_facing]).depth if others else np.inf
+    return Front(pos, np.broadcast_to(ahead >= hits.depth[is_facing] - GAP, len(pos)))
+
+
+def _seen_from(tree: KinematicTree, body: int, other: int) -> Surface:
+    """Return the surface of another body in a body's frame."""
+    data = tree.start
+    turn = data.xmat[body].reshape(3, 3).T
+    return tree.surface[other].placed(turn @ (data.xpos[other] - data.xpos[body]), turn @ data.xmat[other].reshape(3, 3))
+
+
+def hidden(flexion: Flexion) -> set[int]:
+    """Return the bodies of a hand whose inner side is behind other bodies that are fixed to them."""
+    tree, result = flexion.tree, set[int]()
+    for body in (*flexion.hand.mounts, *flexion.hand.fingers):
+        facing = flexion.inner_side(body).facing
+        if facing is not None and len(tree.bodies[tree.segment[body]]) > 1:
+            front = front_of(tree, body, facing)
+            if len(front.pos) and front.is_free.mean() < MIN_SHARE:
+                result.add(body)
+    return result
+
+
+def palm_parts(flexion: Flexion) -> list[int]:
+    """Return the palm, and the bodies fixed to it that are as large by `HALF`."""
+    hand, area = flexion.hand, flexion.tree.area
+    return [] if hand.palm is None else [body for body in hand.mounts if area[body] >= HALF * area[hand.palm]]
+
+
+class PalmFront:
+    """A palm and what is fixed to it, seen from where an object comes.
+
+    Attributes:
+        flexion: The hand.
+    """
+
+    def __init__(self, flexion: Flexion):
+        """Find the outline of what the fingers sweep."""
+        self.flexion, tree, hand = flexion, flexion.tree, flexion.hand
+        assert hand.palm is not None
+        facing = flexion.palm_side(hand.palm).facing
+        self.axes = None if facing is None else frame(tree.start.xmat[hand.palm].reshape(3, 3) @ facing)
+        if self.axes is not None:
+            poses = (flexion.open, flexion.closing.posed(0.5), flexion.shut)
+            swept = [tree.points(b, flexion.closing.poses.kinematics(pose)) for pose in poses for b in hand.fingers]
+            self.outline = ConvexHull(np.concatenate(swept) @ self.axes[:2].T).equations
+            self.margin = MARGIN * hand.length
+            first = [chain[0] for chain in hand.chains]
+            self.joints = max(float(anchor(tree, s) @ self.axes[2]) for s in first)
+
+    def mounts(self) -> list[int]:
+        """Return the bodies fixed to a palm that are in front, those before the one that carries the fingers included."""
+        tree, hand = self.flexion.tree, self.flexion.hand
+        if self.axes is None:
+            return hand.mounts
+        assert hand.palm is not None
+        free, height, _ = self._points(hand.palm)
+        level = float(np.median(height[free])) if free.any() else None
+        return [body for body in tree.bodies[hand.base] if body == hand.palm or self._is_in_front(body, level)]
+
+    def _is_in_front(self, body: int, level: float | None) -> bool:
+        free, height, is_beside = self._points(body)
+        tree, hand = self.flexion.tree, self.flexion.hand
+        assert hand.palm is not None
+        if body in hand.mounts:
+            return not len(free) or bool((~is_beside).mean() >= MIN_SHARE)
+        if level is None or not len(free) or HALF * tree.area[body] > tree.area[hand.palm]:  # a larger one is a flange
+            return False
+        return bool((free & ~is_beside & (np.abs(height - level) <= LEVEL * hand.length)).mean() >= HALF)
+
+    def limit(self, body: int) -> float | None:
+        """Return how far along its inner side a body is no tower beside the hand, in its frame; None if it has none."""
+        if self.axes is None:
+            return None
+        _, height, is_beside = self._points(body)
+        limit = self.joints + TOWER * self.flexion.hand.length
+        is_high = height > limit
+        least = MIN_SHARE * len(height)
+        if (is_high & is_beside).sum() <= least or (is_high & ~is_beside).sum() >= least:
+            return None
+        return limit - float(self.flexion.tree.start.xpos[body] @ self.axes[2])
+
+    def _points(self, body: int) -> tuple[Bool[np.ndarray, " p"], Float[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
+        """Return of points of a body whether they are free, their heights, and whether they are beside the hand."""
+        facing, data = self.flexion.palm_side(body).facing, self.flexion.tree.start
+        if facing is None:
+            return np.zeros(0, bool), np.zeros(0), np.zeros(0, bool)
+        front = front_of(self.flexion.tree, body, facing)
+        assert self.axes is not None
+        place = (data.xpos[body] + front.pos @ data.xmat[body].reshape(3, 3).T) @ self.axes.T
+        beyond = (place[:, :2] @ self.outline[:, :2].T + self.outline[:, 2]).max(axis=1, initial=-np.inf)
+        return front.is_free, place[:, 2], beyond > self.margin
