@@ -154,9 +154,9 @@ def silent_readings(
     weld, body = sim.model.body_weldid, sim.model.body
     result = {}
     for output in touch.outputs:
-        own = [name for name in output.bodies if (int(weld[body(name).id]) or body(name).id) in touching]
-        if output.rows == "taxel" and own and not readings[output.name][0].any():
-            result[output.name] = own
+        bodies = [name for name in output.bodies if (int(weld[body(name).id]) or body(name).id) in touching]
+        if output.rows == "taxel" and bodies and not readings[output.name][0].any():
+            result[output.name] = bodies
     return result
 
 
@@ -174,8 +174,8 @@ def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[s
             continue
         first, names = output.channels.index("force_x"), list(touch.rows[output.name]["body"])
         force = readings[output.name][0, :, first : first + 3].double().cpu().numpy()
-        own = [np.add.reduce(force[[name == body for name in names]], axis=0) for body in output.bodies]
-        felt = float(np.linalg.norm(own, axis=1).sum())
+        of_bodies = [np.add.reduce(force[[name == body for name in names]], axis=0) for body in output.bodies]
+        felt = float(np.linalg.norm(of_bodies, axis=1).sum())
         lost = float(missed[0].double().norm(dim=-1).sum())
         if lost > MISSED * (felt + lost):
             result[report] = f'"{output.name}" misses {lost:.3g} of {felt + lost:.3g} N, which act where none of its taxels is'
@@ -217,7 +217,7 @@ class Recorder:
             elif output.rows == "taxel":
                 arrays |= {f"{output.name}:{column}": self._taxels[output.sensor][column] for column in PLACES}
             elif output.name in self._rows:
-                own = self._rows[output.name]
-                arrays |= {f"{output.name}:{column}": own[column] for column in own.dtype.names or ()}
+                table = self._rows[output.name]
+                arrays |= {f"{output.name}:{column}": table[column] for column in table.dtype.names or ()}
         with atomic_open(path) as file:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

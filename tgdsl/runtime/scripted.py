@@ -65,9 +65,9 @@ def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, pr
 
     Else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
     """
-    own = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
-    if own or keyframes is not None:
-        return Script(own)
+    names = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
+    if names or keyframes is not None:
+        return Script(names)
     progress("finding out how the hand closes")
     closing = closing_of(touch)
     if isinstance(closing, str):

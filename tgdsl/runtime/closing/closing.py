@@ -131,7 +131,7 @@ class Closing:
         """Return the controls of the open and of the closed hand; the scene's own actuators come first and have zero."""
         rest = [0.0] * (num_actuators - len(self.servos))
         ends = [servo.opened for servo in self.servos], [servo.closed for servo in self.servos]
-        return [np.array([*rest, *own]) for own in ends]
+        return [np.array([*rest, *end]) for end in ends]
 
     def _rest(self, spec: mujoco.MjSpec) -> None:
         """Have actuators of the hand give no force, nor tendons that are sprung."""
@@ -166,7 +166,7 @@ def closing_of(touch: TactileModule) -> Closing | str:
     links = {link.body for sensor in touch.plan.sensors for link in touch.plan.layout_of(sensor).links}
     moving = movement(scene, frozenset(links))
     if not moving.ends:
-        is_stiff = not any(moving.is_scalar(joint) for joint in moving.own)
+        is_stiff = not any(moving.is_scalar(joint) for joint in moving.joints)
         return "it has no hinge and no slide" if is_stiff else "which way its joints close is not clear"
     left = []
     for target in touch.plan.objects:
@@ -200,7 +200,7 @@ def _closing(scene: Model, moving: Movement, sweep: Sweep, target: str, place: F
     if place is not None:
         address = int(model.jnt_qposadr[model.body_jntadr[sweep.body]])
         start[address : address + 3] = place
-    names = {joint: model.joint(joint).name for joint in moving.own}
+    names = {joint: model.joint(joint).name for joint in moving.joints}
     bodies = [
         b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees or (sweep.is_free and b == sweep.body)
     ]
@@ -231,8 +231,8 @@ def _servo(moving: Movement, joint: int, force: float) -> Servo:
     lever, lag = (1.0, LAG * reach) if is_slide else (reach, LAG)
     dof = int(model.jnt_dofadr[joint])
     armature = TIP_MASS * reach**2 if not is_slide else TIP_MASS
-    own = 1.0 / max(float(model.dof_invweight0[dof]), 1e-9) - float(model.dof_armature[dof])
-    inertia = armature + max(own, 0.0)
+    link_inertia = 1.0 / max(float(model.dof_invweight0[dof]), 1e-9) - float(model.dof_armature[dof])
+    inertia = armature + max(link_inertia, 0.0)
     stiffness = min(force * lever / lag, armature * (STEPS / float(model.opt.timestep)) ** 2)
     damping = 2.0 * np.sqrt(stiffness * inertia)
     return Servo(model.joint(joint).name, opened, closed, force * lever, float(stiffness), float(damping), armature)
@@ -251,10 +251,10 @@ def _reach(moving: Movement, joint: int) -> float:
 
 def _num_beyond(moving: Movement, joint: int) -> int:
     """Return the most joints that close beyond one on the way to a fingertip."""
-    own = {int(moving.model.jnt_bodyid[other]) for other in moving.closing}
+    closing = {int(moving.model.jnt_bodyid[other]) for other in moving.closing}
     body = int(moving.model.jnt_bodyid[joint])
     paths = [moving.path(tip) for tip in moving.tips]
-    return max((len(own & set(path[: path.index(body)])) for path in paths if body in path), default=0)
+    return max((len(closing & set(path[: path.index(body)])) for path in paths if body in path), default=0)
 
 
 def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
@@ -265,8 +265,8 @@ def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
     """
     model = moving.model
     known = {int(signature) for signature in model.exclude_signature}
-    own = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees and model.body_geomnum[b]]
-    pairs = [(a, b) for a, b in combinations(own, 2) if (a << 16) + b not in known]
+    bodies = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees and model.body_geomnum[b]]
+    pairs = [(a, b) for a, b in combinations(bodies, 2) if (a << 16) + b not in known]
     return tuple((model.body(a).name, model.body(b).name) for a, b in pairs if model.body_weldid[a] != model.body_weldid[b])
 
 
@@ -278,8 +278,8 @@ def _acting(model: mujoco.MjModel, moving: Movement) -> tuple[int, ...]:
     moments = np.zeros((model.nu, model.nv))
     if model.nu:
         mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    own = np.isin(model.dof_jntid, moving.own)
-    return tuple(np.flatnonzero((moments[:, own] != 0).any(axis=1)).tolist())
+    is_hand = np.isin(model.dof_jntid, moving.joints)
+    return tuple(np.flatnonzero((moments[:, is_hand] != 0).any(axis=1)).tolist())
 
 
 def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:

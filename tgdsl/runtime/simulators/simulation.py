@@ -24,22 +24,20 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.controls import warn_of_range, write_controls
-from tgdsl.runtime.simulators.bodies import warn_of_mocap
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults, OnFault
+from tgdsl.runtime.simulators.fields import warn_of_mocap
 from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
-from tgdsl.runtime.simulators.objects.choices import EnvObjects, Values
+from tgdsl.runtime.simulators.objects.choices import EnvObjects, SharedMeshModels, Values
 from tgdsl.runtime.simulators.objects.heat import EnvHeat
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
-from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.watch import Watch, Watched, WatchReader
+from tgdsl.runtime.source import Control
 from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, env_mask
 
 T = TypeVar("T")
-Control = Tensor | np.ndarray | None
-"""Controls of a step, (actuator,) or (env, actuator); None: as they were."""
 SomeRows = Int[np.ndarray, " n"] | None
 """Rows of environments to read; None: all."""
 
