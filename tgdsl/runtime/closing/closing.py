@@ -70,42 +70,39 @@ class Servo:
     armature: float
 
 
-@dataclass(frozen=True)
 class Closing:
     """How a scene's hand closes on an object.
 
     Attributes:
+        target: The object's name.
+        place: Where its body starts, in the world [m]; None: where the scene has it.
         servos: One for each joint that closes.
         num_joints: Number of the hand's joints.
         slack: Joints that follow those that close, by name.
         held: Hinges and slides that are held, by name.
-        welded: Bodies that are held where they start relative to their parents, and these: what ball and free joints move.
-        weightless: Bodies without weight.
-        apart: Pairs of the robot's bodies, which do not collide with one another.
         resting: Indices of actuators that rest.
-        target: The object's name.
-        body: Its body, if that is free.
-        place: Where this starts, in the world [m]; None: where the scene has it.
-        drag: Damping of the object's joint [N s/m, N m s/rad].
+        body: The object's body, if that is free.
         start: Positions of all joints at the start.
     """
 
-    servos: tuple[Servo, ...]
-    num_joints: int
-    slack: tuple[str, ...]
-    held: tuple[str, ...]
-    welded: tuple[tuple[str, str], ...]
-    weightless: tuple[str, ...]
-    apart: tuple[tuple[str, str], ...]
-    resting: tuple[int, ...]
-    target: str
-    body: str | None
-    place: tuple[float, float, float] | None
-    drag: float
-    start: tuple[float, ...]
+    def __init__(self, moving: Movement, sweep: Sweep, target: str, place: Float[np.ndarray, " 3"] | None):
+        model = moving.model
+        force = min(GRIP * float(model.body_subtreemass[sweep.body]) * _EARTH, MOST) if sweep.is_free else FIXED_GRIP
+        self.target, self.place, self.num_joints = target, place, moving.num_joints
+        self.servos = tuple(_servo(moving, joint, force) for joint in moving.ends)
+        self.slack = tuple(model.joint(joint).name for joint in moving.closing if joint not in moving.ends)
+        self.held = tuple(model.joint(joint).name for joint in moving.held if moving.is_scalar(joint))
+        self.resting = _acting(model, moving)
+        self.body = model.body(sweep.body).name if sweep.is_free else None
+        self.start = moving.pose(0.0)
+        if place is not None:
+            address = int(model.jnt_qposadr[model.body_jntadr[sweep.body]])
+            self.start[address : address + 3] = place
+        self._moving, self._drag = moving, force / SPEED
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Change a scene so that its hand can close: `BatchSimulation(touch, 1, prepare=closing.prepare, keyframe=START)`."""
+        moving, model = self._moving, self._moving.model
         name_all(spec)
         for key in list(spec.keys):
             spec.delete(key)
@@ -116,15 +113,20 @@ class Closing:
             _slacken(spec.joint(name))
         for name in self.held:
             spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=name)
-        for name, parent in self.welded:
-            weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=name, name2=parent)
-            weld.data = np.where(np.arange(len(weld.data)) == _TORQUE_SCALE, 1.0, 0.0)  # a pose of zeros is the initial one
-        for name in self.weightless:
-            spec.body(name).gravcomp = 1.0
-        for name, other in self.apart:
+        for joint in moving.held:
+            if not moving.is_scalar(joint):  # a ball or free joint: its body is held where it starts relative to its parent
+                body = model.body(model.jnt_bodyid[joint])
+                weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+                weld.name1, weld.name2 = body.name, model.body(body.parentid[0]).name
+                weld.data = np.where(np.arange(len(weld.data)) == _TORQUE_SCALE, 1.0, 0.0)  # a pose of zeros is the initial one
+        for body in range(1, model.nbody):
+            if int(model.body_rootid[body]) in moving.trees:
+                spec.body(model.body(body).name).gravcomp = 1.0
+        for name, other in _apart(moving):
             spec.add_exclude(bodyname1=name, bodyname2=other)
         if self.body is not None:
-            spec.body(self.body).joints[0].damping = [self.drag, 0, 0]
+            spec.body(self.body).gravcomp = 1.0
+            spec.body(self.body).joints[0].damping = [self._drag, 0, 0]
         spec.add_key(name=START, qpos=self.start, ctrl=self.targets(len(spec.actuators))[0])
 
     def targets(self, num_actuators: int) -> list[Float[np.ndarray, " actuator"]]:
@@ -176,11 +178,11 @@ def closing_of(touch: TactileModule) -> Closing | str:
             continue
         grip = sweep.grip()
         if (grip.holds and grip.overlap < OVERLAP * sweep.radius) or (not sweep.is_free and len(grip.links) > 0):
-            return _closing(scene, moving, sweep, target.name, None)
+            return Closing(moving, sweep, target.name, None)
         if not sweep.is_free:
             left.append(f"{target.name} is fixed out of its reach")
         elif (place := sweep.place()) is not None:
-            return _closing(scene, moving, sweep, target.name, place)
+            return Closing(moving, sweep, target.name, place)
         else:
             left.append(f"{target.name} does not fit between its fingers")
     return listed(left) or "there is no object"
@@ -191,35 +193,6 @@ def name_all(spec: mujoco.MjSpec) -> None:
     for kind, elements in (("body", spec.bodies), ("joint", spec.joints)):
         for i, element in enumerate(elements):
             element.name = element.name or f"tgdsl/{kind}/{i}"
-
-
-def _closing(scene: Model, moving: Movement, sweep: Sweep, target: str, place: Float[np.ndarray, " 3"] | None) -> Closing:
-    model, start = moving.model, moving.pose(0.0)
-    mass = float(model.body_subtreemass[sweep.body])
-    force = min(GRIP * mass * _EARTH, MOST) if sweep.is_free else FIXED_GRIP
-    if place is not None:
-        address = int(model.jnt_qposadr[model.body_jntadr[sweep.body]])
-        start[address : address + 3] = place
-    names = {joint: model.joint(joint).name for joint in moving.joints}
-    bodies = [
-        b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees or (sweep.is_free and b == sweep.body)
-    ]
-    free = [int(model.jnt_bodyid[joint]) for joint in moving.held if not moving.is_scalar(joint)]
-    return Closing(
-        servos=tuple(_servo(moving, joint, force) for joint in moving.ends),
-        num_joints=moving.num_joints,
-        slack=tuple(names[joint] for joint in moving.closing if joint not in moving.ends),
-        held=tuple(names[joint] for joint in moving.held if moving.is_scalar(joint)),
-        welded=tuple((model.body(b).name, model.body(model.body_parentid[b]).name) for b in free),
-        weightless=tuple(model.body(b).name for b in bodies),
-        apart=_apart(moving),
-        resting=_acting(model, moving),
-        target=target,
-        body=model.body(sweep.body).name if sweep.is_free else None,
-        place=None if place is None else (float(place[0]), float(place[1]), float(place[2])),
-        drag=force / SPEED,
-        start=tuple(start.tolist()),
-    )
 
 
 def _servo(moving: Movement, joint: int, force: float) -> Servo:
