@@ -1,7 +1,6 @@
 """One way to step and observe, whatever is behind it: a simulation, a real hand, an emulated one, or a recorded log.
 
-The kinds of sources that can be connected to are tgdsl's own and those of installed packages. A package brings one by an entry
-point, in its pyproject.toml:
+Installed packages bring further kinds of sources by an entry point, in their pyproject.toml:
 
     [project.entry-points."tgdsl.sources"]
     my_hand = "my_package.my_hand:MY_HAND"
@@ -223,7 +222,7 @@ SOURCES: tuple[SourceKind, ...] = (
 
 
 def known_sources() -> tuple[SourceKind, ...]:
-    """Return all kinds of sources: those of tgdsl, then those of installed packages by package and name.
+    """Return all kinds of sources: tgdsl's, then installed ones by package and name.
 
     An installed kind that cannot be had is left out, with a warning, the first time.
 

@@ -27,9 +27,9 @@ from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.source import Simulator
 
 PLACES = ("link", "body", "pos", "normal", "area")
-"""What is kept of each taxel, as `taxels.taxel_table` calls it."""
+"""Columns of `taxels.taxel_table` that a recording holds."""
 MISSED = 0.9
-"""Part of a load that is missed of which a run speaks."""
+"""Share of a load that no taxel feels above which a run reports it."""
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
 
@@ -124,7 +124,7 @@ def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterato
 def touching_bodies(touch: TactileModule, sim: BatchSimulation) -> set[int]:
     """Return the bodies that are in contact with an object, and that object, in the first environment, where it is now.
 
-    A contact is one that MuJoCo makes constraints for: what is nearer than the geoms' margin, and not within their gap alone.
+    A contact is one that MuJoCo makes constraints for: nearer than the geoms' margin, and not within their gap alone.
     Bodies are MuJoCo's indices; of welded ones it is the first.
     """
     model = sim.env_model(0)
@@ -161,7 +161,7 @@ def silent_readings(
 
 
 def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[str, str]:
-    """Return, by the report that says so, of which readings nearly all of the load is where no taxel is, and how much.
+    """Return the readings whose load is nearly all where no taxel is, with a message, by the name of the report of it.
 
     Loads are the sizes of forces by body, in the first environment: of what a body's taxels feel together, and of what it
     misses. Readings with a history are left out.

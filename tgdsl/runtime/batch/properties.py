@@ -29,7 +29,7 @@ class BatchProperties(ObjectProperties):
     """Masses and frictions of a batch: expanded fields of its model, or a model for each environment.
 
     Expanded fields share all else. Variants that differ in what cannot be expanded, such as trees of bounding volumes,
-    take a model for each environment, of which those that are changed are copies.
+    take a model for each environment; changed ones are copies.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What goes wrong in single environments, and what is done about it: they wait for a reset, or are restarted.
+"""Faults of single environments, which then wait for a reset, or are restarted.
 
 Shapes: `env` environments, `kind` kinds of faults.
 """

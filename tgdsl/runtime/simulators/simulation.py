@@ -43,7 +43,7 @@ SomeRows = Int[np.ndarray, " n"] | None
 
 
 class SimOptions(TypedDict, total=False):
-    """Options of a simulation; an engine knows those of its `OPTIONS`."""
+    """Options of a simulation; an engine knows some, its `OPTIONS`."""
 
     substeps: int
     """Physics steps per control step; default 1."""
@@ -197,7 +197,7 @@ class Simulation(ABC):
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor, the keyframe or what is watched, or holds something
+            SimulationError: If the model lacks a body, a contact sensor, the keyframe or a watched element, or holds something
                 that the engine does not support; if the device or a library is missing; if there is nothing to step, more
                 environments than there is memory for, or if the module's state is another simulation's or of other
                 environments.
@@ -253,7 +253,7 @@ class Simulation(ABC):
     def qpos(self) -> Float[Tensor, "env nq"]:
         """Positions of the joints now, as MuJoCo's `qpos`: a live tensor.
 
-        What is written into it counts from the next step on; use `set_state`, or call `forward`, to have `state` follow.
+        Values written into it count from the next step on; use `set_state`, or call `forward`, to have `state` follow.
         """
         return self._arrays["qpos"]
 
@@ -431,7 +431,7 @@ class Simulation(ABC):
         Args:
             env_ids: Indices, or a boolean mask over environments.
             **values: `qpos`, `qvel`, `ctrl`, or another of MuJoCo's arrays that an environment's future follows from (`act`,
-                `mocap_pos`, `mocap_quat`, `time`, `qacc_warmstart`, …); what is not given stays. Each has one row for all
+                `mocap_pos`, `mocap_quat`, `time`, `qacc_warmstart`, …); the others stay. Each has one row for all
                 environments alike, or with indices a row for each in their order, or else (env, …), of which the chosen rows
                 are taken. Tensors or arrays of any float dtype, on any device. Quaternions are brought to unit length by
                 MuJoCo's rule (`mju_normalize4`).

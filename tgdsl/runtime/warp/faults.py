@@ -40,7 +40,7 @@ _LARGEST = 1e10
 
 
 class Faults(EnvFaults):
-    """What has gone wrong in each environment since it was last reset: its own faults, and full pools, which many share."""
+    """Faults of each environment since it was last reset: its own, and full pools, which many share."""
 
     def __init__(self, arrays: Mapping[str, Tensor], on_fault: str):
         device = arrays["qpos"].device
@@ -55,7 +55,7 @@ class Faults(EnvFaults):
         """Look for divergence after a physics step, on the device."""
         for name in ("qpos", "qvel"):
             if self._arrays[name].shape[1]:
-                # Of what is no number, the maximum is none either.
+                # The maximum of a NaN is NaN.
                 torch.maximum(self._peak, self._arrays[name].abs().amax(dim=1), out=self._peak)
 
     def update(self) -> Bool[Tensor, " env"]:

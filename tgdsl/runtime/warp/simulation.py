@@ -81,7 +81,7 @@ class WarpSimulation(Simulation):
     `warp_model.opt.tolerance.fill_(1e-8)`; those of contacts that stick to 1e-5 either way.
 
     Devices are "cuda", "cuda:1", or "cpu", which is slow and meant for tests. On a GPU nothing waits for it unless the host's
-    own numbers are handed in or asked for. What goes wrong there is therefore reported by a later call: `check` looks at once.
+    own numbers are handed in or asked for. Faults there are therefore reported by a later call: `check` looks at once.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first, and with a spare body at the
@@ -108,7 +108,7 @@ class WarpSimulation(Simulation):
         """Advance by one control step and return the module's readings: on a GPU all in one CUDA graph.
 
         It is `step(control)` and then `touch(state())`, without gradients, and for the price of one launch. As with any CUDA
-        graph, the next call overwrites the readings; `clone` what is to be kept. The first two calls run eagerly, the third
+        graph, the next call overwrites the readings; `clone` them to keep them. The first two calls run eagerly, the third
         captures; the graph is captured again when the module holds other tensors than before: when it was moved, compiled,
         freed, or given another dt.
 
@@ -160,7 +160,7 @@ class WarpSimulation(Simulation):
         return self.model if self._world_objects is None else self._world_objects.env_model(env)
 
     def check(self) -> None:
-        """Look for what has gone wrong in any environment since it was last reset. It waits for a GPU.
+        """Look for faults of any environment since it was last reset. It waits for a GPU.
 
         Raises:
             SimulationError: If an environment has diverged or its controls were not finite, or a pool was too small.
@@ -381,8 +381,8 @@ class WarpSimulation(Simulation):
     def _note_stale(self) -> None:
         """Note, on the host, that environments are to be evaluated.
 
-        A graph of a user's own is replayed without the host. What is captured there is therefore evaluated in it; and once
-        there is one, so is everything else at once, as the graph may read it.
+        A user's graph is replayed without the host. Environments put elsewhere inside it are therefore evaluated in it; and
+        once there is one, all others are evaluated at once, as the graph may read them.
         """
         if self._stream.is_capturing:
             self._is_in_graphs = True
@@ -442,7 +442,7 @@ class WarpSimulation(Simulation):
                 put_rows(array, self._is_reset, start)
         for name in _VELOCITIES:
             array = self._arrays[name]
-            if array.numel():  # what is not a number there would come back in the next evaluation
+            if array.numel():  # a NaN there would come back in the next evaluation
                 put_rows(array, self._is_reset, 0.0)
         self._faults.clear(self._is_reset)
         self._is_stale |= self._is_reset

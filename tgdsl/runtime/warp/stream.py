@@ -32,7 +32,7 @@ class WarpStream:
 
     Attributes:
         device: The device.
-        is_captured: Whether what is called again and again is captured as CUDA graphs.
+        is_captured: Whether repeated calls are captured as CUDA graphs.
     """
 
     def __init__(self, device: str, graph: bool = True):
@@ -44,7 +44,7 @@ class WarpStream:
         self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._warp_stream = self._warp.stream_from_torch(self._stream) if self._stream else None
         self.is_in_own_graph = False
-        """Whether what is done now goes into a graph of `capture`."""
+        """Whether the present work goes into a graph of `capture`."""
 
     @property
     def is_capturing(self) -> bool:
@@ -93,7 +93,7 @@ class WarpStream:
     def capture(self, body: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
         """Capture work without doing it; return the graph, and what the body returned: tensors that a replay fills.
 
-        torch owns the capture and Warp is told of it. Nothing may be collected meanwhile: to free one of Warp's arrays breaks
+        torch owns the capture, which Warp joins. Nothing may be collected meanwhile: to free one of Warp's arrays breaks
         a capture.
 
         Raises:

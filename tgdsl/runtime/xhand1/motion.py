@@ -125,7 +125,7 @@ class JointControls:
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel) -> JointControls:
-        """Return those of a model.
+        """Return the controls of a model.
 
         Raises:
             MotionError: If a joint has not just one actuator that takes its angle in rad, or there are others.

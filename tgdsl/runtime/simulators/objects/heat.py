@@ -24,8 +24,8 @@ COLDEST = ZEROS["K"]
 class EnvHeat:
     """What the objects that hold heat are like in each environment.
 
-    To begin with, all have the document's temperature, and environment i the material i modulo their number. What is written
-    into the tensors, as into `sim.qpos`, is handed out with the next state: a sensor takes it when it begins an episode.
+    To begin with, all have the document's temperature, and environment i the material i modulo their number. Values
+    written into the tensors are part of the next state: a sensor takes them when it begins an episode.
 
     Attributes:
         names: The objects, in the order of the tensors' columns: `inputs.heated`.

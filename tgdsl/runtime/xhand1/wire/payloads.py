@@ -1,7 +1,7 @@
 """What the XHand1's frames carry: the exchange's command and state, and register numbers.
 
 The exchange (command 0x02) is the only request whose reply is known. It carries a set-point for every joint, so to read is also
-to command: `PASSIVE` is the command that asks nothing. Sources and what is *unverified*: see `protocol`.
+to command: `PASSIVE` is the command that asks nothing. Sources and *unverified* parts: see `protocol`.
 
 Shapes: `joint` the 12 joints by their id, `finger` thumb, index, middle, ring, pinky; `taxel` the 120 of a fingertip.
 """
