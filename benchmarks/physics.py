@@ -205,7 +205,7 @@ def simulation(touch: TactileModule, scene: Scene, num_envs: int, options: argpa
     sim = WarpSimulation(touch, num_envs, **keys)
     if options.native_ccd:
         sim.warp_model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
-    sim._worlds.faults.polled = lambda: (False, [])
+    sim._faults.polled = lambda: (False, [])
     return sim
 
 

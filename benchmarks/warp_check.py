@@ -66,7 +66,8 @@ def module(options: argparse.Namespace, device: str, dtype: torch.dtype = torch.
 
 def simulation(touch: TactileModule, options: argparse.Namespace, **keys: Any) -> WarpSimulation:
     """Return environments of MuJoCo Warp."""
-    return WarpSimulation(touch, options.num_envs, **{"keyframe": "rest", "device": options.device, **keys})
+    given: dict[str, Any] = {"keyframe": "rest", "device": options.device, **keys}
+    return WarpSimulation(touch, options.num_envs, **given)
 
 
 def grips(model: mujoco.MjModel, strength: np.ndarray, count: int) -> list[np.ndarray]:

@@ -1,7 +1,6 @@
 """One way to step and observe, whatever is behind it: a simulation, a real hand, an emulated one, or a recorded log.
 
-The kinds of sources that can be connected to are tgdsl's own and those of installed packages. A package brings one by an entry
-point, in its pyproject.toml:
+Installed packages bring further kinds of sources by an entry point, in their pyproject.toml:
 
     [project.entry-points."tgdsl.sources"]
     my_hand = "my_package.my_hand:MY_HAND"
@@ -26,7 +25,7 @@ from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.warp.simulation import WarpSimulation
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
-from tgdsl.runtime.xhand1.connection import HandConnection, JointTargets
+from tgdsl.runtime.xhand1.connection import HandConnection, moved_joints
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource, SimulatedBody, SimulatedTips
 from tgdsl.runtime.xhand1.fingertips import warn_of_noise
@@ -56,7 +55,7 @@ def connect(
     lockstep: bool = False,
     taxels: Taxels | None = None,
     scene: SteppedScene | None = None,
-    **own: Any,
+    **options: Any,
 ) -> Connection:
     """Connect a module to what it shall feel.
 
@@ -79,7 +78,7 @@ def connect(
             artefact, a rollout or an id, see `module.taxels.identity.check_taxels`.
         scene: A scene of one's own, such as a task's, that a simulation or an emulator steps in place of the module's; it is
             closed with the connection, and brings its own start in place of the keyframe.
-        **own: Options of this kind of source alone, such as the `nconmax` and `njmax` of `warp`. Those above are left out
+        **options: Options of this kind of source alone, such as the `nconmax` and `njmax` of `warp`. Those above are left out
             where a source has no use for them, so that one script serves all.
 
     Raises:
@@ -98,10 +97,10 @@ def connect(
         raise TgdslError(f'num_envs is {num_envs}, but "{name}" is one environment')
     shared: dict[str, Any] = {"num_envs": num_envs, "control_step": control_step, "keyframe": keyframe, "motion": motion}
     shared |= {"calibration": calibration, "addresses": addresses, "timing": timing, "lockstep": lockstep, "scene": scene}
-    for option in own:
+    for option in options:
         if option not in kind.options:
             raise TgdslError(f'"{name}" has no option "{option}"; {did_you_mean(option, kind.options, "options")}')
-    return kind.open(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **own)
+    return kind.open(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **options)
 
 
 def _open_simulation(
@@ -161,12 +160,12 @@ def _open_emulator(
     _stepping(scene, control_step)
     if not lockstep:
         _refuse_unfit_steps(control_step, motion, timing)
-    targets = JointTargets(touch, motion, "the emulated hand")
+    actuators = moved_joints(touch, motion)
     body = SimulatedBody(scene, tips, read_calibration)
     hand = EmulatedSource(
         body, control_step=control_step, calibration=read_calibration, motion=motion, timing=timing, lockstep=lockstep
     )
-    return HandConnection(hand, observer, targets)
+    return HandConnection(hand, observer, actuators, "the emulated hand")
 
 
 def _open_hand(
@@ -184,7 +183,7 @@ def _open_hand(
     if lockstep:
         raise HandError("a real hand moves in its own time: lockstep is for emulators and logs")
     observer = HandObserver(touch, read_calibration, control_step)
-    targets = JointTargets(touch, motion, "the hand")
+    actuators = moved_joints(touch, motion)
     _refuse_unfit_steps(control_step, motion, timing)
     warn_of_noise(touch.plan)
     port = source.partition(":")[2] or _only_port()
@@ -192,7 +191,7 @@ def _open_hand(
         hand = opened.enter_context(XHand1.open(port, addresses, motion=motion, timing=timing))
         stepped = XHand1Source(hand, control_step=control_step, calibration=read_calibration)
         opened.pop_all()
-    return HandConnection(stepped, observer, targets)
+    return HandConnection(stepped, observer, actuators, "the hand")
 
 
 def _open_log(
@@ -202,7 +201,7 @@ def _open_log(
     replay = ReplaySource(Path(source), control_step=control_step, speed=speed, calibration=_read(calibration))
     observer = HandObserver(touch, replay.calibration, control_step, is_log=True)
     warn_of_noise(touch.plan)
-    return HandConnection(replay, observer)
+    return HandConnection(replay, observer, None)
 
 
 SOURCES: tuple[SourceKind, ...] = (
@@ -223,7 +222,7 @@ SOURCES: tuple[SourceKind, ...] = (
 
 
 def known_sources() -> tuple[SourceKind, ...]:
-    """Return all kinds of sources: those of tgdsl, then those of installed packages by package and name.
+    """Return all kinds of sources: tgdsl's, then installed ones by package and name.
 
     An installed kind that cannot be had is left out, with a warning, the first time.
 

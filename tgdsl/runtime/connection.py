@@ -28,7 +28,7 @@ class Connection(ABC):
     A kind of source supplies `read`, and where it differs `send`, `restart` and `concerns`.
 
     Attributes:
-        source: What is behind it: a `BatchSimulation`, an `XHand1Source`, an `EmulatedSource`, a `ReplaySource` or another.
+        source: The source: a `BatchSimulation`, an `XHand1Source`, an `EmulatedSource`, a `ReplaySource` or another.
     """
 
     def __init__(self, source: Source):
@@ -93,7 +93,7 @@ class Connection(ABC):
         The sensors are read at the first call after a step or a reset: `rate` and `history` count these.
 
         Raises:
-            ObservationError: If the last step or reset failed: what was observed before is not handed out as if it were new.
+            ObservationError: If the last step or reset failed, so that there is nothing new.
         """
         if not self._is_read:
             raise ObservationError("the last step or reset failed, so there is nothing new to observe; step or reset again")
@@ -153,7 +153,7 @@ class SourceKind:
         name: Its name, by which it is also recognised: alone, or with an address, "name:ADDRESS".
         expected: How users name a source of this kind, as errors list it: '"name" or "name:ADDRESS"'.
         open: Opens a source: `open(touch, source, *, option, …)`, given the module and the source as the user named it. The
-            options that it knows are its keyword-only parameters: those of `connect` that it needs, and any of its own.
+            options that it knows are its keyword-only parameters: options of `connect`, and more.
         recognise: Whether a source that a user named is of this kind; default: if its name is the kind's.
     """
 

@@ -49,10 +49,10 @@ def warn_of_range(control: Tensor | np.ndarray, model: mujoco.MjModel) -> bool:
     values = np.atleast_2d(control.detach().double().numpy() if isinstance(control, Tensor) else control)
     low, high = model.actuator_ctrlrange.T
     reach = np.where(model.actuator_ctrllimited, FAR_BEYOND * (high - low), np.inf)
-    found = np.argwhere(np.maximum(low - values, values - high) > reach)
-    if not len(found):
+    far = np.argwhere(np.maximum(low - values, values - high) > reach)
+    if not len(far):
         return False
-    env, i = found[0]
+    env, i = far[0]
     where = f"environment {env}" if len(values) > 1 else "all environments"
     what = f'control of actuator "{model.actuator(int(i)).name}" is {values[env, i]:g} in {where}'
     warnings.warn(f"{what}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; this is said once", stacklevel=4)

@@ -27,9 +27,9 @@ from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.source import Simulator
 
 PLACES = ("link", "body", "pos", "normal", "area")
-"""What is kept of each taxel, as `taxels.taxel_table` calls it."""
+"""Columns of `taxels.taxel_table` that a recording holds."""
 MISSED = 0.9
-"""Part of a load that is missed of which a run speaks."""
+"""Share of a load that no taxel feels above which a run reports it."""
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
 
@@ -124,7 +124,7 @@ def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterato
 def touching_bodies(touch: TactileModule, sim: BatchSimulation) -> set[int]:
     """Return the bodies that are in contact with an object, and that object, in the first environment, where it is now.
 
-    A contact is one that MuJoCo makes constraints for: what is nearer than the geoms' margin, and not within their gap alone.
+    A contact is one that MuJoCo makes constraints for: nearer than the geoms' margin, and not within their gap alone.
     Bodies are MuJoCo's indices; of welded ones it is the first.
     """
     model = sim.env_model(0)
@@ -154,14 +154,14 @@ def silent_readings(
     weld, body = sim.model.body_weldid, sim.model.body
     result = {}
     for output in touch.outputs:
-        own = [name for name in output.bodies if (int(weld[body(name).id]) or body(name).id) in touching]
-        if output.rows == "taxel" and own and not readings[output.name][0].any():
-            result[output.name] = own
+        bodies = [name for name in output.bodies if (int(weld[body(name).id]) or body(name).id) in touching]
+        if output.rows == "taxel" and bodies and not readings[output.name][0].any():
+            result[output.name] = bodies
     return result
 
 
 def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[str, str]:
-    """Return, by the report that says so, of which readings nearly all of the load is where no taxel is, and how much.
+    """Return the readings whose load is nearly all where no taxel is, with a message, by the name of the report of it.
 
     Loads are the sizes of forces by body, in the first environment: of what a body's taxels feel together, and of what it
     misses. Readings with a history are left out.
@@ -174,8 +174,8 @@ def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[s
             continue
         first, names = output.channels.index("force_x"), list(touch.rows[output.name]["body"])
         force = readings[output.name][0, :, first : first + 3].double().cpu().numpy()
-        own = [np.add.reduce(force[[name == body for name in names]], axis=0) for body in output.bodies]
-        felt = float(np.linalg.norm(own, axis=1).sum())
+        of_bodies = [np.add.reduce(force[[name == body for name in names]], axis=0) for body in output.bodies]
+        felt = float(np.linalg.norm(of_bodies, axis=1).sum())
         lost = float(missed[0].double().norm(dim=-1).sum())
         if lost > MISSED * (felt + lost):
             result[report] = f'"{output.name}" misses {lost:.3g} of {felt + lost:.3g} N, which act where none of its taxels is'
@@ -217,7 +217,7 @@ class Recorder:
             elif output.rows == "taxel":
                 arrays |= {f"{output.name}:{column}": self._taxels[output.sensor][column] for column in PLACES}
             elif output.name in self._rows:
-                own = self._rows[output.name]
-                arrays |= {f"{output.name}:{column}": own[column] for column in own.dtype.names or ()}
+                table = self._rows[output.name]
+                arrays |= {f"{output.name}:{column}": table[column] for column in table.dtype.names or ()}
         with atomic_open(path) as file:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

@@ -45,14 +45,11 @@ class Script:
             prepare = self.closing.prepare
             sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=START, options=options, prepare=prepare)
             return Run(sim, controls_between(self.closing.targets(sim.model.nu), seconds, sim.control_step))
+        keyframe = self.keyframes[0] if self.keyframes else None
+        sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=keyframe, options=options)
         if self.keyframes is None:
-            sim = BatchSimulation(touch, num_envs, substeps=substeps, options=options)
             return Run(sim, held_controls(sim.model, seconds, sim.control_step))
-        model = scene_model(touch.plan.scene)
-        timestep = float((options or {}).get("timestep", model.opt.timestep))  # type: ignore[arg-type]
-        controls = scripted_controls(model, self.keyframes, seconds, substeps * timestep)
-        sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=self.keyframes[0], options=options)
-        return Run(sim, controls)
+        return Run(sim, scripted_controls(sim.model, self.keyframes, seconds, sim.control_step))
 
 
 def substeps_of(touch: TactileModule, others: int) -> int:
@@ -65,9 +62,9 @@ def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, pr
 
     Else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
     """
-    own = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
-    if own or keyframes is not None:
-        return Script(own)
+    names = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
+    if names or keyframes is not None:
+        return Script(names)
     progress("finding out how the hand closes")
     closing = closing_of(touch)
     if isinstance(closing, str):

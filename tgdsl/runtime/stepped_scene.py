@@ -22,7 +22,7 @@ from tgdsl.tensors.env_ids import EnvIds
 
 
 class SteppedScene:
-    """A scene that holds its set-points until it is told others, and is read at the end of each control step.
+    """A scene that holds its set-points until `put` changes them, and is read at the end of each control step.
 
     Subclasses that know more of the scene, such as a task, override `advance` and `begin`.
 

@@ -123,7 +123,7 @@ def test_a_divergence_in_one_of_many_physics_steps_counts(tmp_path, simulator):
     plain.qvel[1] = sim.qvel[1] = 3e10
     speeds = []
     for _ in range(5):
-        plain._worlds.step(1)
+        plain._physics(1)
         speeds.append(float(plain.qvel[1]))
     np.testing.assert_allclose(speeds, 3e10 / (1 + 0.002 * 50 / 0.25) ** np.arange(1, 6), rtol=1e-5)
     assert speeds[0] > 1e10 > speeds[-1]
@@ -242,7 +242,7 @@ def test_pools_that_overflow_raise_whatever_becomes_of_faults(tmp_path):
 def test_a_search_that_runs_out_of_room_is_a_fault_of_its_environment(tmp_path, on_fault):
     """No pool is too small, and nobody can make it larger: one of thousands of environments stops nobody else."""
     sim = warp(module(tmp_path), 3, keyframe="home", on_fault=on_fault)
-    sim._worlds.arrays["overflow"][1] = 1 << 8
+    sim.arrays["overflow"][1] = 1 << 8
     text = "the search for the deepest point of two convex shapes ran out of room"
     if on_fault == "raise":
         with pytest.raises(SimulationError, match=rf"^{text} in environments 1: contacts may be wrong; reset them to go on$"):
@@ -283,7 +283,7 @@ def test_values_that_a_gpu_finds_bad_are_left_out(tmp_path):
     qpos[0, 3:7], qpos[1, 0], qpos[3, 0] = 0.0, torch.nan, torch.nan
     table, mask, before = sim._table, torch.tensor([True, True, True, False]), sim.qpos.clone()
     values, bad = table._judged("qpos", qpos)
-    sim._worlds.put(mask, Rows({"qpos": values.float()}, bad.any(dim=0)))
+    sim._put(mask, Rows({"qpos": values.float()}, bad.any(dim=0)))
     assert torch.equal(sim.qpos[[0, 1, 3]], before[[0, 1, 3]])
     np.testing.assert_allclose(sim.qpos[2], sim.model.qpos0, atol=1e-7)
     assert sim.faults.tolist() == [True, True, False, False]

@@ -121,3 +121,10 @@ def test_a_model_of_ones_own_has_its_own_options(tmp_path, simulator):
     model = tgdsl.simulate(touch, 1).model
     with pytest.raises(SimulationError, match="`options` are for the artefact's scene"):
         simulator(touch, 1, model=model, options={"timestep": 0.01})
+
+
+def test_an_unknown_option_is_named(tmp_path):
+    touch = module(tmp_path)
+    for simulate, name in ((tgdsl.simulate, "simulate"), (BatchSimulation, "BatchSimulation"), (warp, "WarpSimulation")):
+        with pytest.raises(SimulationError, match=f'^{name} has no option "subtseps"; did you mean "substeps"\\?$'):
+            simulate(touch, 1, subtseps=2)

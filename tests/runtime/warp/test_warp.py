@@ -30,8 +30,8 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
+from tgdsl.runtime.warp.faults import constraint_rows
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
-from tgdsl.runtime.warp.worlds import constraint_rows
 
 
 class PretendedGpu(WarpStream):
@@ -96,13 +96,13 @@ def test_sensors_are_evaluated_where_they_are_read(tmp_path, monkeypatch, sensor
     spec = mujoco.MjSpec.from_string(SCENE.replace("</mujoco>", f"<sensor>{sensor}</sensor></mujoco>"))
     tgdsl.instrument(spec, touch.inputs)
     sim = warp(touch, 2, model=spec.compile(), keyframe="home", substeps=4)
-    plain_step, flags = sim._worlds._mjw.step, []
+    plain_step, flags = sim._mjw.step, []
 
     def step(model, data):
         flags.append(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR))
         plain_step(model, data)
 
-    monkeypatch.setattr(sim._worlds._mjw, "step", step)
+    monkeypatch.setattr(sim._mjw, "step", step)
     sim.step()
     assert [bool(flag) for flag in flags] == [times < 4] * 3 + [times < 1]
     assert bool(sim.warp_model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR)) == (times < 1)

@@ -1,10 +1,14 @@
 """MuJoCo on CPU threads: many environments of the artefact's scene, stepped together.
 
+`mujoco.batch`, which MuJoCo has from 3.17 on, is imported when a simulation is made: to compile, and to read another
+simulator's state, an older MuJoCo will do.
+
 Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them, `slot` contacts per pair.
 """
 
 from __future__ import annotations
 
+import importlib
 import itertools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,12 +23,10 @@ from tgdsl.module.memory.some_rows import few_rows
 from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
-from tgdsl.runtime.batch import require_batch
-from tgdsl.runtime.batch.own_fields import OwnFields
-from tgdsl.runtime.simulators.bodies import STATE_ARRAYS, BodyFields
+from tgdsl.runtime.batch.properties import BatchProperties
 from tgdsl.runtime.simulators.devices import checked_device
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
-from tgdsl.runtime.simulators.joint_fields import JointColumns
+from tgdsl.runtime.simulators.fields import STATE_ARRAYS, BodyFields, JointColumns
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import geoms_of
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
@@ -62,10 +64,10 @@ class ContactSensors:
         self._shapes = {name: shape_of(name, inputs) for name in self._fields}
         self._num_slots = inputs.slots
         names = [[contact_sensor_names(pair, i) for i in range(len(inputs.touching(pair)))] for pair in inputs.pairs]
-        self._points = [[_PointSensor(model, point, inputs.slots) for point, _ in own] for own in names]
+        self._points = [[_PointSensor(model, point, inputs.slots) for point, _ in parts] for parts in names]
         self._nets: list[list[range]] = []
         if "contact_netforce" in self._fields:
-            self._nets = [[_place(model, net) for _, net in own] for own in names]
+            self._nets = [[_place(model, net) for _, net in parts] for parts in names]
 
     def read(self, data: Float[np.ndarray, "env number"]) -> dict[str, Float[np.ndarray, "env pair *rest"]]:
         """Return the fields that the module wants; `data` is MuJoCo's `sensordata`."""
@@ -73,12 +75,12 @@ class ContactSensors:
             return {name: np.zeros((len(data), *shape)) for name, shape in self._shapes.items()}
         fields: dict[str, np.ndarray] = {}
         if self._nets:
-            nets = [sum(data[:, place.start + 1 : place.start + 4] for place in own) for own in self._nets]
+            nets = [sum(data[:, place.start + 1 : place.start + 4] for place in parts) for parts in self._nets]
             fields["contact_netforce"] = np.stack(nets, axis=1)
-        fields["contact_found"] = np.stack([sum(sensor.count(data) for sensor in own) for own in self._points], axis=1)
+        fields["contact_found"] = np.stack([sum(sensor.count(data) for sensor in parts) for parts in self._points], axis=1)
         if self._num_slots:
-            shown = [[sensor.read(data) for sensor in own] for own in self._points]
-            slots = np.stack([_first_contacts(own, self._num_slots) for own in shown], axis=1)
+            shown = [[sensor.read(data) for sensor in parts] for parts in self._points]
+            slots = np.stack([_first_contacts(parts, self._num_slots) for parts in shown], axis=1)
             fields |= _in_world(slots)
         return {name: fields[name] for name in self._fields}
 
@@ -185,7 +187,7 @@ def _rows(array: np.ndarray, ids: np.ndarray) -> np.ndarray:
 
 def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return `np.cross` of vectors along the last axis, in a fifth of its time for few of them."""
-    (a, b, c), (x, y, z) = ([own[..., i] for i in range(3)] for own in (one, other))
+    (a, b, c), (x, y, z) = ([vector[..., i] for i in range(3)] for vector in (one, other))
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
 
 
@@ -245,7 +247,7 @@ class BatchSimulation(Simulation):
     """
 
     OPTIONS = ("substeps", "threads", "keyframe", "model", "options", "watch", "per_env", "on_fault", "prepare")
-    properties: OwnFields
+    properties: BatchProperties
     _reader: BatchReader
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
@@ -269,7 +271,11 @@ class BatchSimulation(Simulation):
         return self._touch.read_few(state, rows, self.num_envs)
 
     def _open_device(self, device: str, options: SimOptions) -> torch.device:
-        require_batch()
+        try:
+            importlib.import_module("mujoco.batch")
+        except ImportError as error:
+            what = f"MuJoCo {mujoco.__version__} has no `mujoco.batch`, by which tgdsl simulates on a CPU"
+            raise SimulationError(f'{what}: pip install "mujoco>=3.17"') from error
         if unknown := [word for word in options.get("per_env", ()) if word not in PER_ENV]:
             hint = did_you_mean(unknown[0], PER_ENV, "words")
             raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {hint}')
@@ -289,7 +295,7 @@ class BatchSimulation(Simulation):
             self._faults = EnvFaults(num_envs, self._device, options.get("on_fault", "raise"))
         objects = self._objects
         variants, is_open = ([], False) if objects is None else objects.variants()
-        self.properties = OwnFields(self.batch, self.model, self._touch.inputs.bodies_of, variants, is_open)
+        self.properties = BatchProperties(self.batch, self.model, self._touch.inputs.bodies_of, variants, is_open)
         if objects is not None:
             self.properties.use_models(objects.models())
 

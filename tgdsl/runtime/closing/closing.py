@@ -70,42 +70,39 @@ class Servo:
     armature: float
 
 
-@dataclass(frozen=True)
 class Closing:
     """How a scene's hand closes on an object.
 
     Attributes:
+        target: The object's name.
+        place: Where its body starts, in the world [m]; None: where the scene has it.
         servos: One for each joint that closes.
         num_joints: Number of the hand's joints.
         slack: Joints that follow those that close, by name.
         held: Hinges and slides that are held, by name.
-        welded: Bodies that are held where they start relative to their parents, and these: what ball and free joints move.
-        weightless: Bodies without weight.
-        apart: Pairs of the robot's bodies, which do not collide with one another.
         resting: Indices of actuators that rest.
-        target: The object's name.
-        body: Its body, if that is free.
-        place: Where this starts, in the world [m]; None: where the scene has it.
-        drag: Damping of the object's joint [N s/m, N m s/rad].
+        body: The object's body, if that is free.
         start: Positions of all joints at the start.
     """
 
-    servos: tuple[Servo, ...]
-    num_joints: int
-    slack: tuple[str, ...]
-    held: tuple[str, ...]
-    welded: tuple[tuple[str, str], ...]
-    weightless: tuple[str, ...]
-    apart: tuple[tuple[str, str], ...]
-    resting: tuple[int, ...]
-    target: str
-    body: str | None
-    place: tuple[float, float, float] | None
-    drag: float
-    start: tuple[float, ...]
+    def __init__(self, moving: Movement, sweep: Sweep, target: str, place: Float[np.ndarray, " 3"] | None):
+        model = moving.model
+        force = min(GRIP * float(model.body_subtreemass[sweep.body]) * _EARTH, MOST) if sweep.is_free else FIXED_GRIP
+        self.target, self.place, self.num_joints = target, place, moving.num_joints
+        self.servos = tuple(_servo(moving, joint, force) for joint in moving.ends)
+        self.slack = tuple(model.joint(joint).name for joint in moving.closing if joint not in moving.ends)
+        self.held = tuple(model.joint(joint).name for joint in moving.held if moving.is_scalar(joint))
+        self.resting = _acting(model, moving)
+        self.body = model.body(sweep.body).name if sweep.is_free else None
+        self.start = moving.pose(0.0)
+        if place is not None:
+            address = int(model.jnt_qposadr[model.body_jntadr[sweep.body]])
+            self.start[address : address + 3] = place
+        self._moving, self._drag = moving, force / SPEED
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Change a scene so that its hand can close: `BatchSimulation(touch, 1, prepare=closing.prepare, keyframe=START)`."""
+        moving, model = self._moving, self._moving.model
         name_all(spec)
         for key in list(spec.keys):
             spec.delete(key)
@@ -116,22 +113,27 @@ class Closing:
             _slacken(spec.joint(name))
         for name in self.held:
             spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=name)
-        for name, parent in self.welded:
-            weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=name, name2=parent)
-            weld.data = np.where(np.arange(len(weld.data)) == _TORQUE_SCALE, 1.0, 0.0)  # a pose of zeros is the initial one
-        for name in self.weightless:
-            spec.body(name).gravcomp = 1.0
-        for name, other in self.apart:
+        for joint in moving.held:
+            if not moving.is_scalar(joint):  # a ball or free joint: its body is held where it starts relative to its parent
+                body = model.body(model.jnt_bodyid[joint])
+                weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+                weld.name1, weld.name2 = body.name, model.body(body.parentid[0]).name
+                weld.data = np.where(np.arange(len(weld.data)) == _TORQUE_SCALE, 1.0, 0.0)  # a pose of zeros is the initial one
+        for body in range(1, model.nbody):
+            if int(model.body_rootid[body]) in moving.trees:
+                spec.body(model.body(body).name).gravcomp = 1.0
+        for name, other in _apart(moving):
             spec.add_exclude(bodyname1=name, bodyname2=other)
         if self.body is not None:
-            spec.body(self.body).joints[0].damping = [self.drag, 0, 0]
+            spec.body(self.body).gravcomp = 1.0
+            spec.body(self.body).joints[0].damping = [self._drag, 0, 0]
         spec.add_key(name=START, qpos=self.start, ctrl=self.targets(len(spec.actuators))[0])
 
     def targets(self, num_actuators: int) -> list[Float[np.ndarray, " actuator"]]:
         """Return the controls of the open and of the closed hand; the scene's own actuators come first and have zero."""
         rest = [0.0] * (num_actuators - len(self.servos))
         ends = [servo.opened for servo in self.servos], [servo.closed for servo in self.servos]
-        return [np.array([*rest, *own]) for own in ends]
+        return [np.array([*rest, *end]) for end in ends]
 
     def _rest(self, spec: mujoco.MjSpec) -> None:
         """Have actuators of the hand give no force, nor tendons that are sprung."""
@@ -166,7 +168,7 @@ def closing_of(touch: TactileModule) -> Closing | str:
     links = {link.body for sensor in touch.plan.sensors for link in touch.plan.layout_of(sensor).links}
     moving = movement(scene, frozenset(links))
     if not moving.ends:
-        is_stiff = not any(moving.is_scalar(joint) for joint in moving.own)
+        is_stiff = not any(moving.is_scalar(joint) for joint in moving.joints)
         return "it has no hinge and no slide" if is_stiff else "which way its joints close is not clear"
     left = []
     for target in touch.plan.objects:
@@ -176,11 +178,11 @@ def closing_of(touch: TactileModule) -> Closing | str:
             continue
         grip = sweep.grip()
         if (grip.holds and grip.overlap < OVERLAP * sweep.radius) or (not sweep.is_free and len(grip.links) > 0):
-            return _closing(scene, moving, sweep, target.name, None)
+            return Closing(moving, sweep, target.name, None)
         if not sweep.is_free:
             left.append(f"{target.name} is fixed out of its reach")
         elif (place := sweep.place()) is not None:
-            return _closing(scene, moving, sweep, target.name, place)
+            return Closing(moving, sweep, target.name, place)
         else:
             left.append(f"{target.name} does not fit between its fingers")
     return listed(left) or "there is no object"
@@ -193,35 +195,6 @@ def name_all(spec: mujoco.MjSpec) -> None:
             element.name = element.name or f"tgdsl/{kind}/{i}"
 
 
-def _closing(scene: Model, moving: Movement, sweep: Sweep, target: str, place: Float[np.ndarray, " 3"] | None) -> Closing:
-    model, start = moving.model, moving.pose(0.0)
-    mass = float(model.body_subtreemass[sweep.body])
-    force = min(GRIP * mass * _EARTH, MOST) if sweep.is_free else FIXED_GRIP
-    if place is not None:
-        address = int(model.jnt_qposadr[model.body_jntadr[sweep.body]])
-        start[address : address + 3] = place
-    names = {joint: model.joint(joint).name for joint in moving.own}
-    bodies = [
-        b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees or (sweep.is_free and b == sweep.body)
-    ]
-    free = [int(model.jnt_bodyid[joint]) for joint in moving.held if not moving.is_scalar(joint)]
-    return Closing(
-        servos=tuple(_servo(moving, joint, force) for joint in moving.ends),
-        num_joints=moving.num_joints,
-        slack=tuple(names[joint] for joint in moving.closing if joint not in moving.ends),
-        held=tuple(names[joint] for joint in moving.held if moving.is_scalar(joint)),
-        welded=tuple((model.body(b).name, model.body(model.body_parentid[b]).name) for b in free),
-        weightless=tuple(model.body(b).name for b in bodies),
-        apart=_apart(moving),
-        resting=_acting(model, moving),
-        target=target,
-        body=model.body(sweep.body).name if sweep.is_free else None,
-        place=None if place is None else (float(place[0]), float(place[1]), float(place[2])),
-        drag=force / SPEED,
-        start=tuple(start.tolist()),
-    )
-
-
 def _servo(moving: Movement, joint: int, force: float) -> Servo:
     """Return the servo of a joint that presses with a force at the fingertips, stable at the scene's timestep."""
     model, (opened, closed) = moving.model, moving.ends[joint]
@@ -231,8 +204,8 @@ def _servo(moving: Movement, joint: int, force: float) -> Servo:
     lever, lag = (1.0, LAG * reach) if is_slide else (reach, LAG)
     dof = int(model.jnt_dofadr[joint])
     armature = TIP_MASS * reach**2 if not is_slide else TIP_MASS
-    own = 1.0 / max(float(model.dof_invweight0[dof]), 1e-9) - float(model.dof_armature[dof])
-    inertia = armature + max(own, 0.0)
+    link_inertia = 1.0 / max(float(model.dof_invweight0[dof]), 1e-9) - float(model.dof_armature[dof])
+    inertia = armature + max(link_inertia, 0.0)
     stiffness = min(force * lever / lag, armature * (STEPS / float(model.opt.timestep)) ** 2)
     damping = 2.0 * np.sqrt(stiffness * inertia)
     return Servo(model.joint(joint).name, opened, closed, force * lever, float(stiffness), float(damping), armature)
@@ -251,10 +224,10 @@ def _reach(moving: Movement, joint: int) -> float:
 
 def _num_beyond(moving: Movement, joint: int) -> int:
     """Return the most joints that close beyond one on the way to a fingertip."""
-    own = {int(moving.model.jnt_bodyid[other]) for other in moving.closing}
+    closing = {int(moving.model.jnt_bodyid[other]) for other in moving.closing}
     body = int(moving.model.jnt_bodyid[joint])
     paths = [moving.path(tip) for tip in moving.tips]
-    return max((len(own & set(path[: path.index(body)])) for path in paths if body in path), default=0)
+    return max((len(closing & set(path[: path.index(body)])) for path in paths if body in path), default=0)
 
 
 def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
@@ -265,8 +238,8 @@ def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
     """
     model = moving.model
     known = {int(signature) for signature in model.exclude_signature}
-    own = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees and model.body_geomnum[b]]
-    pairs = [(a, b) for a, b in combinations(own, 2) if (a << 16) + b not in known]
+    bodies = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees and model.body_geomnum[b]]
+    pairs = [(a, b) for a, b in combinations(bodies, 2) if (a << 16) + b not in known]
     return tuple((model.body(a).name, model.body(b).name) for a, b in pairs if model.body_weldid[a] != model.body_weldid[b])
 
 
@@ -278,8 +251,8 @@ def _acting(model: mujoco.MjModel, moving: Movement) -> tuple[int, ...]:
     moments = np.zeros((model.nu, model.nv))
     if model.nu:
         mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    own = np.isin(model.dof_jntid, moving.own)
-    return tuple(np.flatnonzero((moments[:, own] != 0).any(axis=1)).tolist())
+    is_hand = np.isin(model.dof_jntid, moving.joints)
+    return tuple(np.flatnonzero((moments[:, is_hand] != 0).any(axis=1)).tolist())
 
 
 def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:

@@ -56,11 +56,11 @@ class Movement:
     @cached_property
     def num_joints(self) -> int:
         """Number of the hand's hinges and slides, of those that follow another only the ones that close it."""
-        wanted = [joint for joint in self.own if joint in self.ends or joint not in self.follows]
+        wanted = [joint for joint in self.joints if joint in self.ends or joint not in self.follows]
         return sum(self.is_scalar(joint) and int(self.model.jnt_bodyid[joint]) in self.hand for joint in wanted)
 
     @cached_property
-    def own(self) -> tuple[int, ...]:
+    def joints(self) -> tuple[int, ...]:
         """All joints of the trees."""
         return tuple(joint for joint in range(self.model.njnt) if self._root(joint) in self.trees)
 
@@ -70,7 +70,7 @@ class Movement:
         looped = self._looped()
         led = {leader for joint in self.ends for leader in leaders(joint, self.follows)}
         coupled = {*self.ends, *self.follows, *led}
-        return tuple(j for j in self.own if j not in coupled and int(self.model.jnt_bodyid[j]) not in looped)
+        return tuple(j for j in self.joints if j not in coupled and int(self.model.jnt_bodyid[j]) not in looped)
 
     @cached_property
     def tips(self) -> tuple[int, ...]:

@@ -55,9 +55,9 @@ class Sweep:
         self.object_geoms = [geom for b in self._rigid(body) for geom in self._touchable(b)]
         self.hand_geoms = [geom for b in sorted(movement.hand) for geom in self._touchable(b)]
         self._posed(0.0)
-        own = [self.data.geom_xpos[geom] - self.data.xpos[body] for geom in self.object_geoms]
-        self.middle = self.data.xmat[body].reshape(3, 3).T @ np.mean(own, axis=0) if own else np.zeros(3)
-        reach = [np.linalg.norm(p - np.mean(own, axis=0)) for p in own]
+        offsets = [self.data.geom_xpos[geom] - self.data.xpos[body] for geom in self.object_geoms]
+        self.middle = self.data.xmat[body].reshape(3, 3).T @ np.mean(offsets, axis=0) if offsets else np.zeros(3)
+        reach = [np.linalg.norm(p - np.mean(offsets, axis=0)) for p in offsets]
         self.radius = max((r + self.model.geom_rbound[g] for r, g in zip(reach, self.object_geoms, strict=True)), default=0.0)
 
     def place(self) -> Float[np.ndarray, " 3"] | None:
@@ -122,8 +122,8 @@ class Sweep:
     def _gap(self, geom: int) -> tuple[float, Float[np.ndarray, " 3"]]:
         """Return the distance of a geom from the object [m], and the object's nearest point."""
         best, point, ends = 1.0, np.zeros(3), np.zeros(6)
-        for own in self.object_geoms:
-            gap = mujoco.mj_geomDistance(self.model, self.data, own, geom, 1.0, ends)
+        for other in self.object_geoms:
+            gap = mujoco.mj_geomDistance(self.model, self.data, other, geom, 1.0, ends)
             if gap < best:
                 best, point = gap, ends[:3].copy()
         return best, point
@@ -144,5 +144,5 @@ class Sweep:
 
     def _touchable(self, body: int) -> list[int]:
         first, num = int(self.model.body_geomadr[body]), int(self.model.body_geomnum[body])
-        own = [geom for geom in range(first, first + num) if int(self.model.geom_type[geom]) not in _UNBOUNDED]
-        return [geom for geom in own if self.model.geom_contype[geom] or self.model.geom_conaffinity[geom]] or own
+        geoms = [geom for geom in range(first, first + num) if int(self.model.geom_type[geom]) not in _UNBOUNDED]
+        return [geom for geom in geoms if self.model.geom_contype[geom] or self.model.geom_conaffinity[geom]] or geoms

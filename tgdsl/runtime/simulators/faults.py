@@ -1,4 +1,4 @@
-"""What goes wrong in single environments, and what is done about it: they wait for a reset, or are restarted.
+"""Faults of single environments, which then wait for a reset, or are restarted.
 
 Shapes: `env` environments, `kind` kinds of faults.
 """
@@ -102,10 +102,10 @@ class EnvFaults:
 
     def warn_once(self, totals: list[int] | None = None) -> None:
         """Warn of the first faults; without `totals`, a GPU is waited for."""
-        found = self.totals.tolist() if totals is None else totals
-        if self._has_warned or not any(found):
+        counts = self.totals.tolist() if totals is None else totals
+        if self._has_warned or not any(counts):
             return
         self._has_warned = True
-        kinds = ", ".join(text.format(num=num) for text, num in zip(_COUNTS, found, strict=True) if num)
+        kinds = ", ".join(text.format(num=num) for text, num in zip(_COUNTS, counts, strict=True) if num)
         what = "had faults" if self.on_fault == "note" else "had faults and were restarted"
         warnings.warn(f"environments {what}: {kinds}; this is said once, `fault_counts` counts on", stacklevel=4)

@@ -24,28 +24,26 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.controls import warn_of_range, write_controls
-from tgdsl.runtime.simulators.bodies import warn_of_mocap
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults, OnFault
+from tgdsl.runtime.simulators.fields import warn_of_mocap
 from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
-from tgdsl.runtime.simulators.objects.choices import EnvObjects, Values
+from tgdsl.runtime.simulators.objects.choices import EnvObjects, SharedMeshModels, Values
 from tgdsl.runtime.simulators.objects.heat import EnvHeat
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
-from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.watch import Watch, Watched, WatchReader
+from tgdsl.runtime.source import Control
 from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, env_mask
 
 T = TypeVar("T")
-Control = Tensor | np.ndarray | None
-"""Controls of a step, (actuator,) or (env, actuator); None: as they were."""
 SomeRows = Int[np.ndarray, " n"] | None
 """Rows of environments to read; None: all."""
 
 
 class SimOptions(TypedDict, total=False):
-    """Options of a simulation; an engine knows those of its `OPTIONS`."""
+    """Options of a simulation; an engine knows some, its `OPTIONS`."""
 
     substeps: int
     """Physics steps per control step; default 1."""
@@ -199,7 +197,7 @@ class Simulation(ABC):
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor, the keyframe or what is watched, or holds something
+            SimulationError: If the model lacks a body, a contact sensor, the keyframe or a watched element, or holds something
                 that the engine does not support; if the device or a library is missing; if there is nothing to step, more
                 environments than there is memory for, or if the module's state is another simulation's or of other
                 environments.
@@ -255,7 +253,7 @@ class Simulation(ABC):
     def qpos(self) -> Float[Tensor, "env nq"]:
         """Positions of the joints now, as MuJoCo's `qpos`: a live tensor.
 
-        What is written into it counts from the next step on; use `set_state`, or call `forward`, to have `state` follow.
+        Values written into it count from the next step on; use `set_state`, or call `forward`, to have `state` follow.
         """
         return self._arrays["qpos"]
 
@@ -433,7 +431,7 @@ class Simulation(ABC):
         Args:
             env_ids: Indices, or a boolean mask over environments.
             **values: `qpos`, `qvel`, `ctrl`, or another of MuJoCo's arrays that an environment's future follows from (`act`,
-                `mocap_pos`, `mocap_quat`, `time`, `qacc_warmstart`, …); what is not given stays. Each has one row for all
+                `mocap_pos`, `mocap_quat`, `time`, `qacc_warmstart`, …); the others stay. Each has one row for all
                 environments alike, or with indices a row for each in their order, or else (env, …), of which the chosen rows
                 are taken. Tensors or arrays of any float dtype, on any device. Quaternions are brought to unit length by
                 MuJoCo's rule (`mju_normalize4`).

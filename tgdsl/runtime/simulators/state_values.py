@@ -75,7 +75,7 @@ class StateTable:
         """Return values as rows per environment.
 
         Numbers on the host are looked at here. Those on a GPU, and those whose environments are a mask there, are judged there:
-        nothing waits, and `is_bad` says what was found.
+        nothing waits, and `is_bad` is the result.
 
         Args:
             given: By name, one row for all environments alike; or with indices a row for each, in their order; or else
@@ -91,20 +91,20 @@ class StateTable:
         values: dict[str, Tensor] = {}
         is_bad: Bool[Tensor, " env"] | None = None
         for name, value in given.items():
-            found = self._checked(name, value, ids)
-            is_read_here = not (found.is_cuda or (isinstance(env_ids, Tensor) and env_ids.is_cuda))
-            found = found.to(self._device, torch.float64)
-            own = self._arrays[name].ndim - 1
-            if ids is not None and found.ndim > own:
-                every = torch.zeros((self._num_envs, *found.shape[1:]), dtype=found.dtype, device=self._device)
-                found = every.index_copy_(0, torch.from_numpy(ids).to(self._device), found)
-            found, bad = self._judged(name, found.expand(self._num_envs, *found.shape[-own:] if own else ()))
+            rows = self._checked(name, value, ids)
+            is_read_here = not (rows.is_cuda or (isinstance(env_ids, Tensor) and env_ids.is_cuda))
+            rows = rows.to(self._device, torch.float64)
+            ndim = self._arrays[name].ndim - 1
+            if ids is not None and rows.ndim > ndim:
+                every = torch.zeros((self._num_envs, *rows.shape[1:]), dtype=rows.dtype, device=self._device)
+                rows = every.index_copy_(0, torch.from_numpy(ids).to(self._device), rows)
+            rows, bad = self._judged(name, rows.expand(self._num_envs, *rows.shape[-ndim:] if ndim else ()))
             if is_read_here:
                 self._refuse(name, bad, env_ids)
             else:
                 any_bad = bad.any(dim=0)
                 is_bad = any_bad if is_bad is None else is_bad | any_bad
-            values[name] = found.to(self._arrays[name].dtype)
+            values[name] = rows.to(self._arrays[name].dtype)
         return Rows(values, is_bad)
 
     def _checked(self, name: str, value: Any, ids: Int[np.ndarray, " n"] | None) -> Tensor:
@@ -115,14 +115,14 @@ class StateTable:
             result = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
         except (TypeError, ValueError) as error:
             raise SimulationError(f"{name} is no array of numbers: {error}") from error
-        own = tuple(self._arrays[name].shape[1:])
+        shape = tuple(self._arrays[name].shape[1:])
         num_rows = self._num_envs if ids is None else len(ids)
-        if tuple(result.shape) not in ((num_rows, *own), own):
+        if tuple(result.shape) not in ((num_rows, *shape), shape):
             what = "a row per environment" if ids is None else "a row for each index"
             raise SimulationError(
-                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *own)}, {what}, or {own} for all"
+                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *shape)}, {what}, or {shape} for all"
             )
-        if ids is not None and result.ndim > len(own) and len(np.unique(ids)) < len(ids):
+        if ids is not None and result.ndim > len(shape) and len(np.unique(ids)) < len(ids):
             twice = sorted({str(env) for env in ids.tolist() if (ids == env).sum() > 1})
             raise SimulationError(
                 f"env_ids: environments {listed(twice)} are named more than once, and {name} has a row for each"

@@ -26,7 +26,7 @@ _JOINT_FIELDS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
 
 @dataclass(frozen=True)
 class Watch:
-    """Names of what is looked at: see `tgdsl.simulate`.
+    """Names of elements whose motion and forces are read: see `SimOptions`.
 
     Attributes:
         bodies: Bodies, for their poses and velocities.
@@ -140,14 +140,14 @@ class WatchReader:
         )
 
     def _sites(self, pos: Float[Tensor, "env body 3"], quat: Float[Tensor, "env body 4"]) -> tuple[Tensor, Tensor]:
-        """Return position [m] and orientation of each site, of those of the bodies."""
+        """Return position [m] and orientation of each site from the bodies'."""
         carried = quat[:, self._carriers]
-        site_pos, site_quat = (own.to(pos.dtype).expand(len(pos), -1, -1) for own in (self._site_pos, self._site_quat))
+        site_pos, site_quat = (local.to(pos.dtype).expand(len(pos), -1, -1) for local in (self._site_pos, self._site_quat))
         return pos[:, self._carriers] + rotated(carried, site_pos), product(carried, site_quat)
 
 
 def merged_joints(inputs: Inputs, watch: WatchReader | None) -> Inputs:
-    """Return inputs with the joints' fields that a watch needs besides: what is to be kept from before a physics step."""
+    """Return inputs with the joints' fields that a watch needs too, which are kept from before a physics step."""
     if watch is None:
         return inputs
     return replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *watch.inputs.fields))))

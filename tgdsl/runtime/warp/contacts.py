@@ -85,10 +85,10 @@ class PairContacts:
         geoms = {name: _geoms(model, inputs.parts_of(name)) for name in inputs.bodies_of}
         links = {link: i for i, link in enumerate(dict.fromkeys(pair.link for pair in inputs.pairs))}
         pairs = [(geoms[pair.object], links[pair.link]) for pair in inputs.pairs]
-        rows = {own: row for row, own in enumerate(dict.fromkeys(pairs))}
+        rows = {pair: row for row, pair in enumerate(dict.fromkeys(pairs))}
         self._row_of_pair: Int[Tensor, " pair"] | None = None
         if len(rows) < len(pairs):
-            self._row_of_pair = torch.tensor([rows[own] for own in pairs], dtype=torch.int64, device=device)
+            self._row_of_pair = torch.tensor([rows[pair] for pair in pairs], dtype=torch.int64, device=device)
         names = list(self._fields)
         if any(name in names for name in SLOT_FIELDS) and "contact_found" not in names:
             names.append("contact_found")  # it says which slot is free
@@ -114,9 +114,9 @@ class PairContacts:
         if not self.arrays:
             return
         self._memory.zero_()
-        own = warp_data.contact
-        inputs = [warp_model.opt.cone, warp_data.nacon, own.worldid, own.geom, own.type, own.pos]
-        inputs += [own.dist, own.includemargin, own.frame, own.friction, own.dim, own.efc_address, own.adhesion]
+        pool = warp_data.contact
+        inputs = [warp_model.opt.cone, warp_data.nacon, pool.worldid, pool.geom, pool.type, pool.pos]
+        inputs += [pool.dist, pool.includemargin, pool.frame, pool.friction, pool.dim, pool.efc_address, pool.adhesion]
         inputs += [warp_data.efc.force, warp_data.njmax]
         self._launch(self._kernel, dim=warp_data.naconmax, inputs=inputs, outputs=self._outputs)
 

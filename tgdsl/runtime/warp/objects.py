@@ -7,23 +7,32 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
+from tgdsl.runtime.simulators.objects.properties import (
+    MASS_FIELDS,
+    PER_ENV,
+    ObjectProperties,
+    RigidObject,
+    refuse_other_fields,
+)
 from tgdsl.runtime.warp.stream import libraries
-from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.scene import Choice, SceneModels, is_absent
 from tgdsl.tensors.env_ids import broadcast_over
 
 Array = np.ndarray
 Row = dict[str, Array]
 
-OWN_FIELDS = (
+OBJECT_FIELDS = (
     *("geom_size", "geom_aabb", "geom_rbound", "geom_pos", "geom_quat", "geom_dataid"),
     *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_subtreemass", "body_invweight0", "dof_invweight0"),
 )
@@ -62,7 +71,7 @@ class WorldObjects:
         self._written: list[tuple[Choice, ...]] = []
         self.model = shared_model(chosen.scenes, inputs)
 
-    def write_to(self, worlds: Worlds) -> None:
+    def write_to(self, parameters: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
         """Write the fields of environments whose objects were chosen again, in place; the others keep their masses.
 
         Raises:
@@ -70,14 +79,14 @@ class WorldObjects:
         """
         choices = [self._choices(env) for env in range(len(self._chosen.variant))]
         before, self._written = self._written or [None] * len(choices), choices
-        device = worlds.arrays["qpos"].device
+        device = arrays["qpos"].device
         changed = torch.tensor([old != new for old, new in zip(before, choices, strict=True)], device=device)
         distinct = list(dict.fromkeys(choices))
         self._rows = {key: self._rows[key] if key in self._rows else self._row(key) for key in distinct}
         number = {key: i for i, key in enumerate(distinct)}
         index = torch.tensor([number[key] for key in choices], device=device)
-        for name in (*OWN_FIELDS, "geom_xpos", "geom_xmat"):
-            target = worlds.parameters[name] if name in OWN_FIELDS else worlds.arrays[name]
+        for name in (*OBJECT_FIELDS, "geom_xpos", "geom_xmat"):
+            target = parameters[name] if name in OBJECT_FIELDS else arrays[name]
             rows = torch.from_numpy(np.stack([self._rows[key][name] for key in distinct]))
             new = rows.to(target.device, target.dtype)[index].reshape(target.shape)
             target.copy_(torch.where(broadcast_over(changed, new), new, target))
@@ -99,7 +108,7 @@ class WorldObjects:
         """Return the fields that environments with some choices have of their own."""
         model = self._scenes.models([dict(zip(self._names, choices, strict=True))])[0]
         self._check_shared(model)
-        row = {name: np.array(getattr(model, name)) for name in OWN_FIELDS}
+        row = {name: np.array(getattr(model, name)) for name in OBJECT_FIELDS}
         for geom in np.flatnonzero([is_absent(model, geom) for geom in range(model.ngeom)]):
             row["geom_rbound"][geom] = -FAR  # below every plane
             # Each in a place of its own, or two that are lacking would meet there.
@@ -112,7 +121,7 @@ class WorldObjects:
     def _check_shared(self, model: mujoco.MjModel) -> None:
         for field in dataclasses.fields(libraries()[1].Model):
             here = getattr(self.model, field.name, None)
-            if not isinstance(here, Array) or field.name in OWN_FIELDS or field.name in IGNORED_FIELDS:
+            if not isinstance(here, Array) or field.name in OBJECT_FIELDS or field.name in IGNORED_FIELDS:
                 continue
             if not np.array_equal(here, getattr(model, field.name)):
                 what = f"objects {', '.join(self._names)}: their variants differ in MuJoCo's `{field.name}`"
@@ -129,10 +138,78 @@ def shared_model(scenes: SceneModels, inputs: Inputs) -> mujoco.MjModel:
     lacking = {geom for geom in range(model.ngeom) if is_absent(model, geom)}
     for name, num_variants in zip(inputs.objects, inputs.num_variants, strict=True):
         for variant in range(num_variants):
-            own = scenes.model({name: Choice(variant)})
-            model.body_contype |= own.body_contype
-            model.body_conaffinity |= own.body_conaffinity
-            for geom in [geom for geom in lacking if not is_absent(own, geom)]:
-                model.geom_contype[geom], model.geom_conaffinity[geom] = own.geom_contype[geom], own.geom_conaffinity[geom]
+            other = scenes.model({name: Choice(variant)})
+            model.body_contype |= other.body_contype
+            model.body_conaffinity |= other.body_conaffinity
+            for geom in [geom for geom in lacking if not is_absent(other, geom)]:
+                model.geom_contype[geom], model.geom_conaffinity[geom] = other.geom_contype[geom], other.geom_conaffinity[geom]
                 lacking.remove(geom)
     return model
+
+
+class WorldProperties(ObjectProperties):
+    """Masses and frictions of objects, changed on the device without waiting."""
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        model: mujoco.MjModel,
+        bodies_of: Mapping[str, str],
+        num_envs: int,
+        device: torch.device,
+    ):
+        super().__init__(model, bodies_of, num_envs, device)
+        self._fields = parameters
+        self._plain: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
+
+    def renew(self) -> None:
+        """Take what objects now are like as what masses are changed from: after others were chosen."""
+        for parts in self._plain.values():
+            for array, columns, value in parts:
+                value.copy_(array[:, columns])
+
+    def fields(self) -> dict[str, Tensor]:
+        """Return the fields that differ: see `ObjectProperties.fields`."""
+        return dict(self._fields)
+
+    def set_fields(self, fields: Mapping[str, Tensor]) -> None:
+        """Set the fields that differ: see `ObjectProperties.set_fields`."""
+        refuse_other_fields(fields, self._fields)
+        for name, value in fields.items():
+            self._fields[name].copy_(value)
+
+    def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
+        self._check("mass")
+        if not target.is_tree:
+            what = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
+            raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
+        mass_field, inertia, subtree, body, dof = (self._fields[name] for name in MASS_FIELDS)
+        bodies, above, dofs = (self._index(target, name) for name in ("bodies", "above", "dofs"))
+        parts = [(mass_field, bodies), (inertia, bodies), (subtree, bodies), (body, bodies), (dof, dofs)]
+        if target.name not in self._plain:  # what masses are changed from each time: rounding would add up
+            self._plain[target.name] = [(array, columns, array[:, columns].clone()) for array, columns in parts]
+        plain = [value for _, _, value in self._plain[target.name]]
+        before = mass_field[:, bodies].sum(dim=1)
+        factor = mass.to(mass_field.dtype) / plain[0].sum(dim=1)
+        scales = (factor, factor, factor, 1.0 / factor, 1.0 / factor)
+        for (array, columns), value, scale in zip(parts, plain, scales, strict=True):
+            new = value * scale.view(-1, *[1] * (value.ndim - 1))
+            array[:, columns] = torch.where(broadcast_over(mask, new), new, array[:, columns])
+        subtree[:, above] = subtree[:, above] + (mass_field[:, bodies].sum(dim=1) - before)[:, None]
+
+    def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
+        self._check("friction")
+        values = self._fields["geom_friction"]
+        geoms = self._index(target, "geoms")
+        values[:, geoms, 0] = torch.where(mask[:, None], friction.to(values.dtype)[:, None], values[:, geoms, 0])
+
+    def _values(self, field: str) -> Float[Tensor, "env ..."]:
+        """Return what each environment has of a field of the model, also where all share it."""
+        if field in self._fields:
+            return self._fields[field]
+        shared = torch.from_numpy(getattr(self._model, field)).to(self._device, torch.float32)
+        return shared.expand(self._num_envs, *shared.shape)
+
+    def _check(self, word: str) -> None:
+        if not self._fields.keys() >= set(PER_ENV[word]):
+            raise SimulationError(f'environments share each {word}; simulate(..., per_env=("{word}",)) gives them their own')

@@ -16,24 +16,28 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.bodies import BodyFields
-from tgdsl.runtime.simulators.joint_fields import JointColumns
+from tgdsl.runtime.simulators.faults import BAD_VALUES
+from tgdsl.runtime.simulators.fields import FORCES, STATE_ARRAYS, BodyFields, JointColumns
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
-from tgdsl.runtime.simulators.objects.properties import (
-    MASS_FIELDS,
-    PER_ENV,
-    ObjectProperties,
-    RigidObject,
-    refuse_other_fields,
-)
-from tgdsl.runtime.simulators.simulation import Control, SimOptions, Simulation, SomeRows
-from tgdsl.runtime.simulators.state_values import Rows, StateTable
+from tgdsl.runtime.simulators.objects.properties import PER_ENV
+from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
+from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.runtime.simulators.watch import merged_joints
-from tgdsl.runtime.warp.contacts import PairContacts
-from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
-from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
-from tgdsl.runtime.warp.worlds import Worlds
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.runtime.source import Control
+from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
+from tgdsl.runtime.warp.faults import Faults, constraint_rows
+from tgdsl.runtime.warp.objects import OBJECT_FIELDS, WorldObjects, WorldProperties
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
+from tgdsl.tensors.env_ids import put_rows
+from tgdsl.tensors.torch_internals import copy_each
+
+T = TypeVar("T")
+_VELOCITIES = ("cvel", "cdof_dot")
+"""What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
+_DERIVED = tuple(dict.fromkeys((*STATE_ARRAYS, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
+_WATCHED = ("overflow", "nefc", "nacon", "ncollision")
+DEFAULT_NCONMAX = 48
+"""Default capacity for contacts per environment."""
 
 
 class StateReader:
@@ -69,77 +73,6 @@ class StateReader:
         return values
 
 
-class WorldProperties(ObjectProperties):
-    """Masses and frictions of objects, changed on the device without waiting."""
-
-    def __init__(
-        self,
-        parameters: Mapping[str, Tensor],
-        model: mujoco.MjModel,
-        bodies_of: Mapping[str, str],
-        num_envs: int,
-        device: torch.device,
-    ):
-        super().__init__(model, bodies_of, num_envs, device)
-        self._fields = parameters
-        self._plain: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
-
-    def renew(self) -> None:
-        """Take what objects now are like as what masses are changed from: after others were chosen."""
-        for parts in self._plain.values():
-            for array, columns, value in parts:
-                value.copy_(array[:, columns])
-
-    def fields(self) -> dict[str, Tensor]:
-        """Return what environments have of their own: see `ObjectProperties.fields`."""
-        return dict(self._fields)
-
-    def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        """Give environments fields of their own: see `ObjectProperties.set_fields`."""
-        refuse_other_fields(fields, self._fields)
-        for name, value in fields.items():
-            self._fields[name].copy_(value)
-
-    def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
-        self._check("mass")
-        if not target.is_tree:
-            what = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
-            raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
-        own, inertia, subtree, body, dof = (self._fields[name] for name in MASS_FIELDS)
-        bodies, above, dofs = (self._index(target, name) for name in ("bodies", "above", "dofs"))
-        parts = [(own, bodies), (inertia, bodies), (subtree, bodies), (body, bodies), (dof, dofs)]
-        if target.name not in self._plain:  # what masses are changed from each time: rounding would add up
-            self._plain[target.name] = [(array, columns, array[:, columns].clone()) for array, columns in parts]
-        plain = [value for _, _, value in self._plain[target.name]]
-        before = own[:, bodies].sum(dim=1)
-        factor = mass.to(own.dtype) / plain[0].sum(dim=1)
-        scales = (factor, factor, factor, 1.0 / factor, 1.0 / factor)
-        for (array, columns), value, scale in zip(parts, plain, scales, strict=True):
-            new = value * scale.view(-1, *[1] * (value.ndim - 1))
-            array[:, columns] = torch.where(broadcast_over(mask, new), new, array[:, columns])
-        subtree[:, above] = subtree[:, above] + (own[:, bodies].sum(dim=1) - before)[:, None]
-
-    def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
-        self._check("friction")
-        own = self._fields["geom_friction"]
-        geoms = self._index(target, "geoms")
-        own[:, geoms, 0] = torch.where(mask[:, None], friction.to(own.dtype)[:, None], own[:, geoms, 0])
-
-    def _values(self, field: str) -> Float[Tensor, "env ..."]:
-        """Return what each environment has of a field of the model, also where all share it."""
-        if field in self._fields:
-            return self._fields[field]
-        shared = torch.from_numpy(getattr(self._model, field)).to(self._device, torch.float32)
-        return shared.expand(self._num_envs, *shared.shape)
-
-    def _check(self, word: str) -> None:
-        if not self._fields.keys() >= set(PER_ENV[word]):
-            raise SimulationError(f'environments share each {word}; simulate(..., per_env=("{word}",)) gives them their own')
-
-
-T = TypeVar("T")
-
-
 class WarpSimulation(Simulation):
     """Environments in MuJoCo Warp, in float32; `qpos`, `qvel` and `ctrl` are on the physics' device.
 
@@ -148,49 +81,34 @@ class WarpSimulation(Simulation):
     `warp_model.opt.tolerance.fill_(1e-8)`; those of contacts that stick to 1e-5 either way.
 
     Devices are "cuda", "cuda:1", or "cpu", which is slow and meant for tests. On a GPU nothing waits for it unless the host's
-    own numbers are handed in or asked for. What goes wrong there is therefore reported by a later call: `check` looks at once.
+    own numbers are handed in or asked for. Faults there are therefore reported by a later call: `check` looks at once.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first, and with a spare body at the
             end if some of their variants are meshes.
+        arrays: Live tensors (env, …) of what MuJoCo integrates, and of what states are read from. In `sensordata` the contact
+            sensors that `tgdsl.instrument` adds are zero: their contacts are read elsewhere.
+        parameters: Live tensors (env, …) of the model's fields that may differ between environments. What MuJoCo derives from
+            them, such as `body_subtreemass`, is not derived again.
+        warp_model: MuJoCo Warp's model.
+        warp_data: MuJoCo Warp's data.
     """
 
     OPTIONS = ("substeps", "keyframe", "nconmax", "njmax", "model", "options", "watch", "per_env", "on_fault", "graph")
     DEVICE = "cuda"
     properties: WorldProperties
+    parameters: dict[str, Tensor]
+    warp_model: Any
+    warp_data: Any
+    _arrays: dict[str, Tensor]
+    _faults: Faults
     _world_objects: WorldObjects | None = None
-
-    @property
-    def arrays(self) -> Mapping[str, Tensor]:
-        """Live tensors (env, …) of MuJoCo's arrays: what it integrates, and what states are read from.
-
-        In `arrays["sensordata"]` the contact sensors that `tgdsl.instrument` adds are zero: their contacts are read elsewhere.
-        """
-        return self._arrays
-
-    @property
-    def parameters(self) -> Mapping[str, Tensor]:
-        """Live tensors (env, …) of the model's fields that environments have of their own.
-
-        What MuJoCo derives from them, such as `body_subtreemass`, is not derived again.
-        """
-        return self._worlds.parameters
-
-    @property
-    def warp_model(self) -> Any:
-        """MuJoCo Warp's model."""
-        return self._worlds.model
-
-    @property
-    def warp_data(self) -> Any:
-        """MuJoCo Warp's data."""
-        return self._worlds.data
 
     def step_and_read(self, control: Control = None) -> dict[str, Tensor]:
         """Advance by one control step and return the module's readings: on a GPU all in one CUDA graph.
 
         It is `step(control)` and then `touch(state())`, without gradients, and for the price of one launch. As with any CUDA
-        graph, the next call overwrites the readings; `clone` what is to be kept. The first two calls run eagerly, the third
+        graph, the next call overwrites the readings; `clone` them to keep them. The first two calls run eagerly, the third
         captures; the graph is captured again when the module holds other tensors than before: when it was moved, compiled,
         freed, or given another dt.
 
@@ -233,7 +151,7 @@ class WarpSimulation(Simulation):
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
         """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
-        self._worlds.refresh()
+        self._refresh()
         pos, quat = (self.arrays[name][env].double().cpu().numpy() for name in ("xpos", "xquat"))
         return pos, quat
 
@@ -242,20 +160,28 @@ class WarpSimulation(Simulation):
         return self.model if self._world_objects is None else self._world_objects.env_model(env)
 
     def check(self) -> None:
-        """Look for what has gone wrong in any environment since it was last reset. It waits for a GPU.
+        """Look for faults of any environment since it was last reset. It waits for a GPU.
 
         Raises:
             SimulationError: If an environment has diverged or its controls were not finite, or a pool was too small.
         """
-        message = self._worlds.message()
+        message = self._faults.message(
+            {
+                "njmax": int(self.warp_data.njmax),
+                "nconmax": self._nconmax,
+                "naconmax": int(self.warp_data.naconmax),
+                "maxmatch": int(self.warp_model.opt.contact_sensor_maxmatch),
+                **{name: int(self._arrays[name].max()) for name in ("nefc", "nacon", "ncollision")},
+            }
+        )
         if message:
             raise SimulationError(message)
 
     def recapture(self) -> None:
         """Capture the CUDA graphs again: when an array of `warp_model` or `warp_data` was replaced."""
-        for call in (self._step, self._substep, self._step_and_read):
+        calls = (self._step, self._substep, self._step_and_read, self._restarting, self._evaluation, self._posing)
+        for call in calls:
             call.forget()
-        self._worlds.forget_graphs()
 
     def _forget_other_tensors(self) -> None:
         """Forget a graph that was captured with other tensors of the module than it has now."""
@@ -266,17 +192,17 @@ class WarpSimulation(Simulation):
 
     def _physics_and_touch(self) -> dict[str, Tensor]:
         if not self._earlier.are_wanted:
-            self._worlds.step(self.substeps, self.drive)
+            self._physics(self.substeps)
         else:
             self._earlier.begin(self.substeps)
             for i in range(self.substeps):
                 if i:
                     self._earlier.note(self._gathered(float(self.model.opt.timestep)))
-                self._worlds.step(1, self.drive)
+                self._physics(1)
             self._earlier.restart(self._faults.restarted)
         if self._faults.on_fault == "reset":
-            self._touch.reset(self._worlds.restarted)
-            self._worlds.evaluate_stale()
+            self._touch.reset(self._restarted)
+            self._evaluate_stale()
         return self._touch(self._earlier.added_to(self._gathered(self.control_step)))
 
     def _open_device(self, device: str, options: SimOptions) -> torch.device:
@@ -284,73 +210,251 @@ class WarpSimulation(Simulation):
         return self._stream.device
 
     def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
-        inputs = self._touch.inputs
+        inputs, stream, device, model = self._touch.inputs, self._stream, self._device, self.model
+        per_env = [field for word in options.get("per_env", ()) for field in PER_ENV.get(word, (word,))]
         if self._objects is not None:
             self._world_objects = WorldObjects(self._objects, inputs)
-        own = list(OWN_FIELDS) if self._world_objects else []
-        per_env = [field for word in options.get("per_env", ()) for field in PER_ENV.get(word, (word,))]
-        self._worlds = Worlds(
-            self.model if self._world_objects is None else self._world_objects.model,
-            merged_joints(inputs, self._watch),
-            num_envs,
-            self._stream,
-            keyframe=keyframe,
-            nconmax=options.get("nconmax"),
-            njmax=options.get("njmax"),
-            per_env=list(dict.fromkeys(per_env + own)),
-            on_fault=options.get("on_fault", "raise"),
-        )
-        self._arrays, self._faults, self._instant = self._worlds.arrays, self._worlds.faults, self._worlds.kept["time"]
-        self.properties = WorldProperties(self._worlds.parameters, self.model, inputs.bodies_of, num_envs, self._device)
-        with self._stream.scope():
+            model, per_env = self._world_objects.model, per_env + list(OBJECT_FIELDS)
+        self._put_model(model, list(dict.fromkeys(per_env)), num_envs, keyframe, options)
+        self.properties = WorldProperties(self.parameters, self.model, inputs.bodies_of, num_envs, device)
+        with stream.scope():
             self._table = StateTable(self.model, self._arrays)
+        self._has_stale, self._is_in_graphs = True, False
+        self._has_loops = model.neq > 0
         if self._world_objects is not None:
-            self._world_objects.write_to(self._worlds)
-        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps, self.drive))
-        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1, self.drive))
-        self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
+            self._world_objects.write_to(self.parameters, self._arrays)
+        self._restarting, self._evaluation = GraphedCall(stream, self._restart), GraphedCall(stream, self._evaluate_stale)
+        self._posing = GraphedCall(stream, self._evaluate_poses)
+        self._step = GraphedCall(stream, lambda: self._physics(self.substeps))
+        self._substep = GraphedCall(stream, lambda: self._physics(1))
+        self._step_and_read = GraphedCall(stream, self._physics_and_touch)
         self._held: tuple[object, ...] = ()
         self._driven = self.drive
 
-    def _make_reader(self, inputs: Inputs) -> StateReader:
-        contacts = self._worlds.contacts if inputs is self._touch.inputs else None
-        return StateReader(inputs, self.model, self._worlds.arrays, self._worlds.kept, contacts)
+    def _put_model(self, model: mujoco.MjModel, per_env: list[str], num_envs: int, keyframe: int, options: SimOptions) -> None:
+        """Put model and data on the device, all environments at the start.
 
-    def _refresh(self) -> None:
-        self._worlds.refresh()
+        Raises:
+            SimulationError: If MuJoCo Warp does not support something of the model, or a field cannot differ.
+        """
+        refuse_two_instants(model, "bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
+        nconmax, njmax = options.get("nconmax"), options.get("njmax")
+        self._nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
+        rows = constraint_rows(model, self._nconmax) if njmax is None else njmax
+        wp, self._mjw = libraries()
+        start = mujoco.MjData(model)
+        if keyframe >= 0:
+            mujoco.mj_resetDataKeyframe(model, start, keyframe)
+        inputs, stream = merged_joints(self._touch.inputs, self._watch), self._stream
+        with stream.scope():
+            try:
+                self.warp_model = self._mjw.put_model(model, batch_sizes=dict.fromkeys(per_env, num_envs))
+                self.warp_data = self._mjw.put_data(model, start, num_envs, self._nconmax, njmax=rows)
+            except (NotImplementedError, ValueError) as error:
+                raise SimulationError(f"MuJoCo Warp: {error}") from error
+            self.warp_model.opt.warn_overflow = 0  # it would be printed; here it is an error
+            # MuJoCo Warp takes this flag for one thing alone: boxes then meet as in MuJoCo, whose normal is the first box's
+            # face where two are nearly parallel. Otherwise it takes either, and normals differ by the angle between them.
+            self.warp_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+            self._leave_out_sensors(wp, model, inputs)
+            joints = JointColumns.of(inputs, model)
+            names = (*INTEGRATED, *_DERIVED, *_WATCHED)
+            self._arrays = {name: _view(wp, getattr(self.warp_data, name), stream) for name in names}
+            self.parameters = {name: _view(wp, getattr(self.warp_model, name), stream) for name in per_env}
+            self._kept = {array: self._arrays[array].clone() for array in (*joints.moved.values(), "time")}
+            self._instant = self._kept["time"]
+            self._contacts = PairContacts(inputs, model, num_envs, stream.device)
+            self._start_arrays = {name: self._arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
+            self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=stream.device)
+            self._is_reset = torch.zeros_like(self._is_stale)
+            self._restarted = torch.zeros_like(self._is_stale)
+            self._faults = Faults(self._arrays, options.get("on_fault", "raise"))
+
+    def _make_reader(self, inputs: Inputs) -> StateReader:
+        contacts = self._contacts if inputs is self._touch.inputs else None
+        return StateReader(inputs, self.model, self._arrays, self._kept, contacts)
 
     def _use_objects(self, objects: EnvObjects) -> None:
         assert self._world_objects is not None
-        self._world_objects.write_to(self._worlds)
+        self._world_objects.write_to(self.parameters, self._arrays)
         self.properties.renew()
 
-    def _begin_episodes(self, mask: Bool[Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
-        self._worlds.reset(mask, rows, finds_contacts=finds_contacts)
-
-    def _put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
-        self._worlds.put(mask, rows)
-
-    def _evaluate(self, mask: Bool[Tensor, " env"]) -> None:
-        self._worlds.make_stale(mask)
-
     def _advance(self, num_steps: int) -> None:
-        self._worlds.prepare()
+        if self._has_loops:  # `forward` needs velocities of the evaluation before, see `_VELOCITIES`
+            self._refresh()
         if self.drive is not self._driven:
             self._driven = self.drive
             self._step.forget()
             self._substep.forget()
         (self._step if num_steps == self.substeps else self._substep)()
         if self._faults.on_fault == "reset":
-            self._touch.reset(self._worlds.restarted.to(self._touch.device))
+            self._touch.reset(self._restarted.to(self._touch.device))
         self._finish_step()
 
     def _finish_step(self, is_evaluated: bool = False) -> None:
-        self._worlds.note_step(is_evaluated)
+        self._note_step(is_evaluated)
         if self._stream.is_capturing:
             return
         self._touch.incoming.slot_watch.warn()
-        to_raise, totals = self._worlds.faults.polled()
+        to_raise, totals = self._faults.polled()
         if to_raise:
             self.check()
         if self._faults.on_fault != "raise":
             self._faults.warn_once(totals)
+
+    def _physics(self, num_steps: int) -> None:
+        """Advance all environments by some physics steps, and restart those that shall not wait: for a `GraphedCall`.
+
+        Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
+        some of them remember earlier steps.
+        """
+        whole = self.warp_model.opt.disableflags
+        idle = whole if self.warp_model.nhistory else whole | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        try:
+            for i in reversed(range(num_steps)):
+                self.warp_model.opt.disableflags = idle if i else whole
+                if self.drive is not None:
+                    self.drive()
+                if not i:
+                    for name, kept in self._kept.items():
+                        kept.copy_(self._arrays[name])
+                self._mjw.step(self.warp_model, self.warp_data)
+                self._faults.check_divergence()
+        finally:
+            self.warp_model.opt.disableflags = whole
+        # MuJoCo Warp's integrators leave contacts and constraint forces as its last `forward` found them.
+        self._contacts.update(self.warp_model, self.warp_data)
+        self._is_stale.zero_()
+        is_faulty = self._faults.update()
+        if self._faults.on_fault == "reset":
+            self._restarted.copy_(is_faulty)
+            self._is_reset.copy_(is_faulty)
+            self._restart()
+            self._faults.note_restarted(is_faulty)
+
+    def _note_step(self, is_evaluated: bool) -> None:
+        """Take note, on the host, that all environments were stepped, and whether restarted ones were evaluated."""
+        if not self._stream.is_capturing:
+            self._has_stale = False
+        if self._faults.on_fault == "reset" and not is_evaluated:
+            self._note_stale()
+
+    def _begin_episodes(self, mask: Bool[Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
+        """Restart some environments, with values.
+
+        Their poses and contacts are evaluated when they are next asked for; without a look for contacts, their poses at once.
+        """
+        self._is_reset.copy_(mask)
+        self._restarting()
+        self._put(mask, rows)
+        if finds_contacts:
+            self._evaluate(mask)
+        else:
+            self._posing()
+
+    def _put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+        """Write values into the state of some environments; those that cannot be used are left out and noted."""
+        with torch.no_grad():
+            is_put = mask
+            if rows.is_bad is not None:
+                is_put = mask & ~rows.is_bad
+                self._faults.note(BAD_VALUES, mask & rows.is_bad)
+            for name, values in rows.values.items():
+                array = self._arrays[name]
+                if array.numel():
+                    put_rows(array, is_put, values)
+
+    def _evaluate(self, mask: Bool[Tensor, " env"]) -> None:
+        """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
+        self._is_stale |= mask
+        self._note_stale()
+
+    def _refresh(self) -> None:
+        """Evaluate poses, velocities and contacts of the environments that are elsewhere than at the last evaluation."""
+        self._is_in_graphs |= self._stream.is_capturing
+        if not self._has_stale:
+            return
+        if self._is_stale.is_cuda or self._is_stale.any():
+            self._evaluation()
+        self._has_stale = self._stream.is_capturing
+
+    def _note_stale(self) -> None:
+        """Note, on the host, that environments are to be evaluated.
+
+        A user's graph is replayed without the host. Environments put elsewhere inside it are therefore evaluated in it; and
+        once there is one, all others are evaluated at once, as the graph may read them.
+        """
+        if self._stream.is_capturing:
+            self._is_in_graphs = True
+            self._evaluation()
+            return
+        self._has_stale = True
+        if self._is_in_graphs:
+            self._refresh()
+
+    def _evaluate_stale(self) -> None:
+        """Evaluate all environments where they are now, then give those that are not stale back their earlier instant.
+
+        It is for a `GraphedCall`.
+        """
+        arrays = {name: self._arrays[name] for name in (*_DERIVED, "history")} | self._contacts.arrays
+        arrays = {name: array for name, array in arrays.items() if array.numel()}
+        earlier = _copied(arrays)
+        for _ in range(2 if self._has_loops else 1):
+            self._mjw.forward(self.warp_model, self.warp_data)
+        self._contacts.update(self.warp_model, self.warp_data)
+        self._give_back(self._is_stale, earlier, arrays)
+        self._is_stale.zero_()
+
+    def _evaluate_poses(self) -> None:
+        """Evaluate poses and velocities of the environments that were just reset: for a `GraphedCall`.
+
+        Those of all are evaluated, which costs little, and the others are given back their earlier instant.
+        """
+        arrays = {name: self._arrays[name] for name in _DERIVED if self._arrays[name].numel()}
+        earlier = _copied(arrays)
+        for evaluate in (self._mjw.kinematics, self._mjw.com_pos, self._mjw.com_vel):
+            evaluate(self.warp_model, self.warp_data)
+        self._give_back(self._is_reset, earlier, arrays)
+        self._is_stale &= ~self._is_reset
+
+    def _give_back(self, is_new: Bool[Tensor, " env"], earlier: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
+        """Give environments that are not new back what they had, and take the joints of those that are."""
+        is_old = ~is_new
+        for name, before in earlier.items():
+            put_rows(arrays[name], is_old, before)
+        for name, kept in self._kept.items():
+            put_rows(kept, is_new, self._arrays[name])
+
+    def _leave_out_sensors(self, wp: Any, model: mujoco.MjModel, inputs: Inputs) -> None:
+        """Keep MuJoCo Warp from evaluating the sensors that `contacts` stands in for; with no others, from looking for any."""
+        foreign = foreign_sensors(model, inputs)
+        for name in ("sensor_contact_pos_adr", "sensor_contact_acc_adr"):  # of the stages of positions and of forces
+            kept = np.intersect1d(getattr(self.warp_model, name).numpy(), foreign)
+            setattr(self.warp_model, name, wp.array(kept, dtype=int))
+        if not len(foreign):
+            self.warp_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
+    def _restart(self) -> None:
+        for name, start in self._start_arrays.items():
+            array = self._arrays[name]
+            if array.numel():
+                put_rows(array, self._is_reset, start)
+        for name in _VELOCITIES:
+            array = self._arrays[name]
+            if array.numel():  # a NaN there would come back in the next evaluation
+                put_rows(array, self._is_reset, 0.0)
+        self._faults.clear(self._is_reset)
+        self._is_stale |= self._is_reset
+
+
+def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return copies of float32 arrays, made by one kernel."""
+    copies = {name: torch.empty_like(array) for name, array in arrays.items()}
+    copy_each(list(copies.values()), list(arrays.values()))
+    return copies
+
+
+def _view(wp: Any, array: Any, stream: WarpStream) -> Tensor:
+    """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
+    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=stream.device)

@@ -32,7 +32,7 @@ class WarpStream:
 
     Attributes:
         device: The device.
-        is_captured: Whether what is called again and again is captured as CUDA graphs.
+        is_captured: Whether repeated calls are captured as CUDA graphs.
     """
 
     def __init__(self, device: str, graph: bool = True):
@@ -44,7 +44,7 @@ class WarpStream:
         self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._warp_stream = self._warp.stream_from_torch(self._stream) if self._stream else None
         self.is_in_own_graph = False
-        """Whether what is done now goes into a graph of `capture`."""
+        """Whether the present work goes into a graph of `capture`."""
 
     @property
     def is_capturing(self) -> bool:
@@ -75,26 +75,20 @@ class WarpStream:
         Warp learns of the capture. It is on the stream where this has begun: only there can Warp put loops into a graph.
         """
         stream = self._warp.stream_from_torch(torch.cuda.current_stream(self.device))
-        was_enabled = gc.isenabled()
-        gc.disable()
-        try:
-            with (
-                self._quiet(),
-                torch.inference_mode(False),
-                torch.no_grad(),
-                self._warp.ScopedStream(stream, sync_enter=False),  # what Warp did before is in no graph
-                self._warp.ScopedCapture(stream=stream, external=True),
-            ):
-                yield
-        finally:
-            if was_enabled:
-                gc.enable()
+        with (
+            _no_collection(),
+            self._quiet(),
+            torch.inference_mode(False),
+            torch.no_grad(),
+            self._warp.ScopedStream(stream, sync_enter=False),  # Warp's earlier work is in no graph
+            self._warp.ScopedCapture(stream=stream, external=True),
+        ):
+            yield
 
     def capture(self, body: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
         """Capture work without doing it; return the graph, and what the body returned: tensors that a replay fills.
 
-        torch owns the capture and Warp is told of it. Nothing may be collected meanwhile: to free one of Warp's arrays breaks
-        a capture.
+        torch owns the capture, which Warp joins.
 
         Raises:
             SimulationError: If the work cannot be captured.
@@ -102,11 +96,10 @@ class WarpStream:
         graph = torch.cuda.CUDAGraph()
         with self.scope():
             gc.collect()
-            was_enabled = gc.isenabled()
-            gc.disable()
             self.is_in_own_graph = True
             try:
                 with (
+                    _no_collection(),
                     torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
                     self._warp.ScopedCapture(stream=self._warp_stream, external=True),
                 ):
@@ -115,8 +108,6 @@ class WarpStream:
                 raise SimulationError(f"no CUDA graph can be made of this ({error}); graph=False does without") from error
             finally:
                 self.is_in_own_graph = False
-                if was_enabled:
-                    gc.enable()
         return graph, result
 
     def replay(self, graph: torch.cuda.CUDAGraph) -> None:
@@ -133,6 +124,18 @@ class WarpStream:
             yield
         finally:
             self._warp.config.log_level = before
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Keep garbage from being collected: to free one of Warp's arrays breaks a capture."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 class GraphedCall(Generic[T]):

@@ -40,7 +40,7 @@ class FingerSpec(SpecModel):
     rotation: tuple[Row, Row, Row] | None = None
     """Rows of the matrix that takes the sensor's axes to the link's; it may also mirror or exchange axes."""
     bias: Row = (0.0, 0.0, 0.0)
-    """What is added at the end, along the link's axes [unit]."""
+    """Offset of the force, along the link's axes [unit]."""
     tare: Row = (0.0, 0.0, 0.0)
     """What the sensor reads unloaded [counts]."""
 
@@ -110,7 +110,7 @@ class Calibration:
         units: Unit of what `apply` returns.
         scale: Unit per count, along the sensor's axes.
         rotation: From the sensor's axes to the link's.
-        bias: What is added at the end [units].
+        bias: Offset of the force [units].
         tare: What the sensors read unloaded [counts].
         hand: Which hand it is for, or empty.
         contact_threshold: Force above which a fingertip is in contact [units]; None if that was not said.
@@ -126,7 +126,7 @@ class Calibration:
 
     @classmethod
     def none(cls) -> Calibration:
-        """Return that of a hand of which nothing is known: counts stay what they are."""
+        """Return the calibration of an unknown hand: forces stay counts."""
         num = len(FINGERS)
         zero = np.zeros((num, 3))
         return cls("counts", np.ones((num, 3)), np.tile(np.eye(3), (num, 1, 1)), zero, zero)

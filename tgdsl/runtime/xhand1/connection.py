@@ -21,9 +21,17 @@ from tgdsl.tensors.env_ids import EnvIds
 class HandConnection(Connection):
     """A connection to an XHand1, or to the log of one."""
 
-    def __init__(self, source: HandSource, observer: HandObserver, targets: JointTargets | None = None):
+    def __init__(self, source: HandSource, observer: HandObserver, actuators: JointControls | None, name: str = ""):
+        """Connect a hand.
+
+        Args:
+            source: The hand.
+            observer: Observes it for the module.
+            actuators: The actuators whose controls are its joint angles; None: controls go nowhere.
+            name: Its name in a warning, given once, that controls go nowhere; empty: no warning.
+        """
         super().__init__(source)
-        self._hand, self._observer, self._targets = source, observer, targets
+        self._hand, self._observer, self._actuators, self._name = source, observer, actuators, name
 
     @property
     def is_over(self) -> bool:
@@ -40,8 +48,20 @@ class HandConnection(Connection):
         return self._observer.observe(self._hand.sample())
 
     def send(self, control: Control) -> None:
-        """Send the joints where the controls say, and take note of the controls once the step is made."""
-        self._hand.step(None if self._targets is None else self._targets.of(control))
+        """Send the joints where the controls say, and take note of the controls once the step is made.
+
+        Raises:
+            MotionError: If there are not as many controls as joints.
+        """
+        target = None
+        if control is not None and self._actuators is not None:
+            values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
+            target = self._actuators.targets(values)
+        elif control is not None and self._name:
+            what = f"{self._name} was connected for reading alone: its controls go nowhere"
+            warnings.warn(f"{what}; to move it, connect with motion=MotionLimits(...)", stacklevel=3)
+            self._name = ""
+        self._hand.step(target)
         self._observer.note(control)
 
     def restart(self, env_ids: EnvIds | None) -> None:
@@ -58,30 +78,15 @@ class HandConnection(Connection):
         self._hand.resume()
 
 
-class JointTargets:
-    """From a model's controls to joint angles; without leave to move, to none, which is said once."""
+def moved_joints(touch: TactileModule, motion: MotionLimits | None) -> JointControls | None:
+    """Return the actuators of a hand's joints, if it may move.
 
-    def __init__(self, touch: TactileModule, motion: MotionLimits | None, name: str):
-        self._name = name
-        self._joints: JointControls | None = None
-        self._is_told = False
-        if motion is not None:
-            model = scene_model(touch.plan.scene)
-            self._joints = JointControls.of_model(model)
-            check_ranges(model, motion)
-
-    def of(self, control: Control) -> Float[np.ndarray, " joint"] | None:
-        """Return the joint angles to go to [rad].
-
-        Raises:
-            MotionError: If there are not as many controls as joints.
-        """
-        if control is None:
-            return None
-        if self._joints is None:
-            if not self._is_told:
-                self._is_told = True
-                what = f"{self._name} was connected for reading alone: its controls go nowhere"
-                warnings.warn(f"{what}; to move it, connect with motion=MotionLimits(...)", stacklevel=4)
-            return None
-        return self._joints.targets(control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control))
+    Raises:
+        MotionError: If the scene's actuators are not the hand's, or the limits are beyond the robot file's.
+    """
+    if motion is None:
+        return None
+    model = scene_model(touch.plan.scene)
+    result = JointControls.of_model(model)
+    check_ranges(model, motion)
+    return result

@@ -19,7 +19,7 @@ from tgdsl.runtime.xhand1.wire.payloads import NUM_JOINTS
 from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
 
 MAX_AGE_S = 0.1
-"""Readings that are older are not handed out [s], unless replies may take longer."""
+"""Largest age of a reading that is returned [s], unless replies may take longer."""
 READ_TIMEOUT_S = 0.08
 """How long a call waits for a new reading [s], unless replies may take longer."""
 _PATIENCE_S = 1.0
@@ -58,7 +58,7 @@ class XHand1:
         self._max_age_s = max(MAX_AGE_S, two_replies_s) if max_age_s is None else max_age_s
         self._read_timeout_s = max(READ_TIMEOUT_S, two_replies_s)
         self._patience_s = _PATIENCE_S + 2 * two_replies_s  # three requests for the version, and another
-        self._handed_out = 0
+        self._last_sequence = 0
         atexit.register(self._leave)
 
     @classmethod
@@ -79,7 +79,7 @@ class XHand1:
             addresses: Which hand; default: the one with id 0.
             motion: Leave to move it; default: none.
             timing: Times of the line.
-            max_age_s: Readings older than this are not handed out [s]; default: 0.1 s, or as long as two replies may take.
+            max_age_s: Largest age of a reading that is returned [s]; default: 0.1 s, or as long as two replies may take.
             open_port: Opens a port, given its name and baud rate.
 
         Raises:
@@ -106,7 +106,7 @@ class XHand1:
         return hand
 
     def read(self, timeout_s: float | None = None) -> Reading:
-        """Return the newest reading, one that was not handed out before; wait for it if need be.
+        """Return the newest reading, each once; wait for it if need be.
 
         Args:
             timeout_s: How long to wait [s]; default: 0.08 s, or as long as two replies may take.
@@ -123,7 +123,7 @@ class XHand1:
             reading = reader.reading
             if reading is None or not self._is_new(reading):
                 raise self._why_no_reading()
-            self._handed_out = reading.sequence
+            self._last_sequence = reading.sequence
             return reading
 
     def command(self, target: Sequence[float] | Float[np.ndarray, " joint"]) -> None:
@@ -222,7 +222,7 @@ class XHand1:
         self.close()
 
     def _is_new(self, reading: Reading | None) -> bool:
-        return reading is not None and reading.sequence > self._handed_out and reading.age_s() <= self._max_age_s
+        return reading is not None and reading.sequence > self._last_sequence and reading.age_s() <= self._max_age_s
 
     def _why_no_reading(self) -> HandError:
         reading, failure = self._reader.reading, self._reader.failure

@@ -105,7 +105,7 @@ def _hand_term(plan: Plan, planned: PlannedObservation, contact_threshold: float
 
 
 def _joint_term(plan: Plan, planned: PlannedObservation, is_log: bool) -> HandTerm:
-    """Return an observation of the hand's joints, or of what they were last told."""
+    """Return an observation of the hand's joints or last commands."""
     if planned.type == "joint_effort":
         raise ObservationError("it reports each drive's current as a raw number, and no torque")
     if planned.type == "last_action" and is_log:

@@ -49,12 +49,12 @@ class HandIdentity:
         return cls(str(values["device"]), int(values["hand_id"]), **as_bytes)  # type: ignore[arg-type]
 
     def __str__(self) -> str:
-        told = {"version": self.version, "side": self.side, "serial number": self.serial_number, "name": self.name}
-        return f"{self.device}: hand {self.hand_id}, " + ", ".join(f"{what} {shown(value)}" for what, value in told.items())
+        values = {"version": self.version, "side": self.side, "serial number": self.serial_number, "name": self.name}
+        return f"{self.device}: hand {self.hand_id}, " + ", ".join(f"{what} {shown(value)}" for what, value in values.items())
 
 
 def identify(
-    found: FoundHand, *, timing: SerialTiming | None = None, open_port: Callable[[str, int], Port] = open_serial_port
+    hand: FoundHand, *, timing: SerialTiming | None = None, open_port: Callable[[str, int], Port] = open_serial_port
 ) -> HandIdentity:
     """Ask a hand that was found for its registers.
 
@@ -62,12 +62,12 @@ def identify(
         HandDisconnectedError: If the port cannot be opened, or went away.
     """
     timing = timing or SerialTiming()
-    client = SerialClient(open_port(found.device, timing.baud), found.addresses, timing)
+    client = SerialClient(open_port(hand.device, timing.baud), hand.addresses, timing)
     try:
-        told = [_register(client, number) for number in (Register.SIDE, Register.SERIAL_NUMBER, Register.NAME)]
+        registers = [_register(client, number) for number in (Register.SIDE, Register.SERIAL_NUMBER, Register.NAME)]
     finally:
         client.close()
-    return HandIdentity(found.device, found.addresses.hand_id, found.version, *told)
+    return HandIdentity(hand.device, hand.addresses.hand_id, hand.version, *registers)
 
 
 def shown(value: bytes | None) -> str:

@@ -60,8 +60,8 @@ class MotionLimits:
             if not self.lower[i] < self.upper[i]:
                 raise MotionError(f"{name}: the range is {self.lower[i]:g} to {self.upper[i]:g} rad, expected lower < upper")
             if not self.speed[i] > 0 or not 0 < self.current_limit[i] <= 0xFFFF:
-                found = f"speed {self.speed[i]:g} rad/s, current {self.current_limit[i]} mA"
-                raise MotionError(f"{name}: {found}; expected more than 0, and at most 65535 mA")
+                limits = f"speed {self.speed[i]:g} rad/s, current {self.current_limit[i]} mA"
+                raise MotionError(f"{name}: {limits}; expected more than 0, and at most 65535 mA")
         if not 0 < self.watchdog_s <= 1:
             raise MotionError(f"watchdog_s is {self.watchdog_s:g}, expected more than 0 and at most 1 s")
 
@@ -104,8 +104,8 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
         MotionError: If the robot lacks a joint, or one has no range.
     """
     names = [model.joint(i).name for i in range(model.njnt)]
-    results = [[i for i, name in enumerate(names) if name == own or name.endswith(f"_hand_{own}")] for own in JOINTS]
-    if lacking := [own for own, ids in zip(JOINTS, results, strict=True) if len(ids) != 1 or not model.jnt_limited[ids[0]]]:
+    results = [[i for i, name in enumerate(names) if name == joint or name.endswith(f"_hand_{joint}")] for joint in JOINTS]
+    if lacking := [joint for joint, ids in zip(JOINTS, results, strict=True) if len(ids) != 1 or not model.jnt_limited[ids[0]]]:
         what = f"an XHand1, real or emulated, is a whole hand: expected one joint with a range for each of {listed(lacking)}"
         raise MotionError(f"{what}; the robot has {listed(names) or 'none'}")
     return np.array(results)[:, 0]
@@ -125,7 +125,7 @@ class JointControls:
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel) -> JointControls:
-        """Return those of a model.
+        """Return the controls of a model.
 
         Raises:
             MotionError: If a joint has not just one actuator that takes its angle in rad, or there are others.
@@ -155,11 +155,11 @@ def check_ranges(model: mujoco.MjModel, limits: MotionLimits) -> None:
 
 def _actuator(model: mujoco.MjModel, name: str, joint: int) -> int:
     """Return the one actuator of a joint, whose control is the angle to go to [rad]."""
-    is_own = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
-    found = np.flatnonzero(is_own)
-    if len(found) != 1:
-        raise MotionError(f"{name} has {len(found)} actuators, expected one")
-    i = int(found[0])
+    is_of_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
+    actuators = np.flatnonzero(is_of_joint)
+    if len(actuators) != 1:
+        raise MotionError(f"{name} has {len(actuators)} actuators, expected one")
+    i = int(actuators[0])
     gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
     is_position = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and gain > 0 and bias[0] == 0 and bias[1] == -gain
     if not is_position or model.actuator_gear[i, 0] != 1:

@@ -96,7 +96,7 @@ class _Past:
         self.reset()
 
     def push(self, features: Float[Tensor, "env feature"]) -> Float[Tensor, "env steps_feature"]:
-        """Take what the hand says now, and return what is observed."""
+        """Take the present features, and return the observed ones."""
         if not self._last:
             self._last = [features] * self._steps
         else:

@@ -49,7 +49,7 @@ class Reading:
 
 
 class HandReader(threading.Thread):
-    """Exchanges without end. Whoever waits on `changed` is told of every reading and failure.
+    """Exchanges without end, and notifies `changed` of every reading and failure.
 
     Attributes:
         changed: Lock of all that follows.

@@ -290,12 +290,12 @@ def is_chosen(env_ids: EnvIds) -> bool:
     Raises:
         HandError: If there are no such environments.
     """
-    found = np.asarray(torch.as_tensor(env_ids).cpu())
-    if found.dtype == bool and found.shape == (1,):
-        return bool(found[0])
-    if found.size and (found.dtype.kind not in "iu" or found.any()):
-        raise HandError(f"env_ids: found {found.tolist()}, expected index 0, or a mask of 1")
-    return bool(found.size)
+    ids = np.asarray(torch.as_tensor(env_ids).cpu())
+    if ids.dtype == bool and ids.shape == (1,):
+        return bool(ids[0])
+    if ids.size and (ids.dtype.kind not in "iu" or ids.any()):
+        raise HandError(f"env_ids: found {ids.tolist()}, expected index 0, or a mask of 1")
+    return bool(ids.size)
 
 
 def _row(values: np.ndarray, dtype: torch.dtype) -> Tensor:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 class VelocityFilter:
     """Differences of successive angles through a first-order low-pass filter: v ← v + (1 − exp(−Δt/τ)) (Δq/Δt − v).
 
-    For angles that move evenly, what is missing of the speed decays as exp(−t/τ). Of a sine of angular frequency ω, much slower
+    For angles that move evenly, the error of the speed decays as exp(−t/τ). Of a sine of angular frequency ω, much slower
     than the readings, 1/√(1 + ω²τ²) is left, late by arctan(ωτ).
     """
 

@@ -12,11 +12,40 @@ from jaxtyping import Float, Int
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.plan.inputs import Inputs
-from tgdsl.scene.scene import Choice, SceneModels
+from tgdsl.scene.contact_bits import free_bit
+from tgdsl.scene.scene import Choice, SceneModels, with_choices
 from tgdsl.schema.objects import NUM_SIZES
 
 Values = int | float | Sequence[Any] | np.ndarray
 """Numbers, one per environment or one for all."""
+SPARE_BODY = "tgdsl/spare"
+"""The body that holds one geom per mesh: it belongs to the world, touches nothing and is not seen."""
+
+
+class SharedMeshModels(SceneModels):
+    """The models of a scene for simulators that share meshes among environments.
+
+    MuJoCo makes the hulls of meshes that some geom collides with. Here a spare body, the last one, holds every mesh of every
+    variant, so that meshes and hulls are the same whatever is chosen. Without such meshes the models are those of the scene.
+    """
+
+    def _compiled(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
+        plain = super()._compiled(choices)
+        spec = with_choices(self._base.copy(), list(self.objects.values()), choices)
+        meshes = [mesh.name for mesh in spec.meshes if mesh.name.startswith("tgdsl/")]
+        if not meshes:
+            return plain
+        for target in self.objects.values():
+            body, id = spec.body(target.body), plain.body(target.body).id
+            body.explicitinertial = True
+            body.mass, body.inertia = plain.body_mass[id], plain.body_inertia[id]
+            body.iquat, body.ipos = plain.body_iquat[id], plain.body_ipos[id]
+        bit = free_bit(spec, "meshes among variants", SimulationError)
+        spare = spec.worldbody.add_body(name=SPARE_BODY)
+        for name in meshes:
+            kind = mujoco.mjtGeom.mjGEOM_MESH
+            spare.add_geom(type=kind, meshname=name, contype=bit, conaffinity=0, mass=0, rgba=[0, 0, 0, 0])
+        return spec.compile()
 
 
 class EnvObjects:
@@ -59,8 +88,8 @@ class EnvObjects:
         self._tabulate()
 
     def _tabulate(self) -> None:
-        self.variant = np.array([[choice.variant for choice in own.values()] for own in self._choices], dtype=np.int64)
-        self.object_size = np.array([[self._size(*item) for item in own.items()] for own in self._choices])
+        self.variant = np.array([[choice.variant for choice in choices.values()] for choices in self._choices], dtype=np.int64)
+        self.object_size = np.array([[self._size(*item) for item in choices.items()] for choices in self._choices])
 
     def variants(self) -> tuple[list[mujoco.MjModel], bool]:
         """Return a model with each variant that an object may have, and whether a compound's sizes may make further ones."""
@@ -83,10 +112,7 @@ class EnvObjects:
 
     def _variants(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
         self._known(name)
-        found, num = np.asarray(value), self._num_variants[name]
-        if found.shape not in ((), (count,)) or found.dtype.kind not in "iu" or (found < 0).any() or (found >= num).any():
-            raise SimulationError(f"variants of object {name}: expected {count} integers from 0 to {num - 1}, found {value}")
-        return np.broadcast_to(found, count)
+        return checked_numbers(f"variants of object {name}", value, count, self._num_variants[name])
 
     def _sizes(self, name: str, value: Values, count: int) -> Float[np.ndarray, "n size"]:
         self._known(name)
@@ -96,3 +122,11 @@ class EnvObjects:
         if result.shape[:-1] not in ((), (count,)) or not np.isfinite(result).all():
             raise SimulationError(f"sizes of object {name}: found shape {result.shape}, expected ({count}, 1 to 3), finite")
         return np.broadcast_to(result, (count, result.shape[-1]))
+
+
+def checked_numbers(what: str, value: Values, count: int, num: int) -> Int[np.ndarray, " n"]:
+    """Return integers from 0 to `num` − 1, given as one for all or `count` of them."""
+    result = np.asarray(value)
+    if result.shape not in ((), (count,)) or result.dtype.kind not in "iu" or (result < 0).any() or (result >= num).any():
+        raise SimulationError(f"{what}: expected {count} integers from 0 to {num - 1}, found {value}")
+    return np.broadcast_to(result, count).astype(np.int64)

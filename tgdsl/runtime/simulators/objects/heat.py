@@ -15,7 +15,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.fields.units import ZEROS
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.objects.choices import Values
+from tgdsl.runtime.simulators.objects.choices import Values, checked_numbers
 
 COLDEST = ZEROS["K"]
 """Absolute zero [°C]."""
@@ -24,8 +24,8 @@ COLDEST = ZEROS["K"]
 class EnvHeat:
     """What the objects that hold heat are like in each environment.
 
-    To begin with, all have the document's temperature, and environment i the material i modulo their number. What is written
-    into the tensors, as into `sim.qpos`, is handed out with the next state: a sensor takes it when it begins an episode.
+    To begin with, all have the document's temperature, and environment i the material i modulo their number. Values
+    written into the tensors are part of the next state: a sensor takes them when it begins an episode.
 
     Attributes:
         names: The objects, in the order of the tensors' columns: `inputs.heated`.
@@ -62,7 +62,7 @@ class EnvHeat:
     ) -> dict[tuple[str, int], np.ndarray]:
         """Return, checked, what `write` writes: see `Simulation.set_objects`."""
         result = {("temperature", self._column(name)): self._degrees(name, v, len(ids)) for name, v in temperatures.items()}
-        return result | {("material", self._column(name)): self._numbers(name, v, len(ids)) for name, v in materials.items()}
+        return result | {("material", self._column(name)): self._materials(name, v, len(ids)) for name, v in materials.items()}
 
     def write(self, ids: Int[np.ndarray, " n"], chosen: Mapping[tuple[str, int], np.ndarray]) -> None:
         """Write what was chosen for some environments, in place."""
@@ -83,14 +83,11 @@ class EnvHeat:
         if self._starts[self._column(name)] is None:
             hint = "the document frees it with `temperature: {per_env: 45 degC}`"
             raise SimulationError(f"the temperature of object {name} is fixed; {hint}")
-        found = np.asarray(value, dtype=np.float64)
-        if found.shape not in ((), (count,)) or not np.isfinite(found).all() or (found < COLDEST).any():
+        degrees = np.asarray(value, dtype=np.float64)
+        if degrees.shape not in ((), (count,)) or not np.isfinite(degrees).all() or (degrees < COLDEST).any():
             expected = f"{count} numbers of at least {COLDEST} °C"
             raise SimulationError(f"temperatures of object {name}: expected {expected}, found {value}")
-        return np.broadcast_to(found, count).copy()
+        return np.broadcast_to(degrees, count).copy()
 
-    def _numbers(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
-        found, num = np.asarray(value), self._num_materials[self._column(name)]
-        if found.shape not in ((), (count,)) or found.dtype.kind not in "iu" or (found < 0).any() or (found >= num).any():
-            raise SimulationError(f"materials of object {name}: expected {count} integers from 0 to {num - 1}, found {value}")
-        return np.broadcast_to(found, count).astype(np.int64)
+    def _materials(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
+        return checked_numbers(f"materials of object {name}", value, count, self._num_materials[self._column(name)])

@@ -25,7 +25,7 @@ from tgdsl.tensors.env_ids import EnvIds, env_mask
 MASS_FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
 """Fields of a model that follow from the mass of a body, its inertia growing with it."""
 PER_ENV: Mapping[str, tuple[str, ...]] = {"mass": MASS_FIELDS, "friction": ("geom_friction",)}
-"""What environments can have of their own by a word, and the fields of MuJoCo's model that it stands for."""
+"""Properties that may differ between environments, and the fields of MuJoCo's model that each stands for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +99,11 @@ class ObjectProperties(ABC):
 
     @abstractmethod
     def fields(self) -> dict[str, Tensor]:
-        """Return what environments have of their own: fields of MuJoCo's model by name, (env, …)."""
+        """Return the fields of MuJoCo's model that differ between environments, by name, (env, …)."""
 
     @abstractmethod
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        """Give environments fields of their own that `fields` has returned.
+        """Set fields that `fields` has returned.
 
         Raises:
             SimulationError: If these are of other environments or another model.
@@ -132,10 +132,10 @@ class ObjectProperties(ABC):
         return self._objects[name]
 
 
-def refuse_other_fields(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+def refuse_other_fields(given: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> None:
     """Raise an error for fields that environments do not have, or of another shape."""
     for name, value in given.items():
-        if name not in own or tuple(own[name].shape) != tuple(value.shape):
+        if name not in known or tuple(known[name].shape) != tuple(value.shape):
             raise SimulationError(f'environments cannot have a "{name}" of shape {tuple(value.shape)} of their own')
 
 
@@ -152,22 +152,22 @@ def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str])
         raise SimulationError(
             f'there is no object or body "{name}"; {did_you_mean(name, known, "objects and bodies")}'
         ) from error
-    own = [body]
+    bodies = [body]
     for i in range(body + 1, model.nbody):
-        if model.body_parentid[i] in own and not model.body_jntnum[i]:
-            own.append(i)
+        if model.body_parentid[i] in bodies and not model.body_jntnum[i]:
+            bodies.append(i)
     above, parent = [0], int(model.body_parentid[body])
     while parent:
         above.append(parent)
         parent = int(model.body_parentid[parent])
-    if not body or not model.body_mass[own].sum() > 0:
+    if not body or not model.body_mass[bodies].sum() > 0:
         raise SimulationError(f'"{name}" has no mass of its own that could be changed')
     first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
     dofs = np.arange(first, first + count)
     below = [i for i in range(body + 1, model.nbody) if model.body_rootid[i] == model.body_rootid[body]]
-    is_tree = model.body_rootid[body] == body and set(below) <= set(own) and not model.dof_armature[dofs].any()
-    geoms = np.flatnonzero(np.isin(model.geom_bodyid, own))
-    return RigidObject(model.body(body).name, np.array(own), geoms, dofs, np.array(above), bool(is_tree))
+    is_tree = model.body_rootid[body] == body and set(below) <= set(bodies) and not model.dof_armature[dofs].any()
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
+    return RigidObject(model.body(body).name, np.array(bodies), geoms, dofs, np.array(above), bool(is_tree))
 
 
 def property_rows(
@@ -178,9 +178,9 @@ def property_rows(
     if tuple(values.shape) not in ((), (1,), (num_envs,)):
         raise SimulationError(f"{what} has shape {tuple(values.shape)}, expected one number or ({num_envs},)")
     if values.device.type == "cpu":
-        found = values.detach().double().numpy()
-        is_fit = ((found > 0) if is_positive else (found >= 0)) & (found < np.inf)
+        numbers = values.detach().double().numpy()
+        is_fit = ((numbers > 0) if is_positive else (numbers >= 0)) & (numbers < np.inf)
         if not is_fit.all():
             expected = "more than 0" if is_positive else "at least 0"
-            raise SimulationError(f"{what} is {found[~is_fit][0]:g}, expected {expected}")
+            raise SimulationError(f"{what} is {numbers[~is_fit][0]:g}, expected {expected}")
     return values.detach().to(device).expand(num_envs)

@@ -20,7 +20,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import IO, Any
 
@@ -33,31 +33,17 @@ from tgdsl.runtime.xhand1.identity import HandIdentity
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.wire import errors
 from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, NUM_JOINTS, NUM_TAXELS, HandState
+from tgdsl.runtime.xhand1.wire.payloads import STATE_SIZE, HandState, decode_state
 
 FORMAT = 1
+TIMES = ("sequence", "requested_at", "received_at")
+_ZERO = decode_state(bytes(STATE_SIZE))
+STATE = tuple(field.name for field in fields(HandState))
 RECORD = np.dtype(
-    [
-        ("sequence", "<i8"),
-        ("requested_at", "<f8"),
-        ("received_at", "<f8"),
-        ("joint_id", "u1", (NUM_JOINTS,)),
-        ("sensor_id", "u1", (NUM_JOINTS,)),
-        ("position", "<f4", (NUM_JOINTS,)),
-        ("current", "<u2", (NUM_JOINTS,)),
-        ("raw_position", "<u2", (NUM_JOINTS,)),
-        ("joint_temperature", "<u2", (NUM_JOINTS,)),
-        ("joint_error", "<u2", (NUM_JOINTS, 3)),
-        ("reserved", "<u2", (NUM_JOINTS, 3)),
-        ("total_force", "<i2", (len(FINGERS), 3)),
-        ("taxel_force", "<i2", (len(FINGERS), NUM_TAXELS, 3)),
-        ("taxel_temperature", "u1", (len(FINGERS), 20)),
-        ("total_temperature", "u1", (len(FINGERS),)),
-    ]
+    [*zip(TIMES, ("<i8", "<f8", "<f8"), strict=True)]
+    + [(name, getattr(_ZERO, name).dtype, getattr(_ZERO, name).shape) for name in STATE]
 )
 """One reading: the arrays of a log, row by row."""
-TIMES = ("sequence", "requested_at", "received_at")
-STATE = tuple(name for name in RECORD.names or () if name not in TIMES)
 CHUNK = 256
 """Readings that are in memory at a time: 1 MB of them."""
 _DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zlib.error, zipfile.BadZipFile, struct.error)

@@ -197,7 +197,7 @@ class SerialClient:
         """Send a request and return its reply.
 
         Args:
-            command: What is asked.
+            command: The command.
             payload: The request's bytes.
             reply_size: Length of the reply's payload, if it is known.
             hand_id: Whom to ask where the client has no addresses.

@@ -1,7 +1,7 @@
 """What the XHand1's frames carry: the exchange's command and state, and register numbers.
 
 The exchange (command 0x02) is the only request whose reply is known. It carries a set-point for every joint, so to read is also
-to command: `PASSIVE` is the command that asks nothing. Sources and what is *unverified*: see `protocol`.
+to command: `PASSIVE` is the command that asks nothing. Sources and *unverified* parts: see `protocol`.
 
 Shapes: `joint` the 12 joints by their id, `finger` thumb, index, middle, ring, pinky; `taxel` the 120 of a fingertip.
 """
@@ -123,6 +123,22 @@ _TIP = np.dtype(
 )
 _STATE = np.dtype([("joint", _JOINT, (NUM_JOINTS,)), ("tip", _TIP, (len(FINGERS),))])
 STATE_SIZE = _STATE.itemsize
+_PLACES = {
+    "joint_id": ("joint", "id"),
+    "sensor_id": ("joint", "sensor_id"),
+    "position": ("joint", "position"),
+    "current": ("joint", "current"),
+    "raw_position": ("joint", "raw_position"),
+    "joint_temperature": ("joint", "temperature"),
+    "joint_error": ("joint", "error"),
+    "reserved": ("joint", "reserved"),
+    "total_force": ("tip", "total"),
+    "taxel_force": ("tip", "taxel"),
+    "taxel_temperature": ("tip", "temperature"),
+    "total_temperature": ("tip", "total_temperature"),
+}
+"""Part and field of a state in which each attribute of a `HandState` stands."""
+_FORCES = ("total_force", "taxel_force")
 
 FORCE_MIN = np.array([-128, -128, 0])
 FORCE_MAX = np.array([127, 127, 255])
@@ -181,36 +197,22 @@ def decode_state(payload: bytes) -> HandState:
     """Return the state that an exchange's reply of 2208 bytes holds, value for value."""
     _expect_size("a state", payload, STATE_SIZE)
     record = np.frombuffer(payload, dtype=_STATE)[0]
-    joint, tip = record["joint"], record["tip"]
-    return HandState(
-        joint_id=joint["id"],
-        sensor_id=joint["sensor_id"],
-        position=joint["position"],
-        current=joint["current"],
-        raw_position=joint["raw_position"],
-        joint_temperature=joint["temperature"],
-        joint_error=joint["error"],
-        reserved=joint["reserved"],
-        total_force=_components(tip["total"]),
-        taxel_force=_components(tip["taxel"]),
-        taxel_temperature=tip["temperature"],
-        total_temperature=tip["total_temperature"],
-    )
+    values = {name: record[part][field] for name, (part, field) in _PLACES.items()}
+    return HandState(**values | {name: _components(values[name]) for name in _FORCES})
 
 
 def encode_state(state: HandState) -> bytes:
     """Return a state's 2208 bytes."""
     record = np.zeros((), dtype=_STATE)
-    joint, tip = record["joint"], record["tip"]
-    joint["id"], joint["sensor_id"], joint["position"] = state.joint_id, state.sensor_id, state.position
-    joint["current"], joint["raw_position"] = state.current, state.raw_position
-    joint["temperature"], joint["error"], joint["reserved"] = state.joint_temperature, state.joint_error, state.reserved
-    for name, force in (("total", state.total_force), ("taxel", state.taxel_force)):
-        if ((force < FORCE_MIN) | (force > FORCE_MAX)).any():
-            raise ProtocolError(f"{name} forces from {force.min()} to {force.max()}: expected x, y in -128…127, z in 0…255")
+    for name, (part, field) in _PLACES.items():
+        value = getattr(state, name)
+        if name not in _FORCES:
+            record[part][field] = value
+            continue
+        if ((value < FORCE_MIN) | (value > FORCE_MAX)).any():
+            raise ProtocolError(f"{field} forces from {value.min()} to {value.max()}: expected x, y in -128…127, z in 0…255")
         for i, axis in enumerate("xyz"):
-            tip[name][axis] = force[..., i]
-    tip["temperature"], tip["total_temperature"] = state.taxel_temperature, state.total_temperature
+            record[part][field][axis] = value[..., i]
     return record.tobytes()
 
 

@@ -2,7 +2,7 @@
 
 A frame is `55 AA | source | destination | command | length u16 | payload | crc u16`, all little-endian; the checksum is
 CRC-16/XMODEM over all that stands before it. Source: the facts that a republished vendor header, a PNDbotics wiki and an open
-driver tested on hardware agree on. What they leave open, and what is therefore our assumption, is marked *unverified* below:
+driver tested on hardware agree on. Our assumptions, where they leave something open, are marked *unverified* below:
 the payloads of every command but the exchange, and the addresses in replies.
 """
 

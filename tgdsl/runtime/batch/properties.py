@@ -1,4 +1,4 @@
-"""Fields of the model that environments of MuJoCo's batch have of their own: what their objects are like, mass and friction.
+"""Fields of the model that differ between environments of MuJoCo's batch: of objects' variants, mass and friction.
 
 Shapes: `env` environments.
 """
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     import mujoco.batch
 
 Array = np.ndarray
-_OWN = ("body_mass", "body_inertia", "geom_friction")
-"""Fields that are changed in models of their own; the others follow."""
+_DERIVED_FROM = ("body_mass", "body_inertia", "geom_friction")
+"""Fields that are changed in models of single environments; MuJoCo derives the others."""
 
 
-class OwnFields(ObjectProperties):
-    """What environments of a batch have of their own: expanded fields of its model, or models of their own.
+class BatchProperties(ObjectProperties):
+    """Masses and frictions of a batch: expanded fields of its model, or a model for each environment.
 
     Expanded fields share all else. Variants that differ in what cannot be expanded, such as trees of bounding volumes,
-    take a model for each environment, of which those that are changed are copies.
+    take a model for each environment; changed ones are copies.
     """
 
     def __init__(
@@ -44,17 +44,17 @@ class OwnFields(ObjectProperties):
         self._batch = batch
         self._fields: dict[str, Array] = {}
         self._chosen = [model] * batch.nsim
-        self._own = list(self._chosen) if is_open or any(_shared(_differing(model, other)) for other in variants) else None
+        self._models = list(self._chosen) if is_open or any(_shared(_differing(model, other)) for other in variants) else None
         self._is_derived = False
 
     def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
         """Give environments other models; those that keep theirs keep their masses and frictions too."""
         changed = [env for env, model in enumerate(models) if model is not self._chosen[env]]
         self._chosen = list(models)
-        if self._own is not None:
+        if self._models is not None:
             for env in changed:
-                self._own[env] = models[env]
-            self._batch.set_models(self._own)
+                self._models[env] = models[env]
+            self._batch.set_models(self._models)
             return
         for model in {id(models[env]): models[env] for env in changed}.values():
             for name in _differing(self._model, model):
@@ -67,12 +67,12 @@ class OwnFields(ObjectProperties):
             self._batch.set_const(np.array(changed))
 
     def fields(self) -> dict[str, Tensor]:
-        """Return what environments have of their own: see `ObjectProperties.fields`."""
-        names = list(self._fields) if self._own is None else list(_OWN)
+        """Return the fields that differ: see `ObjectProperties.fields`."""
+        names = list(self._fields) if self._models is None else list(_DERIVED_FROM)
         return {name: self._values(name) for name in names}
 
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        """Give environments fields of their own: see `ObjectProperties.set_fields`."""
+        """Set the fields that differ: see `ObjectProperties.set_fields`."""
         names = [name for name in fields if name in mujoco.batch.MODEL_FIELDS]
         refuse_other_fields(fields, {name: self._values(name) for name in names})
         changed = set()
@@ -83,53 +83,53 @@ class OwnFields(ObjectProperties):
                 changed.add(env)
         if "body_mass" in fields:
             self._derive(np.array(sorted(changed), dtype=np.int64))
-        elif self._own is not None:
-            self._batch.set_models(self._own)
+        elif self._models is not None:
+            self._batch.set_models(self._models)
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
         for env, wanted in zip(ids.tolist(), mass.numpy()[ids], strict=True):
-            model, own = self._chosen[env], target.bodies  # not of what it has now: rounding would add up
-            factor = wanted / model.body_mass[own].sum()
-            self._row("body_mass", env)[own] = factor * model.body_mass[own]
-            self._row("body_inertia", env)[own] = factor * model.body_inertia[own]
+            model, bodies = self._chosen[env], target.bodies  # not of what it has now: rounding would add up
+            factor = wanted / model.body_mass[bodies].sum()
+            self._row("body_mass", env)[bodies] = factor * model.body_mass[bodies]
+            self._row("body_inertia", env)[bodies] = factor * model.body_inertia[bodies]
         self._derive(ids)
 
     def _derive(self, ids: Int[Array, " n"]) -> None:
         """Have what follows from masses follow in some environments."""
         self._is_derived = True
-        if self._own is None:
+        if self._models is None:
             if len(ids):
                 self._batch.set_const(ids)
             return
         for env in ids:
-            mujoco.mj_setConst(self._own[env], mujoco.MjData(self._own[env]))
-        self._batch.set_models(self._own)
+            mujoco.mj_setConst(self._models[env], mujoco.MjData(self._models[env]))
+        self._batch.set_models(self._models)
 
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
         for env, wanted in zip(ids.tolist(), friction.numpy()[ids], strict=True):
             self._row("geom_friction", env)[target.geoms, 0] = wanted
-        if self._own is not None:
-            self._batch.set_models(self._own)
+        if self._models is not None:
+            self._batch.set_models(self._models)
 
     def _values(self, field: str) -> Float[Tensor, "env ..."]:
         return torch.from_numpy(np.array(self._arrays_of(field)))
 
     def _arrays_of(self, name: str) -> Array:
         """Return a field of all environments, to be read."""
-        if self._own is not None:
-            return np.stack([getattr(model, name) for model in self._own])
+        if self._models is not None:
+            return np.stack([getattr(model, name) for model in self._models])
         base = getattr(self._model, name)
         return self._fields[name] if name in self._fields else np.broadcast_to(base, (self._batch.nsim, *base.shape))
 
     def _row(self, name: str, env: int) -> Array:
         """Return a field of one environment, to be changed."""
-        if self._own is None:
+        if self._models is None:
             return self._field(name)[env]
-        if self._own[env] is self._chosen[env]:
-            self._own[env] = copy.copy(self._own[env])
-        return getattr(self._own[env], name)
+        if self._models[env] is self._chosen[env]:
+            self._models[env] = copy.copy(self._models[env])
+        return getattr(self._models[env], name)
 
     def _field(self, name: str) -> Array:
         if name not in self._fields:
@@ -144,5 +144,5 @@ def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
 
 
 def _shared(fields: Sequence[str]) -> list[str]:
-    """Return those fields that environments of a batch cannot have of their own."""
+    """Return those fields that all environments of a batch share."""
     return [name for name in fields if name not in mujoco.batch.MODEL_FIELDS]
