@@ -146,7 +146,7 @@ def _poisson(surface: Surface, placement: Poisson, is_covered: Covered | None) -
     except ImportError as error:
         raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
     region = Region.of(surface, placement.region, is_covered)
-    pool = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing)
+    pool = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing, placement.sampler)
     part, hint = "exposed outer surface" if placement.exposed else "outer surface", "widen `region`"
     hint = "other links cover it: place none here" if placement.exposed and not placement.region else hint
     if pool is None:
