@@ -79,8 +79,8 @@ class Model:
             return name
         parent = int(self.compiled.body_parentid[i])
         children = np.flatnonzero(self.compiled.body_parentid == parent).tolist()
-        place = [child for child in children if child].index(i) + 1  # the world is its own parent
-        return f"{self.body_path(parent)}/[{place}]"
+        number = [child for child in children if child].index(i) + 1  # the world is its own parent
+        return f"{self.body_path(parent)}/[{number}]"
 
     @cached_property
     def geoms(self) -> tuple[Geom, ...]:
@@ -111,8 +111,8 @@ class Model:
 
     def touchable(self, body: str) -> tuple[Geom, ...]:
         """Return the geoms of a body that make up its touchable surface: those that collide, or else all."""
-        own = tuple(geom for geom in self.geoms if geom.body == body)
-        return tuple(geom for geom in own if geom.is_colliding) or own
+        geoms = tuple(geom for geom in self.geoms if geom.body == body)
+        return tuple(geom for geom in geoms if geom.is_colliding) or geoms
 
     def rigid_bodies(self, body: str, others: Collection[str] = ()) -> tuple[int, ...]:
         """Return the indices of a body and of those below that are welded to it: they have no joint. Parents come first.
@@ -215,8 +215,8 @@ class Model:
 
     def _triangles(self, geom: Geom, as_collided: bool) -> Surface:
         if geom.shape == "mesh":
-            own = self.hull(geom) if as_collided else self.mesh(geom)
-            vertices, faces = own.vertices, own.faces
+            mesh = self.hull(geom) if as_collided else self.mesh(geom)
+            vertices, faces = mesh.vertices, mesh.faces
         else:
             vertices, faces = self._tessellated(geom)
         vertices = vertices @ geom.rotation.T + geom.pos

@@ -93,11 +93,11 @@ class _TreeBuilder:
 
         Stage order counts from body 0 of the first of them.
         """
-        own = node.joint
-        if own is None or not own.is_stackable:
+        base = node.joint
+        if base is None or not base.is_stackable:
             return node
-        found = [joint for joint in self.joints if joint.is_stackable and set(joint.bodies) == set(own.bodies)]
-        first, *rest = found[::-1] if node.is_swapped(found[0]) else found
+        parallel = [joint for joint in self.joints if joint.is_stackable and set(joint.bodies) == set(base.bodies)]
+        first, *rest = parallel[::-1] if node.is_swapped(parallel[0]) else parallel
         return replace(node, joint=first, stacked=tuple(rest))
 
     def _rank(self, path: str) -> int:
@@ -198,5 +198,5 @@ def filtered_pairs(tree: SpanningTree) -> tuple[set[frozenset[str | None]], dict
         if node.joint is not None and not is_welded:
             above[body] = group[node.parent]
     welded: set[frozenset[str | None]] = {frozenset((a, b)) for a, b in combinations(tree.nodes, 2) if group[a] == group[b]}
-    children = [(body, own) for body in tree.nodes if (own := group[body]) is not None and above.get(own) is not None]
-    return welded, {frozenset((a, b)): own for a, own in children for b in tree.nodes if group[b] == above[own]}
+    children = [(body, root) for body in tree.nodes if (root := group[body]) is not None and above.get(root) is not None]
+    return welded, {frozenset((a, b)): root for a, root in children for b in tree.nodes if group[b] == above[root]}

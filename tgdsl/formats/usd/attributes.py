@@ -347,8 +347,8 @@ def set_customs(prim: Any, table: Table, value: Callable[[str], Any], default: C
         default: The same of an element with MuJoCo's defaults.
     """
     for attribute, row in table.items():
-        if row.array and not np.array_equal(own := np.asarray(value(row.array)), default(row.array)):
-            set_custom(prim, attribute, KEYWORDS[attribute][int(own)] if attribute in KEYWORDS else own.tolist())
+        if row.array and not np.array_equal(number := np.asarray(value(row.array)), default(row.array)):
+            set_custom(prim, attribute, KEYWORDS[attribute][int(number)] if attribute in KEYWORDS else number.tolist())
 
 
 def set_sources(prim: Any, table: Table, model: mujoco.MjModel, index: int) -> None:
@@ -359,17 +359,17 @@ def set_sources(prim: Any, table: Table, model: mujoco.MjModel, index: int) -> N
     for attribute, row in table.items():
         if not row.array:
             continue
-        array = np.asarray(getattr(model, row.array)[index]).ravel()
-        value = array.tolist() if np.ndim(getattr(model, row.array)) > 1 else array.tolist()[0]
+        array = np.asarray(getattr(model, row.array)[index])
+        value = array.ravel().tolist() if array.ndim else array.item()
         if attribute in KEYWORDS:
-            value = KEYWORDS[attribute][int(value)]
+            value = KEYWORDS[attribute][int(array)]
         if not row.sources:
             if np.any(array):
                 set_custom(prim, attribute, value)
         elif row.sources[0].is_range:
             limited = attribute.replace("range", "limited")
             is_limited = getattr(model, table[limited].array)[index] if limited in table else array.any()
-            for end, number in zip(("min", "max"), value if is_limited else (), strict=False):
+            for end, number in zip(("min", "max"), array.tolist() if is_limited else (), strict=False):
                 author(prim, f"{row.sources[0].name}:{end}", number)
         elif array.size:
             author(prim, row.sources[0].name, value)

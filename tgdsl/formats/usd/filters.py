@@ -44,7 +44,7 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], we
     filters = _Filters(stage, colliders, prims, joints)
     result: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
     filtered = filters.of_colliders()
-    owners = [owner for owner, own in colliders.items() if own]
+    owners = [owner for owner, paths in colliders.items() if paths]
     for first, second in combinations(owners, 2) if filtered else ():
         pairs = [frozenset((a, b)) for a in colliders[first] for b in colliders[second]]
         hits = [pair for pair in pairs if pair in filtered]
@@ -120,7 +120,7 @@ class _Filters:
         if path in self.prims:
             return [path]
         if self.stage.has(prim, "PhysicsArticulationRootAPI"):
-            return [own for body in self._articulation(path) for own in self.colliders[body]]
+            return [collider for body in self._articulation(path) for collider in self.colliders[body]]
         if not self.stage.has(prim, "PhysicsCollisionAPI"):  # a collider that is disabled collides with nothing anyway
             self.stage.drop(f"collision filters were dropped of no body, collider or articulation, but {path}", source)
         return []
@@ -135,7 +135,7 @@ class _Filters:
         return [body for body in self.colliders if body in result and body is not None]
 
     def _static(self, path: str) -> bool:
-        return any(own == path or own.startswith(f"{path}/") for own in self.colliders.get(None, ()))
+        return any(collider == path or collider.startswith(f"{path}/") for collider in self.colliders.get(None, ()))
 
     def _groups(self) -> dict[frozenset[str], Prim]:
         physics, sources = self.stage.pxr.UsdPhysics, {}

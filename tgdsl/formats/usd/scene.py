@@ -51,10 +51,10 @@ def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[st
 def _flags(stage: Stage, scene: Prim) -> dict[str, str]:
     flags = {str(name): key for key in FLAGS for name in read_custom(stage, scene, key) or ()}
     names = {name for key in FLAGS for name in flag_names(key)}
-    found = {name: stage.authored(scene, f"mjc:flag:{name}") for name in sorted(names - {"gravity"})}
+    authored = {name: stage.authored(scene, f"mjc:flag:{name}") for name in sorted(names - {"gravity"})}
     gravity = read_attributes(stage, scene, GRAVITY_FLAG).get("gravity")
-    found["gravity"] = None if gravity is None else gravity == "true"
-    for name, value in found.items():
+    authored["gravity"] = None if gravity is None else gravity == "true"
+    for name, value in authored.items():
         if value is None:
             continue
         said = "enable" if value else "disable"

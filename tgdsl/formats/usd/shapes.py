@@ -60,15 +60,15 @@ class Shape:
     @property
     def is_convex(self) -> bool:
         """Whether a mesh is closed and fills its hull."""
-        hull, own = self.hull, self._closed
-        return hull is not None and own is not None and bool(own.volume >= (1 - CONVEX) * hull.volume)
+        hull, closed = self.hull, self._closed
+        return hull is not None and closed is not None and bool(closed.volume >= (1 - CONVEX) * hull.volume)
 
     @cached_property
     def _closed(self) -> trimesh.Trimesh | None:
         assert self.vertices is not None and self.faces is not None
         vertices, faces, _ = merged(Surface(self.vertices, self.faces, np.zeros(len(self.faces), int), ((),)))
-        own = trimesh.Trimesh(vertices, faces, process=False)
-        return own if own.is_volume else None
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        return mesh if mesh.is_volume else None
 
     def mass_properties(self, is_hull: bool) -> MassProperties:
         """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame.

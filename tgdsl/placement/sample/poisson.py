@@ -136,10 +136,10 @@ def _drawn(
     else:
         drawn = lattice.hits(corners, lattice.pitch_below(np.sqrt(point_area)), seed)
     pos, face = drawn.pos, face[drawn.piece]
-    point_area = _exact(drawn, _areas(corners))
+    areas = _exact(drawn, _areas(corners))
     is_kept = region.has_points(pos)
     is_kept[is_kept] = _on_outer_surface(shell, region, pos[is_kept], face[is_kept])
-    return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], point_area[is_kept])
+    return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], areas[is_kept])
 
 
 def _stratified(corners: Float[np.ndarray, "piece 3 3"], point_area: float, seed: int) -> lattice.Hits:

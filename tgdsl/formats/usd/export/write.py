@@ -133,8 +133,8 @@ def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
     set_number(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
     if not model.body_inertia[body].all():
         # Of a body that has none, USD wants neither the moments nor their axes, and makes both, or its mass, of its colliders.
-        own = [model.body_mass[body], *model.body_inertia[body], *model.body_iquat[body]]
-        set_custom(prim, "inertial", [float(value) for value in own])
+        values = [model.body_mass[body], *model.body_inertia[body], *model.body_iquat[body]]
+        set_custom(prim, "inertial", [float(value) for value in values])
         return
     set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
     set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
