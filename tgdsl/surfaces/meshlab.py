@@ -90,8 +90,8 @@ def outer_shell(surface: Surface) -> Shell:
     faces = np.where(is_turned[:, None], clean.faces[:, ::-1], clean.faces)
     shell = Shell(Surface(clean.vertices, faces, clean.face_geom, clean.geoms), component, is_solid)
     is_kept = ~_enclosed(shell)[component]
-    kept, component = np.unique(component[is_kept], return_inverse=True)
-    return Shell(shell.surface.keep(is_kept), component, is_solid[kept])
+    old, component = np.unique(component[is_kept], return_inverse=True)
+    return Shell(shell.surface.keep(is_kept), component, is_solid[old])
 
 
 def _clean(surface: Surface) -> Surface:

@@ -8,7 +8,7 @@ custom attributes named `tgdsl:`, in SI units and radians:
   a joint's `actuatorfrcrange` and its actuator's `forcerange`, of which the drive has the smaller;
   the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
 - a joint's spring, a ball joint's range, a body's `gravcomp`, and its `inertial` if its mass or some moment is zero;
-- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
+- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `attributes.py`.
 
 Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe);
 equality constraints are joints and couplings, as far as there are schemas for them: see `equalities.py`.
