@@ -12,7 +12,7 @@ bodies from each other.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import combinations
 
 from tgdsl.formats.usd.attributes import SELF_COLLISION, read_attributes
@@ -35,13 +35,8 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], we
         geoms: All geoms.
         welded: Pairs that MuJoCo's own filter would keep apart, where it is off only because some joints' bodies collide.
     """
-    colliders: dict[str | None, list[str]] = {body: [] for body in stage.bodies}
-    prims: dict[str, Prim] = {}
-    for geom in geoms:
-        if geom.is_collider:
-            colliders.setdefault(geom.body, []).append(geom.path)
-            prims[geom.path] = geom.prim
-    filters = _Filters(stage, colliders, prims, joints)
+    filters = _Filters(stage, joints, geoms)
+    colliders = filters.colliders
     result: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
     filtered = filters.of_colliders()
     owners = [owner for owner, paths in colliders.items() if paths]
@@ -59,17 +54,15 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], we
 class _Filters:
     """Filters of a stage, by who says so."""
 
-    def __init__(
-        self,
-        stage: Stage,
-        colliders: Mapping[str | None, list[str]],
-        prims: Mapping[str, Prim],
-        joints: Iterable[Joint],
-    ):
+    def __init__(self, stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim]):
         self.stage = stage
-        self.colliders = colliders
-        self.prims = prims
         self.joints = [joint for joint in joints if joint.kind != "free"]
+        self.colliders: dict[str | None, list[str]] = {body: [] for body in stage.bodies}
+        self.prims: dict[str, Prim] = {}
+        for geom in geoms:
+            if geom.is_collider:
+                self.colliders.setdefault(geom.body, []).append(geom.path)
+                self.prims[geom.path] = geom.prim
 
     def of_joints(self) -> set[Pair]:
         """Return pairs of bodies that a joint keeps apart."""
@@ -94,10 +87,7 @@ class _Filters:
 
     def of_colliders(self) -> dict[frozenset[str], Prim]:
         """Return pairs of colliders that must not collide, and the prim that says so."""
-        sources = self._listed_pairs()
-        for pair, group in self._groups().items():
-            sources.setdefault(pair, group)
-        return sources
+        return self._groups() | self._listed_pairs()
 
     def _listed_pairs(self) -> dict[frozenset[str], Prim]:
         stage, sources = self.stage, {}

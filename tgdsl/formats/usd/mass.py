@@ -85,10 +85,11 @@ def inertial_of(stage: Stage, body: Prim, geoms: Sequence[Gprim]) -> Inertial | 
     authored = _authored(stage, body)
     if (exact := _with_zeros(stage, body, authored)) is not None:
         return exact
-    colliders = [(geom, _own_mass(stage, geom)) for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
+    colliders = [geom for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
+    masses = [_authored(stage, geom.prim) if geom.path != geom.body else _Authored() for geom in colliders]
     if authored.mass and authored.centre is not None and authored.tensor is not None:
         return _repaired(stage, body, Inertial(authored.mass, authored.centre, authored.tensor, authored.axes))
-    parts = [_collider(stage, geom, mass, authored.density) for geom, mass in colliders]
+    parts = [_collider(stage, geom, mass, authored.density) for geom, mass in zip(colliders, masses, strict=True)]
     whole = _sum([part for part in parts if part.mass > 0])
     if authored.mass and whole is not None:
         whole = Inertial(authored.mass, whole.centre, whole.tensor * (authored.mass / whole.mass))
@@ -152,10 +153,6 @@ def _overruled(computed: Inertial, authored: _Authored) -> Inertial:
     """Put an authored centre of mass and inertia in place of the computed ones."""
     centre = computed.centre if authored.centre is None else authored.centre
     return Inertial(computed.mass, centre, computed.about(centre) if authored.tensor is None else authored.tensor)
-
-
-def _own_mass(stage: Stage, geom: Gprim) -> _Authored:
-    return _authored(stage, geom.prim) if str(geom.prim.GetPath()) != geom.body else _Authored()
 
 
 def _collider(stage: Stage, geom: Gprim, authored: _Authored, body_density: float) -> Inertial:

@@ -43,7 +43,7 @@ import numpy as np
 from tgdsl.errors import RobotError
 from tgdsl.formats.model import Model
 from tgdsl.formats.usd.actuators import read_actuators, read_keyframes, read_tendons, servos_of
-from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, filtered_pairs, spanning_tree
+from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, filtered_pairs
 from tgdsl.formats.usd.attributes import BODY, read_attributes, read_custom, text_of
 from tgdsl.formats.usd.audit import note_unread
 from tgdsl.formats.usd.equalities import (
@@ -118,8 +118,7 @@ def _read(stage: Stage) -> _Robot:
     inertials = {
         path: inertial_of(stage, prim, [geom for geom in geoms if geom.body == path]) for path, prim in stage.bodies.items()
     }
-    roots = [str(prim.GetPath()) for prim in stage.prims if stage.has(prim, "PhysicsArticulationRootAPI")]
-    tree = spanning_tree(stage.kinematic, joints, roots)
+    tree = SpanningTree(stage, joints)
     kinds = {joint.path: joint.kind for node in tree.nodes.values() for joint in node.joints}
     bodies = unique_names(stage, stage.bodies.values(), ["world"])
     geom_names = unique_names(stage, {geom.path: geom.prim for geom in geoms}.values())
