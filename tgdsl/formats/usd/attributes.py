@@ -115,6 +115,12 @@ def mjc(
     return Row(array, (Source(f"mjc:{name}", unit, neutral, is_range), *more))
 
 
+def flag_names(key: str) -> dict[str, int]:
+    """Return MJCF's names of the flags of `disable` or `enable`, and their bits."""
+    bits, prefix = FLAGS[key]
+    return {name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)}
+
+
 OPTION: Table = {
     "timestep": mjc("option:timestep", Source("newton:timeStepsPerSecond", is_rate=True), array="timestep"),
     **{
@@ -133,7 +139,10 @@ COMPILER: Table = {
     **{name.lower(): mjc(f"compiler:{name}") for name in ("fitAABB", "fuseStatic")},
     "settotalmass": mjc("compiler:setTotalMass", neutral=-1.0),
 }
-GRAVITY_FLAG: Table = {"gravity": Row("", (Source("mjc:flag:gravity"), Source("newton:gravityEnabled")))}
+FLAG: Table = {
+    **{name: mjc(f"flag:{name}") for name in sorted(name for key in FLAGS for name in flag_names(key))},
+    "gravity": mjc("flag:gravity", Source("newton:gravityEnabled")),
+}
 SELF_COLLISION: Table = {
     "self": Row("", (Source("newton:selfCollisionEnabled"), Source("physxArticulation:enabledSelfCollisions")))
 }
@@ -402,9 +411,3 @@ def default_model() -> mujoco.MjModel:
     """Return a model with MuJoCo's default value of every attribute in the tables."""
     inside = '<body><joint/><geom type="sphere" size="1"/><site/></body>'
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{inside}</worldbody></mujoco>")
-
-
-def flag_names(key: str) -> dict[str, int]:
-    """Return MJCF's names of the flags of `disable` or `enable`, and their bits."""
-    bits, prefix = FLAGS[key]
-    return {name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)}

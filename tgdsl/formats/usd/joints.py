@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.attributes import JOINT, read_attributes, read_custom, with_limits
+from tgdsl.formats.usd.attributes import JOINT, read_attributes, read_custom, units, with_limits
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
 INFINITE = 1e30
@@ -352,8 +352,9 @@ def _read_drive(stage: Stage, prim: Prim, instance: str, kind: str, joint_dampin
     if stage.value(prim, f"drive:{instance}:physics:type") == "acceleration":
         stage.drop("drives were dropped whose gains are per mass (type acceleration), which MuJoCo does not have", prim)
         return None, joint_damping
-    gain, force, unit = _si_units(stage, is_angular=kind == "hinge")
-    max_force = math.inf if max_force >= INFINITE else max_force * force
+    unit = units(stage, is_angular=kind == "hinge")
+    gain = unit["damping"]
+    max_force = math.inf if max_force >= INFINITE else max_force * unit["effort"]
     joint_damping = min(joint_damping, damping * gain)
     servo_damping = damping * gain - joint_damping
     servo_damping = 0.0 if servo_damping < ROUNDING * joint_damping else servo_damping
@@ -370,19 +371,11 @@ def _read_drive(stage: Stage, prim: Prim, instance: str, kind: str, joint_dampin
         stiffness * gain,
         servo_damping,
         max_force,
-        target * unit,
-        velocity * unit,
+        target * unit["position"],
+        velocity * unit["position"],
         str(read_custom(stage, prim, "actuator") or ""),
         None if control is None else (float(control[0]), float(control[1])),
         gear,
         math.inf if order is None else float(order),
     )
     return drive, joint_damping
-
-
-def _si_units(stage: Stage, is_angular: bool) -> tuple[float, float, float]:
-    """Return the stage's units of a drive's gains, of its force and of its target, in SI and radians."""
-    if is_angular:
-        torque = stage.kilograms_per_unit * stage.metres_per_unit**2
-        return stage.kilograms_per_unit * (stage.metres_per_unit**2 * math.degrees(1)), torque, math.radians(1)
-    return stage.kilograms_per_unit, stage.kilograms_per_unit * stage.metres_per_unit, stage.metres_per_unit
