@@ -377,6 +377,6 @@ def capsule_profile(radius: float, low: float, high: float, low_radius: float | 
     return [(0.0, rings[0][1]), *rings[1:-1], (0.0, rings[-1][1])]
 
 
-def quaternion(matrix: Matrix) -> Float[np.ndarray, " 4"]:
-    """Return the rotation of a rigid transform as w, x, y, z."""
+def quaternion(matrix: Float[np.ndarray, "row row"]) -> Float[np.ndarray, " 4"]:
+    """Return a rotation matrix, or that of a rigid transform, as w, x, y, z."""
     return Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)
