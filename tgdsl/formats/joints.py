@@ -55,22 +55,22 @@ def robot_joints(robot: Model, scene: Model) -> RobotJoints:
     A joint without a name stands as `` in `joints` only if an actuator acts on it, for then it cannot be left out.
     """
     model, bodies = scene.compiled, set(robot.bodies[1:])
-    own = [i for i in range(model.njnt) if model.body(model.jnt_bodyid[i]).name in bodies]
-    scalar = [i for i in own if model.jnt_type[i] in (_SLIDE, _HINGE)]
+    robot_ids = [i for i in range(model.njnt) if model.body(model.jnt_bodyid[i]).name in bodies]
+    scalar_ids = [i for i in robot_ids if model.jnt_type[i] in (_SLIDE, _HINGE)]
     actuators, driven = [], []
     for i in range(model.nu):
-        joints = [joint for joint in _joints_of(model, i) if joint in own]
+        joints = [joint for joint in _joints_of(model, i) if joint in robot_ids]
         if joints or _bodies_of(model, i) & bodies:
-            acting = [joint for joint in joints if joint in scalar]
+            acting = [joint for joint in joints if joint in scalar_ids]
             actuators.append(Actuator(model.actuator(i).name, i, tuple(model.joint(joint).name for joint in acting)))
             driven += acting
     driven = list(dict.fromkeys(driven))
-    rest = [i for i in scalar if i not in driven and model.joint(i).name]
+    undriven = [i for i in scalar_ids if i not in driven and model.joint(i).name]
     return RobotJoints(
-        joints=tuple(model.joint(i).name for i in [*driven, *rest]),
+        joints=tuple(model.joint(i).name for i in [*driven, *undriven]),
         num_actuated=len(driven),
-        slides=frozenset(model.joint(i).name for i in scalar if model.jnt_type[i] == _SLIDE),
-        others=tuple(model.joint(i).name for i in own if i not in scalar),
+        slides=frozenset(model.joint(i).name for i in scalar_ids if model.jnt_type[i] == _SLIDE),
+        others=tuple(model.joint(i).name for i in robot_ids if i not in scalar_ids),
         actuators=tuple(actuators),
     )
 

@@ -79,8 +79,8 @@ class Model:
             return name
         parent = int(self.compiled.body_parentid[i])
         children = np.flatnonzero(self.compiled.body_parentid == parent).tolist()
-        place = [child for child in children if child].index(i) + 1  # the world is its own parent
-        return f"{self.body_path(parent)}/[{place}]"
+        number = [child for child in children if child].index(i) + 1  # the world is its own parent
+        return f"{self.body_path(parent)}/[{number}]"
 
     @cached_property
     def geoms(self) -> tuple[Geom, ...]:
@@ -111,8 +111,8 @@ class Model:
 
     def touchable(self, body: str) -> tuple[Geom, ...]:
         """Return the geoms of a body that make up its touchable surface: those that collide, or else all."""
-        own = tuple(geom for geom in self.geoms if geom.body == body)
-        return tuple(geom for geom in own if geom.is_colliding) or own
+        geoms = tuple(geom for geom in self.geoms if geom.body == body)
+        return tuple(geom for geom in geoms if geom.is_colliding) or geoms
 
     def rigid_bodies(self, body: str, others: Collection[str] = ()) -> tuple[int, ...]:
         """Return the indices of a body and of those below that are welded to it: they have no joint. Parents come first.
@@ -187,16 +187,20 @@ class Model:
         Raises:
             RobotError: If a geom has no bounded surface.
         """
-        return Surface.joined([self._triangles(geom, as_collided) for geom in geoms])
+        parts = []
+        for geom in geoms:
+            of_mesh = self.hull if as_collided else self.mesh
+            part = of_mesh(geom) if geom.shape == "mesh" else self._tessellated(geom)
+            parts.append(part.placed(geom.pos, geom.rotation))
+        return Surface.joined(parts)
 
     def mesh(self, geom: Geom) -> Surface:
         """Return the triangles of a mesh geom, in the geom's own frame."""
         model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
         first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-        vertices = model.mesh_vert[first : first + count].astype(np.float64)
+        vertices = model.mesh_vert[first : first + count]
         first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-        faces = model.mesh_face[first : first + count].astype(np.int64)
-        return Surface(vertices, faces, np.zeros(count, dtype=np.int64), (geom.names,))
+        return _surface(vertices, model.mesh_face[first : first + count], geom)
 
     def hull(self, geom: Geom) -> Surface:
         """Return the convex hull that MuJoCo collides of a mesh geom, in the geom's own frame; the mesh if it has none."""
@@ -210,19 +214,9 @@ class Model:
         import trimesh
 
         hull = trimesh.convex.convex_hull(surface.vertices[ids])
-        faces = np.asarray(hull.faces, dtype=np.int64)
-        return Surface(np.asarray(hull.vertices, dtype=np.float64), faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
+        return _surface(hull.vertices, hull.faces, geom)
 
-    def _triangles(self, geom: Geom, as_collided: bool) -> Surface:
-        if geom.shape == "mesh":
-            own = self.hull(geom) if as_collided else self.mesh(geom)
-            vertices, faces = own.vertices, own.faces
-        else:
-            vertices, faces = self._tessellated(geom)
-        vertices = vertices @ geom.rotation.T + geom.pos
-        return Surface(vertices, faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
-
-    def _tessellated(self, geom: Geom) -> tuple[np.ndarray, np.ndarray]:
+    def _tessellated(self, geom: Geom) -> Surface:
         import trimesh
 
         if geom.shape == "box":
@@ -238,7 +232,12 @@ class Model:
             mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
         else:
             raise RobotError(f"{self.file}: {geom.shown} of body {geom.body} has no bounded surface to put taxels on")
-        return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+        return _surface(mesh.vertices, mesh.faces, geom)
+
+
+def _surface(vertices: np.ndarray, faces: np.ndarray, geom: Geom) -> Surface:
+    vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+    return Surface(vertices, faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
 
 
 def _matrix(quat: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:

@@ -156,13 +156,13 @@ def _number_names(robot: ET.Element) -> None:
     names = {part.get("name", "") for part in geoms}
     seen: set[str] = set()
     for part in geoms:
-        name = own = part.get("name", "")
+        name = unique = part.get("name", "")
         number = 1
-        while own in seen or (number > 1 and own in names):
+        while unique in seen or (number > 1 and unique in names):
             number += 1
-            own = f"{name}_{number}"
-        seen |= {own} - {""}
-        part.set("name", own)
+            unique = f"{name}_{number}"
+        seen |= {unique} - {""}
+        part.set("name", unique)
 
 
 def _mesh_file(name: str, urdf: Path) -> Path:
@@ -177,7 +177,7 @@ def _mesh_file(name: str, urdf: Path) -> Path:
         raise RobotError(f'{urdf}: mesh "{name}": no folder above the file holds "{inside}"')
     result = urdf.resolve().parent / name.removeprefix("file://")
     if not result.is_file():
-        alike = [own.name for own in result.parent.glob("*") if own.name.lower() == result.name.lower()]
+        alike = [file.name for file in result.parent.glob("*") if file.name.lower() == result.name.lower()]
         raise RobotError(f'{urdf}: mesh "{name}": there is no file {result}' + (f"; there is {alike[0]}" if alike else ""))
     return result
 

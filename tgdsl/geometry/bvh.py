@@ -146,12 +146,12 @@ def nearest(
 def mesh_distance(point: Tensor, which: Tensor, keys: list[int], max_distance: float) -> tuple[Tensor, Tensor]:
     """Return distances (n,) and gradients (n, 3) of float64 points (n, 3); the meshes go by their keys."""
     out = _empty(point, which, keys, max_distance)
-    for own, key in enumerate(keys):
+    for slot, key in enumerate(keys):
         mesh = _MESHES.get(key)
         if mesh is None:
             raise TgdslError("this function was compiled with a mesh that no longer exists; keep the TriangleMesh alive")
         if len(point):
-            mesh._launch(point.detach().contiguous(), own, which.contiguous(), max_distance, out)
+            mesh._launch(point.detach().contiguous(), slot, which.contiguous(), max_distance, out)
     return out
 
 

@@ -319,11 +319,11 @@ class _Moments(Quantity):
             area[k] = moments.area
             for t, link_id in enumerate(layout.link_id):
                 name = layout.links[link_id].body
-                if own.reach[k, t] <= 0 or name == target.body:
+                if use_part.reach[k, t] <= 0 or name == target.body:
                     continue
                 link = scene.body(name)
                 q = link.pos + link.rotation @ layout.pos[t]
-                mass[t, k], about_q = moments.at(body.rotation.T @ (q - body.pos), float(own.reach[k, t]))
+                mass[t, k], about_q = moments.at(body.rotation.T @ (q - body.pos), float(use_part.reach[k, t]))
                 first[t, k] = link.rotation.T @ body.rotation @ about_q
                 velocity[t, k] = link.rotation.T @ (body.velocity_at(q) - link.velocity_at(q))
                 angular[t, k] = link.rotation.T @ (body.angvel - link.angvel)

@@ -63,19 +63,19 @@ def resolve_asset(asset: Asset, robots: Path) -> Path:
     inside = asset.path.removeprefix(ROBOTS)
     is_own = inside != asset.path
     path = robots.resolve() / inside if is_own else Path(asset.path)
-    found = Path(os.path.realpath(path))
-    if not path.is_absolute() or (is_own and not found.is_relative_to(robots.resolve())):
+    real = Path(os.path.realpath(path))
+    if not path.is_absolute() or (is_own and not real.is_relative_to(robots.resolve())):
         raise ArtifactError(f'asset "{asset.path}" of the scene is no place on this machine; compile again')
-    if found != path:
-        raise ArtifactError(f"asset {path} of the scene is a link to {found}; compile again")
+    if real != path:
+        raise ArtifactError(f"asset {path} of the scene is a link to {real}; compile again")
     if not stat.S_ISREG(path.stat().st_mode):
         raise ArtifactError(f"asset {path} of the scene is not a file; compile again")
     return path
 
 
 def _check_key(key: str, endings: tuple[str, ...]) -> None:
-    found = _KEY.fullmatch(key)
-    if found is None or found[1] not in endings:
+    match = _KEY.fullmatch(key)
+    if match is None or match[1] not in endings:
         raise ArtifactError(f'the scene has a file by the name "{key}", expected a hash with the ending {listed(endings)}')
 
 

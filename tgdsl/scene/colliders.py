@@ -44,26 +44,26 @@ def with_colliders(spec: mujoco.MjSpec, colliders: Sequence[Collider]) -> mujoco
         by_body.setdefault(collider.body, []).append(collider)
     if not by_body:
         return spec
-    own = {body: _colliding(spec, body) for body in by_body}
-    replaced = [geom for geoms in own.values() for geom in geoms]
+    geoms_of = {body: _colliding(spec, body) for body in by_body}
+    replaced = [geom for geoms in geoms_of.values() for geom in geoms]
     _refuse_pairs(spec, replaced)
     others = [geom for geom in spec.geoms if geom not in replaced]
     is_self_colliding = any(meets(one.contype, one.conaffinity, other) for one in replaced for other in replaced)
     core = free_bit(spec, "links with primitive colliders", RobotError, ("contype", "conaffinity")) if is_self_colliding else 0
     for body, parts in by_body.items():
-        _refuse_lost(body, own[body], others)
+        _refuse_lost(body, geoms_of[body], others)
         for i, collider in enumerate(parts):
-            _add(spec, collider, i, own[body][0], core if collider.is_core else 0)
+            _add(spec, collider, i, geoms_of[body][0], core if collider.is_core else 0)
     for geom in replaced:
         geom.contype = geom.conaffinity = 0
     return spec
 
 
 def _colliding(spec: mujoco.MjSpec, body: str) -> list[mujoco.MjsGeom]:
-    found = spec.body(body)
-    if found is None:
+    owner = spec.body(body)
+    if owner is None:
         raise RobotError(f'the scene has no body "{body}", which has primitive colliders')
-    geoms = [geom for geom in found.geoms if geom.contype or geom.conaffinity]
+    geoms = [geom for geom in owner.geoms if geom.contype or geom.conaffinity]
     if not geoms:
         raise RobotError(f'no geom of body "{body}" collides, expected one whose place its primitive colliders take')
     return geoms

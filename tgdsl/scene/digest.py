@@ -15,7 +15,7 @@ def scene_digest(scene: SceneFile) -> str:
     """
     root = ET.fromstring(scene.mjcf)
     for sensors in root.findall("sensor"):
-        for sensor in [own for own in sensors if own.get("name", "").startswith("tgdsl/")]:
+        for sensor in [element for element in sensors if element.get("name", "").startswith("tgdsl/")]:
             sensors.remove(sensor)
         if not len(sensors):
             root.remove(sensors)

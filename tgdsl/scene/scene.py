@@ -29,12 +29,12 @@ def weigh(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
     """Give a body the mass and inertia of all of its geoms: MuJoCo's own in a model with nothing else in it."""
     alone = mujoco.MjSpec()
     alone.assets = spec.assets
-    own = alone.worldbody.add_body()
+    copy = alone.worldbody.add_body()
     for name in sorted({geom.meshname for geom in body.geoms} - {""}):
         mesh = spec.mesh(name)
         alone.add_mesh(name=name, file=mesh.file, scale=mesh.scale, inertia=mesh.inertia)
     for geom in body.geoms:
-        added = own.add_geom()
+        added = copy.add_geom()
         for attribute in WEIGHED:
             setattr(added, attribute, getattr(geom, attribute))
     with muted_mujoco():
@@ -205,10 +205,10 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
     """Add geom i of an object to its body as one variant has it, and the meshes that it has in any."""
     meshes = {}
     for v, geoms in enumerate(target.variants):
-        own = geoms[i]
-        if own is not None and own.mesh:
+        shape = geoms[i]
+        if shape is not None and shape.mesh:
             meshes[v] = f"tgdsl/{target.name}/{v}/{i}"
-            spec.add_mesh(name=meshes[v], file=own.mesh, scale=[own.scale] * 3)
+            spec.add_mesh(name=meshes[v], file=shape.mesh, scale=[shape.scale] * 3)
     chosen = target.variants[variant][i]
     like = chosen or next(geoms[i] for geoms in target.variants if geoms[i] is not None)
     assert isinstance(like, SceneGeom)
@@ -289,7 +289,7 @@ class SceneModels:
 
     def models(self, choices: Sequence[Mapping[str, Choice]]) -> list[mujoco.MjModel]:
         """Return the model of each environment, and forget those that none has: sizes redrawn would pile up."""
-        results = [self.model(own) for own in choices]
+        results = [self.model(choice) for choice in choices]
         used = {id(model) for model in results}
         self._models = {key: model for key, model in self._models.items() if id(model) in used}
         return results

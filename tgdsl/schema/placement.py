@@ -77,6 +77,9 @@ class Poisson(_Sampled):
     """Least distance between samples [m], instead of `count`."""
     seed: Annotated[StrictInt, Field(ge=0)] = 0
     """Seed of the sampling."""
+    sampler: Literal["lattice", "pymeshlab"] = "lattice"
+    """Draws the candidates: `lattice`: on lines fixed in space, so that a mesh that was saved again gives the same taxels;
+    `pymeshlab`: its stratified sampling of the faces, which follows their order."""
 
     @model_validator(mode="after")
     def _one_of(self) -> Poisson:

@@ -50,7 +50,7 @@ def bulk(geoms: Sequence[SurfaceGeom]) -> Bulk:
     Args:
         geoms: At least one; a plane is a half-space, whose volume is infinite.
     """
-    each = [_of_mesh(own) if own.shape == "mesh" else _of_primitive(own.geom) for own in geoms]
+    each = [_of_mesh(geom) if geom.shape == "mesh" else _of_primitive(geom.geom) for geom in geoms]
     area = sum(one.area for one in each)
     return Bulk(
         volume=sum(one.volume for one in each),
@@ -67,11 +67,11 @@ def _of_primitive(geom: Geom) -> Bulk:
     return Bulk(volume, area, geom.pos - half, geom.pos + half, curvature)
 
 
-def _of_mesh(own: SurfaceGeom) -> Bulk:
-    surface = own.surface if own.mesh is None else own.mesh
+def _of_mesh(mesh_geom: SurfaceGeom) -> Bulk:
+    surface = mesh_geom.surface if mesh_geom.mesh is None else mesh_geom.mesh
     assert surface is not None
     volume, area = _enclosed(surface)
-    placed = surface.vertices @ own.geom.rotation.T + own.geom.pos
+    placed = surface.vertices @ mesh_geom.geom.rotation.T + mesh_geom.geom.pos
     return Bulk(volume, area, placed.min(axis=0), placed.max(axis=0), 0.0)
 
 

@@ -47,11 +47,11 @@ class ConvexSolid:
 
         Outside it is negative: the point is at least as far away, and −∞ says that it is outside the bounding box.
         """
-        own = (pos - self.pos) @ self.rotation
-        depth = np.full(len(own), -np.inf)
-        near = np.flatnonzero(((own >= self.low - SLACK) & (own <= self.high + SLACK)).all(axis=1))
+        local = (pos - self.pos) @ self.rotation
+        depth = np.full(len(local), -np.inf)
+        near = np.flatnonzero(((local >= self.low - SLACK) & (local <= self.high + SLACK)).all(axis=1))
         if len(near):
-            depth[near] = self._from_planes(own[near]) if len(self.planes) else -self._distance(own[near])
+            depth[near] = self._from_planes(local[near]) if len(self.planes) else -self._distance(local[near])
         return depth
 
     def _from_planes(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -66,12 +66,12 @@ class ConvexSolid:
         cell = np.floor((pos - pos.min(axis=0)) / step).astype(np.int64) @ [4 * CELLS**2, 2 * CELLS, 1]
         order = np.argsort(cell, kind="stable")
         depth = np.empty(len(pos))
-        for own in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
-            middle = pos[own].mean(axis=0)
-            r = np.linalg.norm(pos[own] - middle, axis=1).max()
+        for members in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
+            middle = pos[members].mean(axis=0)
+            r = np.linalg.norm(pos[members] - middle, axis=1).max()
             apart = self.planes[:, 3] - self.planes[:, :3] @ middle
             near = self.planes[apart <= apart.min() + 2.0 * r + SLACK]
-            depth[own] = (near[:, 3] - pos[own] @ near[:, :3].T).min(axis=1)
+            depth[members] = (near[:, 3] - pos[members] @ near[:, :3].T).min(axis=1)
         return depth
 
     def _distance(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:

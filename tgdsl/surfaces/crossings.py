@@ -66,16 +66,16 @@ def crossings(corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 
         covered.append(j[is_flat])
         cover.append(i[is_flat])
         border = np.stack([corners[i[is_flat]], np.roll(corners[i[is_flat]], -1, axis=1)], axis=2)
-        met = [(np.repeat(j[is_flat], 3), border.reshape(-1, 2, 3))]
-        for own, other, height in ((i, j, of_j), (j, i, of_i)):
-            is_cut, found = _sections(corners[other[~is_flat]], height[~is_flat])
-            met.append((own[~is_flat][is_cut], found))
-        for own, found in met:
-            inward = np.cross(normal[own][:, None], edges[own])
-            depth = np.einsum("nekc,nkc->nek", found[:, :, None] - corners[own][:, None], inward)
-            is_cut, found = _clipped(found, depth, tolerance)
-            cut.append(own[is_cut])
-            segments.append(found)
+        candidates = [(np.repeat(j[is_flat], 3), border.reshape(-1, 2, 3))]
+        for face, other, height in ((i, j, of_j), (j, i, of_i)):
+            is_cut, sections = _sections(corners[other[~is_flat]], height[~is_flat])
+            candidates.append((face[~is_flat][is_cut], sections))
+        for face, sections in candidates:
+            inward = np.cross(normal[face][:, None], edges[face])
+            depth = np.einsum("nekc,nkc->nek", sections[:, :, None] - corners[face][:, None], inward)
+            is_cut, sections = _clipped(sections, depth, tolerance)
+            cut.append(face[is_cut])
+            segments.append(sections)
         if sum(map(len, cut)) > MAX_SEGMENTS:
             return skipped
     return Crossings(np.concatenate(cut), np.concatenate(segments), np.concatenate(covered), np.concatenate(cover))
@@ -86,19 +86,19 @@ def _near_pairs(low: Float[np.ndarray, "f 3"], high: Float[np.ndarray, "f 3"]) -
     everything = np.arange(len(low))
     result, waiting, count = [np.zeros((0, 2), np.int64)], [(everything, everything)], 0
     while waiting:
-        own, near = waiting.pop()
-        box_low, box_high = low[own].min(axis=0), high[own].max(axis=0)
+        members, near = waiting.pop()
+        box_low, box_high = low[members].min(axis=0), high[members].max(axis=0)
         near = near[((low[near] <= box_high) & (high[near] >= box_low)).all(axis=1)]
-        if len(own) > LEAF:
-            middle = low[own] + high[own]
-            own = own[np.argsort(middle[:, np.ptp(middle, axis=0).argmax()], kind="stable")]
-            waiting += [(own[: len(own) // 2], near), (own[len(own) // 2 :], near)]
+        if len(members) > LEAF:
+            middle = low[members] + high[members]
+            members = members[np.argsort(middle[:, np.ptp(middle, axis=0).argmax()], kind="stable")]
+            waiting += [(members[: len(members) // 2], near), (members[len(members) // 2 :], near)]
             continue
-        meets = own[:, None] < near
+        meets = members[:, None] < near
         for axis in range(3):
-            meets &= (low[own, axis, None] <= high[near, axis]) & (high[own, axis, None] >= low[near, axis])
+            meets &= (low[members, axis, None] <= high[near, axis]) & (high[members, axis, None] >= low[near, axis])
         a, b = np.nonzero(meets)
-        result.append(np.stack([own[a], near[b]], axis=1))
+        result.append(np.stack([members[a], near[b]], axis=1))
         count += len(a)
         if count > MAX_PAIRS:
             return None

@@ -15,8 +15,8 @@ def merged(surface: Surface) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
     """Return a surface's distinct vertices [m], the faces that have three of them, and which of its faces these are."""
     vertices, same = np.unique(np.asarray(surface.vertices, float) + 0.0, axis=0, return_inverse=True)
     faces = same.reshape(-1)[np.asarray(surface.faces, np.int64)]
-    kept = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
-    return vertices, faces[kept], kept
+    face = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    return vertices, faces[face], face
 
 
 def hole_caps(

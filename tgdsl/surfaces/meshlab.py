@@ -1,8 +1,9 @@
-"""A link's outer surface: its meshes cleaned, and the components that lie inside others dropped.
+"""A link's outer surface: its meshes cleaned, the components that lie inside others dropped; points spread over triangles.
 
 Real meshes hold screws and magnets as components of their own, and disagree with themselves about what is outside.
 
-The only file that imports pymeshlab (GPL-3), and only when a surface is cleaned: compiled modules run without it.
+The only file that imports pymeshlab (GPL-3), and only when a surface is cleaned or sampled: compiled
+modules run without it.
 
 Shapes: `f` faces, `edge` three per face, `component` connected components of the mesh, `n` points. Everything is in the body
 frame.
@@ -89,8 +90,8 @@ def outer_shell(surface: Surface) -> Shell:
     faces = np.where(is_turned[:, None], clean.faces[:, ::-1], clean.faces)
     shell = Shell(Surface(clean.vertices, faces, clean.face_geom, clean.geoms), component, is_solid)
     is_kept = ~_enclosed(shell)[component]
-    kept, component = np.unique(component[is_kept], return_inverse=True)
-    return Shell(shell.surface.keep(is_kept), component, is_solid[kept])
+    old, component = np.unique(component[is_kept], return_inverse=True)
+    return Shell(shell.surface.keep(is_kept), component, is_solid[old])
 
 
 def _clean(surface: Surface) -> Surface:
@@ -122,6 +123,28 @@ def _clean(surface: Surface) -> Surface:
         parts.append(Surface(np.array(mesh.vertex_matrix()), faces, face_geom, ()))
     joined = Surface.joined(parts)
     return Surface(joined.vertices, joined.faces, joined.face_geom, surface.geoms)
+
+
+def stratified_points(
+    corners: Float[np.ndarray, "piece 3 3"], num: int
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """Return about `num` points that are spread evenly over triangles, and the triangle of each; without random numbers.
+
+    Args:
+        corners: The triangles.
+        num: Number of points wanted.
+    """
+    import igl
+    import pymeshlab as untyped
+
+    pymeshlab: Any = untyped
+    vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(vertices, faces))
+    meshes.generate_sampling_stratified_triangle(samplenum=num, sampling="Similar Triangle", random=False)
+    pos = np.array(meshes.current_mesh().vertex_matrix())
+    _, piece, nearest = igl.point_mesh_squared_distance(pos, vertices, faces)[:3]  # the sampler does not name its triangles
+    return np.asarray(nearest), np.asarray(piece, np.int64)
 
 
 def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "edge 2"]:

@@ -56,26 +56,26 @@ def outer(surface: Surface) -> Outer:
     Raises:
         BakeError: If no face has an area.
     """
-    vertices, faces, kept = merged(surface)
+    vertices, faces, source = merged(surface)
     has_area = _has_area(vertices[faces])
-    faces, written = faces[has_area], surface.faces[kept[has_area]]
+    faces, written = faces[has_area], surface.faces[source[has_area]]
     if not len(faces):
         raise BakeError("a surface to bake needs a face with an area")
     parts = outward(vertices, faces, written)
     if len(parts.caps):
         # Parts may share faces, but one that is there once too often is a part of its own.
         first = _distinct(faces)
-        parts = min(parts, outward(vertices, faces[first], written[first]), key=lambda found: len(found.caps))
+        parts = min(parts, outward(vertices, faces[first], written[first]), key=lambda candidate: len(candidate.caps))
     vertices, caps = parts.vertices, parts.caps[_has_area(parts.vertices[parts.caps])]
     closed = np.concatenate([parts.faces, caps])
     corners, size = vertices[closed], float(np.linalg.norm(np.ptp(vertices, axis=0)))
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    met = crossings(corners, normal, TOUCH * size)
-    cells = _cells(corners, met, TOUCH * size)
+    crossed = crossings(corners, normal, TOUCH * size)
+    cells = _cells(corners, crossed, TOUCH * size)
     step = STEP * size * normal[cells.owner]
     pos = cells.middle[:, None]
-    if not met.is_complete:
+    if not crossed.is_complete:
         # A face is within others only if its corners are too.
         pos = np.concatenate([pos, 0.02 * pos + 0.98 * corners], axis=1)
     sides = np.stack([pos + step[:, None], pos - step[:, None]])
@@ -83,8 +83,8 @@ def outer(surface: Surface) -> Outer:
     is_within = (before & behind).all(axis=1)
     before, behind = before[:, 0], behind[:, 0]
     is_sheet = ~before & ~behind
-    is_kept = ~is_within & ~_is_repeated(corners, normal, cells, met)
-    flaws = {OPEN: len(caps) > 0, TWISTED: not parts.is_orientable, UNCUT: not met.is_complete}
+    is_kept = ~is_within & ~_is_repeated(corners, normal, cells, crossed)
+    flaws = {OPEN: len(caps) > 0, TWISTED: not parts.is_orientable, UNCUT: not crossed.is_complete}
     is_turned = before & ~behind
     return _assembled(vertices, closed, cells, is_kept, is_turned, is_sheet, tuple(flaw for flaw in flaws if flaws[flaw]))
 
@@ -117,40 +117,40 @@ class _Cells:
     corners: list[Float[np.ndarray, "_ 3"]]
 
 
-def _cells(corners: Float[np.ndarray, "f 3 3"], met: Crossings, tolerance: float) -> _Cells:
+def _cells(corners: Float[np.ndarray, "f 3 3"], crossed: Crossings, tolerance: float) -> _Cells:
     """Return the cells that faces are cut into."""
-    order = np.argsort(met.cut, kind="stable")
-    names, begin = np.unique(met.cut[order], return_index=True)
+    order = np.argsort(crossed.cut, kind="stable")
+    names, begin = np.unique(crossed.cut[order], return_index=True)
     polygons, owner = [], []
-    for name, segments in zip(names.tolist(), np.split(met.segments[order], begin[1:]), strict=False):
-        found = cells(corners[name], segments, tolerance)
-        if len(found) > 1:
-            polygons += found
-            owner += [name] * len(found)
+    for name, segments in zip(names.tolist(), np.split(crossed.segments[order], begin[1:]), strict=False):
+        pieces = cells(corners[name], segments, tolerance)
+        if len(pieces) > 1:
+            polygons += pieces
+            owner += [name] * len(pieces)
     whole = np.setdiff1d(np.arange(len(corners)), owner)
     middle = [corners[whole].mean(axis=1), *(polygon.mean(axis=0, keepdims=True) for polygon in polygons)]
     return _Cells(np.concatenate([whole, np.array(owner, np.int64)]), np.concatenate(middle), polygons)
 
 
 def _is_repeated(
-    corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 3"], found: _Cells, met: Crossings
+    corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 3"], cells: _Cells, crossed: Crossings
 ) -> Bool[np.ndarray, " n"]:
     """Return which cells an earlier face of the same plane covers."""
-    order = np.argsort(found.owner, kind="stable")
-    begin, end = (np.searchsorted(found.owner[order], met.covered, side) for side in ("left", "right"))
-    pair = np.repeat(np.arange(len(met.covered)), end - begin)
+    order = np.argsort(cells.owner, kind="stable")
+    begin, end = (np.searchsorted(cells.owner[order], crossed.covered, side) for side in ("left", "right"))
+    pair = np.repeat(np.arange(len(crossed.covered)), end - begin)
     cell = order[np.arange(len(pair)) - np.repeat(np.cumsum(end - begin) - end, end - begin)]
-    cover, is_over = met.cover[pair], np.ones(len(pair), bool)
+    cover, is_over = crossed.cover[pair], np.ones(len(pair), bool)
     for k in range(3):
         start, along = corners[cover, k], corners[cover, (k + 1) % 3] - corners[cover, k]
-        is_over &= (np.cross(along, found.middle[cell] - start) * normal[cover]).sum(axis=1) > 0
-    return np.bincount(cell[is_over], minlength=len(found.owner)) > 0
+        is_over &= (np.cross(along, cells.middle[cell] - start) * normal[cover]).sum(axis=1) > 0
+    return np.bincount(cell[is_over], minlength=len(cells.owner)) > 0
 
 
 def _assembled(
     vertices: np.ndarray,
     faces: np.ndarray,
-    found: _Cells,
+    cells: _Cells,
     is_kept: np.ndarray,
     is_turned: np.ndarray,
     is_sheet: np.ndarray,
@@ -158,15 +158,15 @@ def _assembled(
 ) -> Outer:
     """Return the surface of the cells that are kept; faces all of whose cells are kept alike are whole."""
     kind = np.where(is_kept, 1 + is_turned + 2 * is_sheet, 0)
-    least, most = np.full(len(faces), 9), np.zeros(len(faces), np.int64)
-    np.minimum.at(least, found.owner, kind)
-    np.maximum.at(most, found.owner, kind)
-    is_whole = (least == most) & (most > 0)
-    triangles, kinds, new = [faces[is_whole]], [most[is_whole]], [vertices]
+    lowest, highest = np.full(len(faces), 9), np.zeros(len(faces), np.int64)
+    np.minimum.at(lowest, cells.owner, kind)
+    np.maximum.at(highest, cells.owner, kind)
+    is_whole = (lowest == highest) & (highest > 0)
+    triangles, kinds, new = [faces[is_whole]], [highest[is_whole]], [vertices]
     count = len(vertices)
-    first = len(found.owner) - len(found.corners)
-    for i in np.flatnonzero((kind > 0) & ~is_whole[found.owner]).tolist():
-        polygon = found.corners[i - first]
+    first = len(cells.owner) - len(cells.corners)
+    for i in np.flatnonzero((kind > 0) & ~is_whole[cells.owner]).tolist():
+        polygon = cells.corners[i - first]
         fan = np.arange(1, len(polygon) - 1)
         triangles.append(count + np.stack([np.zeros_like(fan), fan, fan + 1], axis=1))
         kinds.append(np.full(len(fan), kind[i]))
@@ -177,7 +177,7 @@ def _assembled(
     triangles, kinds = triangles[has_area], kinds[has_area]
     triangles = np.where((kinds == 2)[:, None], triangles[:, ::-1], triangles)
     triangles = np.concatenate([triangles, triangles[kinds == 3][:, ::-1]])
-    both = np.concatenate([triangles, faces[most > 0]])
+    both = np.concatenate([triangles, faces[highest > 0]])
     vertices, used = np.unique(vertices[both].reshape(-1, 3), axis=0, return_inverse=True)
     both = used.reshape(-1, 3)
     return Outer(vertices, both[: len(triangles)], both[len(triangles) :], flaws)

@@ -55,9 +55,9 @@ def outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], w
     part, is_turned, is_orientable = _coherent(vertices, faces, *_neighbours(vertices, faces, written))
     faces = np.where(is_turned[:, None], faces[:, ::-1], faces)
     num = int(part.max()) + 1
-    own, flat = np.unique(part[:, None] * len(vertices) + faces, return_inverse=True)
-    faces, part_of_vertex = flat.reshape(-1, 3), own // len(vertices)
-    vertices, caps = hole_caps(vertices[own % len(vertices)], faces)
+    corner, flat = np.unique(part[:, None] * len(vertices) + faces, return_inverse=True)
+    faces, part_of_vertex = flat.reshape(-1, 3), corner // len(vertices)
+    vertices, caps = hole_caps(vertices[corner % len(vertices)], faces)
     closed, closed_part = np.concatenate([faces, caps]), np.concatenate([part, part_of_vertex[caps[:, 0]]])
     is_inverted = _inside_out(vertices, closed, closed_part, num)[closed_part]
     closed = np.where(is_inverted[:, None], closed[:, ::-1], closed)
@@ -88,22 +88,22 @@ def _neighbours(
     vertices: np.ndarray, faces: np.ndarray, written: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
     """Return pairs of faces that are neighbours, and whether they run along their edge in opposite senses."""
-    sides, left, pairs = _sides(faces), np.arange(3 * len(faces)), [np.zeros((0, 2), np.int64)]
+    sides, unpaired, pairs = _sides(faces), np.arange(3 * len(faces)), [np.zeros((0, 2), np.int64)]
     is_forward = sides[:, 0] < sides[:, 1]
     for ends in (_sides(written), sides):
-        _, which, count = np.unique(np.sort(ends[left], axis=1), axis=0, return_inverse=True, return_counts=True)
+        _, which, count = np.unique(np.sort(ends[unpaired], axis=1), axis=0, return_inverse=True, return_counts=True)
         which = which.reshape(-1)
-        order, begin = left[np.argsort(which, kind="stable")], (np.cumsum(count) - count)[count == 2]
+        order, begin = unpaired[np.argsort(which, kind="stable")], (np.cumsum(count) - count)[count == 2]
         pairs.append(np.stack([order[begin], order[begin + 1]], axis=1))
-        left, which = left[count[which] != 2], which[count[which] != 2]
-    many = np.bincount(which)[which] > 2 if len(which) else np.zeros(0, bool)
-    left, which = left[many], which[many]
-    if len(left):
-        angle = _angles(vertices, np.sort(sides[left], axis=1), np.roll(faces, 1, axis=1).T.reshape(-1)[left], which)
+        unpaired, which = unpaired[count[which] != 2], which[count[which] != 2]
+    is_shared = np.bincount(which)[which] > 2 if len(which) else np.zeros(0, bool)
+    unpaired, which = unpaired[is_shared], which[is_shared]
+    if len(unpaired):
+        angle = _angles(vertices, np.sort(sides[unpaired], axis=1), np.roll(faces, 1, axis=1).T.reshape(-1)[unpaired], which)
         # At one angle, what ends a wedge comes before what begins one.
-        order = np.lexsort((~is_forward[left], angle, which))
-        groups = np.split(left[order], np.flatnonzero(np.diff(which[order])) + 1)
-        pairs += [np.array(found) for group in groups if (found := _wedges(group.tolist(), is_forward))]
+        order = np.lexsort((~is_forward[unpaired], angle, which))
+        groups = np.split(unpaired[order], np.flatnonzero(np.diff(which[order])) + 1)
+        pairs += [np.array(wedges) for group in groups if (wedges := _wedges(group.tolist(), is_forward))]
     a, b = np.concatenate(pairs).T
     return a % len(faces), b % len(faces), is_forward[a] != is_forward[b]
 
@@ -152,16 +152,16 @@ def _inside_out(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, num: 
     if not is_inverted.any() or is_inverted.all():
         return is_inverted
     order = np.argsort(part, kind="stable")
-    own = np.split(order, np.cumsum(np.bincount(part, minlength=num))[:-1])
+    members = np.split(order, np.cumsum(np.bincount(part, minlength=num))[:-1])
     outermost = np.full(num, -1)
     for container in np.argsort(-np.abs(volume), kind="stable").tolist():
         is_near = (low >= low[container]).all(axis=1) & (high <= high[container]).all(axis=1)
         is_near &= (outermost < 0) & (np.abs(volume) < np.abs(volume[container]))
         near = np.flatnonzero(is_near)
         if len(near):
-            tested = np.concatenate([own[i] for i in near])
+            tested = np.concatenate([members[i] for i in near])
             pos = np.concatenate([vertices[faces[tested]], vertices[faces[tested]].mean(axis=1, keepdims=True)], axis=1)
-            winding = igl.fast_winding_number(vertices, faces[own[container]], pos.reshape(-1, 3))
+            winding = igl.fast_winding_number(vertices, faces[members[container]], pos.reshape(-1, 3))
             is_out = (np.abs(winding).reshape(-1, 4) < ENCLOSED).any(axis=1)
             outermost[near[np.bincount(part[tested], is_out, num)[near] == 0]] = container
     return is_inverted[np.where(outermost < 0, np.arange(num), outermost)]

@@ -109,8 +109,8 @@ def first_hits(view: OrthographicView, uv: Float[np.ndarray, "ray 2"]) -> Hits:
         view: The surface, seen along the rays.
         uv: Where the rays pass through the (u, v) plane [m].
     """
-    found = [_hits(view, uv, face, ray) for face, ray in _pairs(view, uv)]
-    face, ray, t = (np.concatenate([part[i] for part in found]) for i in range(3)) if found else (np.zeros(0, int),) * 3
+    hits = [_hits(view, uv, face, ray) for face, ray in _pairs(view, uv)]
+    face, ray, t = (np.concatenate([part[i] for part in hits]) for i in range(3)) if hits else (np.zeros(0, int),) * 3
     nearest = np.full(len(uv), np.inf)
     np.minimum.at(nearest, ray, t)
     is_first = t <= nearest[ray] + view.rounding

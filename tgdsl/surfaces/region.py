@@ -101,8 +101,8 @@ class Region:
         for bounds in (*self.boxes, *((center - radius, center + radius) for center, radius in self.spheres)):
             for side, bound in zip((-1.0, 1.0), bounds, strict=True):
                 for axis in range(3):
-                    polygons, kept = _clipped(polygons, axis, side, bound[axis])
-                    owner = owner[kept]
+                    polygons, rows = _clipped(polygons, axis, side, bound[axis])
+                    owner = owner[rows]
         return polygons, owner
 
     def extremes(
@@ -119,11 +119,11 @@ class Region:
             The points, and for each a point within its face, both in the body frame [m].
         """
         polygons, owner = self.clipped(corners)
-        found = [polygons]
+        candidates = [polygons]
         for center, radius in self.spheres:
-            found.append(_rim(polygons, center, radius))
-            found.append(_disc(corners[owner], normals[owner], axes, center, radius))
-        points = np.concatenate(found, axis=1)
+            candidates.append(_rim(polygons, center, radius))
+            candidates.append(_disc(corners[owner], normals[owner], axes, center, radius))
+        points = np.concatenate(candidates, axis=1)
         inner = np.broadcast_to(polygons.mean(axis=1, keepdims=True), points.shape)
         is_in = self.is_within(points)  # false for NaN
         return points[is_in], inner[is_in]
@@ -148,8 +148,8 @@ def _clipped(
     num = is_kept.sum(axis=1)
     order = np.argsort(~is_kept, axis=1, kind="stable")
     slot = np.minimum(np.arange(size + 1), np.maximum(num - 1, 0)[:, None])
-    kept = np.flatnonzero(num)
-    return np.take_along_axis(points, np.take_along_axis(order, slot, 1)[..., None], 1)[kept], kept
+    rows = np.flatnonzero(num)
+    return np.take_along_axis(points, np.take_along_axis(order, slot, 1)[..., None], 1)[rows], rows
 
 
 def _rim(polygons: Float[np.ndarray, "n m 3"], center: Float[np.ndarray, " 3"], radius: float) -> Float[np.ndarray, "n k 3"]:
@@ -194,11 +194,11 @@ def clip(surface: Surface, parts: Sequence[RegionPart]) -> Surface:
     region = Region.of(surface, parts)
     if region.spheres:
         raise SampleError("a sphere does not cut faces straight", "use facing, box or geoms")
-    kept = np.flatnonzero(region.has_faces(surface.face_normals, surface.face_geom))
-    polygons, owner = region.clipped(surface.corners[kept])
+    faces = np.flatnonzero(region.has_faces(surface.face_normals, surface.face_geom))
+    polygons, owner = region.clipped(surface.corners[faces])
     fans = [np.stack([polygons[:, 0], polygons[:, k], polygons[:, k + 1]], axis=1) for k in range(1, polygons.shape[1] - 1)]
     corners = np.concatenate(fans)
-    geom = np.tile(surface.face_geom[kept][owner], len(fans))
+    geom = np.tile(surface.face_geom[faces][owner], len(fans))
     size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     corners, geom = corners[size > 0], geom[size > 0]
     if not len(corners):

@@ -70,10 +70,10 @@ class Solid:
     """
 
     def __init__(self, surface: Surface):
-        found = outer(surface)
-        self.corners, self.flaws = found.vertices[found.faces], found.flaws
-        self._creases = _creases(found.vertices, found.uncut)
-        self._faces = found.vertices, found.faces
+        boundary = outer(surface)
+        self.corners, self.flaws = boundary.vertices[boundary.faces], boundary.flaws
+        self._creases = _creases(boundary.vertices, boundary.uncut)
+        self._faces = boundary.vertices, boundary.faces
         self._tree = _tree(*self._faces)
 
     def is_inside(self, pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

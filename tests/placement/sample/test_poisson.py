@@ -1,6 +1,8 @@
 """Even samples against closed forms and statistics."""
 
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -145,3 +147,47 @@ def test_poisson_errors(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
     assert str(error_of(surface, placement("poisson", count=3))).startswith("`poisson` needs pymeshlab: ")
     assert len(sample(surface, placement("grid", rows=1, columns=1, direction=DOWN), HERE).pos) == 1
+
+
+PYMESHLAB = """
+import sys; sys.path[:0] = ["tests/helpers", "tests"]
+from oracles.setups.solids import box, surface_of
+from surfaces import HERE, placement
+from tgdsl.placement.sample.sample import sample
+found = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", count=40, sampler="pymeshlab"), HERE)
+sys.stdout.write((found.pos.tobytes() + found.normal.tobytes() + found.area.tobytes()).hex())
+"""
+
+
+def test_pymeshlab_draws_the_same_bytes_in_every_process():
+    def bytes_of(**keys: object) -> str:
+        found = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", count=40, **keys), HERE)
+        return (found.pos.tobytes() + found.normal.tobytes() + found.area.tobytes()).hex()
+
+    root = Path(__file__).parents[3]
+    fresh = subprocess.run([sys.executable, "-c", PYMESHLAB], cwd=root, capture_output=True, text=True, check=True).stdout
+    assert bytes_of(sampler="pymeshlab") == bytes_of(sampler="pymeshlab") == fresh
+    assert fresh not in (bytes_of(sampler="pymeshlab", seed=1), bytes_of(sampler="lattice"))
+    assert bytes_of(sampler="lattice") == bytes_of()
+
+
+@pytest.mark.parametrize("keys", [{"count": 7}, {"count": 120}, {"spacing": 0.0015}], ids=str)
+def test_pymeshlab_spreads_samples_evenly_over_the_region(keys):
+    radius, region = 0.01, {"facing": [0, 0, 1], "within": "60 deg"}
+    mesh = ball(radius, subdivisions=3)
+    found = sample(surface_of(mesh), placement("poisson", sampler="pymeshlab", region=region, **keys), HERE)
+    is_in = mesh.face_normals[:, 2] >= 0.5
+    np.testing.assert_allclose(found.area.sum(), mesh.area_faces[is_in].sum(), rtol=1e-9)
+    triangles = mesh.triangles[is_in]
+    from_plane = ((found.pos[:, None] - triangles[:, 0]) * mesh.face_normals[is_in]).sum(axis=2)
+    of_normal = np.linalg.norm(found.normal[:, None] - mesh.face_normals[is_in], axis=2).argmin(axis=1)
+    assert np.abs(from_plane[np.arange(len(found.pos)), of_normal]).max() < 1e-9  # on the face whose normal it has
+    nearest = KDTree(found.pos).query(found.pos, k=2)[0][:, 1]
+    if "count" in keys:
+        assert len(found.pos) == keys["count"]
+        ideal = np.sqrt(2 * found.area.sum() / (np.sqrt(3) * keys["count"]))  # hexagonal packing
+        assert nearest.min() > 0.6 * ideal and nearest.std() / nearest.mean() < 0.12
+    else:
+        assert nearest.min() >= keys["spacing"]
+        gaps = KDTree(found.pos).query(triangles.mean(axis=1))[0]
+        assert gaps.max() <= 1.05 * keys["spacing"]  # as large as the pool's points lie apart

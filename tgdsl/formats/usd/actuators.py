@@ -64,13 +64,13 @@ class Actuator:
 def read_actuators(stage: Stage, names: Names) -> list[Actuator]:
     """Read all actuators that are prims, those of MuJoCo first, in stage order."""
     prims = [prim for prim in stage.prims if prim.GetTypeName() in (MJC_ACTUATOR, NEWTON_ACTUATOR)]
-    own = unique_names(stage, prims)
+    prim_names = unique_names(stage, prims)
     results: list[Actuator] = []
     for prim in (prim for prim in prims if prim.GetTypeName() == MJC_ACTUATOR):
-        if actuator := _mjc_actuator(stage, prim, names, own[str(prim.GetPath())]):
+        if actuator := _mjc_actuator(stage, prim, names, prim_names[str(prim.GetPath())]):
             results.append(actuator)
     for prim in (prim for prim in prims if prim.GetTypeName() == NEWTON_ACTUATOR):
-        if actuator := _newton_actuator(stage, prim, names, own[str(prim.GetPath())]):
+        if actuator := _newton_actuator(stage, prim, names, prim_names[str(prim.GetPath())]):
             if actuator.joint in [other.joint for other in results]:
                 stage.drop("NewtonActuators were dropped whose joint has an MjcActuator", prim)
             else:
@@ -160,18 +160,18 @@ def _is_same_servo(drive: Drive, actuator: Actuator) -> bool:
 
 def _servo(joint: Joint, drive: Drive, name: str, taken: set[str]) -> Actuator:
     """Return the actuator that is a joint's drive; its control at the keyframe is the drive's target."""
-    own = drive.actuator or name
-    while own in taken:
-        own += "_drive"
-    taken.add(own)
-    attributes, gear = {"name": own, "joint": name}, drive.gear
+    unique = drive.actuator or name
+    while unique in taken:
+        unique += "_drive"
+    taken.add(unique)
+    attributes, gear = {"name": unique, "joint": name}, drive.gear
     if gear != 1.0:
         attributes["gear"] = text_of([gear])
     if drive.control is not None:
         attributes["ctrlrange"] = text_of(sorted(end * gear for end in drive.control))
     if not math.isinf(drive.max_force):
-        most = drive.max_force / abs(gear)
-        attributes["forcerange"] = text_of([-most, most])
+        limit = drive.max_force / abs(gear)
+        attributes["forcerange"] = text_of([-limit, limit])
     stiffness, damping = drive.stiffness / gear**2, drive.damping / gear**2
     kp, kv = text_of([stiffness]), text_of([damping])
     if not stiffness:
@@ -232,14 +232,14 @@ def read_tendons(stage: Stage, tendon: ET.Element, names: Names) -> None:
         RobotError: If the arrays that describe a path do not belong together.
     """
     prims = [prim for prim in stage.prims if prim.GetTypeName() == "MjcTendon"]
-    own = unique_names(stage, prims)
+    prim_names = unique_names(stage, prims)
     for prim in prims:
         element = _tendon(stage, prim, names)
         if element is None:
             stage.drop("tendons were dropped that pass over what is no joint, site or geom of the model", prim)
             continue
-        names.tendons[str(prim.GetPath())] = own[str(prim.GetPath())]
-        element.set("name", own[str(prim.GetPath())])
+        names.tendons[str(prim.GetPath())] = prim_names[str(prim.GetPath())]
+        element.set("name", prim_names[str(prim.GetPath())])
         tendon.append(element)
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 from tgdsl.formats.usd.joints import Joint
+from tgdsl.formats.usd.stage import Stage
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,40 +36,31 @@ class TreeNode:
         return joint.bodies[0] == self.body
 
 
-@dataclass(frozen=True, eq=False)
 class SpanningTree:
     """A spanning tree of all bodies.
+
+    A kinematic body is a root. Else a group of joined bodies is attached to the world by one of its joints to it (by the marked
+    one, or one below the marked prim, if there are several); without any, its root is the marked body, or else one that is
+    nobody's body 1. Of the joints of a loop, one without drive and limits is left out, the last one in stage order, and a
+    prismatic one only if there is no other. Joints that are excluded from articulations are only in the tree where nothing
+    else holds a group. Joints of MuJoCo (MjcJointAPI) and those of an articulation whose joints add mobility stack: several
+    between the same two bodies are the degrees of freedom of one.
 
     Attributes:
         nodes: By body, depth first and siblings in stage order, which is MuJoCo's order.
         loops: Joints that are not in the tree: they close a loop, or are equality constraints of MuJoCo.
     """
 
-    nodes: dict[str, TreeNode]
-    loops: tuple[Joint, ...]
-
-    def children(self, parent: str | None) -> tuple[TreeNode, ...]:
-        """Return the children of a body, or of the world."""
-        return tuple(node for node in self.nodes.values() if node.parent == parent)
-
-
-class _TreeBuilder:
-    """Builds the tree, one connected group of bodies after the other."""
-
-    def __init__(self, kinematic: Mapping[str, bool], joints: Iterable[Joint], roots: Iterable[str]):
-        self.kinematic = kinematic
+    def __init__(self, stage: Stage, joints: Iterable[Joint]):
         joints = [joint for joint in joints if joint.kind != "free"]
-        self.joints = [joint for joint in joints if not joint.constraint]
-        self.constraints = [joint for joint in joints if joint.constraint]
-        self.roots = list(roots)
+        self._kinematic, self._joints = stage.kinematic, [joint for joint in joints if not joint.constraint]
+        self._roots = [str(prim.GetPath()) for prim in stage.prims if stage.has(prim, "PhysicsArticulationRootAPI")]
+        self._closing_none: list[Joint] = []
         self.nodes: dict[str, TreeNode] = {}
-        self.kept: list[Joint] = []
-
-    def build(self) -> SpanningTree:
         waiting = self._groups()
         for group in list(waiting):
-            held = [body for body in group if self.kinematic[body]]
-            anchors = [joint for joint in self.joints if not joint.is_excluded and _end(joint, None) in group]
+            held = [body for body in group if self._kinematic[body]]
+            anchors = [joint for joint in self._joints if not joint.is_excluded and _end(joint, None) in group]
             if held or anchors:
                 waiting.remove(group)
                 anchor = None if held else min(anchors, key=lambda joint: self._rank(joint.path))
@@ -80,12 +72,16 @@ class _TreeBuilder:
             self._extend([root])
         self.nodes = {body: self._stacked(self.nodes[body]) for body in self._depth_first(None)}
         used = {id(joint) for node in self.nodes.values() for joint in node.joints}
-        loops = (joint for joint in (*self.joints, *self.constraints) if id(joint) not in used)
-        return SpanningTree(self.nodes, tuple(loops))
+        constraints = [joint for joint in joints if joint.constraint]
+        self.loops = tuple(joint for joint in (*self._joints, *constraints) if id(joint) not in used)
+
+    def children(self, parent: str | None) -> tuple[TreeNode, ...]:
+        """Return the children of a body, or of the world."""
+        return tuple(node for node in self.nodes.values() if node.parent == parent)
 
     def _depth_first(self, parent: str | None) -> list[str]:
         """Return all bodies below one, siblings in stage order."""
-        children = [body for body in self.kinematic if self.nodes[body].parent == parent]
+        children = [body for body in self._kinematic if self.nodes[body].parent == parent]
         return [body for child in children for body in (child, *self._depth_first(child))]
 
     def _stacked(self, node: TreeNode) -> TreeNode:
@@ -93,43 +89,43 @@ class _TreeBuilder:
 
         Stage order counts from body 0 of the first of them.
         """
-        own = node.joint
-        if own is None or not own.is_stackable:
+        base = node.joint
+        if base is None or not base.is_stackable:
             return node
-        found = [joint for joint in self.joints if joint.is_stackable and set(joint.bodies) == set(own.bodies)]
-        first, *rest = found[::-1] if node.is_swapped(found[0]) else found
+        parallel = [joint for joint in self._joints if joint.is_stackable and set(joint.bodies) == set(base.bodies)]
+        first, *rest = parallel[::-1] if node.is_swapped(parallel[0]) else parallel
         return replace(node, joint=first, stacked=tuple(rest))
 
     def _rank(self, path: str) -> int:
         """Rank a candidate root: has PhysicsArticulationRootAPI itself, is below a prim that has it, neither."""
-        return 0 if path in self.roots else 1 if any(path.startswith(f"{root}/") for root in self.roots) else 2
+        return 0 if path in self._roots else 1 if any(path.startswith(f"{root}/") for root in self._roots) else 2
 
     def _groups(self) -> list[list[str]]:
         """Return connected components over articulated joints, in stage order, and keep the joints that close no loop."""
-        group_of = {body: [body] for body in self.kinematic}
-        for joint in sorted(self.joints, key=_loop_priority):
+        group_of = {body: [body] for body in self._kinematic}
+        for joint in sorted(self._joints, key=_loop_priority):
             first, second = joint.bodies
             if first is not None and second is not None and not joint.is_excluded and group_of[first] is not group_of[second]:
                 group_of[first] += group_of[second]
                 group_of |= dict.fromkeys(group_of[second], group_of[first])
-                self.kept.append(joint)
-        order = list(self.kinematic)
+                self._closing_none.append(joint)
+        order = list(self._kinematic)
         return [sorted(group, key=order.index) for group in {id(group): group for group in group_of.values()}.values()]
 
     def _root(self, group: list[str]) -> tuple[str, bool]:
         """Return the root of a group that is not joined to the world, and whether it has PhysicsArticulationRootAPI."""
-        marked = [body for body in group if body in self.roots]
-        marked += [j.bodies[0] for j in self.joints if j.path in self.roots and j.bodies[0] in group and j.bodies[0]]
+        marked = [body for body in group if body in self._roots]
+        marked += [j.bodies[0] for j in self._joints if j.path in self._roots and j.bodies[0] in group and j.bodies[0]]
         if marked:
             return marked[0], True
-        children = {joint.bodies[1] for joint in self.joints if not joint.is_excluded}
+        children = {joint.bodies[1] for joint in self._joints if not joint.is_excluded}
         return min(group, key=lambda body: (body in children, self._rank(body))), False
 
     def _attached(self, waiting: list[list[str]]) -> tuple[list[str], TreeNode] | None:
         """Return a group that only a joint excluded from articulations joins to a body of the tree: it closes no loop."""
         for group in waiting:
             root, is_marked = self._root(group)
-            for joint in self.joints:
+            for joint in self._joints:
                 for parent, body in (joint.bodies, joint.bodies[::-1]):
                     is_placed = parent is None or parent in self.nodes
                     if joint.is_excluded and is_placed and body in group and body and (body == root or not is_marked):
@@ -146,7 +142,7 @@ class _TreeBuilder:
         queue = [root.body for root in roots]
         while queue:
             parent = queue.pop(0)
-            for joint in (joint for joint in self.joints if joint in self.kept):
+            for joint in (joint for joint in self._joints if joint in self._closing_none):
                 body = _end(joint, parent)
                 if body is not None and body not in self.nodes:
                     self.nodes[body] = TreeNode(body, parent, joint)
@@ -165,24 +161,6 @@ def _end(joint: Joint | None, other: str | None) -> str | None:
     return joint.bodies[1] if joint.bodies[0] == other else joint.bodies[0]
 
 
-def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots: Iterable[str]) -> SpanningTree:
-    """Choose the parent of every body.
-
-    A kinematic body is a root. Else a group of joined bodies is attached to the world by one of its joints to it (by the marked
-    one, or one below the marked prim, if there are several); without any, its root is the marked body, or else one that is
-    nobody's body 1. Of the joints of a loop, one without drive and limits is left out, the last one in stage order, and a
-    prismatic one only if there is no other. Joints that are excluded from articulations are only in the tree where nothing
-    else holds a group. Joints of MuJoCo (MjcJointAPI) and those of an articulation whose joints add mobility stack: several
-    between the same two bodies are the degrees of freedom of one.
-
-    Args:
-        kinematic: All bodies by path in stage order, and whether each is kinematic.
-        joints: All joints, in stage order.
-        roots: Paths of the prims that are marked as roots of articulations.
-    """
-    return _TreeBuilder(kinematic, joints, roots).build()
-
-
 def filtered_pairs(tree: SpanningTree) -> tuple[set[frozenset[str | None]], dict[frozenset[str | None], str]]:
     """Return the pairs of bodies that MuJoCo never collides by itself.
 
@@ -198,5 +176,5 @@ def filtered_pairs(tree: SpanningTree) -> tuple[set[frozenset[str | None]], dict
         if node.joint is not None and not is_welded:
             above[body] = group[node.parent]
     welded: set[frozenset[str | None]] = {frozenset((a, b)) for a, b in combinations(tree.nodes, 2) if group[a] == group[b]}
-    children = [(body, own) for body in tree.nodes if (own := group[body]) is not None and above.get(own) is not None]
-    return welded, {frozenset((a, b)): own for a, own in children for b in tree.nodes if group[b] == above[own]}
+    children = [(body, root) for body in tree.nodes if (root := group[body]) is not None and above.get(root) is not None]
+    return welded, {frozenset((a, b)): root for a, root in children for b in tree.nodes if group[b] == above[root]}

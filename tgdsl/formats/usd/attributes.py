@@ -115,6 +115,12 @@ def mjc(
     return Row(array, (Source(f"mjc:{name}", unit, neutral, is_range), *more))
 
 
+def flag_names(key: str) -> dict[str, int]:
+    """Return MJCF's names of the flags of `disable` or `enable`, and their bits."""
+    bits, prefix = FLAGS[key]
+    return {name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)}
+
+
 OPTION: Table = {
     "timestep": mjc("option:timestep", Source("newton:timeStepsPerSecond", is_rate=True), array="timestep"),
     **{
@@ -133,7 +139,10 @@ COMPILER: Table = {
     **{name.lower(): mjc(f"compiler:{name}") for name in ("fitAABB", "fuseStatic")},
     "settotalmass": mjc("compiler:setTotalMass", neutral=-1.0),
 }
-GRAVITY_FLAG: Table = {"gravity": Row("", (Source("mjc:flag:gravity"), Source("newton:gravityEnabled")))}
+FLAG: Table = {
+    **{name: mjc(f"flag:{name}") for name in sorted(name for key in FLAGS for name in flag_names(key))},
+    "gravity": mjc("flag:gravity", Source("newton:gravityEnabled")),
+}
 SELF_COLLISION: Table = {
     "self": Row("", (Source("newton:selfCollisionEnabled"), Source("physxArticulation:enabledSelfCollisions")))
 }
@@ -347,8 +356,8 @@ def set_customs(prim: Any, table: Table, value: Callable[[str], Any], default: C
         default: The same of an element with MuJoCo's defaults.
     """
     for attribute, row in table.items():
-        if row.array and not np.array_equal(own := np.asarray(value(row.array)), default(row.array)):
-            set_custom(prim, attribute, KEYWORDS[attribute][int(own)] if attribute in KEYWORDS else own.tolist())
+        if row.array and not np.array_equal(number := np.asarray(value(row.array)), default(row.array)):
+            set_custom(prim, attribute, KEYWORDS[attribute][int(number)] if attribute in KEYWORDS else number.tolist())
 
 
 def set_sources(prim: Any, table: Table, model: mujoco.MjModel, index: int) -> None:
@@ -359,17 +368,17 @@ def set_sources(prim: Any, table: Table, model: mujoco.MjModel, index: int) -> N
     for attribute, row in table.items():
         if not row.array:
             continue
-        array = np.asarray(getattr(model, row.array)[index]).ravel()
-        value = array.tolist() if np.ndim(getattr(model, row.array)) > 1 else array.tolist()[0]
+        array = np.asarray(getattr(model, row.array)[index])
+        value = array.ravel().tolist() if array.ndim else array.item()
         if attribute in KEYWORDS:
-            value = KEYWORDS[attribute][int(value)]
+            value = KEYWORDS[attribute][int(array)]
         if not row.sources:
             if np.any(array):
                 set_custom(prim, attribute, value)
         elif row.sources[0].is_range:
             limited = attribute.replace("range", "limited")
             is_limited = getattr(model, table[limited].array)[index] if limited in table else array.any()
-            for end, number in zip(("min", "max"), value if is_limited else (), strict=False):
+            for end, number in zip(("min", "max"), array.tolist() if is_limited else (), strict=False):
                 author(prim, f"{row.sources[0].name}:{end}", number)
         elif array.size:
             author(prim, row.sources[0].name, value)
@@ -402,9 +411,3 @@ def default_model() -> mujoco.MjModel:
     """Return a model with MuJoCo's default value of every attribute in the tables."""
     inside = '<body><joint/><geom type="sphere" size="1"/><site/></body>'
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{inside}</worldbody></mujoco>")
-
-
-def flag_names(key: str) -> dict[str, int]:
-    """Return MJCF's names of the flags of `disable` or `enable`, and their bits."""
-    bits, prefix = FLAGS[key]
-    return {name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)}

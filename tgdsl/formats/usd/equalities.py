@@ -117,7 +117,7 @@ def read_polynomials(stage: Stage, equality: ET.Element, names: Names) -> None:
         if prim.GetTypeName() != "Scope" or (coefficients := read_custom(stage, prim, "polycoef")) is None:
             continue
         paths = [str(path) for end in (1, 2) for path in stage.targets(prim, f"{NAMESPACE}end{end}")]
-        tag = next((tag for tag, own in ends.items() if paths and all(path in own for path in paths)), None)
+        tag = next((tag for tag, names_by_path in ends.items() if paths and all(path in names_by_path for path in paths)), None)
         if tag is None:
             stage.drop("equality constraints were dropped whose ends are no joints or tendons of the model", prim)
             continue
@@ -171,12 +171,12 @@ def constraint_attributes(stage: Stage, joint: Joint) -> dict[str, str]:
 def _add(stage: Stage, equality: ET.Element, tag: str, prim: Prim, name: str, attributes: Mapping[str, str]) -> None:
     """Add a constraint under the name that it had, or one like the name given."""
     taken = {element.get("name") for element in equality}
-    own = str(read_custom(stage, prim, "equality_name") or name)
-    while own in taken:
-        own += "_"
+    unique = str(read_custom(stage, prim, "equality_name") or name)
+    while unique in taken:
+        unique += "_"
     place = read_custom(stage, prim, "equality")
     order = {} if place is None else {ORDER: str(int(place))}
-    ET.SubElement(equality, tag, {"name": own, **attributes, **order})
+    ET.SubElement(equality, tag, {"name": unique, **attributes, **order})
 
 
 def put_in_order(equality: ET.Element) -> None:

@@ -12,7 +12,7 @@ bodies from each other.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import combinations
 
 from tgdsl.formats.usd.attributes import SELF_COLLISION, read_attributes
@@ -35,16 +35,11 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], we
         geoms: All geoms.
         welded: Pairs that MuJoCo's own filter would keep apart, where it is off only because some joints' bodies collide.
     """
-    colliders: dict[str | None, list[str]] = {body: [] for body in stage.bodies}
-    prims: dict[str, Prim] = {}
-    for geom in geoms:
-        if geom.is_collider:
-            colliders.setdefault(geom.body, []).append(geom.path)
-            prims[geom.path] = geom.prim
-    filters = _Filters(stage, colliders, prims, joints)
+    filters = _Filters(stage, joints, geoms)
+    colliders = filters.colliders
     result: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
     filtered = filters.of_colliders()
-    owners = [owner for owner, own in colliders.items() if own]
+    owners = [owner for owner, paths in colliders.items() if paths]
     for first, second in combinations(owners, 2) if filtered else ():
         pairs = [frozenset((a, b)) for a in colliders[first] for b in colliders[second]]
         hits = [pair for pair in pairs if pair in filtered]
@@ -59,17 +54,15 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], we
 class _Filters:
     """Filters of a stage, by who says so."""
 
-    def __init__(
-        self,
-        stage: Stage,
-        colliders: Mapping[str | None, list[str]],
-        prims: Mapping[str, Prim],
-        joints: Iterable[Joint],
-    ):
+    def __init__(self, stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim]):
         self.stage = stage
-        self.colliders = colliders
-        self.prims = prims
         self.joints = [joint for joint in joints if joint.kind != "free"]
+        self.colliders: dict[str | None, list[str]] = {body: [] for body in stage.bodies}
+        self.prims: dict[str, Prim] = {}
+        for geom in geoms:
+            if geom.is_collider:
+                self.colliders.setdefault(geom.body, []).append(geom.path)
+                self.prims[geom.path] = geom.prim
 
     def of_joints(self) -> set[Pair]:
         """Return pairs of bodies that a joint keeps apart."""
@@ -94,10 +87,7 @@ class _Filters:
 
     def of_colliders(self) -> dict[frozenset[str], Prim]:
         """Return pairs of colliders that must not collide, and the prim that says so."""
-        sources = self._listed_pairs()
-        for pair, group in self._groups().items():
-            sources.setdefault(pair, group)
-        return sources
+        return self._groups() | self._listed_pairs()
 
     def _listed_pairs(self) -> dict[frozenset[str], Prim]:
         stage, sources = self.stage, {}
@@ -120,7 +110,7 @@ class _Filters:
         if path in self.prims:
             return [path]
         if self.stage.has(prim, "PhysicsArticulationRootAPI"):
-            return [own for body in self._articulation(path) for own in self.colliders[body]]
+            return [collider for body in self._articulation(path) for collider in self.colliders[body]]
         if not self.stage.has(prim, "PhysicsCollisionAPI"):  # a collider that is disabled collides with nothing anyway
             self.stage.drop(f"collision filters were dropped of no body, collider or articulation, but {path}", source)
         return []
@@ -135,7 +125,7 @@ class _Filters:
         return [body for body in self.colliders if body in result and body is not None]
 
     def _static(self, path: str) -> bool:
-        return any(own == path or own.startswith(f"{path}/") for own in self.colliders.get(None, ()))
+        return any(collider == path or collider.startswith(f"{path}/") for collider in self.colliders.get(None, ()))
 
     def _groups(self) -> dict[frozenset[str], Prim]:
         physics, sources = self.stage.pxr.UsdPhysics, {}

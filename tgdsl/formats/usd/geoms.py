@@ -166,10 +166,10 @@ def _geoms(stage: Stage, prim: Prim, is_collider: bool, is_visible: bool) -> lis
 def _mass_model(stage: Stage, prim: Prim) -> str:
     """Return how MuJoCo takes a geom's mass and inertia, or nothing if only UsdPhysics says so."""
     is_shell = stage.authored(prim, "newton:massModel") == "shell" or stage.authored(prim, "mjc:shellinertia")
-    own = "shell" if is_shell else str(stage.authored(prim, "mjc:inertia") or "")
-    if own and own not in MASS_MODELS:
-        raise stage.error(prim, f"mjc:inertia is {own!r}; expected one of {', '.join(MASS_MODELS)}")
-    return own
+    model = "shell" if is_shell else str(stage.authored(prim, "mjc:inertia") or "")
+    if model and model not in MASS_MODELS:
+        raise stage.error(prim, f"mjc:inertia is {model!r}; expected one of {', '.join(MASS_MODELS)}")
+    return model
 
 
 def _is_visible(stage: Stage, prim: Prim) -> bool:

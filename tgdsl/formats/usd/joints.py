@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.attributes import JOINT, read_attributes, read_custom, with_limits
+from tgdsl.formats.usd.attributes import JOINT, read_attributes, read_custom, units, with_limits
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
 INFINITE = 1e30
@@ -182,9 +182,9 @@ def _joint(stage: Stage, prim: Prim) -> Joint:
     _drop_the_rest(stage, prim, instance if kind in ("hinge", "slide") else "")
     drive = None
     if kind in ("hinge", "slide"):
-        shared = float(read_custom(stage, prim, "damping") or 0.0)  # only `tgdsl:damping` is part of the drive's
-        drive, own = _read_drive(stage, prim, instance, kind, shared)
-        attributes |= {"damping": repr(own)} if shared else {}
+        shared_damping = float(read_custom(stage, prim, "damping") or 0.0)  # only `tgdsl:damping` is part of the drive's
+        drive, joint_damping = _read_drive(stage, prim, instance, kind, shared_damping)
+        attributes |= {"damping": repr(joint_damping)} if shared_damping else {}
     return Joint(
         path=str(prim.GetPath()),
         prim=prim,
@@ -295,12 +295,12 @@ def _side(stage: Stage, prim: Prim, side: int) -> tuple[str | None, Matrix, str]
         raise stage.error(prim, f"physics:body{side} names {targets[0]}, which does not exist")
     body = stage.owners[str(target.GetPath())]
     frame, scale = stage.frame(target)
-    own = np.eye(4)
-    own[:3, 3] = scale * np.array(stage.value(prim, f"physics:localPos{side}"), dtype=np.float64)
-    own[:3, :3] = rotation_of(stage, prim, f"physics:localRot{side}").as_matrix()
-    if not np.isfinite(own).all():
+    local = np.eye(4)
+    local[:3, 3] = scale * np.array(stage.value(prim, f"physics:localPos{side}"), dtype=np.float64)
+    local[:3, :3] = rotation_of(stage, prim, f"physics:localRot{side}").as_matrix()
+    if not np.isfinite(local).all():
         raise stage.error(prim, f"physics:localPos{side} is not finite")
-    frame = frame @ own
+    frame = frame @ local
     return body, stage.in_body(frame, body), str(targets[0]) if targets else ""
 
 
@@ -331,7 +331,7 @@ def _drop_the_rest(stage: Stage, prim: Prim, instance: str) -> None:
             stage.drop("joints do not break: their breakForce and breakTorque were dropped", prim)
 
 
-def _read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -> tuple[Drive | None, float]:
+def _read_drive(stage: Stage, prim: Prim, instance: str, kind: str, joint_damping: float) -> tuple[Drive | None, float]:
     """Return a joint's drive, if it has one that can exert a force, and the joint's own damping.
 
     Args:
@@ -339,50 +339,43 @@ def _read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) 
         prim: The joint.
         instance: Which drive is along its degree of freedom.
         kind: `hinge` or `slide`.
-        own: The joint's own damping [N·m·s/rad or N·s/m], which is part of the drive's.
+        joint_damping: The joint's own damping [N·m·s/rad or N·s/m], which is part of the drive's.
     """
     if not prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, instance):
-        return None, own
-    stiffness, damping, most, target, velocity = (
+        return None, joint_damping
+    stiffness, damping, max_force, target, velocity = (
         stage.number(prim, f"drive:{instance}:physics:{name}")
         for name in ("stiffness", "damping", "maxForce", "targetPosition", "targetVelocity")
     )
     if not stiffness and not damping:
-        return None, own  # it never exerts a force
+        return None, joint_damping  # it never exerts a force
     if stage.value(prim, f"drive:{instance}:physics:type") == "acceleration":
         stage.drop("drives were dropped whose gains are per mass (type acceleration), which MuJoCo does not have", prim)
-        return None, own
-    gain, force, unit = _si_units(stage, is_angular=kind == "hinge")
-    most = math.inf if most >= INFINITE else most * force
-    own = min(own, damping * gain)
-    rest = damping * gain - own
-    rest = 0.0 if rest < ROUNDING * own else rest
-    if not stiffness and not rest:
-        return None, own
+        return None, joint_damping
+    unit = units(stage, is_angular=kind == "hinge")
+    gain = unit["damping"]
+    max_force = math.inf if max_force >= INFINITE else max_force * unit["effort"]
+    joint_damping = min(joint_damping, damping * gain)
+    servo_damping = damping * gain - joint_damping
+    servo_damping = 0.0 if servo_damping < ROUNDING * joint_damping else servo_damping
+    if not stiffness and not servo_damping:
+        return None, joint_damping
     gear = float(read_custom(stage, prim, "gear") or 1.0)
     of_joint, of_actuator = (read_custom(stage, prim, key) for key in ("actuatorfrcrange", "forcerange"))
-    if of_joint is not None and math.isclose(most, np.abs(of_joint).max(), rel_tol=ROUNDING):
+    if of_joint is not None and math.isclose(max_force, np.abs(of_joint).max(), rel_tol=ROUNDING):
         # The drive's limit is the smaller of the joint's, which is read with the joint, and the actuator's.
-        most = math.inf if of_actuator is None else float(of_actuator[1]) * abs(gear)
+        max_force = math.inf if of_actuator is None else float(of_actuator[1]) * abs(gear)
     control = read_custom(stage, prim, "ctrlrange")
     order = read_custom(stage, prim, "order")
     drive = Drive(
         stiffness * gain,
-        rest,
-        most,
-        target * unit,
-        velocity * unit,
+        servo_damping,
+        max_force,
+        target * unit["position"],
+        velocity * unit["position"],
         str(read_custom(stage, prim, "actuator") or ""),
         None if control is None else (float(control[0]), float(control[1])),
         gear,
         math.inf if order is None else float(order),
     )
-    return drive, own
-
-
-def _si_units(stage: Stage, is_angular: bool) -> tuple[float, float, float]:
-    """Return the stage's units of a drive's gains, of its force and of its target, in SI and radians."""
-    if is_angular:
-        torque = stage.kilograms_per_unit * stage.metres_per_unit**2
-        return stage.kilograms_per_unit * (stage.metres_per_unit**2 * math.degrees(1)), torque, math.radians(1)
-    return stage.kilograms_per_unit, stage.kilograms_per_unit * stage.metres_per_unit, stage.metres_per_unit
+    return drive, joint_damping

@@ -82,21 +82,22 @@ def inertial_of(stage: Stage, body: Prim, geoms: Sequence[Gprim]) -> Inertial | 
     Raises:
         RobotError: If what is authored is no mass, or no inertia.
     """
-    own = _authored(stage, body)
-    if (exact := _with_zeros(stage, body, own)) is not None:
+    authored = _authored(stage, body)
+    if (exact := _with_zeros(stage, body, authored)) is not None:
         return exact
-    colliders = [(geom, _own_mass(stage, geom)) for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
-    if own.mass and own.centre is not None and own.tensor is not None:
-        return _repaired(stage, body, Inertial(own.mass, own.centre, own.tensor, own.axes))
-    parts = [_collider(stage, geom, found, own.density) for geom, found in colliders]
+    colliders = [geom for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
+    masses = [_authored(stage, geom.prim) if geom.path != geom.body else _Authored() for geom in colliders]
+    if authored.mass and authored.centre is not None and authored.tensor is not None:
+        return _repaired(stage, body, Inertial(authored.mass, authored.centre, authored.tensor, authored.axes))
+    parts = [_collider(stage, geom, mass, authored.density) for geom, mass in zip(colliders, masses, strict=True)]
     whole = _sum([part for part in parts if part.mass > 0])
-    if own.mass and whole is not None:
-        whole = Inertial(own.mass, whole.centre, whole.tensor * (own.mass / whole.mass))
-    elif own.mass and own.tensor is None:
-        whole = _fallback_inertial(stage, body, own.mass, geoms)
-    elif own.mass:
-        whole = Inertial(own.mass, np.zeros(3), np.zeros((3, 3)))
-    return None if whole is None else _repaired(stage, body, _overruled(whole, own))
+    if authored.mass and whole is not None:
+        whole = Inertial(authored.mass, whole.centre, whole.tensor * (authored.mass / whole.mass))
+    elif authored.mass and authored.tensor is None:
+        whole = _fallback_inertial(stage, body, authored.mass, geoms)
+    elif authored.mass:
+        whole = Inertial(authored.mass, np.zeros(3), np.zeros((3, 3)))
+    return None if whole is None else _repaired(stage, body, _overruled(whole, authored))
 
 
 def _authored(stage: Stage, prim: Prim) -> _Authored:
@@ -124,16 +125,16 @@ def _authored(stage: Stage, prim: Prim) -> _Authored:
     )
 
 
-def _with_zeros(stage: Stage, body: Prim, own: _Authored) -> Inertial | None:
+def _with_zeros(stage: Stage, body: Prim, authored: _Authored) -> Inertial | None:
     """Return the mass and inertia of which some are zero, as `export` wrote them: mass, moments and axes (w x y z)."""
     values = np.array(read_custom(stage, body, "inertial") or (), dtype=np.float64)
-    if not values.size or own.tensor is not None or np.float32(own.mass) != np.float32(values[0]):
+    if not values.size or authored.tensor is not None or np.float32(authored.mass) != np.float32(values[0]):
         return None
     if values.size != 8 or not np.isfinite(values).all() or values[:4].min() < 0 or not values[4:].any():
         raise stage.error(body, f"tgdsl:inertial is {values.tolist()}; expected a mass, three moments and a quaternion")
     turn = Rotation.from_quat(values[4:], scalar_first=True)
     tensor = turn.as_matrix() @ np.diag(values[1:4]) @ turn.as_matrix().T
-    return Inertial(own.mass, np.zeros(3) if own.centre is None else own.centre, tensor, (values[1:4], turn))
+    return Inertial(authored.mass, np.zeros(3) if authored.centre is None else authored.centre, tensor, (values[1:4], turn))
 
 
 def _full_tensor(stage: Stage, prim: Prim) -> Tensor | None:
@@ -148,31 +149,27 @@ def _full_tensor(stage: Stage, prim: Prim) -> Tensor | None:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def _overruled(computed: Inertial, own: _Authored) -> Inertial:
+def _overruled(computed: Inertial, authored: _Authored) -> Inertial:
     """Put an authored centre of mass and inertia in place of the computed ones."""
-    centre = computed.centre if own.centre is None else own.centre
-    return Inertial(computed.mass, centre, computed.about(centre) if own.tensor is None else own.tensor)
+    centre = computed.centre if authored.centre is None else authored.centre
+    return Inertial(computed.mass, centre, computed.about(centre) if authored.tensor is None else authored.tensor)
 
 
-def _own_mass(stage: Stage, geom: Gprim) -> _Authored:
-    return _authored(stage, geom.prim) if str(geom.prim.GetPath()) != geom.body else _Authored()
-
-
-def _collider(stage: Stage, geom: Gprim, own: _Authored, body_density: float) -> Inertial:
+def _collider(stage: Stage, geom: Gprim, authored: _Authored, body_density: float) -> Inertial:
     """Return what a collider contributes, in the body's frame."""
-    density = own.density or body_density or geom.density or DENSITY
+    density = authored.density or body_density or geom.density or DENSITY
     volume, centre, tensor = _properties(stage, geom)
-    mass = own.mass or volume * density
+    mass = authored.mass or volume * density
     computed = Inertial(mass, centre, tensor * (mass / volume if volume else 0.0))
-    if own.centre is None and own.tensor is None:
+    if authored.centre is None and authored.tensor is None:
         return computed
     place = stage.in_body(stage.frame(geom.prim)[0], geom.body)
     turn, point = place[:3, :3], place[:3, 3]
     return _overruled(
         computed,
         _Authored(
-            centre=None if own.centre is None else turn @ own.centre + point,
-            tensor=None if own.tensor is None else turn @ own.tensor @ turn.T,
+            centre=None if authored.centre is None else turn @ authored.centre + point,
+            tensor=None if authored.tensor is None else turn @ authored.tensor @ turn.T,
         ),
     )
 
@@ -213,14 +210,14 @@ def _fallback_inertial(stage: Stage, body: Prim, mass: float, geoms: Sequence[Gp
     return Inertial(mass, np.zeros(3), 0.4 * mass * FALLBACK_RADIUS**2 * np.eye(3))
 
 
-def _repaired(stage: Stage, body: Prim, found: Inertial) -> Inertial:
+def _repaired(stage: Stage, body: Prim, inertial: Inertial) -> Inertial:
     """Replace an inertia that breaks the triangle inequality by a ball's of about the same size; rounding is only corrected."""
-    moments, axes = found.ascending()
-    low, middle, high = np.sort(found.principal()[0])
+    moments, axes = inertial.ascending()
+    low, middle, high = np.sort(inertial.principal()[0])
     if low > 0 and low + middle >= high:
-        return found
+        return inertial
     if low > 0 and low + middle >= high * (1 - 1e-6):  # authored in float32: a disc may miss by a digit
         turn = axes.as_matrix()
-        return Inertial(found.mass, found.centre, turn @ np.diag([low, middle, (low + middle) * (1 - 1e-12)]) @ turn.T)
+        return Inertial(inertial.mass, inertial.centre, turn @ np.diag([low, middle, (low + middle) * (1 - 1e-12)]) @ turn.T)
     stage.drop("inertias that no body can have were mended", body)
-    return Inertial(found.mass, found.centre, max(float(moments.mean()), LEAST_INERTIA) * np.eye(3))
+    return Inertial(inertial.mass, inertial.centre, max(float(moments.mean()), LEAST_INERTIA) * np.eye(3))

@@ -43,7 +43,7 @@ import numpy as np
 from tgdsl.errors import RobotError
 from tgdsl.formats.model import Model
 from tgdsl.formats.usd.actuators import read_actuators, read_keyframes, read_tendons, servos_of
-from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, filtered_pairs, spanning_tree
+from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, filtered_pairs
 from tgdsl.formats.usd.attributes import BODY, read_attributes, read_custom, text_of
 from tgdsl.formats.usd.audit import note_unread
 from tgdsl.formats.usd.equalities import (
@@ -118,8 +118,7 @@ def _read(stage: Stage) -> _Robot:
     inertials = {
         path: inertial_of(stage, prim, [geom for geom in geoms if geom.body == path]) for path, prim in stage.bodies.items()
     }
-    roots = [str(prim.GetPath()) for prim in stage.prims if stage.has(prim, "PhysicsArticulationRootAPI")]
-    tree = spanning_tree(stage.kinematic, joints, roots)
+    tree = SpanningTree(stage, joints)
     kinds = {joint.path: joint.kind for node in tree.nodes.values() for joint in node.joints}
     bodies = unique_names(stage, stage.bodies.values(), ["world"])
     geom_names = unique_names(stage, {geom.path: geom.prim for geom in geoms}.values())
@@ -284,8 +283,8 @@ class _Mjcf:
         content = vertices.tobytes() + b"|" + faces.tobytes() + repr(sorted(attributes.items())).encode()
         key, names = hashlib.sha256(content).hexdigest(), self._mesh_names
         if key not in names:
-            wanted = (attributes.get("name", name), name, *(f"{name}_{i + 2}" for i in range(len(names))))
-            names[key] = next(own for own in wanted if own not in names.values())
+            candidates = (attributes.get("name", name), name, *(f"{name}_{i + 2}" for i in range(len(names))))
+            names[key] = next(unique for unique in candidates if unique not in names.values())
             # Masses are given with the bodies; a shell is what MuJoCo never finds wrong with a mesh that is open or flat.
             mesh = ET.SubElement(self._asset, "mesh", {"inertia": "shell", **attributes, "name": names[key]})
             mesh.set("vertex", " ".join(map(str, vertices.reshape(-1))))
@@ -347,10 +346,10 @@ class _Mjcf:
         nodes = list(self._robot.tree.nodes.values())
         prims = read_actuators(self._stage, self._names)
         servos = servos_of(self._stage, [joint for node in nodes for joint in node.joints], prims, self._names)
-        actuators = sorted((*prims, *servos), key=lambda own: own.order)
-        for own in actuators:
-            ET.SubElement(actuator, own.kind, own.attributes)
-        ctrl = [own.control for own in actuators]
+        actuators = sorted((*prims, *servos), key=lambda element: element.order)
+        for element in actuators:
+            ET.SubElement(actuator, element.kind, element.attributes)
+        ctrl = [element.control for element in actuators]
         qpos, is_needed = self._authored_qpos(nodes)
         if is_needed or any(ctrl):
             key = ET.SubElement(keyframe, "key", name="authored", qpos=text_of(qpos))
@@ -370,8 +369,8 @@ class _Mjcf:
                 continue
             apart, position, _ = joint.authored(self._stage)
             if node.stacked:
-                for own in node.joints:
-                    qpos += [1.0, 0.0, 0.0, 0.0] if own.kind == "ball" else [own.reference]
+                for stacked in node.joints:
+                    qpos += [1.0, 0.0, 0.0, 0.0] if stacked.kind == "ball" else [stacked.reference]
             elif joint.kind in ("hinge", "slide"):
                 qpos.append(position + joint.reference)
                 is_needed |= abs(position) > REST_TOLERANCE
@@ -389,11 +388,11 @@ def _pose(pose: Matrix) -> dict[str, str]:
 
 def _friction(geom: Gprim) -> str | None:
     """Return the frictions of a geom: sliding as its material says, the others as `tgdsl:friction`, or else its material."""
-    own = [float(value) for value in geom.mjcf_attributes.get("friction", "").split()]
+    custom = [float(value) for value in geom.mjcf_attributes.get("friction", "").split()]
     sliding, *others = geom.friction
-    if not own and geom.friction == (None, None, None):
+    if not custom and geom.friction == (None, None, None):
         return None
-    values = [sliding if sliding is not None else (own or FRICTION)[0]]
+    values = [sliding if sliding is not None else (custom or FRICTION)[0]]
     for number, other in enumerate(others, start=1):
-        values.append(own[number] if len(own) > number else FRICTION[number] if other is None else other)
+        values.append(custom[number] if len(custom) > number else FRICTION[number] if other is None else other)
     return text_of(values)

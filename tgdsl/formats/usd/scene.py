@@ -13,10 +13,9 @@ import numpy as np
 
 from tgdsl.formats.usd.attributes import (
     COMPILER,
+    FLAG,
     FLAGS,
-    GRAVITY_FLAG,
     OPTION,
-    flag_names,
     read_attributes,
     read_custom,
     text_of,
@@ -50,14 +49,8 @@ def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[st
 
 def _flags(stage: Stage, scene: Prim) -> dict[str, str]:
     flags = {str(name): key for key in FLAGS for name in read_custom(stage, scene, key) or ()}
-    names = {name for key in FLAGS for name in flag_names(key)}
-    found = {name: stage.authored(scene, f"mjc:flag:{name}") for name in sorted(names - {"gravity"})}
-    gravity = read_attributes(stage, scene, GRAVITY_FLAG).get("gravity")
-    found["gravity"] = None if gravity is None else gravity == "true"
-    for name, value in found.items():
-        if value is None:
-            continue
-        said = "enable" if value else "disable"
+    for name, value in read_attributes(stage, scene, FLAG).items():
+        said = "enable" if value == "true" else "disable"
         if flags.setdefault(name, said) != said:
             stage.drop(f"mjc:flag:{name} was dropped, which contradicts tgdsl:{flags[name]}", scene)
     return flags

@@ -8,19 +8,12 @@ from functools import cached_property
 import mujoco
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.meshes import (
-    Faces,
-    Vertices,
-    capsule_profile,
-    merge_vertices,
-    read_mesh,
-    rotation_from_z,
-    surface_of_revolution,
-)
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage, rotation_and_scale
+from tgdsl.surfaces.holes import merged
+from tgdsl.surfaces.surface import Surface
 
 CIRCULAR = 1e-5
 """Relative difference of two scales up to which a circle stays one: scales are often authored in float32."""
@@ -30,6 +23,10 @@ FLAT = 1e-6
 """A mesh whose thickness is at most this share of its length has no hull."""
 SCHEMAS = ("Mesh", "Cube", "Sphere", "Capsule", "Capsule_1", "Cylinder", "Cylinder_1", "Cone", "Plane")
 """Geometry that can be read."""
+SECTIONS = 64
+"""Corners of a circle where a round shape becomes a mesh: its area is 0.16 % too small."""
+Vertices = Float[np.ndarray, "vertex 3"]
+Faces = Int[np.ndarray, "face 3"]
 MassProperties = tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]
 
 
@@ -63,14 +60,15 @@ class Shape:
     @property
     def is_convex(self) -> bool:
         """Whether a mesh is closed and fills its hull."""
-        hull, own = self.hull, self._closed
-        return hull is not None and own is not None and bool(own.volume >= (1 - CONVEX) * hull.volume)
+        hull, closed = self.hull, self._closed
+        return hull is not None and closed is not None and bool(closed.volume >= (1 - CONVEX) * hull.volume)
 
     @cached_property
     def _closed(self) -> trimesh.Trimesh | None:
         assert self.vertices is not None and self.faces is not None
-        own = trimesh.Trimesh(*merge_vertices(self.vertices, self.faces), process=False)
-        return own if own.is_volume else None
+        vertices, faces, _ = merged(Surface(self.vertices, self.faces, np.zeros(len(self.faces), int), ((),)))
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        return mesh if mesh.is_volume else None
 
     def mass_properties(self, is_hull: bool) -> MassProperties:
         """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame.
@@ -266,6 +264,119 @@ def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tu
     return shape, wanted == "convexHull"
 
 
-def quaternion(matrix: Matrix) -> Float[np.ndarray, " 4"]:
-    """Return the rotation of a rigid transform as w, x, y, z."""
+def read_mesh(stage: Stage, prim: Prim) -> tuple[Vertices, Faces]:
+    """Return the control cage of a mesh as triangles, in its own space and unit; its faces look outwards.
+
+    Subdivision and holes are ignored.
+
+    Raises:
+        RobotError: If it has no points or faces, or they are broken.
+    """
+    time = stage.pxr.Usd.TimeCode.EarliestTime()
+    mesh = stage.pxr.UsdGeom.Mesh(prim)
+    points, counts, indices = (
+        attribute.Get(time)
+        for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    )
+    for name, value in (("points", points), ("faceVertexCounts", counts), ("faceVertexIndices", indices)):
+        if not value:
+            raise stage.error(prim, f"the mesh has no {name}")
+    vertices = np.array(points, dtype=np.float64)
+    sizes, corners = np.array(counts, dtype=np.int64), np.array(indices, dtype=np.int64)
+    if not np.isfinite(vertices).all():
+        raise stage.error(prim, "the mesh has points that are not finite")
+    if sizes.min() < 3:
+        raise stage.error(prim, f"the mesh has a face with {sizes.min()} corners; expected 3 or more")
+    if sizes.sum() != len(corners):
+        raise stage.error(prim, f"faceVertexCounts add up to {sizes.sum()}, but there are {len(corners)} faceVertexIndices")
+    if corners.min() < 0 or corners.max() >= len(vertices):
+        wrong = corners.min() if corners.min() < 0 else corners.max()
+        raise stage.error(prim, f"faceVertexIndices holds {wrong}; the mesh has {len(vertices)} points")
+    faces = _triangles(vertices, sizes, corners)
+    return vertices, faces[:, ::-1] if mesh.GetOrientationAttr().Get() == "leftHanded" else faces
+
+
+def _triangles(vertices: Vertices, sizes: Int[np.ndarray, " polygon"], corners: Int[np.ndarray, " corner"]) -> Faces:
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    results = [corners[starts[sizes == 3, None] + np.arange(3)]]
+    order = [np.flatnonzero(sizes == 3)]
+    for polygon in np.flatnonzero(sizes > 3):
+        ring = corners[starts[polygon] : starts[polygon] + sizes[polygon]]
+        results.append(ring[_ear_clipping(vertices[ring])])
+        order.append(np.full(len(ring) - 2, polygon))
+    return np.concatenate(results)[np.argsort(np.concatenate(order), kind="stable")]
+
+
+def _ear_clipping(ring: Vertices) -> Faces:
+    """Triangulate a simple polygon by ear clipping."""
+    following = np.roll(ring, -1, axis=0)
+    normal = np.cross(ring - ring[0], following - ring[0]).sum(axis=0)
+    axis = int(np.abs(normal).argmax())
+    sign = -1.0 if normal[axis] < 0 else 1.0
+    flat = np.delete(ring, axis, axis=1) * ([1.0, sign] if axis != 1 else [1.0, -sign])
+    left, faces = list(range(len(ring))), []
+    while len(left) > 3:
+        at = next((i for i in range(len(left)) if _is_ear(flat, left, i)), 0)  # of a degenerate ring any corner will do
+        faces.append([left[at - 1], left[at], left[(at + 1) % len(left)]])
+        del left[at]
+    return np.array([*faces, left], dtype=np.int64)
+
+
+def _is_ear(flat: Float[np.ndarray, "corner 2"], left: list[int], at: int) -> bool:
+    a, b, c = flat[left[at - 1]], flat[left[at]], flat[left[(at + 1) % len(left)]]
+    if _cross(b - a, c - b) <= 0:
+        return False
+    others = flat[[i for i in left if not any(np.array_equal(flat[i], corner) for corner in (a, b, c))]]
+    if not len(others):
+        return True
+    sides = np.stack([_cross(q - p, others - p) for p, q in ((a, b), (b, c), (c, a))])
+    return not (sides >= 0).all(axis=0).any()
+
+
+def _cross(a: Float[np.ndarray, " 2"], b: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+    return np.asarray(a[0] * b[..., 1] - a[1] * b[..., 0])
+
+
+def surface_of_revolution(profile: list[tuple[float, float]], axis: str) -> tuple[Vertices, Faces]:
+    """Return the surface of a convex solid of revolution as triangles.
+
+    Args:
+        profile: Radius and height of its rings, from the lowest to the highest; a ring of radius zero is a tip.
+        axis: Its axis of revolution, X, Y or Z.
+    """
+    tips = [(0.0, profile[end][1]) for end in (0, -1) if profile[end][0]]
+    outline = [*tips[:1], *profile, *tips[1:]] if profile[0][0] else [*profile, *tips]
+    mesh = trimesh.creation.revolve(outline, sections=SECTIONS)
+    return np.asarray(mesh.vertices) @ rotation_from_z(axis).T, np.asarray(mesh.faces, dtype=np.int64)
+
+
+def rotation_from_z(axis: str) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation that takes z to an axis: a cyclic permutation."""
+    return np.eye(3)[:, {"X": [1, 2, 0], "Y": [2, 0, 1], "Z": [0, 1, 2]}[axis]]
+
+
+def capsule_profile(radius: float, low: float, high: float, low_radius: float | None = None) -> list[tuple[float, float]]:
+    """Return the profile of the hull of two balls, for `surface_of_revolution`.
+
+    Args:
+        radius: Radius of the upper ball, and of the lower one too unless that is given.
+        low: Height of the lower ball's centre.
+        high: Height of the upper ball's centre.
+        low_radius: Radius of the lower ball.
+    """
+    low_radius = radius if low_radius is None else low_radius
+    gap = high - low
+    if gap <= abs(radius - low_radius):  # one holds the other
+        low, radius = (high, radius) if radius >= low_radius else (low, low_radius)
+        high, low_radius, gap = low, radius, 0.0
+    lean = float(np.arcsin((low_radius - radius) / gap)) if gap else 0.0  # angle up to where the common tangent touches
+    below = np.linspace(-np.pi / 2, lean, SECTIONS // 4 + 1)
+    above = np.linspace(lean, np.pi / 2, SECTIONS // 4 + 1)
+    rings = [(float(low_radius * np.cos(t)), float(low + low_radius * np.sin(t))) for t in below]
+    rings += [(float(radius * np.cos(t)), float(high + radius * np.sin(t))) for t in above]
+    return [(0.0, rings[0][1]), *rings[1:-1], (0.0, rings[-1][1])]
+
+
+def quaternion(matrix: Float[np.ndarray, "row row"]) -> Float[np.ndarray, " 4"]:
+    """Return a rotation matrix, or that of a rigid transform, as w, x, y, z."""
     return Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)

@@ -232,10 +232,10 @@ class Stage:
         Raises:
             RobotError: If it is not finite.
         """
-        own = np.eye(4) if prim.IsPseudoRoot() else np.array(self._poses.GetLocalToWorldTransform(prim), dtype=np.float64).T
-        if not np.isfinite(own).all():
+        matrix = np.eye(4) if prim.IsPseudoRoot() else np.array(self._poses.GetLocalToWorldTransform(prim), dtype=np.float64).T
+        if not np.isfinite(matrix).all():
             raise self.error(prim, "its transform is not finite")
-        return self.world_from_stage @ own
+        return self.world_from_stage @ matrix
 
     def frame(self, prim: Prim) -> tuple[Matrix, Float[np.ndarray, " 3"]]:
         """Return a prim's rigid frame in the world [m] and the scale [m per unit of its space] along its axes.

@@ -3,10 +3,11 @@
 A point is on the outer surface if it is in no solid component (by winding numbers) and is visible from far away: pockets
 may be joined to the outside by a pinhole.
 
-Samplers of pymeshlab and libigl are unseeded and have no exact count (libigl's blue noise of one radius on one sphere: 84 to
-92 points), trimesh's rejects points within a radius; none knows a region, and all follow the mesh's order of faces. So the pool
-is drawn on lines that are fixed in space (`lattice`), each with a priority of its own, and points are taken from it by dart
-throwing in the order of their priorities: at one spacing, or, for an exact count, at spacings that fall along a fixed series
+Poisson-disk samplers of pymeshlab and libigl are unseeded and have no exact count (libigl's blue noise of one radius on one
+sphere: 84 to 92 points), trimesh's rejects points within a radius; none knows a region, and all follow the mesh's order of
+faces. So the pool is drawn on lines that are fixed in space (`lattice`), or on request by pymeshlab's stratified sampling of
+triangles, which draws no random numbers. Each point has a priority, and points are taken by dart throwing in the order of
+their priorities: at one spacing, or, for an exact count, at spacings that fall along a fixed series
 until there are enough. Hence a mesh whose vertices are off by rounding gives the same samples: a decision changes only where a
 distance equals a spacing to within the rounding, and then one or two neighbours change with it. Sample elimination (Yuksel
 2015) compares sums of eighth powers of distances: thirty times as many of its choices change. Distances are straight lines, not
@@ -25,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from tgdsl.placement.sample import lattice
-from tgdsl.surfaces.meshlab import Shell
+from tgdsl.surfaces.meshlab import Shell, stratified_points
 from tgdsl.surfaces.rays import OrthographicView, first_hits, frame
 from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
@@ -67,7 +68,9 @@ class Pool:
         return float(self.point_area.sum())
 
 
-def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: float | None) -> Pool | None:
+def pool(
+    shell: Shell, region: Region, seed: int, count: int | None, spacing: float | None, sampler: str = "lattice"
+) -> Pool | None:
     """Return a pool dense enough for a count or a spacing; None if the region holds nothing of the outer surface.
 
     It stays sparse where that would take more than `MAX_POOL` points, or where nearly all of the region lies inside.
@@ -78,6 +81,7 @@ def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: fl
         seed: Seed of the points.
         count: Number of samples wanted.
         spacing: Least distance of samples [m], if there is no count.
+        sampler: What draws the points: `lattice` or `pymeshlab`.
     """
     face, corners = _pieces(shell.surface, region)
     area = float(_areas(corners).sum())
@@ -85,7 +89,7 @@ def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: fl
     point_area, drawn = area / _wanted(0.0, count, spacing), None
     while len(face):
         num = area / point_area
-        drawn = _drawn(shell, region, face, corners, lattice.pitch_below(np.sqrt(point_area)), seed)
+        drawn = _drawn(shell, region, face, corners, point_area, seed, sampler)
         found, wanted = len(drawn.pos), _wanted(drawn.area, count, spacing)
         is_hopeless = num >= limit or (count is None and wanted > MAX_POOL) or (not found and num >= 10 * MIN_POOL)
         if found > 0.7 * wanted or is_hopeless:
@@ -127,16 +131,28 @@ def _drawn(
     region: Region,
     face: Int[np.ndarray, " piece"],
     corners: Float[np.ndarray, "piece 3 3"],
-    pitch: float,
+    point_area: float,
     seed: int,
+    sampler: str,
 ) -> Pool:
-    """Draw points of pieces of faces on a lattice of some pitch [m]; keep those in the region and on the outer surface."""
-    drawn = lattice.hits(corners, pitch, seed)
+    """Draw points of pieces of faces, one for at most each area [m²]; keep those in the region and on the outer surface."""
+    if sampler == "pymeshlab":
+        drawn = _stratified(corners, point_area, seed)
+    else:
+        drawn = lattice.hits(corners, lattice.pitch_below(np.sqrt(point_area)), seed)
     pos, face = drawn.pos, face[drawn.piece]
-    point_area = _exact(drawn, _areas(corners))
+    areas = _exact(drawn, _areas(corners))
     is_kept = region.has_points(pos)
     is_kept[is_kept] = _on_outer_surface(shell, region, pos[is_kept], face[is_kept])
-    return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], point_area[is_kept])
+    return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], areas[is_kept])
+
+
+def _stratified(corners: Float[np.ndarray, "piece 3 3"], point_area: float, seed: int) -> lattice.Hits:
+    """Return points that pymeshlab draws, in random order: its own is that of the faces."""
+    area = float(_areas(corners).sum())
+    pos, piece = stratified_points(corners, int(np.ceil(area / point_area)))
+    order = np.random.default_rng(seed).permutation(len(pos))
+    return lattice.Hits(pos[order], piece[order], np.full(len(pos), area / max(len(pos), 1)))
 
 
 def _exact(drawn: lattice.Hits, area: Float[np.ndarray, " piece"]) -> Float[np.ndarray, " hit"]:

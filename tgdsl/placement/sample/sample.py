@@ -153,14 +153,14 @@ def _poisson(
 ) -> Samples:
     """Poisson-disk samples: an exact count, or as many as fit at a spacing."""
     size = placement.spacing if placement.count is None else poisson.size(placement.count)
-    drawn = (placement.region, placement.exposed, placement.seed, size)
+    drawn = (placement.region, placement.exposed, placement.seed, size, placement.sampler)
     if drawn not in pools:
         try:
             shell = meshlab.outer_shell(surface)
         except ImportError as error:
             raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
         region = Region.of(surface, placement.region, is_covered)
-        pools[drawn] = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing)
+        pools[drawn] = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing, placement.sampler)
     pool = pools[drawn]
     part, hint = "exposed outer surface" if placement.exposed else "outer surface", "widen `region`"
     hint = "other links cover it: place none here" if placement.exposed and not placement.region else hint

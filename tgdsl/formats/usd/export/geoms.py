@@ -104,8 +104,8 @@ def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
     shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
     shape.CreateSubdivisionSchemeAttr("none")
     set_custom(shape.GetPrim(), "mesh", model.mesh(mesh).name)
-    own, usual = writer.spec.mesh(model.mesh(mesh).name), mujoco.MjSpec().add_mesh(inertia=AS_SHELL)
-    set_customs(shape.GetPrim(), MESH, lambda name: getattr(own, name), lambda name: getattr(usual, name))
+    asset, default = writer.spec.mesh(model.mesh(mesh).name), mujoco.MjSpec().add_mesh(inertia=AS_SHELL)
+    set_customs(shape.GetPrim(), MESH, lambda name: getattr(asset, name), lambda name: getattr(default, name))
 
 
 def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:

@@ -8,7 +8,7 @@ custom attributes named `tgdsl:`, in SI units and radians:
   a joint's `actuatorfrcrange` and its actuator's `forcerange`, of which the drive has the smaller;
   the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
 - a joint's spring, a ball joint's range, a body's `gravcomp`, and its `inertial` if its mass or some moment is zero;
-- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
+- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `attributes.py`.
 
 Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe);
 equality constraints are joints and couplings, as far as there are schemas for them: see `equalities.py`.
@@ -133,8 +133,8 @@ def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
     set_number(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
     if not model.body_inertia[body].all():
         # Of a body that has none, USD wants neither the moments nor their axes, and makes both, or its mass, of its colliders.
-        own = [model.body_mass[body], *model.body_inertia[body], *model.body_iquat[body]]
-        set_custom(prim, "inertial", [float(value) for value in own])
+        values = [model.body_mass[body], *model.body_inertia[body], *model.body_iquat[body]]
+        set_custom(prim, "inertial", [float(value) for value in values])
         return
     set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
     set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
