@@ -190,8 +190,10 @@ def _sampled_hands(
 def _boxes(flexion: Flexion) -> dict[int, Box]:
     """Return the boxes of the mounts of a hand that hold a tower beside it: they end where this rises above the rest."""
     result: dict[int, Box] = {}
-    front = PalmFront(flexion) if flexion.hand.palm is not None else None
-    for body in flexion.hand.mounts if front is not None else []:
+    if flexion.hand.palm is None:
+        return result
+    front = PalmFront(flexion)
+    for body in flexion.hand.mounts:
         if (limit := front.limit(body)) is not None:
             facing = np.array(flexion.palm_side(body).facing)
             corners = flexion.tree.surface[body].corners.reshape(-1, 3)
