@@ -15,6 +15,7 @@ from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity, Scene
 from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
+from tgdsl.sensors.base import Kind
 from tgdsl.sensors.noise.radius import RADIUS
 from tgdsl.sensors.noise.stage import Now
 from tgdsl.sensors.noise.stages import Drawn
@@ -42,10 +43,11 @@ def constant_arrays(plan: Plan) -> dict[str, np.ndarray]:
     return result
 
 
-def bind(plan: Plan, tensor_of: Callable[[str], Tensor]) -> Tree:
-    """Return these parts with a tensor in the place of each array."""
+def bind(plan: Plan, kinds: Mapping[str, Kind], tensor_of: Callable[[str], Tensor]) -> Tree:
+    """Return these parts with a tensor in the place of each array, and constants as the kind of each sensor has them."""
     names = {id(array): name for name, array in plan.arrays.items()}
-    return tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]), _is_prepared)
+    bound = tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]), _is_prepared)
+    return {**bound, "sensors": {name: kinds[name].typed(constants) for name, constants in bound["sensors"].items()}}
 
 
 def _stays_on_host(record: Any) -> bool:

@@ -70,7 +70,7 @@ class TactileModule(HookedModule):
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
         self._stages = {sensor.name: stages_of(sensor.noise.terms if sensor.noise else ()) for sensor in plan.sensors}
-        self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
+        self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan, self._kinds))
         self.memory = Memory(plan.sensors, plan.readings(), self._kinds)
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
         self._overwritten = [name for name, part in state if part.overwritten]

@@ -5,8 +5,10 @@ Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row, 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -21,7 +23,7 @@ from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.sensors.base import UNTIMED, Constants, Context, Kind
+from tgdsl.sensors.base import UNTIMED, Context, Kind
 from tgdsl.sensors.noise.gain import GAIN
 from tgdsl.sensors.noise.release import RELEASE
 from tgdsl.sensors.noise.stage import NO_CLOCK, Now
@@ -33,7 +35,7 @@ Tensors = dict[str, Tensor]
 
 
 def joined_signal(
-    kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Constants]
+    kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Any]
 ) -> Float[Tensor, "env channel taxel"]:
     """Return the signals of sensors that are computed as one, one sensor's taxels after the other's.
 
@@ -44,11 +46,12 @@ def joined_signal(
         constants: What was folded for each of them: scalars.
     """
     of_taxels: Tensors = {}
-    if names := tuple(constants[0]):
+    if names := tuple(sensors[0].constants):
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
-        rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
+        value = operator.getitem if kind.constants is None else getattr
+        rows = [torch.cat([value(own, name).expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
         of_taxels = dict(zip(names, materialised(torch.stack(rows)).unbind(), strict=True))
-    result, _ = kind.forward(gathered, UNTIMED, of_taxels, {})
+    result, _ = kind.forward(gathered, UNTIMED, kind.typed(of_taxels), {})
     return _stacked(result, "signal", sensors[0].signal)
 
 
@@ -57,7 +60,7 @@ def read(
     kind: Kind,
     gathered: Gathered,
     context: Context,
-    constants: Constants,
+    constants: Any,
     stages: Sequence[AnyStage],
     drawn: Drawn,
     memory: Mapping[str, Tensor],
@@ -100,7 +103,8 @@ def read(
         if kind.decide is not None:
             released = {"release_threshold": drawn[RELEASE.name].release_threshold[:, 0]} if RELEASE in stages else {}
             planes = dict(zip(sensor.signal, made.unbind(1), strict=True))
-            planes, decided = kind.decide(planes, {**constants, **released}, state)
+            own_constants = {**constants, **released} if kind.constants is None else replace(constants, **released)
+            planes, decided = kind.decide(planes, own_constants, state)
             made = torch.stack([planes[name] for name in reading.channels], dim=1)
             new |= {path + name: value for name, value in decided.items()}
         readings[reading.name] = made.transpose(1, 2)
@@ -117,7 +121,7 @@ def block(
     kind: Kind,
     gathered: Sequence[Gathered],
     contexts: Sequence[Context],
-    constants: Constants,
+    constants: Any,
     memory: Mapping[str, Tensor],
 ) -> tuple[Tensors, Tensors, list[Tensors]]:
     """Return the reading of a sensor that is advanced at each substep, its new state, and what its kind returned at each.
@@ -145,7 +149,7 @@ def block(
 
 
 def _answer(
-    sensor: PlannedSensor, kind: Kind, gathered: Gathered, context: Context, constants: Constants, state: Tensors
+    sensor: PlannedSensor, kind: Kind, gathered: Gathered, context: Context, constants: Any, state: Tensors
 ) -> tuple[Tensors, Tensors]:
     """Return what a kind's `forward` returns, after a look at it.
 
