@@ -16,7 +16,8 @@ grounded conductors, flat over an electrode; of several the nearest counts.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal
 
 import numpy as np
 import torch
@@ -27,8 +28,8 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities import ContactDepth, Gathered, References
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import (
+    Array,
     Channel,
-    Constants,
     Context,
     Lowered,
     ProbeSpec,
@@ -36,6 +37,7 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import BASE
@@ -77,28 +79,36 @@ def reference(
     return (EPSILON * layout.area / (gap + cover / spec.permittivity) - rest)[:, None], {}
 
 
+@dataclass(frozen=True, eq=False)
+class CapacitanceConstants(Generic[Array]):
+    """Area times ε₀ of each taxel [F·m], and the parameters."""
+
+    strength: Array
+    thickness: Array
+    least_thickness: Array
+    permittivity: Array
+    range: Array
+
+
 def lower(spec: CapacitanceSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """One constant per taxel, its area times ε₀, and the parameters."""
-    constants = {
-        "strength": EPSILON * layout.area,
-        "thickness": scalar(spec.thickness),
-        "least_thickness": scalar(spec.least_thickness),
-        "permittivity": scalar(spec.permittivity),
-        "range": scalar(spec.range),
-    }
+    parameters = (spec.thickness, spec.least_thickness, spec.permittivity, spec.range)
+    constants = CapacitanceConstants(EPSILON * layout.area, *map(scalar, parameters))
     request = ContactDepth(spec.objects, spec.is_gated, range=spec.range, distance=True)
-    return Lowered((Channel("capacitance", "F"),), constants, requests=(request,))
+    return Lowered((Channel("capacitance", "F"),), by_name(constants), requests=(request,))
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, torch.Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: CapacitanceConstants[torch.Tensor], state: State
+) -> tuple[dict[str, torch.Tensor], State]:
     """Return the plane of y [F], (env, taxel), as one fraction: exactly 0 at rest."""
     distances = [found.value for found in gathered[ContactDepth].distances.values()]
     distance = torch.stack(distances).amin(dim=0)
-    gap = torch.minimum(distance.clamp(min=0.0), constants["range"])
-    cover = torch.maximum(constants["least_thickness"], constants["thickness"] + distance.clamp(max=0.0))
-    nearer = (constants["range"] - gap) + (constants["thickness"] - cover) / constants["permittivity"]
-    rest = constants["range"] + constants["thickness"] / constants["permittivity"]
-    return {"capacitance": constants["strength"] * nearer / ((gap + cover / constants["permittivity"]) * rest)}, {}
+    gap = torch.minimum(distance.clamp(min=0.0), constants.range)
+    cover = torch.maximum(constants.least_thickness, constants.thickness + distance.clamp(max=0.0))
+    nearer = (constants.range - gap) + (constants.thickness - cover) / constants.permittivity
+    rest = constants.range + constants.thickness / constants.permittivity
+    return {"capacitance": constants.strength * nearer / ((gap + cover / constants.permittivity) * rest)}, {}
 
 
-CAPACITANCE = Kind(CapacitanceSpec, lower, forward, reference, knobs=BASE)
+CAPACITANCE = Kind(CapacitanceSpec, lower, forward, reference, knobs=BASE, constants=CapacitanceConstants)

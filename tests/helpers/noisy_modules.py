@@ -10,7 +10,8 @@ from torch import Tensor
 
 import tgdsl
 from tgdsl.module.module import TactileModule
-from tgdsl.sensors.noise import stages
+from tgdsl.sensors.noise.stage import NO_CLOCK
+from tgdsl.sensors.noise.stages import draw, stages_of
 from tgdsl.testing import only
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "every_sensor.yaml"
@@ -110,7 +111,8 @@ def read_of_rank(rank: int, file: str, made: dict, folder: str) -> None:
 
 
 def circumstances(touch: TactileModule, memory: Mapping[str, Tensor], dt: Tensor | None = None):
-    """Return when each sensor is read next, and the values of its noise's knobs then, by sensor."""
+    """Return when each sensor is read next, and the values of its noise's stages then, by sensor."""
     nows = touch.memory.clock.nows(memory, dt)
-    knobs = {name: stages.knob_values(own, nows.get(name)) for name, own in touch.constants.tree["noise"].items()}
-    return nows, knobs
+    terms = {sensor.name: sensor.noise.terms for sensor in touch.plan.sensors if sensor.noise is not None}
+    tree = touch.constants.tree["noise"]
+    return nows, {name: draw(stages_of(terms[name]), own, nows.get(name, NO_CLOCK)) for name, own in tree.items()}

@@ -12,6 +12,7 @@ import torch
 from oracles.comparison import Values, field
 from oracles.setups.signals import KOLMOGOROV, MM, Noise, normal_distance, standard_errors, uniform_distance
 from tgdsl.sensors.noise import stages
+from tgdsl.sensors.noise.radius import RADIUS
 
 NUM, SIDE = 10**6, 1000
 """Samples: of 1000 environments with 1000 rows."""
@@ -124,8 +125,8 @@ def radii(width: float = 0.3 * MM):
     noise, like, errors = million({"radius_noise": width}), torch.zeros(SIDE, SIDE), []
     for _ in range(2):
         now = noise.now()
-        values = stages.knob_values(noise.constants, now)["radius_noise"]
-        shift = stages.radius_shift(values, now, like).double().numpy()
+        values = stages.draw(noise.stages, noise.constants, now)[RADIUS.name]
+        shift = RADIUS.shift(values, now, like).double().numpy()
         errors.append(_distance(uniform_distance(shift, -width, width)) if np.abs(shift).max() <= width else np.inf)
         noise.read(0.0)
     return 0.0, errors

@@ -16,7 +16,7 @@ from tgdsl.quantities.base import Request
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import Contacts
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Axis, Channel, ContactProbeSpec, LinkSpec, Lowered, Memory
+from tgdsl.sensors.base import Axis, Channel, ContactProbeSpec, LinkSpec, Lowered, Memory, by_name
 
 SCENE = """
 <mujoco><worldbody>
@@ -85,6 +85,40 @@ def build(tmp_path):
         return tgdsl.compile(document, kinds=[asking], dtype=torch.float64)
 
     return compiled
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Areas:
+    """Constants of the kind with a dataclass for them."""
+
+    area: object
+    unused: object = None
+
+
+def test_constants_of_a_dataclass(build, tmp_path):
+    """The kind gets the dataclass, with None for what `lower` leaves out; plan and artefact have the same names as before."""
+    seen = []
+
+    def lower_typed(spec, layout, surface_of):
+        lowered = lower(spec, layout, surface_of)
+        return dataclasses.replace(lowered, constants=by_name(Areas(lowered.constants["area"])))
+
+    def forward_typed(gathered, context, constants, state):
+        seen.append(constants)
+        return forward(gathered, context, {"area": constants.area}, state)
+
+    typed = Kind(ProbeAllSpec, lower_typed, forward_typed, KIND.reference, constants=Areas)
+    touch, mapped = build(typed), build()
+    assert touch.plan.to_json() == mapped.plan.to_json()
+    assert touch.plan.arrays.keys() == mapped.plan.arrays.keys()
+    state = touch.example_state(3)
+    found, expected = touch(state), mapped(state)
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    assert all(isinstance(own, Areas) and own.unused is None for own in seen) and seen
+    tgdsl.save(touch, tmp_path / "touch.safetensors")
+    loaded = tgdsl.load(tmp_path / "touch.safetensors", kinds=[typed], dtype=torch.float64)
+    assert torch.equal(loaded(state)["s"], expected["s"])
+    assert seen[-1].area.dtype == loaded.dtype
 
 
 def test_a_kind_gets_what_it_asks_for(build):

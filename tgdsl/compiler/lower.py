@@ -320,8 +320,7 @@ def _inputs(
 
 def _is_timed(sensor: LoweredSensor) -> bool:
     """Return whether a sensor wants to know how much time has passed."""
-    terms = () if sensor.noise is None else sensor.noise.terms
-    return sensor.kind.is_timed or sensor.spec.rate is not None or "hysteresis" in terms or "delay" in terms
+    return sensor.kind.is_timed or sensor.spec.rate is not None or (sensor.noise is not None and sensor.noise.needs_dt)
 
 
 def _sensor(
@@ -392,9 +391,8 @@ def _state(
             rows = (quantity.num_rows(parts[quantity.name], shared.of_sensor[sensor.name][quantity.name]),)
         memory[name] = PlannedMemory(own.rest, rows, overwritten=own.overwritten)
     if sensor.noise is not None:
-        for term in sensor.noise.memory:
-            past = sensor.noise.past if term == "ring" else 0.0
-            memory[f"noise/{term}"] = PlannedMemory(0.0, shape, past)
+        for name, past in sensor.noise.memory.items():
+            memory[f"noise/{name}"] = PlannedMemory(0.0, shape, past)
     if sensor.spec.rate is not None:
         memory["sample/phase"] = PlannedMemory(0.0, ())
         held = ["measured", "clean"][: len(sensor.readings)]

@@ -24,7 +24,8 @@ from tgdsl.sensors import Kind
 from tgdsl.sensors.base import AnySensorSpec, Axis, Fitting, Lowered, ReadSensor, body_axis, taxel_axis
 from tgdsl.sensors.known import check_lowered
 from tgdsl.sensors.noise import Knobs, NoiseSpec, built_in, resolve_noise
-from tgdsl.sensors.noise.lower import LoweredNoise, lower_noise, quantity
+from tgdsl.sensors.noise.fields import quantity
+from tgdsl.sensors.noise.lower import LoweredNoise, lower_noise
 from tgdsl.surfaces.surface import Surface
 
 
@@ -125,7 +126,7 @@ def imperfections(
         raise LowerError(what, field="noise", hint="leave `crosstalk` out")
     channels = [channel.name for channel in lowered.signal or lowered.channels]
     sets = [_without_idle(name, kind, own) for own in sets]
-    noise = lower_noise(sets, which, channels, layout, rows.name == "taxel")
+    noise = lower_noise(sets, which, channels, layout)
     return noise if noise.terms else None
 
 
@@ -134,8 +135,7 @@ def _without_idle(name: str, kind: Kind, knobs: Knobs) -> Knobs:
     idle = [knob for knob in knobs.active() if knob in kind.idle_knobs]
     for knob in idle:
         warnings.warn(f'sensor "{name}": {knob} changes nothing in what {kind.name} reads', stacklevel=2)
-    neutral = {knob: Knobs.model_fields[knob].default for knob in idle}
-    return Knobs.model_validate(neutral).over(knobs)
+    return knobs.plain.model_validate({knob: knobs.defaults()[knob] for knob in idle}).over(knobs)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Quantity
-from tgdsl.sensors.noise.lower import quantity
+from tgdsl.sensors.noise.fields import quantity
+from tgdsl.sensors.noise.stages import stages_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.torch_internals import TorchDispatchMode
 
@@ -207,41 +208,21 @@ def _sizes(touch: Explained, sensor: PlannedSensor) -> tuple[int, int]:
     return fixed + size * windows, ring
 
 
-_OF_READING = "unit of the reading"
-_KNOBS: dict[str, tuple[tuple[str, str, str], ...]] = {
-    "radius_noise": (("radius_noise", "", " m"),),
-    "gain": (("gain_low", "from ", ""), ("gain_high", "to ", "")),
-    "hysteresis": (("hysteresis_strength", "strength ", ""), ("hysteresis_time", "time constant ", " s")),
-    "crosstalk": (("crosstalk_strength", "strength ", ""),),
-    "delay": (("read_delay", "", " s"), ("jitter", "jitter ", " s")),
-    "bias": (("bias", "", _OF_READING),),
-    "white_noise": (("white_noise", "", _OF_READING),),
-    "drift": (("drift", "", _OF_READING),),
-    "quantization": (("quantization", "", _OF_READING),),
-    "dead": (
-        ("dead_probability", "probability ", ""),
-        ("dead_low", "stuck from ", _OF_READING),
-        ("dead_high", "to ", _OF_READING),
-    ),
-    "release_threshold": (("release_threshold", "", " m"),),
-}
-"""Of each stage its constants, what they are called, and their unit."""
-
-
 def _noise(touch: Explained, sensor: PlannedSensor) -> list[str]:
     """Return the stages of a sensor's noise, in their order, with the values of their knobs."""
     if sensor.noise is None:
         return []
-    lines = []
-    for term in sensor.noise.terms:
-        parts = []
-        for name, label, unit in (part for part in _KNOBS[term] if part[0] in sensor.noise.constants):
-            value = sensor.noise.constants[name]
-            if name == "dead_low" and "dead_high" not in sensor.noise.constants:
-                label = "stuck at "
-            shown = _amplitudes(sensor, value) if unit == _OF_READING else _value(value[..., 0, :]) + unit
-            parts.append(label + shown)
-        lines.append(f"{term} {', '.join(parts)}")
+    lines, constants = [], sensor.noise.constants
+    for stage in stages_of(sensor.noise.terms):
+        shown = {}
+        for name, number in stage.numbers.items():
+            if name in constants and number.label is not None:
+                value = constants[name]
+                label = "stuck at " if name == "dead_low" and "dead_high" not in constants else number.label
+                amount = _amplitudes(sensor, value) if number.unit is None else _value(value[..., 0, :]) + number.unit
+                shown[name] = label + amount
+        parts = shown.items() if len(stage.terms) > 1 else [(stage.name, ", ".join(shown.values()))]
+        lines += [f"{term} {part}" for term, part in parts]
     return lines
 
 

@@ -15,12 +15,12 @@ from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity, Scene
 from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
-from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.instant import Now
+from tgdsl.sensors.base import Kind
+from tgdsl.sensors.noise.radius import RADIUS
+from tgdsl.sensors.noise.stage import Now
+from tgdsl.sensors.noise.stages import Drawn
 
 Tensors = Mapping[str, Tensor]
-Knobs = Mapping[str, Mapping[str, Tensor]]
-"""Values of the sensors' noise, by their names."""
 Tree = Mapping[str, Any]
 """What `parts` returns, with tensors for arrays."""
 
@@ -43,10 +43,11 @@ def constant_arrays(plan: Plan) -> dict[str, np.ndarray]:
     return result
 
 
-def bind(plan: Plan, tensor_of: Callable[[str], Tensor]) -> Tree:
-    """Return these parts with a tensor in the place of each array."""
+def bind(plan: Plan, kinds: Mapping[str, Kind], tensor_of: Callable[[str], Tensor]) -> Tree:
+    """Return these parts with a tensor in the place of each array, and constants as the kind of each sensor has them."""
     names = {id(array): name for name, array in plan.arrays.items()}
-    return tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]), _is_prepared)
+    bound = tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]), _is_prepared)
+    return {**bound, "sensors": {name: kinds[name].typed(constants) for name, constants in bound["sensors"].items()}}
 
 
 def _stays_on_host(record: Any) -> bool:
@@ -59,7 +60,9 @@ def _is_prepared(record: Any) -> bool:
     return _stays_on_host(record) and record.prepared is not None
 
 
-def scene_of(plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], knobs: Knobs, dtype: torch.dtype) -> Scene:
+def scene_of(
+    plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], drawn: Mapping[str, Drawn], dtype: torch.dtype
+) -> Scene:
     """Return what quantities are gathered from.
 
     Args:
@@ -67,15 +70,15 @@ def scene_of(plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], k
         own: Its parts, bound.
         tensors: The fields of `SceneState` that `inputs` names.
         nows: When sensors are read, by their names.
-        knobs: Values of their noise, which may disturb the taxels' radii.
+        drawn: Values of their noise, which may disturb the taxels' radii.
         dtype: Dtype of what is gathered.
     """
     shifts = {}
     for sensor in plan.sensors:
-        if sensor.noise is not None and "radius_noise" in sensor.noise.terms:
-            half_width = knobs[sensor.name]["radius_noise"]
-            probes = half_width.new_empty(sensor.rows[1] - sensor.rows[0])
-            shifts[sensor.name] = stages.radius_shift(half_width, nows[sensor.name], probes)
+        if sensor.noise is not None and RADIUS.name in sensor.noise.terms:
+            values = drawn[sensor.name][RADIUS.name]
+            probes = values.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
+            shifts[sensor.name] = RADIUS.shift(values, nows[sensor.name], probes)
     return Scene(tensors, plan.objects, _pairs(own["pairs"], tensors, dtype) if plan.objects else None, shifts, dtype)
 
 

@@ -34,6 +34,7 @@ from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.known import kinds_by_sensor, quantities_of
+from tgdsl.sensors.noise.stages import stages_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype
 from tgdsl.tensors.env_ids import EnvIds, env_mask
@@ -68,7 +69,8 @@ class TactileModule(HookedModule):
         self.saved_taxels = SavedTaxels(plan)
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
-        self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
+        self._stages = {sensor.name: stages_of(sensor.noise.terms if sensor.noise else ()) for sensor in plan.sensors}
+        self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan, self._kinds))
         self.memory = Memory(plan.sensors, plan.readings(), self._kinds)
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
         self._overwritten = [name for name, part in state if part.overwritten]
@@ -262,7 +264,7 @@ class TactileModule(HookedModule):
 
     def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what `core` does; a kernel may write new state over the old, which is then not returned."""
-        sensing = Sensing(self.plan, self._kinds, self._quantities, self.memory.clock, self._order)
+        sensing = Sensing(self.plan, self._kinds, self._quantities, self._stages, self.memory.clock, self._order)
         return sense(sensing, self.constants.tree, tensors, memory, self.dtype)
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:

@@ -5,8 +5,10 @@ Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row, 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -21,9 +23,11 @@ from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.sensors.base import UNTIMED, Constants, Context, Kind
-from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.instant import Now
+from tgdsl.sensors.base import UNTIMED, Context, Kind
+from tgdsl.sensors.noise.gain import GAIN
+from tgdsl.sensors.noise.release import RELEASE
+from tgdsl.sensors.noise.stage import NO_CLOCK, Now
+from tgdsl.sensors.noise.stages import AnyStage, Drawn, disturb, draw
 from tgdsl.sensors.upstream import Upstream
 from tgdsl.tensors.fusion import materialised
 
@@ -31,7 +35,7 @@ Tensors = dict[str, Tensor]
 
 
 def joined_signal(
-    kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Constants]
+    kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Any]
 ) -> Float[Tensor, "env channel taxel"]:
     """Return the signals of sensors that are computed as one, one sensor's taxels after the other's.
 
@@ -42,11 +46,12 @@ def joined_signal(
         constants: What was folded for each of them: scalars.
     """
     of_taxels: Tensors = {}
-    if names := tuple(constants[0]):
+    if names := tuple(sensors[0].constants):
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
-        rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
+        value = operator.getitem if kind.constants is None else getattr
+        rows = [torch.cat([value(own, name).expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
         of_taxels = dict(zip(names, materialised(torch.stack(rows)).unbind(), strict=True))
-    result, _ = kind.forward(gathered, UNTIMED, of_taxels, {})
+    result, _ = kind.forward(gathered, UNTIMED, kind.typed(of_taxels), {})
     return _stacked(result, "signal", sensors[0].signal)
 
 
@@ -55,13 +60,14 @@ def read(
     kind: Kind,
     gathered: Gathered,
     context: Context,
-    constants: Constants,
-    knobs: Tensors,
-    memory: Tensors,
-    now: Now | None,
+    constants: Any,
+    stages: Sequence[AnyStage],
+    drawn: Drawn,
+    memory: Mapping[str, Tensor],
+    now: Now,
     joined: Float[Tensor, "env channel row"] | None = None,
 ) -> tuple[Tensors, Tensors, Tensors]:
-    """Return a sensor's readings by name (env, row, channel), its new memory, and what its kind's `forward` returned.
+    """Return a sensor's readings by name (env, row, channel), its new state, and what its kind's `forward` returned.
 
     Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
     fuses then has the equation write all channels side by side, and would else form them again for each number of the noise.
@@ -72,42 +78,41 @@ def read(
         gathered: What it asked for.
         context: When its kind is called.
         constants: What its kind folded.
-        knobs: Values of its noise, see `stages.knob_values`.
-        memory: What it remembers, by name.
-        now: When it is read; None if it does not matter.
+        stages: The stages of its noise.
+        drawn: Their values.
+        memory: The state of all sensors, by `sensor:name`.
+        now: When it is read.
         joined: Its signal, if that was computed with others'.
     """
-    terms = () if sensor.noise is None else sensor.noise.terms
-    at = now if "gain" in terms else None
-    if at is not None and kind.gains_depth:
-        felt = gathered[ContactDepth]
-        gathered = gathered.replaced(ContactDepth, felt._replace(depth=stages.gain(knobs, at, felt.depth) * felt.depth))
-    result, new = ({}, {}) if joined is not None else _answer(sensor, kind, gathered, context, constants, _own(memory))
+    if GAIN in stages and kind.gains_depth:
+        felt, gains = gathered[ContactDepth], drawn[GAIN.name]
+        gathered = gathered.replaced(ContactDepth, felt._replace(depth=GAIN.of_taxels(gains, now, felt.depth) * felt.depth))
+        stages = [stage for stage in stages if stage is not GAIN]
+    state, path = _kind_state(sensor, memory), f"{sensor.name}:"
+    result, new = ({}, {}) if joined is not None else _answer(sensor, kind, gathered, context, constants, state)
+    new = {path + name: value for name, value in new.items()}
     signal = clean = _stacked(result, "signal", sensor.signal) if joined is None else joined
-    if at is not None and not kind.gains_depth:
-        signal = stages.gain(knobs, at, clean[:, 0])[:, None] * clean
-    if terms:
-        past = {name.removeprefix("noise/"): value for name, value in memory.items() if name.startswith("noise/")}
-        signal, noted = stages.disturb(signal, terms, knobs, past, now)
-        new |= {f"noise/{name}": value for name, value in noted.items()}
+    signal, noted = disturb(signal, stages, drawn, f"{path}noise/", memory, now)
+    new |= noted
     own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
-    readings: Tensors = {f"{sensor.name}/signal": clean} if terms else {}
+    readings: Tensors = {} if sensor.noise is None else {f"{sensor.name}/signal": clean}
     for reading, which, made in zip(own, ("measured", "clean"), (signal, clean), strict=False):
-        if now is not None and now.is_sample is not None:
-            made = torch.where(now.is_sample[..., None], made, memory[f"sample/{which}"])
-            new[f"sample/{which}"] = made
+        if now.is_sample is not None:
+            made = torch.where(now.is_sample[..., None], made, memory[f"{path}sample/{which}"])
+            new[f"{path}sample/{which}"] = made
         if kind.decide is not None:
-            released = {name: knobs[name][:, 0] for name in ("release_threshold",) if name in knobs}
+            released = {"release_threshold": drawn[RELEASE.name].release_threshold[:, 0]} if RELEASE in stages else {}
             planes = dict(zip(sensor.signal, made.unbind(1), strict=True))
-            planes, decided = kind.decide(planes, {**constants, **released}, _own(memory))
+            own_constants = {**constants, **released} if kind.constants is None else replace(constants, **released)
+            planes, decided = kind.decide(planes, own_constants, state)
             made = torch.stack([planes[name] for name in reading.channels], dim=1)
-            new |= decided
+            new |= {path + name: value for name, value in decided.items()}
         readings[reading.name] = made.transpose(1, 2)
     for reading in sensor.readings[len(own) :]:
         report = reading.name.rpartition("/")[2]
         readings[reading.name] = _stacked(result, f"{report}/signal", reading.channels).transpose(1, 2)
-    if now is not None and now.period is not None:
-        new["sample/phase"] = _phase(memory["sample/phase"], now.period, now)
+    if now.period is not None:
+        new[f"{path}sample/phase"] = _phase(memory[f"{path}sample/phase"], now.period, now)
     return readings, new, result
 
 
@@ -116,10 +121,10 @@ def block(
     kind: Kind,
     gathered: Sequence[Gathered],
     contexts: Sequence[Context],
-    constants: Constants,
-    memory: Tensors,
+    constants: Any,
+    memory: Mapping[str, Tensor],
 ) -> tuple[Tensors, Tensors, list[Tensors]]:
-    """Return the reading of a sensor that is advanced at each substep, its new memory, and what its kind returned at each.
+    """Return the reading of a sensor that is advanced at each substep, its new state, and what its kind returned at each.
 
     The reading is (env, sample, row, channel).
 
@@ -129,9 +134,9 @@ def block(
         gathered: What it asked for, at each substep.
         contexts: When its kind is called.
         constants: What its kind folded.
-        memory: What it remembers, by name.
+        memory: The state of all sensors, by `sensor:name`.
     """
-    samples, answers, state = [], [], _own(memory)
+    samples, answers, state = [], [], _kind_state(sensor, memory)
     for own, context in zip(gathered, contexts, strict=True):
         found, new = _answer(sensor, kind, own, context, constants, state)
         state = {**state, **new}
@@ -139,11 +144,12 @@ def block(
         samples.append(made if made.ndim == 4 else made[:, None])
         answers.append(found)
     made = samples[0] if len(samples) == 1 else torch.cat(samples, dim=1)
-    return {sensor.name: made.transpose(2, 3)}, dict(state), answers
+    new = {f"{sensor.name}:{name}": value for name, value in state.items()}
+    return {sensor.name: made.transpose(2, 3)}, new, answers
 
 
 def _answer(
-    sensor: PlannedSensor, kind: Kind, gathered: Gathered, context: Context, constants: Constants, state: Tensors
+    sensor: PlannedSensor, kind: Kind, gathered: Gathered, context: Context, constants: Any, state: Tensors
 ) -> tuple[Tensors, Tensors]:
     """Return what a kind's `forward` returns, after a look at it.
 
@@ -185,9 +191,9 @@ def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) ->
     return found[name] if name in found else torch.stack([found[channel] for channel in channels], dim=1)
 
 
-def _own(memory: Tensors) -> Tensors:
+def _kind_state(sensor: PlannedSensor, memory: Mapping[str, Tensor]) -> Tensors:
     """Return what the kind remembers."""
-    return {name: value for name, value in memory.items() if "/" not in name}
+    return {name: memory[f"{sensor.name}:{name}"] for name in sensor.state if "/" not in name}
 
 
 def _phase(phase: Float[Tensor, " env"], period: Tensor, now: Now) -> Float[Tensor, " env"]:
@@ -205,6 +211,7 @@ class Sensing(NamedTuple):
         plan: The plan.
         kinds: The kind of each sensor, by the sensor's name.
         quantities: The quantities that some sensor asks for.
+        stages: The stages of each sensor's noise, by the sensor's name.
         clock: Says when sensors are read.
         order: The sensors, each after those that it reads.
     """
@@ -212,6 +219,7 @@ class Sensing(NamedTuple):
     plan: Plan
     kinds: Mapping[str, Kind]
     quantities: tuple[Quantity, ...]
+    stages: Mapping[str, Sequence[AnyStage]]
     clock: Clock
     order: tuple[PlannedSensor, ...]
 
@@ -245,21 +253,20 @@ def sense(
     """
     plan, dt = sensing.plan, tensors.get("dt")
     nows = sensing.clock.nows(memory, dt)
-    knobs = {s.name: stages.knob_values(own["noise"].get(s.name, {}), nows.get(s.name)) for s in plan.sensors}
-    gathered = _gathered(sensing, own, tensors, nows, knobs, dtype)
-    earlier = [_gathered(sensing, own, part, nows, knobs, dtype) for part in _substeps(plan, tensors)]
+    drawn = {name: draw(sensing.stages[name], constants, nows.get(name, NO_CLOCK)) for name, constants in own["noise"].items()}
+    gathered = _gathered(sensing, own, tensors, nows, drawn, dtype)
+    earlier = [_gathered(sensing, own, part, nows, drawn, dtype) for part in _substeps(plan, tensors)]
     readings: Tensors = {}
     joined: dict[tuple[str, ...], Tensor] = {}
     answers: dict[str, list[Tensors]] = {}
     updated = sensing.clock.after(memory, dt)
     for sensor in sensing.order:
         kind, constants = sensing.kinds[sensor.name], own["sensors"][sensor.name]
-        state = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
         if sensor.substeps:
             contexts = [sensing.clock.context(sensor, memory, dt, i) for i in range(sensor.substeps)]
             each = [*(part[sensor.name] for part in earlier), gathered[sensor.name]]
             each = [_with_upstream(sensor, part, answers, i) for i, part in enumerate(each)]
-            found, new, answered = block(sensor, kind, each, contexts, constants, state)
+            found, new, answered = block(sensor, kind, each, contexts, constants, memory)
         else:
             signal, asked = None, _with_upstream(sensor, gathered[sensor.name], answers, -1)
             if sensor.joined:
@@ -267,12 +274,13 @@ def sense(
                     joined[sensor.joined] = _joined(sensing, own, sensor, gathered[sensor.name])
                 signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
             context = sensing.clock.context(sensor, memory, dt)
-            values = constants, knobs[sensor.name], state, nows.get(sensor.name)
-            found, new, answer = read(sensor, kind, asked, context, *values, signal)
+            noise = sensing.stages[sensor.name], drawn.get(sensor.name, {})
+            now = nows.get(sensor.name, NO_CLOCK)
+            found, new, answer = read(sensor, kind, asked, context, constants, *noise, memory, now, signal)
             answered = [answer]
         if sensor.provides:
             answers[sensor.name] = answered
-        updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
+        updated |= new
         readings |= _with_history(sensor, found, memory, updated)
     for reading in plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
         readings[reading.name] = tensors[reading.name].to(dtype, copy=True).unsqueeze(2)
@@ -291,11 +299,11 @@ def _gathered(
     own: Tree,
     tensors: Mapping[str, Tensor],
     nows: Mapping[str, Now],
-    knobs: Mapping[str, Tensors],
+    drawn: Mapping[str, Drawn],
     dtype: torch.dtype,
 ) -> dict[str, Gathered]:
     """Return by sensor what it asked for, of one state."""
-    scene = scene_of(sensing.plan, own, tensors, nows, knobs, dtype)
+    scene = scene_of(sensing.plan, own, tensors, nows, drawn, dtype)
     values = gather(sensing.quantities, own, scene)
     return {sensor.name: gathered_of(sensor, sensing.quantities, values) for sensor in sensing.plan.sensors}
 

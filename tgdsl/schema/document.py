@@ -13,9 +13,11 @@ from tgdsl.schema.conditional import conditional
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import KINDS, Kind
-from tgdsl.sensors.base import ProbeSpec
+from tgdsl.sensors.base import AnySensorSpec, ProbeSpec
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise import NoiseSpec
+from tgdsl.sensors.noise.spec import noise_model
+from tgdsl.sensors.noise.stages import AnyStage, more_stages
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 
@@ -62,14 +64,25 @@ class Spec(SpecModel):
     """What policies read: groups of observation terms, concatenated in order."""
 
 
-@cache
 def document_model(kinds: tuple[Kind, ...] = KINDS, needs_sensors: bool = True) -> type[Spec]:
-    """Return the document model whose sensors are of the given kinds."""
+    """Return the document model whose sensors are of the given kinds, with the knobs of all known stages of noise."""
+    return _document_model(kinds, needs_sensors, more_stages())
+
+
+@cache
+def _document_model(kinds: tuple[Kind, ...], needs_sensors: bool, stages: tuple[AnyStage, ...]) -> type[Spec]:
+    noise: Any = noise_model(stages)
     specs = tuple(kind.spec for kind in kinds)
+    if stages:
+        field: Any = Annotated[Text | Annotated[noise, Tag("other")], TEXT_OR_OTHER]
+        about = AnySensorSpec.model_fields["noise"]
+        described = Field(default=about.default, description=about.description)
+        specs = tuple(create_model(own.__name__, __base__=own, __doc__=own.__doc__, noise=(field, described)) for own in specs)
     union: Any = Annotated[Union[specs], Field(discriminator="kind")] if len(specs) > 1 else specs[0]  # type: ignore  # noqa: UP007
     need: dict[str, Any] = {"min_length": 1} if needs_sensors else {"default": {}}
     sensors = (dict[Name, union], Field(description="Sensors by name.", **need))
-    return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, sensors=sensors)
+    profiles = (dict[Name, noise], Spec.model_fields["noise"])
+    return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, sensors=sensors, noise=profiles)
 
 
 def json_schema(kinds: tuple[Kind, ...] | None = None) -> dict[str, Any]:

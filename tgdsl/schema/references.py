@@ -8,6 +8,7 @@ from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
+from tgdsl.sensors.noise.stages import knobs_of
 
 
 def reference_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
@@ -85,10 +86,11 @@ def _noise_problems(loaded: Loaded, name: str, noise: str | NoiseSpec, kind: Kin
     problems = []
     own = noise if isinstance(noise, NoiseSpec) else None
     base, links = resolve_noise(noise, kind.name, loaded.spec.noise)
+    known = knobs_of(kind.knobs)
     for pattern, knobs in [("", base), *links]:
-        for knob in (knob for knob in knobs.active() if knob not in kind.knobs):
+        for knob in (knob for knob in knobs.active() if knob not in known):
             what = f'"{kind.name}" has no knob "{knob}"'
-            hint = f"it has {', '.join(sorted(kind.knobs)) or 'none'}"
+            hint = f"it has {', '.join(sorted(known)) or 'none'}"
             place = (*path, "links", pattern, knob) if pattern else (*path, knob)
             is_own = own is not None and (pattern in own.links if pattern else knob in own.model_fields_set)
             where = "" if is_own else f" (in the profile {' → '.join(chain)})"

@@ -8,9 +8,10 @@ Shapes: `env` environments, `taxel` taxels of one sensor, `body` bodies that car
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int, UInt64
@@ -279,7 +280,10 @@ class SurfaceOf(Protocol):
         ...
 
 
+Array = TypeVar("Array")
+"""`np.ndarray` where constants are made, `Tensor` where they are read."""
 Constants = Mapping[str, Tensor]
+"""Constants of a kind without a dataclass for them."""
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
 Planes = Mapping[str, Tensor]
@@ -354,13 +358,15 @@ class Kind:
         warns: Names of its state, and `(sensor's name, constants, rows of the sensors that it reads, largest numbers of all
             environments) → messages`: what users are to be warned of, each once.
         fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from sensors that it reads.
+        constants: A dataclass with a field for each constant, None where it may be left out: `forward` and `decide` get one,
+            and `lower` makes `Lowered.constants` of one by `by_name`. None: they get a mapping.
     """
 
     spec: type[AnySensorSpec]
     lower: Callable[[Any, Layout, SurfaceOf], Lowered]
-    forward: Callable[[Gathered, Context, Constants, State], tuple[Planes, State]]
+    forward: Callable[[Gathered, Context, Any, State], tuple[Planes, State]]
     reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], ReferenceAnswer]
-    decide: Callable[[Planes, Constants, State], tuple[Planes, State]] | None = None
+    decide: Callable[[Planes, Any, State], tuple[Planes, State]] | None = None
     knobs: frozenset[str] = BASE
     gains_depth: bool = False
     idle_knobs: frozenset[str] = frozenset()
@@ -375,12 +381,23 @@ class Kind:
     reads: str = ""
     warns: tuple[tuple[str, Warn], ...] = ()
     fit: Callable[[Any, Lowered, Fitting], Lowered] | None = None
+    constants: type[Any] | None = None
+
+    def typed(self, constants: Mapping[str, Tensor]) -> Any:
+        """Return constants as `forward` gets them."""
+        return constants if self.constants is None else self.constants(**constants)
 
     @property
     def name(self) -> str:
         """The kind's name in the grammar."""
         (name,) = self.spec.model_fields["kind"].annotation.__args__  # type: ignore[union-attr]
         return name
+
+
+def by_name(constants: Any) -> dict[str, np.ndarray]:
+    """Return the fields of a dataclass of constants as `Lowered.constants` has them, without those that are None."""
+    fields = {part.name: getattr(constants, part.name) for part in dataclasses.fields(constants)}
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def scalar(value: float) -> Float[np.ndarray, ""]:

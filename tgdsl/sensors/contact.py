@@ -11,7 +11,8 @@ Source: Chung et al., *Tactile Genesis*, appendix, "ContactProbe". Departures: n
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal
 
 import numpy as np
 import torch
@@ -24,8 +25,8 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
+    Array,
     Channel,
-    Constants,
     ContactProbeSpec,
     Context,
     Kind,
@@ -35,6 +36,7 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import TAXEL
@@ -76,30 +78,39 @@ def reference(
     return bit[:, None].astype(np.float64), {"bit": bit.astype(np.float64)}
 
 
+@dataclass(frozen=True, eq=False)
+class ContactConstants(Generic[Array]):
+    """Depths at which a bit switches on, and off if that is another one [m]."""
+
+    threshold: Array
+    release_threshold: Array | None = None
+
+
 def lower(spec: ContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The bit is state only where the two thresholds differ."""
-    constants = {"threshold": scalar(spec.threshold)}
+    has_memory = spec.release != spec.threshold
+    constants = ContactConstants(scalar(spec.threshold), scalar(spec.release) if has_memory else None)
     channels, signal = (Channel("contact", "1"),), (Channel("depth", "m"),)
     requests = (ContactDepth(spec.objects, spec.is_gated),)
-    if spec.release == spec.threshold:
-        return Lowered(channels, constants, requests=requests, signal=signal)
-    constants["release_threshold"] = scalar(spec.release)
-    return Lowered(channels, constants, state={"bit": Memory()}, requests=requests, signal=signal)
+    state = {"bit": Memory()} if has_memory else {}
+    return Lowered(channels, by_name(constants), state, requests, signal=signal)
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: ContactConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the depth plane [m], which is what noise acts on."""
     return {"depth": gathered[ContactDepth].depth}, {}
 
 
-def decide(signal: Mapping[str, Tensor], constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def decide(signal: Mapping[str, Tensor], constants: ContactConstants[Tensor], state: State) -> tuple[dict[str, Tensor], State]:
     """Return the bit plane, 0 or 1 in the module's dtype."""
-    depth, threshold = signal["depth"], constants["threshold"]
-    if "bit" in state:
-        threshold = torch.where(state["bit"] > 0.5, constants["release_threshold"], threshold)
+    depth, threshold = signal["depth"], constants.threshold
+    if constants.release_threshold is not None and "bit" in state:
+        threshold = torch.where(state["bit"] > 0.5, constants.release_threshold, threshold)
     bit = (depth > threshold).to(depth.dtype)
     bit = torch.where(depth.isnan(), depth, bit)  # a broken pose must not look like no contact
     return {"contact": bit}, ({"bit": bit} if "bit" in state else {})
 
 
-CONTACT = Kind(ContactSpec, lower, forward, reference, decide, TAXEL | {"release_threshold"})
+CONTACT = Kind(ContactSpec, lower, forward, reference, decide, TAXEL | {"release_threshold"}, constants=ContactConstants)

@@ -40,7 +40,8 @@ force follows depth, not load, unless balanced: its sum over a pad is not the we
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal
 
 import numpy as np
 import torch
@@ -55,8 +56,8 @@ from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import ContactPoints, Contacts, ReferenceContacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
+    Array,
     Channel,
-    Constants,
     ContactProbeSpec,
     Context,
     Kind,
@@ -65,6 +66,7 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import FORCE
@@ -155,67 +157,86 @@ def reference_balance(pressed: np.ndarray, body_id: np.ndarray, contacts: Refere
     return normal, limit
 
 
+@dataclass(frozen=True, eq=False)
+class KinematicTaxelConstants(Generic[Array]):
+    """Coefficients, with the sign of the model folded in; None where no output needs them."""
+
+    normal_stiffness: Array
+    normal_damping: Array
+    depth_exponent: Array
+    shear_damping: Array
+    spin_damping: Array | None = None
+    about_link: Array | None = None
+    friction_cone: Array | None = None
+    member: Array | None = None
+    """Which body each taxel is on, 0 or 1 (taxel, body); with `body` only for `balance: solver`."""
+    body: Array | None = None
+    """The same as an index (taxel,)."""
+    patch: Array | None = None
+    """Radius of each probe [m]."""
+
+
 def _ordered(spec: KinematicTaxelSpec) -> tuple[str, ...]:
     return tuple(name for name in ("force", "torque") if name in spec.outputs)
 
 
 def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Fold the sign of the model into the damping constants; leave out what no output needs."""
-    constants = {
-        "normal_stiffness": scalar(spec.normal_stiffness),
-        "normal_damping": scalar(spec.normal_damping),
-        "depth_exponent": scalar(spec.depth_exponent),
-        "shear_damping": scalar(spec.shear_sign * spec.shear_damping),
-    }
     channels: list[Channel] = []
     if "force" in spec.outputs:
         channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
     if "torque" in spec.outputs:
         channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
-        constants["spin_damping"] = scalar(spec.shear_sign * spec.spin_damping)
-        if spec.torque_about == "link":
-            constants["about_link"] = scalar(1.0)
-    if spec.friction_cone is not None:
-        constants["friction_cone"] = scalar(spec.friction_cone)
-    motion = bool(spec.normal_damping or spec.shear_damping or ("torque" in spec.outputs and spec.spin_damping))
-    depth = ContactDepth(spec.objects, spec.is_gated, normal=True, motion=motion)
-    if spec.balance == "none":
-        return Lowered(tuple(channels), constants, requests=(depth,))
+    has_torque, is_balanced = "torque" in spec.outputs, spec.balance == "solver"
     member = layout.body_id[:, None] == np.arange(len(layout.bodies))
-    constants |= {"member": member.astype(np.float64), "body": layout.body_id}
-    if "spin_damping" in constants:
-        constants["patch"] = np.maximum(layout.radius, 0.0)
-    return Lowered(tuple(channels), constants, requests=(depth, Contacts(spec.objects, slots=spec.slots)))
+    constants = KinematicTaxelConstants(
+        normal_stiffness=scalar(spec.normal_stiffness),
+        normal_damping=scalar(spec.normal_damping),
+        depth_exponent=scalar(spec.depth_exponent),
+        shear_damping=scalar(spec.shear_sign * spec.shear_damping),
+        spin_damping=scalar(spec.shear_sign * spec.spin_damping) if has_torque else None,
+        about_link=scalar(1.0) if has_torque and spec.torque_about == "link" else None,
+        friction_cone=None if spec.friction_cone is None else scalar(spec.friction_cone),
+        member=member.astype(np.float64) if is_balanced else None,
+        body=layout.body_id if is_balanced else None,
+        patch=np.maximum(layout.radius, 0.0) if is_balanced and has_torque else None,
+    )
+    motion = bool(spec.normal_damping or spec.shear_damping or (has_torque and spec.spin_damping))
+    depth = ContactDepth(spec.objects, spec.is_gated, normal=True, motion=motion)
+    requests = (depth, Contacts(spec.objects, slots=spec.slots)) if is_balanced else (depth,)
+    return Lowered(tuple(channels), by_name(constants), requests=requests)
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: KinematicTaxelConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the force planes [N] and, if wanted, the torque planes [N·m].
 
     Where nothing is touched, depth, normal and motion are all zero, and so is every term.
     """
     felt = gathered[ContactDepth]
     assert felt.normal is not None
-    stiffness = planes.power(felt.depth, constants["depth_exponent"])
-    pressed, shear, limit = constants["normal_stiffness"] * stiffness, None, None
+    stiffness = planes.power(felt.depth, constants.depth_exponent)
+    pressed, shear, limit = constants.normal_stiffness * stiffness, None, None
     if felt.velocity is not None:
         approach = planes.dot(felt.velocity, felt.normal)
-        pressed = pressed + constants["normal_damping"] * stiffness * approach
-        shear = planes.scale(constants["shear_damping"], planes.sub(felt.velocity, planes.scale(approach, felt.normal)))
-    if "member" in constants:
-        pressed, limit = _balanced(pressed, gathered[Contacts], constants)
-    if "friction_cone" in constants:
-        limit = constants["friction_cone"] * pressed.clamp(min=0)
+        pressed = pressed + constants.normal_damping * stiffness * approach
+        shear = planes.scale(constants.shear_damping, planes.sub(felt.velocity, planes.scale(approach, felt.normal)))
+    if constants.member is not None and constants.body is not None:
+        pressed, limit = _balanced(pressed, gathered[Contacts], constants.member, constants.body)
+    if constants.friction_cone is not None:
+        limit = constants.friction_cone * pressed.clamp(min=0)
     force = planes.scale(pressed, felt.normal)
     if shear is not None:
         force = planes.add(force, shear if limit is None else _within(limit, shear))
     readings = {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
-    if "spin_damping" in constants:
+    if constants.spin_damping is not None:
         none = felt.depth * 0.0  # not-a-number where the pose is
-        torque = planes.cross(felt.pos, force) if "about_link" in constants else (none, none, none)
+        torque = planes.cross(felt.pos, force) if constants.about_link is not None else (none, none, none)
         if felt.angular is not None:
-            spin = constants["spin_damping"] * planes.dot(felt.angular, felt.normal)
-            if "patch" in constants and limit is not None:
-                largest = constants["patch"] * limit
+            spin = constants.spin_damping * planes.dot(felt.angular, felt.normal)
+            if constants.patch is not None and limit is not None:
+                largest = constants.patch * limit
                 spin = torch.minimum(torch.maximum(spin, -largest), largest)
             torque = planes.add(torque, planes.scale(spin, felt.normal))
         readings |= {f"torque_{axis}": plane for axis, plane in zip("xyz", torque, strict=True)}
@@ -234,16 +255,18 @@ def _within(limit: Tensor, shear: planes.Vec) -> planes.Vec:
     return planes.scale(torch.where(is_outside, limit / torch.where(is_outside, size, 1.0), 1.0), shear)
 
 
-def _balanced(pressed: Tensor, contacts: ContactPoints, constants: Constants) -> tuple[Tensor, Tensor]:
+def _balanced(pressed: Tensor, contacts: ContactPoints, member: Tensor, body: Tensor) -> tuple[Tensor, Tensor]:
     """Return normal forces that sum to the solver's on each body [N], and the limits of friction [N]: (env, taxel)."""
     along = planes.dot(contacts.force, contacts.normal)
     across = planes.sub(contacts.force, planes.scale(along, contacts.normal))
     part = pressed.clamp(min=0)
-    total = part @ constants["member"]
+    total = part @ member
     per_part = total / (total * total + unloaded() ** 2)
     normal = per_part * along.sum(dim=-1)
     limit = per_part * planes.safe_sqrt(planes.dot(across, across)).sum(dim=-1)
-    return part * normal[:, constants["body"]], part * limit[:, constants["body"]]
+    return part * normal[:, body], part * limit[:, body]
 
 
-KINEMATIC_TAXEL = Kind(KinematicTaxelSpec, lower, forward, reference, knobs=FORCE, is_pointwise=True)
+KINEMATIC_TAXEL = Kind(
+    KinematicTaxelSpec, lower, forward, reference, knobs=FORCE, is_pointwise=True, constants=KinematicTaxelConstants
+)

@@ -20,7 +20,8 @@ sensor/contact).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Generic, Literal
 
 import numpy as np
 import torch
@@ -34,8 +35,8 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contacts import Contacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
+    Array,
     Channel,
-    Constants,
     Context,
     Kind,
     Lowered,
@@ -45,6 +46,7 @@ from tgdsl.sensors.base import (
     State,
     SurfaceOf,
     body_axis,
+    by_name,
     scalar,
 )
 
@@ -84,29 +86,40 @@ def reference(
     return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
 
 
+@dataclass(frozen=True, eq=False)
+class LinkContactConstants(Generic[Array]):
+    """Force above which a body counts as touched [N]."""
+
+    threshold: Array
+
+
 def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The net force alone is wanted, without slots, unless normal forces are; and no probe."""
     force = tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
     parts = {"contact": (Channel("contact", "1"),), "force": force, "normal_force": (Channel("normal_force", "N"),)}
     channels = tuple(channel for name, own in parts.items() if name in spec.outputs for channel in own)
     signal, slots = (force + parts["normal_force"], spec.slots) if "normal_force" in spec.outputs else (force, 0)
-    constants = {"threshold": scalar(spec.threshold)}
+    constants = by_name(LinkContactConstants(scalar(spec.threshold)))
     return Lowered(channels, constants, requests=(Contacts(spec.objects, slots=slots),), rows=body_axis(layout), signal=signal)
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: LinkContactConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the force planes and the normal force [N], by body, which are what noise acts on."""
     contacts = gathered[Contacts]
     pressed = planes.dot(contacts.force, contacts.normal).clamp(min=0.0).sum(dim=-1)
     return {**{f"force_{axis}": plane for axis, plane in zip("xyz", contacts.net, strict=True)}, "normal_force": pressed}, {}
 
 
-def decide(signal: Mapping[str, Tensor], constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def decide(
+    signal: Mapping[str, Tensor], constants: LinkContactConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the bit [1], the force planes and, if it is there, the normal force [N], by body."""
     force = (signal["force_x"], signal["force_y"], signal["force_z"])
     size = planes.safe_sqrt(planes.dot(force, force))
-    bit = torch.where(size.isnan(), size, (size > constants["threshold"]).to(size.dtype))
+    bit = torch.where(size.isnan(), size, (size > constants.threshold).to(size.dtype))
     return {**signal, "contact": bit}, {}
 
 
-LINK_CONTACT = Kind(LinkContactSpec, lower, forward, reference, decide)
+LINK_CONTACT = Kind(LinkContactSpec, lower, forward, reference, decide, constants=LinkContactConstants)

@@ -16,7 +16,8 @@ geoms the magnitude is that of the deepest geom alone, which is at most the true
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal
 
 import numpy as np
 import torch
@@ -29,8 +30,8 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
+    Array,
     Channel,
-    Constants,
     Context,
     Kind,
     Lowered,
@@ -39,6 +40,7 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import PROBE
@@ -68,19 +70,28 @@ def reference(
     return np.concatenate([distance, vector.reshape(len(vector), -1)], axis=1), {}
 
 
+@dataclass(frozen=True, eq=False)
+class SurfaceDistanceConstants(Generic[Array]):
+    """Largest distance that is read [m]."""
+
+    max_range: Array
+
+
 def lower(spec: SurfaceDistanceSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """One channel per object, and three more where the vector is wanted."""
     channels = [Channel(f"distance_{name}", "m") for name in spec.feels]
     if spec.nearest:
         channels += [Channel(f"nearest_{name}_{axis}", "m") for name in spec.feels for axis in "xyz"]
-    constants = {"max_range": scalar(spec.max_range)}
+    constants = by_name(SurfaceDistanceConstants(scalar(spec.max_range)))
     request = ContactDepth(spec.objects, spec.is_gated, range=spec.max_range, distance=True)
     return Lowered(tuple(channels), constants, requests=(request,))
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: SurfaceDistanceConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the distance planes, and the vectors' planes, by object [m]."""
-    max_range = constants["max_range"]
+    max_range = constants.max_range
     readings: dict[str, Tensor] = {}
     for name, (distance, gradient) in gathered[ContactDepth].distances.items():
         capped = torch.minimum(distance, max_range)
@@ -92,5 +103,12 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
 
 
 SURFACE_DISTANCE = Kind(
-    SurfaceDistanceSpec, lower, forward, reference, knobs=PROBE, idle_knobs=frozenset({"radius_noise"}), is_pointwise=True
+    SurfaceDistanceSpec,
+    lower,
+    forward,
+    reference,
+    knobs=PROBE,
+    idle_knobs=frozenset({"radius_noise"}),
+    is_pointwise=True,
+    constants=SurfaceDistanceConstants,
 )

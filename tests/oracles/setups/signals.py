@@ -15,7 +15,8 @@ from torch import Tensor
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.sensors.noise import Knobs, random, stages
 from tgdsl.sensors.noise.lower import lower_noise
-from tgdsl.sensors.noise.reference import ReferenceNoise
+from tgdsl.sensors.noise.stage import Now
+from tgdsl.sensors.noise.stages import ReferenceNoise
 
 MM = 1e-3
 """A millimetre [m]."""
@@ -58,11 +59,12 @@ class Noise:
         which = np.zeros(count, dtype=np.int64) if len(sets) == 1 else np.arange(count)
         self.channels, self.num_envs, self.dtype = tuple(channels), num_envs, dtype
         self._rows, self.key = [sets[i] for i in which], random.sensor_key(seed, name)
-        self.lowered = lower_noise(sets, which, channels, self.layout, True)
+        self.lowered = lower_noise(sets, which, channels, self.layout)
+        self.stages = stages.stages_of(self.lowered.terms)
         self.constants = {key: torch.tensor(value, dtype=dtype) for key, value in self.lowered.constants.items()}
         self.memory = {key: torch.full((num_envs, len(channels), count), math.nan, dtype=dtype) for key in self.lowered.memory}
         if "ring" in self.memory:
-            length = max(math.ceil(self.lowered.past / dt - 1e-6), 1)
+            length = max(math.ceil(self.lowered.memory["ring"] / dt - 1e-6), 1)
             self.memory["ring"] = torch.full((num_envs, length, len(channels), count), math.nan, dtype=dtype)
         self.env = torch.arange(num_envs) + first_env
         self.ages = torch.zeros(num_envs, length if "ring" in self.memory else 1, dtype=dtype)
@@ -73,24 +75,20 @@ class Noise:
         """Return the definition, for each environment."""
         return [ReferenceNoise(self._rows, self.channels, self.key, int(env), self.layout) for env in self.env]
 
-    def now(self, dt: float | int = 0.0, is_sample: Tensor | None = None) -> stages.Now:
+    def now(self, dt: float | int = 0.0, is_sample: Tensor | None = None) -> Now:
         """Return the circumstances of the next call."""
         step, drawn = torch.full((self.num_envs,), self.step), {}
         if self.lowered.streams:
             (drawn,) = random.streams(torch.tensor([self.key], dtype=torch.int32), self.env, step, self.episode)
-        return stages.Now(
-            torch.tensor(dt, dtype=self.dtype), step[:, None], self.age[:, None], self.ages + dt, is_sample, None, drawn
-        )
+        return Now(torch.tensor(dt, dtype=self.dtype), step[:, None], self.age[:, None], self.ages + dt, is_sample, None, drawn)
 
     def read(self, signal: Any, dt: float | int = 0.0, is_sample: Tensor | None = None) -> Tensor:
         """Return what is read of a signal, which is broadcast to (env, row, channel)."""
         shape = (self.num_envs, self.layout.num_taxels, len(self.channels))
         signal = torch.as_tensor(signal, dtype=self.dtype).expand(shape).transpose(1, 2)
         now = self.now(dt, is_sample)
-        values = stages.knob_values(self.constants, now)
-        if "gain" in self.lowered.terms:
-            signal = stages.gain(values, now, signal)[:, None] * signal
-        signal, new = stages.disturb(signal, self.lowered.terms, values, self.memory, now)
+        values = stages.draw(self.stages, self.constants, now)
+        signal, new = stages.disturb(signal, self.stages, values, "", self.memory, now)
         for key, value in new.items():
             buffer = self.memory[key]
             place = buffer[:, self.step % buffer.shape[1]] if key == "ring" else buffer

@@ -43,8 +43,9 @@ def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
         state = touch.example_state(num_envs)
         memory = touch.memory.tensors(num_envs, state.dt, touch.dtype, touch.device)
         dt = None if state.dt is None else torch.tensor(state.dt, dtype=torch.float64)
-        values = circumstances(touch, memory, dt)[1]["s"]
+        stages = circumstances(touch, memory, dt)[1]["s"]
         touch(state)
+        values = {name: value for stage in stages.values() for name, value in stage._asdict().items()}
         return {name: values[name][:, 0, 0] for name in expected}
 
     first, second = drawn(), drawn()

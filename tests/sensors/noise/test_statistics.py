@@ -11,6 +11,8 @@ from oracles.setups.signals import KOLMOGOROV, MM, Noise, correlation, standard_
 from torch import Tensor
 
 from tgdsl.sensors.noise import random, stages
+from tgdsl.sensors.noise.radius import RADIUS
+from tgdsl.sensors.noise.stage import Now
 
 
 def test_white_noise_is_white():
@@ -98,7 +100,8 @@ def test_radii_are_uniform_at_each_step():
     found = []
     for _ in range(2):
         now = noise.now()
-        found.append(stages.radius_shift(stages.knob_values(noise.constants, now)["radius_noise"], now, like).double().numpy())
+        values = stages.draw(noise.stages, noise.constants, now)[RADIUS.name]
+        found.append(RADIUS.shift(values, now, like).double().numpy())
         noise.read(0.0)
     for shift in found:
         assert np.abs(shift).max() <= 0.3 * MM
@@ -139,11 +142,17 @@ def test_ranges_are_uniform_over_environments():
         "hysteresis": {"strength": [0, 1], "time_constant": [0.1, 0.2]}, "crosstalk": {"strength": [0, 0.5], "sigma": [1e-3, 2e-3]},
     }  # fmt: skip
     noise = Noise(knobs, 1, num_envs=N, dt=2.0)
-    drawn = {name for name, value in noise.constants.items() if stages.is_drawn(name, value.ndim)}
-    assert drawn == set(stages.PARAMETERS) - {"release_threshold"}
-    before = stages.knob_values(noise.constants, noise.now())
+    numbers = stages.draws_of(noise.stages)
+    drawn = {name for name, value in noise.constants.items() if name in numbers and value.ndim == 3}
+    assert drawn == set(stages.draws_of(stages.STAGES)) - {"release_threshold"}
+
+    def values() -> dict[str, Tensor]:
+        stages_ = stages.draw(noise.stages, noise.constants, noise.now()).values()
+        return {name: value for stage in stages_ for name, value in stage._asdict().items()}
+
+    before = values()
     noise.reset()
-    after = stages.knob_values(noise.constants, noise.now())
+    after = values()
     samples = {name: before[name].numpy().ravel() for name in sorted(drawn)}
     for name, sample in samples.items():
         low, high = noise.constants[name].flatten().tolist()
@@ -166,9 +175,9 @@ def advanced(
     )
     ages = memory["ages"] + dt
     steps = step.expand(noise.num_envs)[:, None]
-    now = stages.Now(dt, steps, steps, ages, None, None, streams)
-    values, past = stages.knob_values(noise.constants, now), {key: memory[key] for key in noise.memory}
-    found, new = stages.disturb(signal[:, None], noise.lowered.terms, values, past, now)
+    now = Now(dt, steps, steps, ages, None, None, streams)
+    values, past = stages.draw(noise.stages, noise.constants, now), {key: memory[key] for key in noise.memory}
+    found, new = stages.disturb(signal[:, None], noise.stages, values, "", past, now)
     place = (step % memory["ring"].shape[1])[None]
     ring = memory["ring"].index_copy(1, place, new["ring"][:, None])
     ages = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1]], dim=1)

@@ -15,8 +15,8 @@ from torch import Tensor
 from tgdsl.errors import TgdslError
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.sensors.base import UNTIMED, Context
-from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import Stream, kind_stream, sensor_key, streams
+from tgdsl.sensors.noise.stage import Now
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers
 
 ENV = "clock/env"

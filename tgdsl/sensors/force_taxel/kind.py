@@ -29,7 +29,8 @@ still sum to the solver's.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal
 
 import numpy as np
 import torch
@@ -46,8 +47,8 @@ from tgdsl.quantities.contacts import Contacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Alternative,
+    Array,
     Channel,
-    Constants,
     ContactProbeSpec,
     Context,
     Kind,
@@ -56,6 +57,7 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    by_name,
 )
 from tgdsl.sensors.force_taxel import footprint
 from tgdsl.sensors.noise import FORCE
@@ -119,27 +121,26 @@ def reference_reports(spec: ForceTaxelSpec, layout: Layout, gathered: References
     return force, missed, residual
 
 
+@dataclass(frozen=True, eq=False)
+class ForceTaxelConstants(Generic[Array]):
+    """Fields of `footprint.Bodies`; r_f of each body [m]; least curvature of each step [1]."""
+
+    taxel: Array
+    inverse_radius: Array
+    row: Array
+    first: Array
+    box: Array
+    place: Array
+    padded: Array
+    footprint: Array
+    levenberg: Array
+    inward: Array | None = None
+    """Inward normals over the taxels' areas [1/m²], (3, taxel)."""
+
+
 def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Pad the taxels of each body to the same number, with inactive ones, so that all bodies are one batch."""
     is_active = layout.radius > 0
-    counts = np.bincount(layout.body_id)
-    first = np.concatenate([[0], np.cumsum(counts)])
-    taxel = np.repeat(first[:-1, None], counts.max(), axis=1)  # padding repeats the body's own first taxel
-    rank = np.arange(layout.num_taxels) - first[layout.body_id]
-    inverse_radius = np.zeros(taxel.shape)
-    taxel[layout.body_id, rank] = np.arange(layout.num_taxels)
-    inverse_radius[layout.body_id, rank] = np.where(is_active, 1.0 / np.where(is_active, layout.radius, 1.0), 0.0)
-    constants = {
-        "taxel": taxel,
-        "inverse_radius": inverse_radius,
-        "first": first,
-        "row": layout.body_id * counts.max() + rank,
-        "box": np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
-        "place": footprint.place(layout.pos, layout.normal, is_active),
-        "padded": np.concatenate([layout.pos.T, -2.0 * layout.normal.T])[:, taxel],
-        "footprint": spec.radii(layout),
-        "levenberg": np.array(spec.levenberg),
-    }
     channels: list[Channel] = []
     if "force" in spec.outputs:
         channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
@@ -147,19 +148,39 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         if (layout.area[is_active] <= 0).any():
             raise LowerError("a taxel of no area has no pressure", field="outputs", hint="leave pressure out, or give its area")
         channels.append(Channel("pressure", "Pa"))
-        constants["inward"] = -layout.normal.T / np.where(is_active, layout.area, np.inf)
+    counts = np.bincount(layout.body_id)
+    first = np.concatenate([[0], np.cumsum(counts)])
+    taxel = np.repeat(first[:-1, None], counts.max(), axis=1)  # padding repeats the body's own first taxel
+    rank = np.arange(layout.num_taxels) - first[layout.body_id]
+    inverse_radius = np.zeros(taxel.shape)
+    taxel[layout.body_id, rank] = np.arange(layout.num_taxels)
+    inverse_radius[layout.body_id, rank] = np.where(is_active, 1.0 / np.where(is_active, layout.radius, 1.0), 0.0)
+    constants = ForceTaxelConstants(
+        taxel=taxel,
+        inverse_radius=inverse_radius,
+        row=layout.body_id * counts.max() + rank,
+        first=first,
+        box=np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
+        place=footprint.place(layout.pos, layout.normal, is_active),
+        padded=np.concatenate([layout.pos.T, -2.0 * layout.normal.T])[:, taxel],
+        footprint=spec.radii(layout),
+        levenberg=np.array(spec.levenberg),
+        inward=-layout.normal.T / np.where(is_active, layout.area, np.inf) if "pressure" in spec.outputs else None,
+    )
     reports = {
         "missed": tuple(Channel(f"missed_{axis}", "N") for axis in "xyz"),
         "residual": tuple(Channel(f"residual_{axis}", "N·m") for axis in "xyz"),
     }
     requests = (ContactDepth(spec.objects, spec.is_gated), Contacts(spec.objects, slots=spec.slots))
-    return Lowered(tuple(channels), constants, requests=requests, reports=reports)
+    return Lowered(tuple(channels), by_name(constants), requests=requests, reports=reports)
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: ForceTaxelConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the force [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
     contacts, felt = gathered[Contacts], gathered[ContactDepth]
-    bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
+    bodies = footprint.Bodies(*(getattr(constants, name) for name in footprint.Bodies._fields))
     shared = footprint.SHARED_FORCES(
         bodies,
         felt.depth,
@@ -167,16 +188,16 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
         contacts.force,
         contacts.torque,
         contacts.normal,
-        constants["footprint"],
-        constants["levenberg"],
+        constants.footprint,
+        constants.levenberg,
     )
     missed = torch.stack(contacts.net, dim=1) - shared.carried
     readings = {"missed/signal": missed, "residual/signal": shared.residual}
-    if "inward" not in constants:
+    if constants.inward is None:
         return {"signal": shared.force, **readings}, {}
     force = planes.vec(shared.force.unbind(1))
     readings |= {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
-    readings["pressure"] = planes.dot(force, planes.vec(constants["inward"])).clamp(min=0)
+    readings["pressure"] = planes.dot(force, planes.vec(constants.inward)).clamp(min=0)
     return readings, {}
 
 
@@ -190,4 +211,13 @@ def alternatives(spec: ForceTaxelSpec) -> list[Alternative]:
     return [Alternative(f"{num} Newton steps", {"moment_iterations": num}) for num in (0, 1, 2, 4, 8, 16)]
 
 
-FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference, knobs=FORCE, indices=indices, alternatives=alternatives)
+FORCE_TAXEL = Kind(
+    ForceTaxelSpec,
+    lower,
+    forward,
+    reference,
+    knobs=FORCE,
+    indices=indices,
+    alternatives=alternatives,
+    constants=ForceTaxelConstants,
+)

@@ -1,135 +1,69 @@
-"""The knobs of a sensor's imperfections, and the profiles that name a set of them. What each does is in `stages`.
-
-Any number may be a range `[low, high]`: each environment then draws its own at reset, uniformly. Amplitudes are in the unit of
-the reading, and may be given for each of its quantities: `white_noise: {force: 5e-3, torque: 1e-4}`.
-"""
+"""The knobs of a sensor's noise, and the profiles that name a set of them. What each does is in the file of its stage."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from functools import cache
+from typing import Annotated, Any, ClassVar
 
-from pydantic import Tag, model_validator
+from pydantic import Tag, create_model
 
-from tgdsl.fields.models import TEXT_OR_OTHER, Range, RangeOf, SpecModel, Text, Usual
-
-Amplitude = Mapping[str, Range]
-"""A range for each quantity of a reading, or under `ALL` for every one."""
-ALL = "*"
-
-
-class AmplitudeOf(RangeOf):
-    """Marks a range that may also be a mapping from quantities to ranges."""
-
-    def _read(self, found: object) -> Any:
-        if not isinstance(found, Mapping):
-            return {ALL: super()._read(found)}
-        read = {}
-        for name, part in found.items():
-            try:
-                read[str(name)] = super()._read(part)
-            except ValueError as error:
-                raise ValueError(f"{name}: {error}") from error
-        return read
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        """Return a range, or a mapping of ranges."""
-        one = super().__get_pydantic_json_schema__(schema, handler)
-        return {"anyOf": [*one["anyOf"], {"type": "object", "additionalProperties": one}]}
+from tgdsl.fields.models import TEXT_OR_OTHER, Text
+from tgdsl.sensors.noise.crosstalk import CrosstalkKnobs
+from tgdsl.sensors.noise.dead import DeadKnobs
+from tgdsl.sensors.noise.delay import DelayKnobs
+from tgdsl.sensors.noise.fields import ZERO
+from tgdsl.sensors.noise.gain import GainKnobs
+from tgdsl.sensors.noise.hysteresis import HysteresisKnobs
+from tgdsl.sensors.noise.offset import OffsetKnobs
+from tgdsl.sensors.noise.quantization import QuantizationKnobs
+from tgdsl.sensors.noise.radius import RadiusKnobs
+from tgdsl.sensors.noise.release import ReleaseKnobs
+from tgdsl.sensors.noise.stage import Stage
 
 
-class ProbabilityRange(RangeOf):
-    """Marks a share from 0 to 1, or a range of it."""
+class Knobs(
+    ReleaseKnobs,  # pydantic collects fields from the last base on: this is the reverse of `STAGES`
+    DeadKnobs,
+    QuantizationKnobs,
+    OffsetKnobs,
+    DelayKnobs,
+    CrosstalkKnobs,
+    HysteresisKnobs,
+    GainKnobs,
+    RadiusKnobs,
+):
+    """All knobs; the defaults are neutral.
 
-    def __init__(self) -> None:
-        super().__init__("number", ge=0.0)
+    Attributes:
+        plain: The model with these knobs and nothing else.
+    """
 
-    def _read(self, found: object) -> Any:
-        low, high = super()._read(found)
-        if high > 1:
-            raise ValueError(f"{high:g} is out of range, expected at most 1")
-        return low, high
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        """Return a number up to 1, or a list of two."""
-        one = {"type": "number", "minimum": 0.0, "maximum": 1.0}
-        return {"anyOf": [one, {"type": "array", "items": one, "minItems": 2, "maxItems": 2}]}
-
-
-AnyAmplitude = Annotated[Amplitude, AmplitudeOf("number")]
-NonNegativeAmplitude = Annotated[Amplitude, AmplitudeOf("number", ge=0.0)]
-TimeRange = Annotated[Range, RangeOf("time", ge=0.0)]
-Share = Annotated[Range, ProbabilityRange()]
-ZERO: Range = (0.0, 0.0)
-NO_AMPLITUDE: Amplitude = {ALL: ZERO}
-
-
-class Hysteresis(SpecModel):
-    """Viscoelastic memory of the substrate: one Maxwell branch."""
-
-    strength: Annotated[Range, RangeOf("number", ge=0.0)]
-    """β, overshoot after a step, as a share of the step."""
-    time_constant: Annotated[Range, RangeOf("time", gt=0.0), Usual("time", high=3600.0)]
-    """τ, time constant of the decay [s]."""
-
-
-class Crosstalk(SpecModel):
-    """Mixing of neighbouring taxels of a link; the sum over its taxels stays what it is."""
-
-    strength: Share
-    """χ, share of each taxel's signal that goes to its neighbourhood."""
-    sigma: Annotated[Range, RangeOf("length", gt=0.0), Usual("length", high=0.1)]
-    """Standard deviation of the Gaussian neighbourhood [m]."""
-
-
-class Knobs(SpecModel):
-    """All knobs; the defaults are neutral."""
-
-    radius_noise: Annotated[Range, RangeOf("length", ge=0.0), Usual("length", high=0.1)] = ZERO
-    """ρ, half-width of the uniform disturbance of each probe's radius, drawn at each reading [m]."""
-    gain: tuple[Annotated[Range, RangeOf("number", gt=0.0)], Annotated[Range, RangeOf("number", gt=0.0)]] = (
-        (1.0, 1.0),
-        (1.0, 1.0),
-    )
-    """Lowest and highest gain: each probe draws its own at reset."""
-    hysteresis: Hysteresis | None = None
-    """Viscoelastic memory."""
-    crosstalk: Crosstalk | None = None
-    """Mixing of neighbouring taxels."""
-    read_delay: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
-    """Age of what is read [s]; between two calls the signal counts as linear."""
-    jitter: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
-    """Largest additional age, drawn uniformly at each reading for all taxels together [s]."""
-    bias: AnyAmplitude = NO_AMPLITUDE
-    """Constant offset [unit of the reading]."""
-    white_noise: NonNegativeAmplitude = NO_AMPLITUDE
-    """σ, standard deviation of additive Gaussian noise [unit of the reading]."""
-    drift: NonNegativeAmplitude = NO_AMPLITUDE
-    """Standard deviation of the random walk's step at each reading [unit of the reading]; the walk starts at reset."""
-    quantization: NonNegativeAmplitude = NO_AMPLITUDE
-    """Step of the quantiser [unit of the reading]; 0: none."""
-    dead_probability: Share = ZERO
-    """Chance that a taxel is dead for an episode."""
-    dead_range: tuple[AnyAmplitude, AnyAmplitude] = (NO_AMPLITUDE, NO_AMPLITUDE)
-    """Lowest and highest stuck reading of a dead taxel, drawn at reset [unit of the reading]."""
-    release_threshold: Annotated[Annotated[Range, RangeOf("length", ge=0.0)] | None, Usual("length", high=0.1)] = None
-    """Depth below which a `contact` taxel switches off again [m]; default: the sensor's own."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Knobs:
-        if self.gain[0][0] > self.gain[1][1]:
-            raise ValueError(f"gain [{self.gain[0][0]:g}, {self.gain[1][1]:g}] is not ordered, expected [low, high]")
-        return self
+    plain: ClassVar[type[Knobs]]
 
     def over(self, base: Knobs) -> Knobs:
         """Return the knobs of another with those of this one that were written."""
-        own = {name: getattr(self, name) for name in Knobs.model_fields if name in self.model_fields_set}
-        values = {name: getattr(base, name) for name in Knobs.model_fields if name in base.model_fields_set}
-        return Knobs.model_construct(_fields_set=set(values | own), **{**_defaults(), **values, **own})
+        model = max(self.plain, base.plain, key=lambda model: len(model.model_fields))
+        values = {
+            name: getattr(knobs, name)
+            for knobs in (base, self)
+            for name in knobs.plain.model_fields
+            if name in knobs.model_fields_set
+        }
+        return model.model_construct(_fields_set=set(values), **{**model.defaults(), **values})
 
     def active(self) -> tuple[str, ...]:
         """Return the names of the knobs that are not at their neutral value, in the order of the stages."""
-        return tuple(name for name, neutral in _defaults().items() if _plain(getattr(self, name)) != _plain(neutral))
+        neutral = self.plain.defaults()
+        return tuple(name for name, value in neutral.items() if _plain(getattr(self, name)) != _plain(value))
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        """Return the neutral values of all knobs."""
+        return {name: field.default for name, field in cls.plain.model_fields.items()}
+
+
+Knobs.plain = Knobs
 
 
 class NoiseSpec(Knobs):
@@ -145,8 +79,18 @@ NoiseField = Annotated[Text | Annotated[NoiseSpec, Tag("other")], TEXT_OR_OTHER]
 """A profile's name, or knobs in line."""
 
 
-def _defaults() -> dict[str, Any]:
-    return {name: field.default for name, field in Knobs.model_fields.items()}
+@cache
+def noise_model(more: tuple[Stage[Any, Any], ...]) -> type[NoiseSpec]:
+    """Return `NoiseSpec` with the knobs of more stages."""
+    if not more:
+        return NoiseSpec
+    parts: tuple[Any, ...] = tuple(stage.Knobs for stage in reversed(more))
+    knobs: Any = create_model("Knobs", __base__=(*parts, Knobs), __doc__=Knobs.__doc__)
+    knobs.plain = knobs
+    links = (dict[str, knobs], NoiseSpec.model_fields["links"])
+    spec: Any = create_model("NoiseSpec", __base__=(*parts, NoiseSpec), __doc__=NoiseSpec.__doc__, links=links)
+    spec.plain = knobs
+    return spec
 
 
 def _plain(value: Any) -> Any:
