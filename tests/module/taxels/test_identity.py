@@ -149,3 +149,21 @@ def test_connections(three, monkeypatch):
     with pytest.raises(TaxelError) as caught:
         tgdsl.connect(touch, "xhand1:/dev/nowhere", taxels=other.taxels)  # the port is not looked for
     assert str(caught.value) == "this module" + OTHER_ORDER
+
+
+class Marker:
+    """Leaves a file behind where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_a_rollout_runs_no_code_of_who_wrote_it(three, tmp_path):
+    tables = {"touch:pos": np.array([Marker(tmp_path / "ran")], dtype=object), "touch:link": np.array(["pad"])}
+    np.savez(tmp_path / "evil.npz", **tables, allow_pickle=True)
+    with pytest.raises(TgdslError, match=r"evil\.npz: expected the \.npz file of a rollout"):
+        tgdsl.check_taxels(three[0], tmp_path / "evil.npz")
+    assert not (tmp_path / "ran").exists()
