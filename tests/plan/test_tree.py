@@ -96,3 +96,14 @@ def test_frozen_arrays_are_of_the_plans_dtypes(given, kind):
 def test_numbers_of_numpy_are_plain_and_lists_are_walked():
     assert tree.flatten({"a": np.int64(3), "b": [np.float64(0.5), np.bool_(True)]})[0] == {"a": 3, "b": [0.5, True]}
     assert tree.mapped([np.zeros(2)], lambda array: "leaf") == ("leaf",)
+
+
+@pytest.mark.parametrize("change", [{"shared": None}, {"more": 1}, None])
+def test_a_record_has_the_fields_of_its_type_and_no_others(change):
+    """Whether one is missing or too many, or it is no record at all."""
+    plain, arrays = tree.flatten(made())
+    given = 3 if change is None else {name: part for name, part in (plain | change).items() if part is not None}
+    with pytest.raises(ArtifactError) as caught:
+        tree.restored(Root, given, arrays)
+    assert str(caught.value).startswith("not a plan: ")
+    assert str(caught.value).endswith(", expected the fields parts, scale, shared")

@@ -117,3 +117,19 @@ def test_bits_that_are_all_taken_are_an_error():
         changed(bits=f'contype="{2**31 - 1}"')
     says = "the scene's geoms use all bits of `contype` and `conaffinity`; links with primitive colliders need a free one"
     assert str(error.value) == says
+
+
+def test_what_meets_one_of_a_links_geoms_by_its_conaffinity_alone_is_refused():
+    """The link's first geom has no `contype` and does not meet the ball; its second one does."""
+    spec = mujoco.MjSpec.from_string(SCENE.format(bits="", ball='contype="0" conaffinity="1"', more=""))
+    spec.geom("one").contype = 0
+    spec.body("one").add_geom(name="more", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0])
+    with pytest.raises(RobotError, match='geom "ball"'):
+        with_colliders(spec, COLLIDERS)
+
+
+def test_sizes_are_those_of_the_type():
+    """MuJoCo's own model of a sphere and a capsule has zeros beyond its radius and half length."""
+    model = changed()
+    for i, size in enumerate(([0.02, 0, 0], [0.01, 0.05, 0])):
+        np.testing.assert_array_equal(model.geom(collider_name("one", i)).size, size)

@@ -133,16 +133,16 @@ class PlannedSensor(Generic[Array]):
     readings: tuple[PlannedReading, ...]
     axes: tuple[PlannedAxis, ...]
     constants: Mapping[str, Array] = inline()
-    noise: PlannedNoise[Array] | None = None
-    period: float = 0.0
-    history: PlannedHistory | None = None
-    notes: tuple[str, ...] = ()
-    is_timed: bool = False
-    substeps: int = 0
-    upstream: tuple[str, ...] = ()
-    provides: tuple[str, ...] = ()
-    is_random: bool = False
-    timestep: float = 0.0
+    noise: PlannedNoise[Array] | None
+    period: float
+    history: PlannedHistory | None
+    notes: tuple[str, ...]
+    is_timed: bool
+    substeps: int
+    upstream: tuple[str, ...]
+    provides: tuple[str, ...]
+    is_random: bool
+    timestep: float
 
     @property
     def wants_clock(self) -> bool:

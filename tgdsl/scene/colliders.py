@@ -90,7 +90,7 @@ def _add(spec: mujoco.MjSpec, collider: Collider, i: int, like: mujoco.MjsGeom, 
     geom = spec.body(collider.body).add_geom(
         name=collider_name(collider.body, i),
         type=getattr(mujoco.mjtGeom, f"mjGEOM_{collider.type.upper()}"),
-        size=[*collider.size, 0.0, 0.0, 0.0][:3],
+        size=[*collider.size, 0.0, 0.0][:3],
         pos=collider.pos,
         quat=collider.quat,
     )

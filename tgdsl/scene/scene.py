@@ -98,8 +98,6 @@ def readable(name: str, content: bytes) -> bytes:
         return _OBJ_NAME.sub(b"", content) if num_objects(content) > 1 else content
     if Path(name).suffix.lower() != ".stl" or content.lstrip()[:5].lower() != b"solid":
         return content
-    if len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
-        return content  # binary, whatever its header says
     try:
         corners = np.array(_STL_VERTEX.findall(content)).astype(np.float32).reshape(-1, 3, 3)
     except ValueError:
@@ -313,7 +311,6 @@ class SceneModels:
         model = spec.compile()
         for name in self._off_center:
             body, id = spec.body(name), model.body(name).id
-            body.explicitinertial = True
             body.mass, body.inertia = model.body_mass[id], model.body_inertia[id]
             body.iquat, body.ipos = model.body_iquat[id], model.body_ipos[id] + np.array([OFF_CENTER, 0, 0])
         return spec.compile() if self._off_center else model

@@ -188,3 +188,21 @@ def test_a_robot_that_was_exported_has_the_same_taxels(tmp_path, name, text):
     ]
     assert modules[0].taxels_id != modules[1].taxels_id
     tgdsl.check_taxels(modules[0], modules[1])
+
+
+class Marker:
+    """Leaves a file behind where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_a_rollout_runs_no_code_of_who_wrote_it(three, tmp_path):
+    tables = {"touch:pos": np.array([Marker(tmp_path / "ran")], dtype=object), "touch:link": np.array(["pad"])}
+    np.savez(tmp_path / "evil.npz", **tables, allow_pickle=True)
+    with pytest.raises(TgdslError, match=r"evil\.npz: expected the \.npz file of a rollout"):
+        tgdsl.check_taxels(three[0], tmp_path / "evil.npz")
+    assert not (tmp_path / "ran").exists()
