@@ -99,7 +99,7 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
             problems += error.problems
             continue
         term = validate(source, place, class_, problems, ())
-        if isinstance(term, RewardTerm) and hasattr(getattr(spec, "rewards", None), name):
+        if isinstance(term, RewardTerm) and getattr(getattr(spec, "rewards", None), name, None) is not None:
             problems.append(source.problem(place, f'the task has a term "{name}"', f"set `rewards.{name}`", on_key=True))
         elif isinstance(term, ObservationTerm) and name in SHARED_GROUPS:
             problems.append(
