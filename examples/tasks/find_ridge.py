@@ -20,7 +20,7 @@ Without touch all places within [a + ε, b − ε] pay the same, so nothing but 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -68,7 +68,7 @@ def chance(spec: FindRidgeSpec) -> float:
     return min(1.0, 2.0 * spec.tolerance / (high - low)) if high > low else 1.0
 
 
-def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, float]]:
+def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
     """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:

@@ -25,6 +25,7 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
+from tgdsl.rl.curricula import Curricula
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes, Observations, Step, StepInfo
 from tgdsl.rl.grasps.load import with_grasps
@@ -61,6 +62,7 @@ class TouchEnv:
         touch: The module.
         actuation: The drives of the joints that the policy moves.
         pushes: Forces that push the object.
+        curricula: Numbers of terms that change while a policy is learned: whoever learns calls `advance`.
         groups: Size of each group of observations.
         felt: Where those of what is felt come from.
         steps: Control steps of each environment's present episode; may be written.
@@ -118,8 +120,9 @@ class TouchEnv:
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws, first_env)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
+        self.curricula = Curricula(loaded, self.sim.qpos)
         try:
-            self.task = loaded.task(self.spec, setup)
+            self.task = loaded.task(self.curricula.spec, setup)
         except LowerError as error:
             raise loaded.error((error.field,), error.what, error.hint) from error
         self._draws, self._first_env = draws, first_env
@@ -309,7 +312,8 @@ class TouchEnv:
         actions = {"used": self._used, "before": self._before}
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         kept = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
-        return kept | ({"speeds": self._speeds.memory()} if self._speeds else {})
+        kept |= {"speeds": self._speeds.memory()} if self._speeds else {}
+        return kept | ({"curricula": self.curricula.values} if self.curricula.values else {})
 
     def _prepare(self, tell: Progress, is_compiled: bool) -> None:
         """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
@@ -374,7 +378,7 @@ class TouchEnv:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
         rates = self.task.rates(now, terminated)
-        for name, term in self.loaded.terms.items():
+        for name, term in self.curricula.terms.items():
             if isinstance(term, RewardTerm):
                 if name in rates:
                     raise SimulationError(
@@ -438,7 +442,7 @@ class TouchEnv:
         exact = groups.proprio(now)
         proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
         own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
-        terms = {name: term for name, term in self.loaded.terms.items() if isinstance(term, ObservationTerm)}
+        terms = {name: term for name, term in self.curricula.terms.items() if isinstance(term, ObservationTerm)}
         own |= {name: self._checked(name, term.observe(now, self.task.setup), proprio, ndim=2) for name, term in terms.items()}
         own |= self.task.checked_observations(now, own)
         return {name: value.to(self.device, torch.float32) for name, value in own.items()}

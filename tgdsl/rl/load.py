@@ -15,7 +15,7 @@ from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
-from tgdsl.rl.terms import TERMS, ObservationTerm, RewardTerm, Term
+from tgdsl.rl.terms import TERMS, CurriculumTerm, ObservationTerm, RewardTerm, Term
 from tgdsl.schema.load import read_source
 from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Path as Place
@@ -107,7 +107,21 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
             )
         elif isinstance(term, Term):
             terms[name] = term
+    known = numbers(spec, terms)
+    for name, term in terms.items():
+        if isinstance(term, CurriculumTerm) and term.of not in known:
+            what = f'there is no number "{term.of}" of a term'
+            problems.append(source.problem(("terms", name, "of"), what, did_you_mean(term.of, known, "numbers")))
     return terms
+
+
+def numbers(spec: TaskSpec, terms: Mapping[str, Term]) -> dict[str, float]:
+    """Return the numbers that a curriculum may change, by dotted path: weights of the task's terms, numbers of the others."""
+    fields = {f"rewards.{name}": value for name, value in getattr(spec, "rewards", ())}
+    for name, term in terms.items():
+        if not isinstance(term, CurriculumTerm):
+            fields |= {f"terms.{name}.{key}": value for key, value in term}
+    return {path: value for path, value in fields.items() if isinstance(value, float)}
 
 
 def _task_class(source: Source, folder: Path) -> type[Task[Any]]:

@@ -256,8 +256,9 @@ class Task(ABC, Generic[S]):
         own = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
         cls.terms = {**cls.terms, **own}
         if cls.terms and (own or "Spec" in vars(cls)):
+            weight: Any = Weight
             fields: dict[str, Any] = {
-                name: (Weight | None, Field(term.weight, description=f"{term.summary} [{term.unit}]."))
+                name: (weight | None, Field(term.weight, description=f"{term.summary} [{term.unit}]."))
                 for name, term in cls.terms.items()
             }
             doc = "Weights of the reward's terms; null leaves one out."

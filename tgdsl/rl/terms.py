@@ -1,6 +1,7 @@
 """Terms of rewards, ends and observations that tasks share, and that a document adds to its task: `terms` of `TaskSpec`.
 
-A `RewardTerm` adds a rate to the reward, a `TerminationTerm` ends episodes, an `ObservationTerm` adds a group of observations.
+A `RewardTerm` adds a rate to the reward, a `TerminationTerm` ends episodes, an `ObservationTerm` adds a group of observations;
+a `CurriculumTerm` changes a weight or another number of a term while a policy is learned.
 `TERMS` has those that documents may name; a user's own is a subclass, named as `file.py:Class`.
 
 Symbols: a action; q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
@@ -19,11 +20,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from pydantic import model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
@@ -66,7 +68,7 @@ class RewardTerm(Term):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         """Return its rate without the weight; the reward is the sum of all rates times Δt."""
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         """Return the rate of one environment in float64, for tests: of `Now`'s fields and the limits of `Setup`."""
         raise NotImplementedError
 
@@ -120,13 +122,29 @@ class ObservationTerm(Term):
         """Return the group."""
 
 
+class CurriculumTerm(Term):
+    """A weight or another number of a term that follows the progress of learning."""
+
+    of: str
+    """The number: `rewards.effort`, or `terms.slip.weight`."""
+
+    @abstractmethod
+    def value(self, iteration: int, score: float | None) -> float:
+        """Return the number.
+
+        Args:
+            iteration: How many iterations were made.
+            score: Mean score of the episodes that have ended last, in `Task.score_unit`; None: none has ended yet.
+        """
+
+
 class ActionRate(RewardTerm):
     """Change of the action, |a_t − a_{t−1}|²."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.action - now.last_action).square().sum(dim=1)
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         return np.sum((row["action"] - row["last_action"]) ** 2)
 
 
@@ -139,7 +157,7 @@ class JointLimit(RewardTerm):
         middle, half = 0.5 * (setup.low + setup.high), 0.5 * (setup.high - setup.low)
         return ((now.joint_pos - middle).abs() - FREE_SHARE * half).clamp(min=0.0).sum(dim=1)
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         middle, half = 0.5 * (row["low"] + row["high"]), 0.5 * (row["high"] - row["low"])
         return np.sum(np.maximum(abs(row["joint_pos"] - middle) - 0.95 * half, 0.0))
 
@@ -152,7 +170,7 @@ class Work(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.torque * now.joint_vel).abs().sum(dim=1)
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         return np.sum(np.abs(row["torque"] * row["joint_vel"]))
 
 
@@ -162,7 +180,7 @@ class Effort(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.torque / setup.max_torque).square().sum(dim=1)
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         return np.sum((row["torque"] / row["max_torque"]) ** 2)
 
 
@@ -176,7 +194,7 @@ class ContactForce(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return ((vector_norm(now.link_force, dim=2) - self.max_force).clamp(min=0.0) / self.max_force).sum(dim=1)
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         return sum(max(0.0, np.linalg.norm(f) - self.max_force) / self.max_force for f in row["link_force"])
 
 
@@ -190,7 +208,7 @@ class Near(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return torch.exp(-now.distance.clamp(min=0.0) / self.width).mean(dim=1)
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         return np.mean(np.exp(-np.maximum(row["distance"], 0.0) / self.width))
 
 
@@ -207,7 +225,7 @@ class ObjectSpeed(RewardTerm):
         speed, spin = ((vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(own, free, strict=True))
         return speed + spin
 
-    def reference(self, row: Row) -> float:
+    def reference(self, row: Row) -> float | np.floating:
         speed, spin = np.linalg.norm(row["linvel"]), np.linalg.norm(row["angvel"])
         return max(0.0, speed / self.free_speed - 1.0) + max(0.0, spin / self.free_spin - 1.0)
 
@@ -249,6 +267,32 @@ class ObjectState(ObservationTerm):
         return groups.object_state(now)
 
 
+class Linear(CurriculumTerm):
+    """`start` up to `first`, `end` from `last` on, and linear between: of iterations, or of the score."""
+
+    by: Literal["iteration", "score"] = "iteration"
+    """What it follows; before an episode has ended the score counts as `first`."""
+    first: Number
+    """Where the change begins, in iterations or in the score's unit."""
+    last: Number
+    """Where the change ends; for a score of which less is better, less than `first`."""
+    start: Number
+    """The number before the change."""
+    end: Number
+    """The number after it."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Linear:
+        if self.first == self.last:
+            raise ValueError(f"first and last are both {self.first:g}, expected a change that takes some time")
+        return self
+
+    def value(self, iteration: int, score: float | None) -> float:
+        x = iteration if self.by == "iteration" else self.first if score is None else score
+        share = min(1.0, max(0.0, (x - self.first) / (self.last - self.first)))
+        return self.start + share * (self.end - self.start)
+
+
 TERMS: Mapping[str, type[Term]] = {
     "action_rate": ActionRate,
     "joint_limit": JointLimit,
@@ -261,5 +305,6 @@ TERMS: Mapping[str, type[Term]] = {
     "speed_limit": SpeedLimit,
     "link_force": LinkForce,
     "object_state": ObjectState,
+    "linear": Linear,
 }
 """The terms that documents may name."""

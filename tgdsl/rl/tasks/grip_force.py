@@ -40,7 +40,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -86,7 +86,7 @@ class GripForceSpec(TaskSpec):
     """F_crush: a larger sum of normal forces crushes the object [N]."""
 
 
-def reference(spec: GripForceSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, float]]:
+def reference(spec: GripForceSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
     """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:

@@ -36,7 +36,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -114,7 +114,7 @@ class InHandReposeSpec(TaskSpec):
         return self
 
 
-def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, float]]:
+def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
     """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:

@@ -86,7 +86,7 @@ class InPalmRotateSpec(TaskSpec):
     """ω_free: the same of its angular velocity, about whatever axis [rad/s]."""
 
 
-def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, float]]:
+def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
     """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:

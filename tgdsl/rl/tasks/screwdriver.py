@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
@@ -123,7 +123,7 @@ class ScrewdriverSpec(TaskSpec):
     """Further from where it was, the tip is out of the screw [m]."""
 
 
-def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, float]]:
+def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
     """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:
