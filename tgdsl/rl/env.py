@@ -28,6 +28,7 @@ from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.curricula import Curricula
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes, Observations, Step, StepInfo
+from tgdsl.rl.events import Events
 from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
@@ -125,6 +126,7 @@ class TouchEnv:
             self.task = loaded.task(self.curricula.spec, setup)
         except LowerError as error:
             raise loaded.error((error.field,), error.what, error.hint) from error
+        self._events = Events(self.curricula.terms, self.sim, setup)
         self._draws, self._first_env = draws, first_env
         random, arrays = self.spec.randomise, self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
@@ -256,6 +258,7 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad(), self._dispatch():
             self.actuation.follow(control)
             self.pushes.advance()
+            self._events.advance()
             self.sim.step(self.sim.ctrl)
             now = self._instant = self._now(self.sim.read())
             self._measure(now)
@@ -313,7 +316,8 @@ class TouchEnv:
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         kept = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
         kept |= {"speeds": self._speeds.memory()} if self._speeds else {}
-        return kept | ({"curricula": self.curricula.values} if self.curricula.values else {})
+        kept |= {"curricula": self.curricula.values} if self.curricula.values else {}
+        return kept | ({"events": self._events.memory} if self._events.memory else {})
 
     def _prepare(self, tell: Progress, is_compiled: bool) -> None:
         """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
@@ -328,6 +332,7 @@ class TouchEnv:
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin episodes of some environments."""
         self._episodes.begin(chosen)
+        self._events.reset(chosen, self._episodes.number)
         for held in (self._used, self._before):
             held.masked_fill_(chosen[:, None], 0.0)
 
@@ -340,6 +345,7 @@ class TouchEnv:
         with self._logic_by():
             self._before.copy_(self._used)
             control = self._commanded(self._action, sim.ctrl)
+            self._events.advance()
         sim.step(control)
         readings = sim.read()
         with self._logic_by():

@@ -9,13 +9,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
-from tgdsl.rl.terms import TERMS, CurriculumTerm, ObservationTerm, RewardTerm, Term
+from tgdsl.rl.terms import TERMS, CurriculumTerm, ObservationTerm, RewardTerm, Term, event_term
 from tgdsl.schema.load import read_source
 from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Path as Place
@@ -158,6 +159,8 @@ def _class_of(
         raise SpecError(
             [source.problem(place, f'{module} has no class "{class_}"', did_you_mean(class_, classes, f"{which} in it"))]
         )
+    if isinstance(result, FunctionType) and base is Term:
+        return cast(type[C], event_term(result))
     if not (isinstance(result, type) and issubclass(result, base)):
         raise SpecError([source.problem(place, f'"{name}" is no subclass of {base.__module__}.{base.__name__}')])
     return result

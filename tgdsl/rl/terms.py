@@ -1,7 +1,8 @@
 """Terms of rewards, ends and observations that tasks share, and that a document adds to its task: `terms` of `TaskSpec`.
 
 A `RewardTerm` adds a rate to the reward, a `TerminationTerm` ends episodes, an `ObservationTerm` adds a group of observations;
-a `CurriculumTerm` changes a weight or another number of a term while a policy is learned.
+an `EventTerm` changes the simulation at random; a `CurriculumTerm` changes a weight or another number of a term while a policy
+is learned.
 `TERMS` has those that documents may name; a user's own is a subclass, named as `file.py:Class`.
 
 Symbols: a action; q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
@@ -16,23 +17,26 @@ Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from pydantic import model_validator
+from jaxtyping import Bool, Float, Int
+from pydantic import create_model, model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Number, PositiveLength, Quantity, SpecModel
+from tgdsl.fields.models import Number, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl import groups
+from tgdsl.rl.draws import within
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Now, Rate, Setup, Task, TaskReward
+from tgdsl.runtime.simulators.simulation import Simulation
 
 FREE_SHARE = 0.95
 """Share of a joint's range that costs nothing."""
@@ -120,6 +124,59 @@ class ObservationTerm(Term):
     @abstractmethod
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
         """Return the group."""
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """An event that happens now.
+
+    Attributes:
+        sim: The simulation; its `arrays` and `properties` may be changed, of the chosen environments alone.
+        setup: What the task is made for.
+        chosen: The environments in which it happens: decide by this mask, not by `if`.
+        count: How often it has happened in each environment, above that the episode.
+        name: Its name in the document.
+    """
+
+    sim: Simulation
+    setup: Setup
+    chosen: Bool[Tensor, " env"]
+    count: Int[Tensor, " env"]
+    name: str
+
+    def uniform(self, num: int, low: float = 0.0, high: float = 1.0) -> Float[Tensor, "env num"]:
+        """Return random numbers between two bounds, of physics' dtype: others each time that it happens."""
+        what = f"event {self.name}"
+        return within(self.setup.draws.shares({what: num}, self.count, self.chosen)[what].to(self.setup.dtype), low, high)
+
+
+class EventTerm(Term):
+    """Something that happens to the simulation, at each reset or after intervals that are drawn."""
+
+    mode: Literal["reset", "interval"] = "interval"
+    """When it happens."""
+    interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
+    """Time from one to the next, drawn for each [s]."""
+
+    @abstractmethod
+    def apply(self, event: Event) -> None:
+        """Change the simulation."""
+
+
+def event_term(function: Callable[..., None]) -> type[EventTerm]:
+    """Return the term of a function of an `Event`: its other parameters, with annotations and defaults, are the term's."""
+    parameters = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
+    fields: dict[str, Any] = {
+        own.name: (own.annotation, ... if own.default is own.empty else own.default) for own in parameters
+    }
+
+    def apply(self: EventTerm, event: Event) -> None:
+        function(event, **{name: getattr(self, name) for name in fields})
+
+    base = type(
+        function.__name__, (EventTerm,), {"apply": apply, "__module__": function.__module__, "__doc__": function.__doc__}
+    )
+    return create_model(function.__name__, __base__=base, **fields)
 
 
 class CurriculumTerm(Term):
@@ -267,6 +324,21 @@ class ObjectState(ObservationTerm):
         return groups.object_state(now)
 
 
+class ObjectVelocity(EventTerm):
+    """The object, which moves freely, is given more velocity, as by a knock."""
+
+    speed: Annotated[Range, RangeOf("speed")] = (0.0, 0.0)
+    """Velocity along each of the world's axes that is added [m/s]."""
+    spin: Annotated[Range, RangeOf("number")] = (0.0, 0.0)
+    """Angular velocity about each of the object's axes that is added [rad/s]."""
+
+    def apply(self, event: Event) -> None:
+        first = int(event.setup.model.body(event.setup.object).dofadr[0])
+        share = event.uniform(6)
+        added = torch.cat([within(share[:, :3], *self.speed), within(share[:, 3:], *self.spin)], dim=1)
+        event.sim.arrays["qvel"][:, first : first + 6] += torch.where(event.chosen[:, None], added, 0.0)
+
+
 class Linear(CurriculumTerm):
     """`start` up to `first`, `end` from `last` on, and linear between: of iterations, or of the score."""
 
@@ -305,6 +377,7 @@ TERMS: Mapping[str, type[Term]] = {
     "speed_limit": SpeedLimit,
     "link_force": LinkForce,
     "object_state": ObjectState,
+    "object_velocity": ObjectVelocity,
     "linear": Linear,
 }
 """The terms that documents may name."""
