@@ -14,19 +14,13 @@ Groups: `command` holds the targets of the joints [rad], the last action and the
 which knows of the ridge; `priv_ridge` p − r [m], v [m/s] and |f| [N]. Measured positions of the joints are in `proprio`; where
 they differ from the targets something is in the way, so a policy without touch must not have them.
 
-The reward is the sum of these terms times Δt.
-
-    rest               w · (rests)                                               1 1/s
-    found              w · (rests, at the end)                                   80 1/s
-    action_rate        w · |a_t − a_{t−1}|²                                      −1e-3 1/s
-
 Without touch all places within [a + ε, b − ε] pay the same, so nothing but chance can be learned. Score: whether it rests.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -34,25 +28,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.fields.models import Position, PositiveLength, Quantity, Range, RangeOf, SpecModel
+from tgdsl.fields.models import Position, PositiveLength, Quantity, Range, RangeOf
 from tgdsl.rl import rotations, terms
-from tgdsl.rl.spec import RandomSpec, TaskSpec, Weight
-from tgdsl.rl.task import HandNow, Now, Setup, Start, Task
+from tgdsl.rl.spec import RandomSpec, TaskSpec
+from tgdsl.rl.task import HandNow, Now, Setup, Start, Task, reward_term
 from tgdsl.runtime.simulators.watch import Watch
 
 ACROSS = 1
 """World axis across the ridge."""
-
-
-class Rewards(SpecModel):
-    """Weights of the reward's terms; 0 leaves one out."""
-
-    rest: Weight = 1.0
-    """The fingertip rests on the ridge [1/s]."""
-    found: Weight = 80.0
-    """It does so at the end [1/s]."""
-    action_rate: Weight = -1e-3
-    """Change of the action [1/s]."""
 
 
 class RidgeRandomSpec(RandomSpec):
@@ -67,8 +50,6 @@ class FindRidgeSpec(TaskSpec):
 
     randomise: RidgeRandomSpec = RidgeRandomSpec()
     """What is random."""
-    rewards: Rewards = Rewards()
-    """Weights of the reward's terms."""
     tip: str = "right_hand_index_rota_link2"
     """The body of the fingertip."""
     pad: Position = (0.009, 0.0, 0.032)
@@ -87,16 +68,15 @@ def chance(spec: FindRidgeSpec) -> float:
     return min(1.0, 2.0 * spec.tolerance / (high - low)) if high > low else 1.0
 
 
-def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
-    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
+    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:
         spec: The task's document.
         record: One row per instant, the first that at the start: of the fingertip `pos` [m], `quat`, `linvel` [m/s] and
-            `angvel` [rad/s]; `place`, where the ridge is [m]; `force`, of the ridge on the fingertip [N]; and `action`.
+            `angvel` [rad/s]; `place`, where the ridge is [m]; `force`, of the ridge on the fingertip [N].
         dt: Δt [s].
     """
-    weights, rows = spec.rewards, []
     for t in range(1, len(record["pos"])):
         w, x, y, z = record["quat"][t]
         turned = np.array(
@@ -115,13 +95,7 @@ def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) 
             and abs(speed) <= spec.max_speed
         )
         is_over = t >= round(spec.episode / dt)
-        row = {
-            "rest": weights.rest * rests,
-            "found": weights.found * (rests and is_over),
-            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
-        }
-        rows.append(row | {"is_over": is_over, "score": float(rests)})
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        yield {"rest": rests, "found": rests and is_over, "is_over": is_over, "score": float(rests)}
 
 
 def command(now: Now | HandNow, left: Float[Tensor, " env"]) -> Float[Tensor, "env feature"]:
@@ -136,6 +110,18 @@ class FindRidge(Task[FindRidgeSpec]):
     senses = ("link_contact",)
     score_unit = "found"
     hand_groups = ("command",)
+
+    @reward_term(1.0, "1/s")
+    def rest(self, now: Now) -> Bool[Tensor, " env"]:
+        """The fingertip rests on the ridge."""
+        return self.rests
+
+    @reward_term(80.0, "1/s")
+    def found(self, now: Now) -> Bool[Tensor, " env"]:
+        """The fingertip rests on the ridge at the end."""
+        return self.rests & self.is_over(now)
+
+    action_rate = terms.ActionRate.of_task(-1e-3)
 
     def __init__(self, spec: FindRidgeSpec, setup: Setup):
         """Begin with the ridge where the scene has it.
@@ -176,15 +162,6 @@ class FindRidge(Task[FindRidgeSpec]):
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where time is over."""
         return self.elapsed >= self.num_steps
-
-    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return the terms of the reward: see the top of this page."""
-        weights = self.spec.rewards
-        return {
-            "rest": weights.rest * self.rests,
-            "found": weights.found * (self.rests & is_over),
-            "action_rate": weights.action_rate * terms.action_rate(now),
-        }
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return what was commanded, and what is privileged of the ridge."""

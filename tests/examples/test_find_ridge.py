@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import binomtest
+from task_records import reference_rates
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
@@ -80,7 +81,7 @@ def test_rewards_ends_and_scores_are_those_of_the_reference(make):
         for i in range(env.num_envs):
             record = {name: np.stack([row[name][i] for row in rows[own]]) for name in rows[0]}
             record = {name: np.concatenate([np.zeros_like(value[:1]), value]) for name, value in record.items()}
-            expected = OWN.reference(env.spec, record, env.control_step)
+            expected = reference_rates(env.task, OWN.reference, env.spec, record, env.control_step)
             for t, step in enumerate(made[own]):
                 terms = {name: float(value[i]) for name, value in step.info.terms.items()}
                 assert terms == pytest.approx({name: expected[name][t] * env.control_step for name in terms}, abs=TOLERANCE)

@@ -8,8 +8,11 @@ from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.task import Now
+from tgdsl.rl.terms import SharedReward
 
 Record = dict[str, np.ndarray]
+NAMES = ("joint_pos", "joint_vel", "torque", "action", "link_force", "distance", "linvel", "angvel")
+"""What references of shared terms read."""
 
 
 class Recorder:
@@ -60,7 +63,7 @@ class Recorder:
         for episodes in self.episodes:
             for instants, rows in episodes:
                 if rows:
-                    limits = {"low": actuators.low, "high": actuators.high}
+                    limits = {"low": actuators.low, "high": actuators.high, "max_torque": actuators.limit}
                     yield _stacked(instants) | limits, _stacked(rows)
 
 
@@ -84,11 +87,27 @@ def _stacked(rows: Sequence[Record]) -> Record:
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
+def reference_rates(task, reference, spec, record: Record, dt: float) -> Record:
+    """Return all terms of a task's reward [1/s], `is_over` and `score` at each step of one environment, in float64."""
+    weights, limits = spec.rewards, {name: record[name] for name in ("low", "high", "max_torque") if name in record}
+    instants = {name: record[name] for name in NAMES if name in record}
+    shared = {
+        name: term.term.for_spec(spec, term.parameters) for name, term in task.terms.items() if isinstance(term, SharedReward)
+    }
+    rows = []
+    for t, own in enumerate(reference(spec, record, dt), start=1):
+        row = {name: value[t] for name, value in instants.items()} | {"last_action": record["action"][t - 1]} | limits
+        rates = own | {name: term.reference(row) for name, term in shared.items()}
+        rows.append(own | {name: getattr(weights, name) * rates[name] for name in task.terms})
+    return _stacked(rows)
+
+
 def assert_reference(recorder: Recorder, reference, tolerance: float = 1e-6) -> set[str]:
     """Compare rewards, ends and scores of all episodes with a task's reference; return what was ever different from 0."""
     seen: set[str] = set()
     for record, rows in recorder.records():
-        expected = reference(recorder.env.spec, record, recorder.env.control_step)
+        env = recorder.env
+        expected = reference_rates(env.task, reference, env.spec, record, env.control_step)
         assert expected.keys() == rows.keys()
         for name, value in expected.items():
             scale = max(1.0, float(np.abs(value).max()))

@@ -7,6 +7,7 @@ from tiny_tasks import tiny_env, write_task
 
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl.load import load_task
+from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 OWN = '''
 import torch
@@ -153,3 +154,34 @@ def test_a_term_does_not_replace_one_of_the_tasks_own(folder):
         tiny_env(folder, task="own.py:Idle", more="terms: {nothing: {term: work, weight: 1}}\n").step(torch.zeros(4, 2))
     with pytest.raises(SimulationError, match='group "goal"'):
         tiny_env(folder, more="terms: {goal: {term: object_state}}\n")
+
+
+def test_a_document_leaves_out_a_term_of_the_task(folder):
+    """Its name is free then, and the others are as they were."""
+    env, plain = tiny_env(folder, overrides={"rewards.near": "null"}), tiny_env(folder)
+    made, other = env.step(torch.full((4, 2), 0.3)), plain.step(torch.full((4, 2), 0.3))
+    assert made.info.terms.keys() == other.info.terms.keys() - {"near"}
+    assert torch.allclose(made.reward, other.reward - other.info.terms["near"], rtol=1e-6, atol=1e-7)
+    env = tiny_env(folder, more="rewards: {near: null}\nterms: {near: {weight: 2, width: 1 cm}}\n")
+    made = env.step(torch.full((4, 2), 0.3))
+    rate = np.exp(-np.maximum(env.now.distance.numpy(), 0.0) / 0.01).mean(axis=1)
+    np.testing.assert_allclose(made.info.terms["near"], 2 * env.control_step * rate, rtol=1e-6)
+
+
+def test_a_task_of_ones_own_lists_its_terms(folder):
+    """Weights are keys of its document, after those of the task that it is made from."""
+    (folder / "lift.py").write_text(
+        "from tgdsl.rl.task import reward_term\n"
+        "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n\n"
+        "class Lift(InPalmRotate):\n"
+        "    @reward_term(3.0, '1/(m s)')\n"
+        "    def height(self, now):\n"
+        '        """Height of the object."""\n'
+        "        return now.object.pos[:, 2]\n"
+    )
+    env = tiny_env(folder, task="lift.py:Lift", overrides={"rewards.height": -2})
+    assert list(env.task.terms)[-1] == "height" and len(env.task.terms) == len(InPalmRotate.terms) + 1
+    assert env.task.Rewards.model_fields["height"].description == "Height of the object [1/(m s)]."
+    made = env.step(torch.zeros(4, 2))
+    expected = -2 * env.control_step * env.now.object.pos[:, 2].numpy()
+    np.testing.assert_allclose(made.info.terms["height"], expected, rtol=1e-6)

@@ -25,8 +25,10 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
+from tgdsl.rl.curricula import Curricula
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes, Observations, Step, StepInfo
+from tgdsl.rl.events import Events
 from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
@@ -61,6 +63,7 @@ class TouchEnv:
         touch: The module.
         actuation: The drives of the joints that the policy moves.
         pushes: Forces that push the object.
+        curricula: Numbers of terms that change while a policy is learned: whoever learns calls `advance`.
         groups: Size of each group of observations.
         felt: Where those of what is felt come from.
         steps: Control steps of each environment's present episode; may be written.
@@ -118,10 +121,12 @@ class TouchEnv:
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws, first_env)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
+        self.curricula = Curricula(loaded, self.sim.qpos)
         try:
-            self.task = loaded.task(self.spec, setup)
+            self.task = loaded.task(self.curricula.spec, setup)
         except LowerError as error:
             raise loaded.error((error.field,), error.what, error.hint) from error
+        self._events = Events(self.curricula.terms, self.sim, setup)
         self._draws, self._first_env = draws, first_env
         random, arrays = self.spec.randomise, self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
@@ -253,6 +258,7 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad(), self._dispatch():
             self.actuation.follow(control)
             self.pushes.advance()
+            self._events.advance()
             self.sim.step(self.sim.ctrl)
             now = self._instant = self._now(self.sim.read())
             self._measure(now)
@@ -309,7 +315,9 @@ class TouchEnv:
         actions = {"used": self._used, "before": self._before}
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         kept = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
-        return kept | ({"speeds": self._speeds.memory()} if self._speeds else {})
+        kept |= {"speeds": self._speeds.memory()} if self._speeds else {}
+        kept |= {"curricula": self.curricula.values} if self.curricula.values else {}
+        return kept | ({"events": self._events.memory} if self._events.memory else {})
 
     def _prepare(self, tell: Progress, is_compiled: bool) -> None:
         """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
@@ -324,6 +332,7 @@ class TouchEnv:
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin episodes of some environments."""
         self._episodes.begin(chosen)
+        self._events.reset(chosen, self._episodes.number)
         for held in (self._used, self._before):
             held.masked_fill_(chosen[:, None], 0.0)
 
@@ -336,6 +345,7 @@ class TouchEnv:
         with self._logic_by():
             self._before.copy_(self._used)
             control = self._commanded(self._action, sim.ctrl)
+            self._events.advance()
         sim.step(control)
         readings = sim.read()
         with self._logic_by():
@@ -374,7 +384,7 @@ class TouchEnv:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
         rates = self.task.rates(now, terminated)
-        for name, term in self.loaded.terms.items():
+        for name, term in self.curricula.terms.items():
             if isinstance(term, RewardTerm):
                 if name in rates:
                     raise SimulationError(
@@ -438,7 +448,7 @@ class TouchEnv:
         exact = groups.proprio(now)
         proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
         own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
-        terms = {name: term for name, term in self.loaded.terms.items() if isinstance(term, ObservationTerm)}
+        terms = {name: term for name, term in self.curricula.terms.items() if isinstance(term, ObservationTerm)}
         own |= {name: self._checked(name, term.observe(now, self.task.setup), proprio, ndim=2) for name, term in terms.items()}
         own |= self.task.checked_observations(now, own)
         return {name: value.to(self.device, torch.float32) for name, value in own.items()}

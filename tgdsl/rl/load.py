@@ -9,13 +9,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
-from tgdsl.rl.terms import TERMS, ObservationTerm, RewardTerm, Term
+from tgdsl.rl.terms import TERMS, CurriculumTerm, ObservationTerm, RewardTerm, Term, event_term
 from tgdsl.schema.load import read_source
 from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Path as Place
@@ -99,7 +100,7 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
             problems += error.problems
             continue
         term = validate(source, place, class_, problems, ())
-        if isinstance(term, RewardTerm) and hasattr(getattr(spec, "rewards", None), name):
+        if isinstance(term, RewardTerm) and getattr(getattr(spec, "rewards", None), name, None) is not None:
             problems.append(source.problem(place, f'the task has a term "{name}"', f"set `rewards.{name}`", on_key=True))
         elif isinstance(term, ObservationTerm) and name in SHARED_GROUPS:
             problems.append(
@@ -107,7 +108,21 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
             )
         elif isinstance(term, Term):
             terms[name] = term
+    known = numbers(spec, terms)
+    for name, term in terms.items():
+        if isinstance(term, CurriculumTerm) and term.of not in known:
+            what = f'there is no number "{term.of}" of a term'
+            problems.append(source.problem(("terms", name, "of"), what, did_you_mean(term.of, known, "numbers")))
     return terms
+
+
+def numbers(spec: TaskSpec, terms: Mapping[str, Term]) -> dict[str, float]:
+    """Return the numbers that a curriculum may change, by dotted path: weights of the task's terms, numbers of the others."""
+    fields = {f"rewards.{name}": value for name, value in getattr(spec, "rewards", ())}
+    for name, term in terms.items():
+        if not isinstance(term, CurriculumTerm):
+            fields |= {f"terms.{name}.{key}": value for key, value in term}
+    return {path: value for path, value in fields.items() if isinstance(value, float)}
 
 
 def _task_class(source: Source, folder: Path) -> type[Task[Any]]:
@@ -144,6 +159,8 @@ def _class_of(
         raise SpecError(
             [source.problem(place, f'{module} has no class "{class_}"', did_you_mean(class_, classes, f"{which} in it"))]
         )
+    if isinstance(result, FunctionType) and base is Term:
+        return cast(type[C], event_term(result))
     if not (isinstance(result, type) and issubclass(result, base)):
         raise SpecError([source.problem(place, f'"{name}" is no subclass of {base.__module__}.{base.__name__}')])
     return result

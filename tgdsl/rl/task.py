@@ -1,8 +1,11 @@
 """A task: how an episode begins and ends, what is observed and rewarded, and how well it went.
 
-A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done, its groups and every term of its reward as an
-equation; the spec; `reference`, the reward and the end of an episode in float64 NumPy; then the class, with `reset`, `advance`,
-`is_over`, `reward`, `observe`, `score`.
+A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done and its groups; the spec; `reference`, its own
+terms of the reward and the end of an episode in float64 NumPy; then the class: its terms, `reset`, `advance`, `is_over`,
+`observe`, `score`.
+
+A term of the reward is a method marked by `reward_term`, or a shared one of `tgdsl.rl.terms` such as `near = Near.of_task(0.1,
+width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order.
 
 All methods take and return tensors of all environments, and change memory in place, so that on a GPU a whole step can be
 captured as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host. `is_over`,
@@ -15,21 +18,24 @@ probes of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from functools import partial
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import mujoco
 import torch
 from jaxtyping import Bool, Float, Int
+from pydantic import Field, create_model
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable
 from tgdsl.errors import SimulationError
+from tgdsl.fields.models import SpecModel
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.table import GraspTable
-from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.spec import TaskSpec, Weight
 from tgdsl.runtime.simulators.model_ids import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
@@ -169,6 +175,48 @@ class Start(NamedTuple):
     contacts: Contacts = "none"
 
 
+Rate = Callable[[Now], Float[Tensor, " env"]]
+"""A term of the reward without its weight."""
+
+
+@dataclass(frozen=True)
+class TaskReward:
+    """A term of a task's reward.
+
+    Attributes:
+        weight: Its weight unless the document gives another.
+        unit: Unit of the weight.
+        summary: What it is, in a line.
+        rate_of: Makes the term of a task.
+        name: Its name if it is not that of the attribute.
+    """
+
+    weight: float
+    unit: str
+    summary: str
+    rate_of: Callable[[Any], Rate]
+    name: str | None = None
+
+    def __get__(self, task: Task | None, owner: type[Task]) -> Any:
+        return self if task is None else self.rate_of(task)
+
+
+def reward_term(weight: float, unit: str, name: str | None = None) -> Callable[[Callable[[Any, Now], Tensor]], TaskReward]:
+    """Mark a method of a task, which takes `Now` and returns a tensor (env,), as a term of its reward.
+
+    Args:
+        weight: Its weight unless the document gives another: of a gain more than 0, of a penalty less.
+        unit: Unit of the weight, such as "1/s": weight times term is a rate, the reward is the sum of all rates times Δt.
+        name: Its name; default: the method's.
+    """
+
+    def mark(method: Callable[[Any, Now], Tensor]) -> TaskReward:
+        summary = (method.__doc__ or "").partition("\n")[0].rstrip(".")
+        return TaskReward(weight, unit, summary, lambda task: partial(method, task), name)
+
+    return mark
+
+
 class Task(ABC, Generic[S]):
     """A task of all environments.
 
@@ -182,6 +230,8 @@ class Task(ABC, Generic[S]):
         hand_groups: Groups of its own that `observe_hand` makes without a scene; of policies that see no others, hands can have
             some.
         goal_units: Units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for.
+        terms: Terms of its reward by name.
+        Rewards: Model of their weights.
         spec: Its document.
         setup: What it is made for.
         memory: Its own state, (env, …) each, kept by `state_dict`.
@@ -194,13 +244,36 @@ class Task(ABC, Generic[S]):
     is_less_better: ClassVar[bool] = False
     hand_groups: ClassVar[tuple[str, ...]] = ()
     goal_units: ClassVar[tuple[str, ...]] = ()
+    terms: ClassVar[Mapping[str, TaskReward]] = {}
+    Rewards: ClassVar[type[SpecModel]] = SpecModel
     spec: S
     setup: Setup
     memory: dict[str, Tensor]
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Collect the terms of the reward, and add `rewards`, their weights, to the model of the document."""
+        super().__init_subclass__(**options)
+        own = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
+        cls.terms = {**cls.terms, **own}
+        if cls.terms and (own or "Spec" in vars(cls)):
+            weight: Any = Weight
+            fields: dict[str, Any] = {
+                name: (weight | None, Field(term.weight, description=f"{term.summary} [{term.unit}]."))
+                for name, term in cls.terms.items()
+            }
+            doc = "Weights of the reward's terms; null leaves one out."
+            cls.Rewards = create_model("Rewards", __base__=SpecModel, __module__=cls.__module__, __doc__=doc, **fields)
+            rewards: Any = (cls.Rewards, Field(cls.Rewards(), description="Weights of the reward's terms."))
+            base = cls.Spec
+            cls.Spec = create_model(
+                base.__name__, __base__=base, __module__=cls.__module__, __doc__=base.__doc__, rewards=rewards
+            )
+
     def __init__(self, spec: S, setup: Setup):
         """Begin with nothing remembered; what a task remembers it takes from `keep`."""
         self.spec, self.setup, self.memory = spec, setup, {}
+        weights = getattr(spec, "rewards", None)
+        self._rates = {name: term.rate_of(self) for name, term in self.terms.items() if getattr(weights, name) is not None}
 
     @classmethod
     def watch(cls, spec: S) -> Watch:
@@ -243,7 +316,6 @@ class Task(ABC, Generic[S]):
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return which episodes end for good: not those that merely have lasted long enough."""
 
-    @abstractmethod
     def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
         """Return the terms of the reward by name, weights included, as rates: the reward is their sum times Δt [1/s].
 
@@ -251,6 +323,8 @@ class Task(ABC, Generic[S]):
             now: The instant after the control step.
             is_over: Which episodes have ended for good.
         """
+        weights: Any = getattr(self.spec, "rewards", None)
+        return {name: getattr(weights, name) * rate(now) for name, rate in self._rates.items()}
 
     @abstractmethod
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:

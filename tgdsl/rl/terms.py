@@ -1,19 +1,13 @@
-"""Terms that tasks share, and terms that a document adds to its task: `terms` of `TaskSpec`.
+"""Terms of rewards, ends and observations that tasks share, and that a document adds to its task: `terms` of `TaskSpec`.
 
-A `RewardTerm` adds a rate to the reward, a `TerminationTerm` ends episodes, an `ObservationTerm` adds a group of observations.
-`TERMS` has those that documents may name; a user's own is a subclass, named as `file.py:Class`. Rewards that tasks share:
+A `RewardTerm` adds a rate to the reward, a `TerminationTerm` ends episodes, an `ObservationTerm` adds a group of observations;
+an `EventTerm` changes the simulation at random; a `CurriculumTerm` changes a weight or another number of a term while a policy
+is learned.
+`TERMS` has those that documents may name; a user's own is a subclass, named as `file.py:Class`.
 
-    action_rate       |a_t − a_{t−1}|²                                                      [1]
-    joint_limit       Σ_j max(0, |q_j − m_j| − s h_j)                                       [rad]
-    work              Σ_j |τ_j q̇_j|                                                         [W]
-    contact_force     Σ_l max(0, |f_l| − f_max) / f_max                                     [1]
-    near              mean_p exp(−max(0, d_p) / λ)                                          [1]
-    effort            Σ_j (τ_j/τ_max,j)²                                                    [1]
-    object_speed      max(0, |v|/v_free − 1) + max(0, |ω|/ω_free − 1)                       [1]
-
-with a the action, q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
-width of their ranges, s the share of these that is free, f_l the object's force on link l, d_p the distance from probe p to the
-object, τ_max the largest torques of the drives, v and ω the object's velocity and angular velocity.
+Symbols: a action; q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
+width of their ranges; f_l the object's force on link l, d_p the distance from probe p to the object; τ_max the largest torques
+of the drives; v and ω the object's velocity and angular velocity.
 
 Source of the names: Chung et al., *Tactile Genesis*, appendix, "Reward terms", which prints no formulas: these are ours.
 `effort` and `object_speed` are ours altogether.
@@ -23,64 +17,34 @@ Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from pydantic import create_model, model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Number, PositiveLength, Quantity, SpecModel
+from tgdsl.fields.models import Number, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl import groups
-from tgdsl.rl.task import Now, Setup
+from tgdsl.rl.draws import within
+from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.task import Now, Rate, Setup, Task, TaskReward
+from tgdsl.runtime.simulators.simulation import Simulation
 
 FREE_SHARE = 0.95
-"""s, share of a joint's range that costs nothing."""
-
-
-def action_rate(now: Now) -> Float[Tensor, " env"]:
-    """Return |a_t − a_{t−1}|²."""
-    return (now.action - now.last_action).square().sum(dim=1)
-
-
-def joint_limit(now: Now, setup: Setup) -> Float[Tensor, " env"]:
-    """Return how far joints are beyond the middle `FREE_SHARE` of their ranges, summed [rad]."""
-    middle, half = 0.5 * (setup.low + setup.high), 0.5 * (setup.high - setup.low)
-    return ((now.joint_pos - middle).abs() - FREE_SHARE * half).clamp(min=0.0).sum(dim=1)
-
-
-def work(now: Now) -> Float[Tensor, " env"]:
-    """Return the power of all drives, that which brakes included [W]."""
-    return (now.torque * now.joint_vel).abs().sum(dim=1)
-
-
-def contact_force(now: Now, most: float) -> Float[Tensor, " env"]:
-    """Return by how much the object's force on each link exceeds a limit [N], as a share of it, summed."""
-    return ((vector_norm(now.link_force, dim=2) - most).clamp(min=0.0) / most).sum(dim=1)
-
-
-def near(now: Now, width: float) -> Float[Tensor, " env"]:
-    """Return how near the probes are to the object's surface, from 0 to 1, which is touch; `width` λ [m]."""
-    return torch.exp(-now.distance.clamp(min=0.0) / width).mean(dim=1)
-
-
-def effort(now: Now, setup: Setup) -> Float[Tensor, " env"]:
-    """Return the squares of the torques as shares of the largest ones, summed; a drive without a limit makes none."""
-    return (now.torque / setup.max_torque).square().sum(dim=1)
-
-
-def object_speed(now: Now, free_speed: float, free_spin: float) -> Float[Tensor, " env"]:
-    """Return by how much the object is faster than what costs nothing [m/s, rad/s], as shares of that, summed."""
-    own, free = (now.object.linvel, now.object.angvel), (free_speed, free_spin)
-    speed, spin = ((vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(own, free, strict=True))
-    return speed + spin
-
-
+"""Share of a joint's range that costs nothing."""
 Force = Annotated[float, Quantity("force", gt=0.0)]
 Speed = Annotated[float, Quantity("speed", gt=0.0)]
 Spin = Annotated[float, Quantity("number", gt=0.0)]
+Row = Mapping[str, np.ndarray]
+"""One instant of one environment: fields of `Now`, and `low`, `high` and `max_torque` of `Setup`."""
 
 
 class Term(SpecModel, ABC):
@@ -99,12 +63,51 @@ class Term(SpecModel, ABC):
 class RewardTerm(Term):
     """A term of the reward."""
 
+    unit: ClassVar[str] = "1/s"
+    """Unit of its weight."""
     weight: Number
     """Factor on its rate: more than 0 for what pays, less for what costs."""
 
     @abstractmethod
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         """Return its rate without the weight; the reward is the sum of all rates times Δt."""
+
+    def reference(self, row: Row) -> float | np.floating:
+        """Return the rate of one environment in float64, for tests: of `Now`'s fields and the limits of `Setup`."""
+        raise NotImplementedError
+
+    @classmethod
+    def of_task(cls, weight: float, **parameters: str) -> TaskReward:
+        """Return the term as one of a task's reward.
+
+        Args:
+            weight: Its weight unless the document gives another.
+            parameters: The term's parameters, each by the key of the task's document that has it.
+        """
+
+        def rate_of(task: Task) -> Rate:
+            return partial(cls.for_spec(task.spec, parameters).rate, setup=task.setup)
+
+        summary = (cls.__doc__ or "").partition("\n")[0].rstrip(".")
+        return SharedReward(weight, cls.unit, summary, rate_of, None, cls, parameters)
+
+    @classmethod
+    def for_spec(cls, spec: TaskSpec, parameters: Mapping[str, str]) -> Self:
+        """Return the term with the parameters that a task's document has, its weight aside."""
+        return cls.model_construct(weight=1.0, **{name: getattr(spec, key) for name, key in parameters.items()})
+
+
+@dataclass(frozen=True)
+class SharedReward(TaskReward):
+    """A shared term as one of a task's reward.
+
+    Attributes:
+        term: The term.
+        parameters: Its parameters, each by the key of the task's document that has it.
+    """
+
+    term: type[RewardTerm] = RewardTerm
+    parameters: Mapping[str, str] = field(default_factory=dict)
 
 
 class TerminationTerm(Term):
@@ -123,66 +126,165 @@ class ObservationTerm(Term):
         """Return the group."""
 
 
+@dataclass(frozen=True, eq=False)
+class Event:
+    """An event that happens now.
+
+    Attributes:
+        sim: The simulation; its `arrays` and `properties` may be changed, of the chosen environments alone.
+        setup: What the task is made for.
+        chosen: The environments in which it happens: decide by this mask, not by `if`.
+        count: How often it has happened in each environment, above that the episode.
+        name: Its name in the document.
+    """
+
+    sim: Simulation
+    setup: Setup
+    chosen: Bool[Tensor, " env"]
+    count: Int[Tensor, " env"]
+    name: str
+
+    def uniform(self, num: int, low: float = 0.0, high: float = 1.0) -> Float[Tensor, "env num"]:
+        """Return random numbers between two bounds, of physics' dtype: others each time that it happens."""
+        what = f"event {self.name}"
+        return within(self.setup.draws.shares({what: num}, self.count, self.chosen)[what].to(self.setup.dtype), low, high)
+
+
+class EventTerm(Term):
+    """Something that happens to the simulation, at each reset or after intervals that are drawn."""
+
+    mode: Literal["reset", "interval"] = "interval"
+    """When it happens."""
+    interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
+    """Time from one to the next, drawn for each [s]."""
+
+    @abstractmethod
+    def apply(self, event: Event) -> None:
+        """Change the simulation."""
+
+
+def event_term(function: Callable[..., None]) -> type[EventTerm]:
+    """Return the term of a function of an `Event`: its other parameters, with annotations and defaults, are the term's."""
+    parameters = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
+    fields: dict[str, Any] = {
+        own.name: (own.annotation, ... if own.default is own.empty else own.default) for own in parameters
+    }
+
+    def apply(self: EventTerm, event: Event) -> None:
+        function(event, **{name: getattr(self, name) for name in fields})
+
+    base = type(
+        function.__name__, (EventTerm,), {"apply": apply, "__module__": function.__module__, "__doc__": function.__doc__}
+    )
+    return create_model(function.__name__, __base__=base, **fields)
+
+
+class CurriculumTerm(Term):
+    """A weight or another number of a term that follows the progress of learning."""
+
+    of: str
+    """The number: `rewards.effort`, or `terms.slip.weight`."""
+
+    @abstractmethod
+    def value(self, iteration: int, score: float | None) -> float:
+        """Return the number.
+
+        Args:
+            iteration: How many iterations were made.
+            score: Mean score of the episodes that have ended last, in `Task.score_unit`; None: none has ended yet.
+        """
+
+
 class ActionRate(RewardTerm):
-    """|a_t − a_{t−1}|² [1/s]."""
+    """Change of the action, |a_t − a_{t−1}|²."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return action_rate(now)
+        return (now.action - now.last_action).square().sum(dim=1)
+
+    def reference(self, row: Row) -> float | np.floating:
+        return np.sum((row["action"] - row["last_action"]) ** 2)
 
 
 class JointLimit(RewardTerm):
-    """How far joints are beyond the middle 95 % of their ranges, summed [rad]."""
+    """How far joints are beyond the middle 95 % of their ranges, Σ_j max(0, |q_j − m_j| − 0.95 h_j)."""
+
+    unit = "1/(rad s)"
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return joint_limit(now, setup)
+        middle, half = 0.5 * (setup.low + setup.high), 0.5 * (setup.high - setup.low)
+        return ((now.joint_pos - middle).abs() - FREE_SHARE * half).clamp(min=0.0).sum(dim=1)
+
+    def reference(self, row: Row) -> float | np.floating:
+        middle, half = 0.5 * (row["low"] + row["high"]), 0.5 * (row["high"] - row["low"])
+        return np.sum(np.maximum(abs(row["joint_pos"] - middle) - 0.95 * half, 0.0))
 
 
 class Work(RewardTerm):
-    """Power of the drives [W]."""
+    """Power of the drives, braking included, Σ_j |τ_j q̇_j|."""
+
+    unit = "1/J"
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return work(now)
+        return (now.torque * now.joint_vel).abs().sum(dim=1)
+
+    def reference(self, row: Row) -> float | np.floating:
+        return np.sum(np.abs(row["torque"] * row["joint_vel"]))
 
 
 class Effort(RewardTerm):
-    """Squares of the torques as shares of the largest ones, summed [1/s]."""
+    """Squares of the torques as shares of the largest ones, Σ_j (τ_j/τ_max,j)²; a drive without a limit makes none."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return effort(now, setup)
+        return (now.torque / setup.max_torque).square().sum(dim=1)
+
+    def reference(self, row: Row) -> float | np.floating:
+        return np.sum((row["torque"] / row["max_torque"]) ** 2)
 
 
 class ContactForce(RewardTerm):
-    """By how much the object's force on each link exceeds `max_force`, as a share of it, summed [1/s]."""
+    """Force on links beyond `max_force`, Σ_l max(0, |f_l| − f_max)/f_max."""
 
     senses = ("link_contact",)
     max_force: Force = 10.0
-    """Less force on a link costs nothing [N]."""
+    """f_max: less force on a link costs nothing [N]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return contact_force(now, self.max_force)
+        return ((vector_norm(now.link_force, dim=2) - self.max_force).clamp(min=0.0) / self.max_force).sum(dim=1)
+
+    def reference(self, row: Row) -> float | np.floating:
+        return sum(max(0.0, np.linalg.norm(f) - self.max_force) / self.max_force for f in row["link_force"])
 
 
 class Near(RewardTerm):
-    """How near the probes of `surface_distance` are to the object, from 0 to 1 [1/s]."""
+    """How near the probes of `surface_distance` are to the object, mean_p exp(−max(0, d_p)/λ): from 0 to 1, which is touch."""
 
     senses = ("surface_distance",)
     width: PositiveLength = 0.02
-    """Decay length [m]."""
+    """λ, decay length [m]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return near(now, self.width)
+        return torch.exp(-now.distance.clamp(min=0.0) / self.width).mean(dim=1)
+
+    def reference(self, row: Row) -> float | np.floating:
+        return np.mean(np.exp(-np.maximum(row["distance"], 0.0) / self.width))
 
 
 class ObjectSpeed(RewardTerm):
-    """By how much the object is faster than what is free, as shares of that, summed [1/s]."""
+    """Speed and spin of the object beyond what is free, max(0, |v|/v_free − 1) + max(0, |ω|/ω_free − 1)."""
 
     free_speed: Speed = 0.2
-    """A slower object costs nothing [m/s]."""
+    """v_free: a slower object costs nothing [m/s]."""
     free_spin: Spin = 4.0
-    """The same for its angular velocity [rad/s]."""
+    """ω_free: the same for its angular velocity [rad/s]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return object_speed(now, self.free_speed, self.free_spin)
+        own, free = (now.object.linvel, now.object.angvel), (self.free_speed, self.free_spin)
+        speed, spin = ((vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(own, free, strict=True))
+        return speed + spin
+
+    def reference(self, row: Row) -> float | np.floating:
+        speed, spin = np.linalg.norm(row["linvel"]), np.linalg.norm(row["angvel"])
+        return max(0.0, speed / self.free_speed - 1.0) + max(0.0, spin / self.free_spin - 1.0)
 
 
 class ForceLimit(TerminationTerm):
@@ -222,6 +324,47 @@ class ObjectState(ObservationTerm):
         return groups.object_state(now)
 
 
+class ObjectVelocity(EventTerm):
+    """The object, which moves freely, is given more velocity, as by a knock."""
+
+    speed: Annotated[Range, RangeOf("speed")] = (0.0, 0.0)
+    """Velocity along each of the world's axes that is added [m/s]."""
+    spin: Annotated[Range, RangeOf("number")] = (0.0, 0.0)
+    """Angular velocity about each of the object's axes that is added [rad/s]."""
+
+    def apply(self, event: Event) -> None:
+        first = int(event.setup.model.body(event.setup.object).dofadr[0])
+        share = event.uniform(6)
+        added = torch.cat([within(share[:, :3], *self.speed), within(share[:, 3:], *self.spin)], dim=1)
+        event.sim.arrays["qvel"][:, first : first + 6] += torch.where(event.chosen[:, None], added, 0.0)
+
+
+class Linear(CurriculumTerm):
+    """`start` up to `first`, `end` from `last` on, and linear between: of iterations, or of the score."""
+
+    by: Literal["iteration", "score"] = "iteration"
+    """What it follows; before an episode has ended the score counts as `first`."""
+    first: Number
+    """Where the change begins, in iterations or in the score's unit."""
+    last: Number
+    """Where the change ends; for a score of which less is better, less than `first`."""
+    start: Number
+    """The number before the change."""
+    end: Number
+    """The number after it."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Linear:
+        if self.first == self.last:
+            raise ValueError(f"first and last are both {self.first:g}, expected a change that takes some time")
+        return self
+
+    def value(self, iteration: int, score: float | None) -> float:
+        x = iteration if self.by == "iteration" else self.first if score is None else score
+        share = min(1.0, max(0.0, (x - self.first) / (self.last - self.first)))
+        return self.start + share * (self.end - self.start)
+
+
 TERMS: Mapping[str, type[Term]] = {
     "action_rate": ActionRate,
     "joint_limit": JointLimit,
@@ -234,5 +377,7 @@ TERMS: Mapping[str, type[Term]] = {
     "speed_limit": SpeedLimit,
     "link_force": LinkForce,
     "object_state": ObjectState,
+    "object_velocity": ObjectVelocity,
+    "linear": Linear,
 }
 """The terms that documents may name."""

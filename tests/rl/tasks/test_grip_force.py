@@ -13,7 +13,7 @@ from task_records import Recorder, assert_reference
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.tasks.grip_force import Rewards, reference
+from tgdsl.rl.tasks.grip_force import GripForce, reference
 from tgdsl.scene.scene import Choice, SceneModels
 
 FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
@@ -65,7 +65,7 @@ ODD = {
     "episode": "0.6 s", "change": ["0.1 s", "0.2 s"], "settling": "0.06 s", "force": ["2 N", "6 N"], "force_width": 0.4,
     "free_distance": "0.1 mm", "drop_distance": "6 mm", "max_force": "9 N", "start_force": "6 N", "action.scale": "0.02 rad",
     "randomise.push": {"z": ["-4 N", "-4 N"], "interval": ["0.2 s", "0.3 s"]},
-    "rewards": {name: 1.5 * value for name, value in Rewards()},
+    "rewards": {name: 1.5 * value for name, value in GripForce.Rewards()},
 }  # fmt: skip
 """Other numbers than the document's, and enough going on that every term is seen."""
 
@@ -93,7 +93,7 @@ def test_rewards_ends_and_scores_equal_the_reference():
     assert sum(len(episodes) for episodes in recorder.episodes) > 2 * NUM
     found = assert_reference(recorder, by_command)
     # The end of a joint's range is nowhere near.
-    assert found == {*Rewards.model_fields, "is_over", "score"} - {"joint_limit"}
+    assert found == {*GripForce.Rewards.model_fields, "is_over", "score"} - {"joint_limit"}
     env.close()
 
 

@@ -68,8 +68,8 @@ def test_torques_and_speeds_cost():
         ),
     )
     setup = SimpleNamespace(max_torque=torch.tensor([1.0, 0.4, torch.inf]))
-    assert terms.effort(now, setup).tolist() == pytest.approx([1.25])
-    assert terms.object_speed(now, 0.2, 2.0).tolist() == pytest.approx([1.5, 0.0])
+    assert terms.Effort(weight=1).rate(now, setup).tolist() == pytest.approx([1.25])
+    assert terms.ObjectSpeed(weight=1, free_speed=0.2, free_spin=2.0).rate(now, setup).tolist() == pytest.approx([1.5, 0.0])
 
 
 def test_a_coasting_object_earns_its_share(tmp_path):

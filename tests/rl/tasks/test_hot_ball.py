@@ -13,7 +13,7 @@ from task_records import Recorder, assert_reference
 
 from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.tasks.hot_ball import Rewards, reference
+from tgdsl.rl.tasks.hot_ball import HotBall, reference
 from tgdsl.schema.load import load
 
 FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
@@ -81,7 +81,7 @@ def cells(now):
 ODD = {
     "episode": "0.6 s", "margin": 0.95, "min_force": "0.5 N", "near_width": "5 cm", "lost_height": "12 cm",
     "ambient": "21 degC", "target": "60 degC", "action.slide_scale": "1 mm", "action.scale": 0.01,
-    "rewards": {name: 1.5 * value for name, value in Rewards()},
+    "rewards": {name: 1.5 * value for name, value in HotBall.Rewards()},
 }  # fmt: skip
 """Other numbers than the document's, and enough going on that every term is seen."""
 
@@ -95,7 +95,7 @@ def test_rewards_ends_and_scores_equal_the_reference():
             put_on(env, [0] * 8, press=0.03)
         recorder.step(action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 12
-    assert assert_reference(recorder, reference) == {*Rewards.model_fields, "is_over", "score"}
+    assert assert_reference(recorder, reference) == {*HotBall.Rewards.model_fields, "is_over", "score"}
     env.close()
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 from paper_drives import PAPER
 from scipy.spatial.transform import Rotation
-from task_records import Recorder
+from task_records import Recorder, reference_rates
 from tiny_tasks import tiny_env
 
 from tgdsl.errors import SpecError
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.tasks.in_hand_repose import InHandReposeSpec, Rewards, reference
+from tgdsl.rl.tasks.in_hand_repose import InHandRepose, InHandReposeSpec, reference
 
 FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
 DOCUMENTS = [FOLDER / "in_hand_repose.yaml", FOLDER / "in_hand_repose_sharpa.yaml"]
@@ -78,7 +78,7 @@ def compare(env, recorder, first_episode=2, kind="any"):
             if number not in axes:
                 axes[number] = [goal_axes(env.num_envs, number, k, kind) for k in range(12)]
             record["goal_axis"] = np.stack([axis[env_id] for axis in axes[number]])
-            expected = reference(env.spec, record, env.control_step)
+            expected = reference_rates(env.task, reference, env.spec, record, env.control_step)
             assert expected.keys() == found.keys()
             for name, value in expected.items():
                 scale = max(1.0, float(np.abs(value).max()))
@@ -100,7 +100,7 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path, kind):
     seen = compare(env, recorder, kind=kind)
     assert len(seen) >= 12 and max(rows["score"].max() for rows in seen) >= 2
     assert sum(rows["goal_timeout"].any() for rows in seen) >= 2 and sum(rows["drop"].any() for rows in seen) >= 1
-    terms = set(Rewards.model_fields) | {"is_over", "score"}
+    terms = set(InHandRepose.Rewards.model_fields) | {"is_over", "score"}
     assert {name for rows in seen for name, value in rows.items() if np.abs(value).max() > 1e-9} == terms
     assert max(np.abs(rows["progress"]).max() for rows in seen) > 0.2 * 2  # what is faster the wrong way costs more
     assert max(rows["progress"].max() for rows in seen) <= 0.2 * 2 + 1e-6
@@ -282,19 +282,17 @@ def busy(tmp_path_factory):
 
 def changed_terms(env, **changes):
     """Return the terms of the reward at an instant with some values of the document changed."""
-    task, spec = env.task, env.task.spec
-    task.spec = spec.model_copy(update=changes)
-    try:
-        return task.reward(env.now, task.is_over(env.now))
-    finally:
-        task.spec = spec
+    task = InHandRepose(env.task.spec.model_copy(update=changes), env.task.setup)
+    for name, value in env.task.memory.items():
+        task.memory[name].copy_(value)
+    return task.reward(env.now, task.is_over(env.now))
 
 
 def test_every_term_is_there(busy):
     assert all(term.abs().max() > 1e-9 for term in changed_terms(busy).values())
 
 
-@pytest.mark.parametrize("name", list(Rewards.model_fields))
+@pytest.mark.parametrize("name", list(InHandRepose.Rewards.model_fields))
 def test_a_weight_scales_its_term_alone(busy, name):
     weights = busy.spec.rewards
     doubled = changed_terms(busy, rewards=weights.model_copy(update={name: 2 * getattr(weights, name)}))
@@ -348,8 +346,10 @@ def test_the_documents_have_the_papers_numbers(document):
     assert random.push.x == random.push.y == random.push.z == (-1, 1) and random.push.interval == (2, 4)
     assert spec.episode == 20 and spec.physics.timestep == 0.005 and spec.physics.substeps == 5
     weights = [500, 2, 2, 0.2, 0.5, -5, -100, -200, -1e-5, -20, -1e-3]
-    assert list(Rewards().model_dump().values()) == weights
-    assert spec.rewards == (Rewards(joint_limit=-4) if document is DOCUMENTS[0] else Rewards())  # docs/tasks.md says why
+    assert list(InHandRepose.Rewards().model_dump().values()) == weights
+    assert spec.rewards == (
+        InHandRepose.Rewards(joint_limit=-4) if document is DOCUMENTS[0] else InHandRepose.Rewards()
+    )  # docs/tasks.md says why
 
 
 @pytest.mark.slow

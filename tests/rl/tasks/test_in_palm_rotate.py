@@ -11,7 +11,7 @@ from tiny_tasks import tiny_env
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.links import are_fingers
-from tgdsl.rl.tasks.in_palm_rotate import Rewards, reference
+from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate, reference
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "in_palm_rotate.yaml"
 MORE = "episode: 0.5 s\nmax_force: 0.05 N\nfree_distance: 1 mm\ndrop_distance: 20 mm\naction: {scale: 0.3}\n"
@@ -23,7 +23,7 @@ COSTS = {"rewards.effort": -0.5, "rewards.object_speed": -0.2}
 def held_reference(env):
     """Return the reference, given largest torques and which links are fingers."""
     setup = env.task.setup
-    own = {"limit": setup.actuators.limit, "fingers": are_fingers(setup.model, setup.links)}
+    own = {"fingers": are_fingers(setup.model, setup.links)}
     return lambda spec, record, dt: reference(spec, record | own, dt)
 
 
@@ -41,7 +41,7 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path, direction):
         env.sim.qvel[:2, 8] = 6.0 if direction == "counterclockwise" else -6.0  # spun by hand: nothing else turns a ball
         recorder.step(action if i < 40 else torch.ones_like(action))
     assert sum(len(episodes) for episodes in recorder.episodes) >= 12
-    every = {*Rewards.model_fields, "is_over", "score"}
+    every = {*InPalmRotate.Rewards.model_fields, "is_over", "score"}
     assert assert_reference(recorder, held_reference(env)) == every
 
 
@@ -91,7 +91,7 @@ def test_turning_to_and_fro_pays_nothing(tmp_path):
         total += made.reward
         reached += int(made.info.terms["success"][0] > 0)
     assert reached == 1 and made.info.score.tolist() == [1.0, 1.0]
-    assert total[0].item() == pytest.approx(Rewards().success * env.control_step, abs=0.02)
+    assert total[0].item() == pytest.approx(InPalmRotate.Rewards().success * env.control_step, abs=0.02)
 
 
 @pytest.mark.parametrize(("direction", "way"), [("counterclockwise", 1.0), ("clockwise", -1.0)])
@@ -129,12 +129,12 @@ def test_a_tilted_object_reaches_no_goal(tmp_path):
     assert env.task.tilt.tolist() == pytest.approx([0.0, 0.5], abs=1e-6)
 
 
-@pytest.mark.parametrize("name", list(Rewards.model_fields))
+@pytest.mark.parametrize("name", list(InPalmRotate.Rewards.model_fields))
 def test_a_weight_scales_its_term_alone(tmp_path, name):
     one, two = (tmp_path / "one"), (tmp_path / "two")
     one.mkdir(), two.mkdir()
     more = MORE + "randomise: {push: {x: [-2 N, 2 N], interval: [0.1 s, 0.2 s]}}\n"
-    weight = lambda name: COSTS.get(f"rewards.{name}", getattr(Rewards(), name))  # noqa: E731
+    weight = lambda name: COSTS.get(f"rewards.{name}", getattr(InPalmRotate.Rewards(), name))  # noqa: E731
     plain = tiny_env(one, 3, more=more, overrides=COSTS)
     other = tiny_env(two, 3, more=more, overrides=COSTS | {f"rewards.{name}": 2 * weight(name)})
     for action in random_actions(plain, 15):

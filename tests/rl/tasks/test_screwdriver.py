@@ -14,13 +14,13 @@ from task_records import Recorder, assert_reference
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.links import are_fingers
-from tgdsl.rl.tasks.screwdriver import Rewards, reference
+from tgdsl.rl.tasks.screwdriver import Screwdriver, reference
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "screwdriver.yaml"
 ODD = {
     "episode": "0.6 s", "max_spin": 1.0, "near_width": "3 mm", "free_distance": "2 mm", "drop_tilt": 0.3, "engagement": "8 mm",
     "action.scale": 0.01, "randomise.push": {"x": ["-3 N", "3 N"], "y": ["-3 N", "3 N"], "interval": ["0.1 s", "0.2 s"]},
-    "rewards": {name: 1.5 * value or -0.5 for name, value in Rewards()}, "max_force": "0.1 N", "hold": {"coasting_pay": 0.25},
+    "rewards": {name: 1.5 * value or -0.5 for name, value in Screwdriver.Rewards()}, "max_force": "0.1 N", "hold": {"coasting_pay": 0.25},
 }  # fmt: skip
 """Other numbers than the document's, and enough going on that every term is seen."""
 FREE = slice(3, 10)
@@ -47,7 +47,7 @@ def rotation(quat):
 def by_tip(env, upright, length):
     """Return the reference, given where the tip is: so far below the body's origin, which was upright at a place."""
     setup = env.task.setup
-    own = {"limit": setup.actuators.limit, "fingers": are_fingers(setup.model, setup.links)}
+    own = {"fingers": are_fingers(setup.model, setup.links)}
 
     def told(spec, record, dt):
         down = np.array([0, 0, -length])
@@ -76,7 +76,7 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path):
         recorder.step(action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 18
     found = assert_reference(recorder, by_tip(env, np.array([0, 0, 0.1]), LENGTH))
-    assert found == {*Rewards.model_fields, "is_over", "score"}
+    assert found == {*Screwdriver.Rewards.model_fields, "is_over", "score"}
     env.close()
 
 
@@ -87,7 +87,7 @@ def test_the_hand_too():
     for action in random_actions(env, 80):
         recorder.step(action)
     found = assert_reference(recorder, by_tip(env, np.array([0.09, 0.08, 0.215]), 0.19))
-    assert {*Rewards.model_fields, "is_over", "score"} - {"joint_limit", "contact_force", "effort"} <= found
+    assert {*Screwdriver.Rewards.model_fields, "is_over", "score"} - {"joint_limit", "contact_force", "effort"} <= found
     env.close()
 
 

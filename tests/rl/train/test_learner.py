@@ -32,6 +32,20 @@ def test_an_iteration(tmp_path):
     assert all(made.rollout > 0 and made.update > 0 for made in found)
 
 
+def test_curricula_follow_iterations_and_scores(tmp_path):
+    """The score is that of the episodes which ended before an iteration, and goes on with a run."""
+    ramp = {"term": "linear", "first": 0, "last": 4, "start": 0, "end": -1}
+    terms = {"ramp": ramp | {"of": "rewards.effort"}, "skill": ramp | {"of": "rewards.near", "by": "score", "last": 10}}
+    learner, _ = small_learner(tmp_path, train__desynchronise=False, terms=terms)
+    values, found = learner.env.curricula.values, []
+    for i in range(4):
+        score = next((made.told["Episode/score"] for made in reversed(found) if "Episode/score" in made.told), 0.0)
+        found.append(learner.iterate())
+        assert values["rewards.effort"].item() == pytest.approx(-i / 4)
+        assert values["rewards.near"].item() == pytest.approx(-min(1.0, max(0.0, score / 10)))
+    assert learner.state_dict()["score"] == found[-1].told["Episode/score"]
+
+
 def test_only_what_somebody_sees_is_kept(tmp_path):
     learner, _ = small_learner(tmp_path)
     assert set(learner.algorithm.storage.observations.keys()) == {"priv_proprio", "goal", "priv_obj_state", "priv_obj_props"}

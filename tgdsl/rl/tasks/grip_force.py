@@ -19,17 +19,7 @@ after every reset that stores none.
 
 Groups: `goal` holds F* [N]; `priv_force` F and s_l of each link [N]; `priv_obj_state` and `priv_obj_props` as in `groups`.
 
-The reward is the sum of these terms times Δt. The error is that to the command which was known before the step.
-
-    force_near         w · exp(−(e/σ)²)                                          2 1/s
-    force_far          w · max(0, 1 − |e|)                                       1 1/s
-    object_distance    w · max(0, |p − p_0| − r)                                 −100 1/(m s)
-    object_angle       w · θ                                                     −1 1/(rad s)
-    drop               w · (|p − p_0| > d_max)                                   −100 1/s
-    crush              w · (F > F_crush)                                         −100 1/s
-    action_rate        w · |a_t − a_{t−1}|²                                      −0.01 1/s
-    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)                    −40 1/(rad s)
-    work               w · Σ_j |τ_j q̇_j|                                         −5e-3 1/J
+The error that pays is that to the command which was known before the step.
 
 An episode ends for good where the object is dropped or crushed. Both force terms are 0 or more and end with the object: to hold
 on pays in any case.
@@ -49,8 +39,8 @@ ends the episode, since what is crushed stays so.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -59,39 +49,16 @@ from pydantic import Field
 from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
-from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, RangeOf, SpecModel
+from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, RangeOf
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.draws import whole
-from tgdsl.rl.spec import TaskSpec, Time, Weight
-from tgdsl.rl.task import HandNow, Now, Setup, Start, Task
+from tgdsl.rl.spec import TaskSpec, Time
+from tgdsl.rl.task import HandNow, Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.placing import object_qpos
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.tensors.env_ids import may_be_nonempty
 
 Force = Annotated[float, Quantity("force", gt=0.0)]
-
-
-class Rewards(SpecModel):
-    """Weights of the reward's terms; 0 leaves one out."""
-
-    force_near: Weight = 2.0
-    """Force close to the command [1/s]."""
-    force_far: Weight = 1.0
-    """Force less than as far from the command as none at all [1/s]."""
-    object_distance: Weight = -100.0
-    """Distance of the object from where it started, beyond `free_distance` [1/(m s)]."""
-    object_angle: Weight = -1.0
-    """By how much the object has turned [1/(rad s)]."""
-    drop: Weight = -100.0
-    """Object dropped [1/s]."""
-    crush: Weight = -100.0
-    """Object crushed [1/s]."""
-    action_rate: Weight = -0.01
-    """Change of the action [1/s]."""
-    joint_limit: Weight = -40.0
-    """Joints near the ends of their ranges [1/(rad s)]."""
-    work: Weight = -5e-3
-    """Power of the drives [1/J]."""
 
 
 class GripForceSpec(TaskSpec):
@@ -109,8 +76,6 @@ class GripForceSpec(TaskSpec):
     """Time from one command to the next, drawn for each [s]."""
     settling: Time = 1.0
     """Time after a change of the command that does not count for the score [s]."""
-    rewards: Rewards = Rewards()
-    """Weights of the reward's terms."""
     force_width: Positive = 0.2
     """σ, relative error at which `force_near` has fallen to 1/e [1]."""
     free_distance: PositiveLength = 0.005
@@ -121,19 +86,16 @@ class GripForceSpec(TaskSpec):
     """F_crush: a larger sum of normal forces crushes the object [N]."""
 
 
-def reference(spec: GripForceSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
-    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+def reference(spec: GripForceSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
+    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:
         spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
-            `torque` [N·m], `action`, `normal_force` (step, link) [N], `command`, as observed then [N], and `is_new`, whether
-            that was drawn then; and `low`, `high`, limits [rad].
+        record: One row per instant, the first that at the start: `pos` [m], `quat`, `normal_force` (step, link) [N], `command`,
+            as observed then [N], and `is_new`, whether that was drawn then.
         dt: Δt [s].
     """
-    weights, low, high = spec.rewards, record["low"], record["high"]
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    since, squares, rows = 0, [], []
+    since, squares = 0, []
     for t in range(1, len(record["pos"])):
         since += 1
         force = float(np.sum(record["normal_force"][t]))
@@ -144,19 +106,16 @@ def reference(spec: GripForceSpec, record: Mapping[str, np.ndarray], dt: float) 
         distance = float(np.linalg.norm(record["pos"][t] - record["pos"][0]))
         alike = min(1.0, abs(float(np.dot(record["quat"][t], record["quat"][0]))))
         is_dropped, is_crushed = distance > spec.drop_distance, force > spec.max_force
-        row = {
-            "force_near": weights.force_near * math.exp(-((error / spec.force_width) ** 2)),
-            "force_far": weights.force_far * max(0.0, 1.0 - abs(error)),
-            "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
-            "object_angle": weights.object_angle * 2.0 * math.acos(alike),
-            "drop": weights.drop * is_dropped,
-            "crush": weights.crush * is_crushed,
-            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
-            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(record["joint_pos"][t] - middle) - 0.95 * half, 0.0)),
-            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+        yield {
+            "force_near": math.exp(-((error / spec.force_width) ** 2)),
+            "force_far": max(0.0, 1.0 - abs(error)),
+            "object_distance": max(0.0, distance - spec.free_distance),
+            "object_angle": 2.0 * math.acos(alike),
+            "drop": is_dropped,
+            "crush": is_crushed,
+            "is_over": is_dropped or is_crushed,
+            "score": math.sqrt(np.mean(squares)) if squares else 1.0,
         }
-        rows.append(row | {"is_over": is_dropped or is_crushed, "score": math.sqrt(np.mean(squares)) if squares else 1.0})
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 class GripForce(Task[GripForceSpec]):
@@ -169,6 +128,40 @@ class GripForce(Task[GripForceSpec]):
     is_less_better = True
     hand_groups = ("goal",)
     goal_units = ("N",)
+
+    @reward_term(2.0, "1/s")
+    def force_near(self, now: Now) -> Float[Tensor, " env"]:
+        """Force close to the command, exp(−(e/σ)²)."""
+        return torch.exp(-(self.error / self.spec.force_width).square())
+
+    @reward_term(1.0, "1/s")
+    def force_far(self, now: Now) -> Float[Tensor, " env"]:
+        """Force less than as far from the command as none at all, max(0, 1 − |e|)."""
+        return (1.0 - self.error.abs()).clamp(min=0.0)
+
+    @reward_term(-100.0, "1/(m s)")
+    def object_distance(self, now: Now) -> Float[Tensor, " env"]:
+        """Distance of the object from where it started beyond `free_distance`, max(0, |p − p_0| − r)."""
+        return ((now.object.pos - self.start_pos).norm(dim=1) - self.spec.free_distance).clamp(min=0.0)
+
+    @reward_term(-1.0, "1/(rad s)")
+    def object_angle(self, now: Now) -> Float[Tensor, " env"]:
+        """By how much the object has turned, θ."""
+        return rotations.between(now.object.quat, self.start_quat)
+
+    @reward_term(-100.0, "1/s")
+    def drop(self, now: Now) -> Bool[Tensor, " env"]:
+        """Object dropped, |p − p_0| > d_max."""
+        return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance
+
+    @reward_term(-100.0, "1/s")
+    def crush(self, now: Now) -> Bool[Tensor, " env"]:
+        """Object crushed, F > F_crush."""
+        return now.normal_force.sum(dim=1) > self.spec.max_force
+
+    action_rate = terms.ActionRate.of_task(-0.01)
+    joint_limit = terms.JointLimit.of_task(-40.0)
+    work = terms.Work.of_task(-5e-3)
 
     @classmethod
     def asked_for(cls, spec: GripForceSpec, goal: tuple[float, ...]) -> GripForceSpec:
@@ -236,24 +229,7 @@ class GripForce(Task[GripForceSpec]):
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped or crushed."""
-        return self._is_dropped(now) | self._is_crushed(now)
-
-    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return the terms of the reward: see the top of this page."""
-        spec, weights = self.spec, self.spec.rewards
-        distance = (now.object.pos - self.start_pos).norm(dim=1)
-        turned = rotations.between(now.object.quat, self.start_quat)
-        return {
-            "force_near": weights.force_near * torch.exp(-(self.error / spec.force_width).square()),
-            "force_far": weights.force_far * (1.0 - self.error.abs()).clamp(min=0.0),
-            "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
-            "object_angle": weights.object_angle * turned,
-            "drop": weights.drop * self._is_dropped(now),
-            "crush": weights.crush * self._is_crushed(now),
-            "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
-            "work": weights.work * terms.work(now),
-        }
+        return self.drop(now) | self.crush(now)
 
     def asked(self) -> Float[Tensor, "env goal"]:
         """Return the command [N]."""
@@ -281,12 +257,6 @@ class GripForce(Task[GripForceSpec]):
         found = draws.shares({"command": 1, "command interval": 1}, self.count, chosen)
         share, left = found["command"][:, 0].to(least.dtype), whole(found["command interval"], self.first, self.last)
         self.begin(chosen, command=least + share * (high - least), left=left[:, 0], since=0.0)
-
-    def _is_dropped(self, now: Now) -> Bool[Tensor, " env"]:
-        return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance
-
-    def _is_crushed(self, now: Now) -> Bool[Tensor, " env"]:
-        return now.normal_force.sum(dim=1) > self.spec.max_force
 
 
 def _keyframes(spec: GripForceSpec, setup: Setup, field: str) -> Float[Tensor, "variant number"]:

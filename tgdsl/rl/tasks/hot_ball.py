@@ -13,16 +13,6 @@ force on fingertip l, d_p the distance from probe p of the fingertips to its sur
 Groups: `priv_heat` holds π_i of each link, b and c; `priv_obj_state` and `priv_obj_props` are of the hot ball, as in `groups`.
 The policy must have none of them: `proprio` and `tactile_sensors`, with `touch: temperature`, are what it has.
 
-The reward is the sum of these terms times Δt.
-
-    approach           w · exp(−max(0, min_p d_p)/λ)                             1 1/s
-    contact            w · c                                                     1 1/s
-    progress           w · π                                                     2 1/s
-    latched            w · b c                                                   10 1/s
-    lost               w · (lost in this step)                                   −100 1/s
-    action_rate        w · |a_t − a_{t−1}|²                                      −5e-4 1/s
-    work               w · Σ_j |τ_j q̇_j|                                         −5e-3 1/J
-
 An episode ends for good where the hot ball has left the bin: its middle is below `lost_height`. Score: S.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Task and Success Metric": bin, balls, temperatures, what is observed, π_i,
@@ -37,8 +27,8 @@ refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -47,30 +37,11 @@ from pydantic import model_validator
 from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
-from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf, SpecModel, Temperature
+from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf, Temperature
 from tgdsl.rl import groups, terms
-from tgdsl.rl.spec import RandomSpec, TaskSpec, Weight
-from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.spec import RandomSpec, TaskSpec
+from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.placing import free_qpos, object_qpos
-
-
-class Rewards(SpecModel):
-    """Weights of the reward's terms; 0 leaves one out."""
-
-    approach: Weight = 1.0
-    """How near the nearest fingertip is to the hot ball [1/s]."""
-    contact: Weight = 1.0
-    """A fingertip is on the hot ball [1/s]."""
-    progress: Weight = 2.0
-    """How hot the hottest finger link is [1/s]."""
-    latched: Weight = 10.0
-    """A fingertip is on the hot ball, and the latch on [1/s]."""
-    lost: Weight = -100.0
-    """The hot ball has left the bin [1/s]."""
-    action_rate: Weight = -5e-4
-    """Change of the action [1/s]."""
-    work: Weight = -5e-3
-    """Power of the drives [1/J]."""
 
 
 class HotBallRandomSpec(RandomSpec):
@@ -94,8 +65,6 @@ class HotBallSpec(TaskSpec):
     """Bodies of the other balls: each may be where the keyframe has another one, or the hot one."""
     randomise: HotBallRandomSpec = HotBallRandomSpec()
     """What is random."""
-    rewards: Rewards = Rewards()
-    """Weights of the reward's terms."""
     ambient: Temperature = 22.0
     """T_a, temperature of the surroundings, as the sensors' document has it [°C]."""
     target: Temperature = 45.0
@@ -116,17 +85,16 @@ class HotBallSpec(TaskSpec):
         return self
 
 
-def reference(spec: HotBallSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
-    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+def reference(spec: HotBallSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
+    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:
         spec: The task's document.
-        record: One row per instant, the first that at the start: `pos`, of the hot ball [m], `joint_vel` [rad/s, m/s],
-            `torque` [N·m, N], `action`, `link_force`, of it on fingertips (step, link, 3) [N], `distance` [m], and `heat`, what
-            grids read (step, cell) [°C].
+        record: One row per instant, the first that at the start: `pos`, of the hot ball [m], `link_force`, of it on fingertips
+            (step, link, 3) [N], `distance` [m], and `heat`, what grids read (step, cell) [°C].
         dt: Δt [s].
     """
-    weights, is_latched, score, rows = spec.rewards, False, 0.0, []
+    is_latched, score = False, 0.0
     for t in range(1, len(record["pos"])):
         # The largest of clamped progresses is that of the hottest cell.
         progress = (record["heat"][t].max() - spec.ambient) / (spec.target - spec.ambient)
@@ -135,17 +103,15 @@ def reference(spec: HotBallSpec, record: Mapping[str, np.ndarray], dt: float) ->
         is_touched = bool(np.linalg.norm(record["link_force"][t], axis=1).max() >= spec.min_force)
         score += dt * (is_latched and is_touched)
         is_over = bool(record["pos"][t][2] < spec.lost_height)
-        row = {
-            "approach": weights.approach * math.exp(-max(0.0, record["distance"][t].min()) / spec.near_width),
-            "contact": weights.contact * is_touched,
-            "progress": weights.progress * progress,
-            "latched": weights.latched * (is_latched and is_touched),
-            "lost": weights.lost * is_over,
-            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
-            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+        yield {
+            "approach": math.exp(-max(0.0, record["distance"][t].min()) / spec.near_width),
+            "contact": is_touched,
+            "progress": progress,
+            "latched": is_latched and is_touched,
+            "lost": is_over,
+            "is_over": is_over,
+            "score": score,
         }
-        rows.append(row | {"is_over": is_over, "score": score})
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 class HotBall(Task[HotBallSpec]):
@@ -154,6 +120,34 @@ class HotBall(Task[HotBallSpec]):
     Spec = HotBallSpec
     senses = ("temperature_grid", "link_contact", "surface_distance")
     score_unit = "s of latched contact"
+
+    @reward_term(1.0, "1/s")
+    def approach(self, now: Now) -> Float[Tensor, " env"]:
+        """How near the nearest fingertip is to the hot ball, exp(−max(0, min_p d_p)/λ)."""
+        return torch.exp(-now.distance.amin(dim=1).clamp(min=0.0) / self.spec.near_width)
+
+    @reward_term(1.0, "1/s")
+    def contact(self, now: Now) -> Bool[Tensor, " env"]:
+        """A fingertip is on the hot ball, c."""
+        return self.is_touched
+
+    @reward_term(2.0, "1/s", name="progress")
+    def highest_progress(self, now: Now) -> Float[Tensor, " env"]:
+        """How hot the hottest finger link is, π."""
+        return self.progress.amax(dim=1)
+
+    @reward_term(10.0, "1/s")
+    def latched(self, now: Now) -> Bool[Tensor, " env"]:
+        """A fingertip is on the hot ball, and the latch on, b c."""
+        return self.is_latched & self.is_touched
+
+    @reward_term(-100.0, "1/s")
+    def lost(self, now: Now) -> Bool[Tensor, " env"]:
+        """The hot ball has left the bin in this step."""
+        return self.is_over(now)
+
+    action_rate = terms.ActionRate.of_task(-5e-4)
+    work = terms.Work.of_task(-5e-3)
 
     def __init__(self, spec: HotBallSpec, setup: Setup):
         """Look up the balls, and the cells of each link.
@@ -195,19 +189,6 @@ class HotBall(Task[HotBallSpec]):
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the hot ball has left the bin."""
         return now.object.pos[:, 2] < self.spec.lost_height
-
-    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return the terms of the reward: see the top of this page."""
-        weights = self.spec.rewards
-        return {
-            "approach": weights.approach * torch.exp(-now.distance.amin(dim=1).clamp(min=0.0) / self.spec.near_width),
-            "contact": weights.contact * self.is_touched,
-            "progress": weights.progress * self.progress.amax(dim=1),
-            "latched": weights.latched * (self.is_latched & self.is_touched),
-            "lost": weights.lost * self.is_over(now),
-            "action_rate": weights.action_rate * terms.action_rate(now),
-            "work": weights.work * terms.work(now),
-        }
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return what is privileged: of heat, and of the hot ball."""

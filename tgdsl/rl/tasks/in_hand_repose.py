@@ -17,20 +17,8 @@ and 0 to 5 about any axis.
 Groups: `goal` holds six numbers of the goal's orientation in the world and φ [rad]; `priv_obj_state` and `priv_obj_props` as in
 `groups`.
 
-The reward is the sum of these terms times Δt; weights are the paper's. φ and φ' are angles at the end and at the begin of the
-control step, both to the goal that it was made for.
-
-    success            w · (goal reached in this step)                           500 1/s
-    track_gaussian     w · exp(−φ²/(2 σ²))                                       2 1/s
-    track_inverse      w / (1 + (φ/φ_0)²)                                        2 1/s
-    progress           w · min((φ' − φ)/Δt, ω_max)                               0.2 1/rad
-    near               w · mean_p exp(−max(0, d_p)/λ)                            0.5 1/s
-    contact_force      w · Σ_l max(0, |f_l| − f_max)/f_max                       −5 1/s
-    drop               w · (dropped in this step)                                −100 1/s
-    goal_timeout       w · (too late in this step)                               −200 1/s
-    action_rate        w · |a_t − a_{t−1}|²                                      −1e-5 1/s
-    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)                    −20 1/(rad s)
-    work               w · Σ_j |τ_j q̇_j|                                         −1e-3 1/J
+Weights of the reward's terms are the paper's. φ and φ' are angles at the end and at the begin of the control step, both to the
+goal that it was made for.
 
 An episode ends for good where the object is further than `drop_distance` from p_0, or where a goal is not reached within
 `goal_timeout`: what has failed is not worth what would have come. Score: goals in a row, k.
@@ -47,8 +35,8 @@ speaks of penalties of grip and slip, which its table does not have, and which a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -57,41 +45,14 @@ from pydantic import model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Angle, Positive, PositiveLength, Quantity, SpecModel
+from tgdsl.fields.models import Angle, Positive, PositiveLength, Quantity
 from tgdsl.rl import groups, rotations, terms
-from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Time, Weight, Whole
+from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Time, Whole
 from tgdsl.rl.students.spec import DistillSpec
-from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.placing import placed
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.tensors.env_ids import may_be_nonempty
-
-
-class Rewards(SpecModel):
-    """Weights of the reward's terms; 0 leaves one out."""
-
-    success: Weight = 500.0
-    """Goal reached [1/s]."""
-    track_gaussian: Weight = 2.0
-    """Orientation near the goal, a Gaussian of the angle to it [1/s]."""
-    track_inverse: Weight = 2.0
-    """Orientation near the goal, the inverse of the squared angle to it [1/s]."""
-    progress: Weight = 0.2
-    """Rate at which the angle to the goal gets smaller [1/rad]."""
-    near: Weight = 0.5
-    """How near fingers are to the object [1/s]."""
-    contact_force: Weight = -5.0
-    """Force on links beyond `max_force` [1/s]."""
-    drop: Weight = -100.0
-    """Object dropped [1/s]."""
-    goal_timeout: Weight = -200.0
-    """Goal not reached in time [1/s]."""
-    action_rate: Weight = -1e-5
-    """Change of the action [1/s]."""
-    joint_limit: Weight = -20.0
-    """Joints near the ends of their ranges [1/(rad s)]."""
-    work: Weight = -1e-3
-    """Power of the drives [1/J]."""
 
 
 class Train(TrainSpec):
@@ -118,8 +79,6 @@ class InHandReposeSpec(TaskSpec):
 
     randomise: PlacedRandomSpec = PlacedRandomSpec()
     """What is random."""
-    rewards: Rewards = Rewards()
-    """Weights of the reward's terms."""
     goal_step: Angle = 0.4
     """α: how far a goal is from the one before [rad]."""
     goal_axis: Literal["any", "vertical"] = "vertical"
@@ -155,47 +114,37 @@ class InHandReposeSpec(TaskSpec):
         return self
 
 
-def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
-    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
+    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:
         spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
-            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m]; and `low`, `high`, limits [rad];
-            `goal_axis` (goal, 3), axes of goals in turn.
+        record: One row per instant, the first that at the start: `pos` [m] and `quat`; and `goal_axis` (goal, 3), axes of goals
+            in turn.
         dt: Δt [s].
     """
-    weights, low, high, pos = spec.rewards, record["low"], record["high"], record["pos"]
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    pos = record["pos"]
     rot = [_matrix(quat) for quat in record["quat"]]
     reached, near_since, given = 0, 0, 0
     goal = _turn(record["goal_axis"][0], spec.goal_step) @ rot[0]
-    rows = []
     for t in range(1, len(pos)):
         error = _angle_between(goal, rot[t])
         near_since = near_since + 1 if error < spec.goal_tolerance else 0
         is_reached = near_since >= spec.goal_hold
         is_late = not is_reached and t - given >= round(spec.goal_timeout / dt)
-        force = np.linalg.norm(record["link_force"][t], axis=1)
         is_dropped = np.linalg.norm(pos[t] - pos[0]) > spec.drop_distance
         row = {
-            "success": weights.success * is_reached,
-            "track_gaussian": weights.track_gaussian * math.exp(-0.5 * (error / spec.track_width) ** 2),
-            "track_inverse": weights.track_inverse / (1 + (error / spec.track_half) ** 2),
-            "progress": weights.progress * min((_angle_between(goal, rot[t - 1]) - error) / dt, spec.max_spin),
-            "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
-            "contact_force": weights.contact_force * sum(max(0.0, f - spec.max_force) / spec.max_force for f in force),
-            "drop": weights.drop * is_dropped,
-            "goal_timeout": weights.goal_timeout * is_late,
-            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
-            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(record["joint_pos"][t] - middle) - 0.95 * half, 0.0)),
-            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+            "success": is_reached,
+            "track_gaussian": math.exp(-0.5 * (error / spec.track_width) ** 2),
+            "track_inverse": 1 / (1 + (error / spec.track_half) ** 2),
+            "progress": min((_angle_between(goal, rot[t - 1]) - error) / dt, spec.max_spin),
+            "drop": is_dropped,
+            "goal_timeout": is_late,
         }
         if is_reached:
             reached, near_since, given = reached + 1, 0, t
             goal = _turn(record["goal_axis"][reached], spec.goal_step) @ goal
-        rows.append(row | {"is_over": is_dropped or is_late, "score": reached})
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        yield row | {"is_over": is_dropped or is_late, "score": reached}
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
@@ -218,6 +167,43 @@ class InHandRepose(Task[InHandReposeSpec]):
     Spec = InHandReposeSpec
     senses = ("link_contact", "surface_distance")
     score_unit = "goals in a row"
+
+    @reward_term(500.0, "1/s")
+    def success(self, now: Now) -> Bool[Tensor, " env"]:
+        """Goal reached in this step."""
+        return self.is_reached
+
+    @reward_term(2.0, "1/s")
+    def track_gaussian(self, now: Now) -> Float[Tensor, " env"]:
+        """Orientation near the goal, exp(−φ²/(2 σ²))."""
+        return torch.exp(-0.5 * (self.error / self.spec.track_width).square())
+
+    @reward_term(2.0, "1/s")
+    def track_inverse(self, now: Now) -> Float[Tensor, " env"]:
+        """Orientation near the goal, 1/(1 + (φ/φ_0)²)."""
+        return 1.0 / (1.0 + (self.error / self.spec.track_half).square())
+
+    @reward_term(0.2, "1/rad")
+    def progress(self, now: Now) -> Float[Tensor, " env"]:
+        """Rate at which the angle to the goal gets smaller, min((φ' − φ)/Δt, ω_max)."""
+        return self.rate
+
+    near = terms.Near.of_task(0.5, width="near_width")
+    contact_force = terms.ContactForce.of_task(-5.0, max_force="max_force")
+
+    @reward_term(-100.0, "1/s")
+    def drop(self, now: Now) -> Bool[Tensor, " env"]:
+        """Object dropped in this step."""
+        return vector_norm(now.object.pos - self.start_pos, dim=1) > self.spec.drop_distance
+
+    @reward_term(-200.0, "1/s")
+    def goal_timeout(self, now: Now) -> Bool[Tensor, " env"]:
+        """Goal not reached in time."""
+        return self.is_late
+
+    action_rate = terms.ActionRate.of_task(-1e-5)
+    joint_limit = terms.JointLimit.of_task(-20.0)
+    work = terms.Work.of_task(-1e-3)
 
     def __init__(self, spec: InHandReposeSpec, setup: Setup):
         """Begin with all objects where the keyframe has them."""
@@ -263,24 +249,7 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped or the goal was not reached in time."""
-        return self._is_dropped(now) | self.is_late
-
-    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return the terms of the reward: see the top of this page."""
-        spec, weights = self.spec, self.spec.rewards
-        return {
-            "success": weights.success * self.is_reached,
-            "track_gaussian": weights.track_gaussian * torch.exp(-0.5 * (self.error / spec.track_width).square()),
-            "track_inverse": weights.track_inverse / (1.0 + (self.error / spec.track_half).square()),
-            "progress": weights.progress * self.rate,
-            "near": weights.near * terms.near(now, spec.near_width),
-            "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
-            "drop": weights.drop * self._is_dropped(now),
-            "goal_timeout": weights.goal_timeout * self.is_late,
-            "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
-            "work": weights.work * terms.work(now),
-        }
+        return self.drop(now) | self.is_late
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
@@ -298,9 +267,6 @@ class InHandRepose(Task[InHandReposeSpec]):
     def score(self) -> Float[Tensor, " env"]:
         """Return how many goals were reached."""
         return self.reached.to(self.setup.dtype)
-
-    def _is_dropped(self, now: Now) -> Bool[Tensor, " env"]:
-        return vector_norm(now.object.pos - self.start_pos, dim=1) > self.spec.drop_distance
 
     def _goal_after(self, quat: Float[Tensor, "env 4"]) -> Float[Tensor, "env 4"]:
         """Return orientations turned by a goal's step: those of goal `reached`."""

@@ -11,22 +11,8 @@ and n up for `direction: counterclockwise`, down for `clockwise`, as seen from a
 Groups: `goal` holds six numbers of the goal's orientation, rot_n(g) q_0, and the angle from there to q [rad], by which whoever
 sees it knows the object's exact angle; `priv_obj_state` and `priv_obj_props` as in `groups`.
 
-The reward is the sum of these terms times Δt; weights are the paper's.
-
-    success            w · s (goal reached in this step)                         150 1/s
-    spin               w · c min(Δψ/Δt, ω_max); w · Δψ/Δt where Δψ < 0           2 1/rad
-    near               w · mean_p exp(−max(0, d_p)/λ)                            0.1 1/s
-    tilt               w · θ                                                     −1 1/(rad s)
-    object_distance    w · max(0, |p − p_0| − r)                                 −100 1/(m s)
-    contact_force      w · Σ_l max(0, |f_l| − f_max)/f_max                       −5 1/s
-    drop               w · (dropped in this step)                                −100 1/s
-    action_rate        w · |a_t − a_{t−1}|²                                      −5e-4 1/s
-    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)                    −40 1/(rad s)
-    work               w · Σ_j |τ_j q̇_j|                                         −5e-3 1/J
-    effort             w · Σ_j (τ_j/τ_max,j)²                                    0 1/s
-    object_speed       w · (max(0, |v|/v_free − 1) + max(0, |ω|/ω_free − 1))     0 1/s
-
-with c = 1 where the object is held, else `hold.coasting_pay`: see `holding`; and s the share of Σ max(0, Δψ) since the goal
+Weights of the reward's terms are the paper's. Progress pays c, 1 where the object is held, else `hold.coasting_pay`: see
+`holding`. s is the share of Σ max(0, Δψ) since the goal
 before that was paid, Σ c max(0, Δψ) over it. By default c = s = 1: whether an object is held or coasts makes no difference.
 
 An episode ends for good where the object is further than `drop_distance` from p_0. Score: quarter turns, k.
@@ -40,7 +26,7 @@ that coasts; goals that were reached stay reached.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -49,45 +35,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel
+from tgdsl.fields.models import Angle, PositiveLength, Quantity
 from tgdsl.rl import groups, rotations, terms
-from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Weight
+from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
-from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks import holding
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
 from tgdsl.rl.tasks.placing import placed
 
 QUARTER = 0.5 * math.pi
-
-
-class Rewards(SpecModel):
-    """Weights of the reward's terms; 0 leaves one out."""
-
-    success: Weight = 150.0
-    """Goal reached [1/s]."""
-    spin: Weight = 2.0
-    """Angular velocity about the vertical, the right way [1/rad]."""
-    near: Weight = 0.1
-    """How near fingers are to the object [1/s]."""
-    tilt: Weight = -1.0
-    """Tilt of the object [1/(rad s)]."""
-    object_distance: Weight = -100.0
-    """Distance of the object from where it started, beyond `free_distance` [1/(m s)]."""
-    contact_force: Weight = -5.0
-    """Force on links beyond `max_force` [1/s]."""
-    drop: Weight = -100.0
-    """Object dropped [1/s]."""
-    action_rate: Weight = -5e-4
-    """Change of the action [1/s]."""
-    joint_limit: Weight = -40.0
-    """Joints near the ends of their ranges [1/(rad s)]."""
-    work: Weight = -5e-3
-    """Power of the drives [1/J]."""
-    effort: Weight = 0.0
-    """Squares of the torques, as shares of the largest ones [1/s]."""
-    object_speed: Weight = 0.0
-    """Speed and spin of the object beyond `free_speed` and `free_spin`, as shares of these [1/s]."""
 
 
 class Distill(DistillSpec):
@@ -105,8 +62,6 @@ class InPalmRotateSpec(TaskSpec):
 
     randomise: PlacedRandomSpec = PlacedRandomSpec()
     """What is random."""
-    rewards: Rewards = Rewards()
-    """Weights of the reward's terms."""
     direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
     """Which way the object is to turn, seen from above."""
     goal_tolerance: Angle = 0.1
@@ -131,20 +86,17 @@ class InPalmRotateSpec(TaskSpec):
     """ω_free: the same of its angular velocity, about whatever axis [rad/s]."""
 
 
-def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
-    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
+    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:
         spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
-            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m], `linvel` [m/s], `angvel` [rad/s]; and
-            `low`, `high`, limits [rad], `limit`, largest torques [N·m], `fingers`, which links are fingers.
+        record: One row per instant, the first that at the start: `pos` [m], `quat`, `link_force` (step, link, 3) [N]; and
+            `fingers`, which links are fingers.
         dt: Δt [s].
     """
-    weights, way = spec.rewards, _way(spec)
-    pos, quat, low, high = record["pos"], record["quat"], record["low"], record["high"]
-    angle, reached, forth, paid, rows = 0.0, 0, 0.0, 0.0, []
-    limit, fingers = record["limit"], record["fingers"]
+    way, pos, quat = _way(spec), record["pos"], record["quat"]
+    angle, reached, forth, paid = 0.0, 0, 0.0, 0.0
     for t in range(1, len(pos)):
         w, x, y, z = _quat_product(quat[t], quat[t - 1] * [1, -1, -1, -1])
         step = 2.0 * way * math.atan2(z if w >= 0 else -z, abs(w))
@@ -153,31 +105,21 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
         tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
         is_reached = (reached + 1) * QUARTER - angle < spec.goal_tolerance and tilt < spec.max_tilt
         reached += is_reached
-        pay = holding.reference(spec.hold, record["link_force"][t], fingers)
+        pay = holding.reference(spec.hold, record["link_force"][t], record["fingers"])
         forth, paid = forth + max(0.0, step), paid + pay * max(0.0, step)
         share = paid / forth if forth else 1.0
         forth, paid = (0.0, 0.0) if is_reached else (forth, paid)
-        speed, spin = (np.linalg.norm(record[name][t]) for name in ("linvel", "angvel"))
-        distance, force = np.linalg.norm(pos[t] - pos[0]), np.linalg.norm(record["link_force"][t], axis=1)
-        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        distance = np.linalg.norm(pos[t] - pos[0])
         is_over = distance > spec.drop_distance
-        row = {
-            "success": weights.success * is_reached * share,
-            "spin": weights.spin * min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
-            "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
-            "tilt": weights.tilt * tilt,
-            "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
-            "contact_force": weights.contact_force * sum(max(0.0, f - spec.max_force) / spec.max_force for f in force),
-            "drop": weights.drop * is_over,
-            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
-            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(record["joint_pos"][t] - middle) - 0.95 * half, 0.0)),
-            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
-            "effort": weights.effort * np.sum((record["torque"][t] / limit) ** 2),
-            "object_speed": weights.object_speed
-            * (max(0.0, speed / spec.free_speed - 1) + max(0.0, spin / spec.free_spin - 1)),
+        yield {
+            "success": is_reached * share,
+            "spin": min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
+            "tilt": tilt,
+            "object_distance": max(0.0, distance - spec.free_distance),
+            "drop": is_over,
+            "is_over": is_over,
+            "score": reached,
         }
-        rows.append(row | {"is_over": is_over, "score": reached})
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def _way(spec: InPalmRotateSpec) -> float:
@@ -196,6 +138,41 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     Spec = InPalmRotateSpec
     senses = ("link_contact", "surface_distance")
     score_unit = "quarter turns"
+
+    @reward_term(150.0, "1/s")
+    def success(self, now: Now) -> Float[Tensor, " env"]:
+        """Goal reached: s in the step that reaches one."""
+        return self.is_reached * self.share
+
+    @reward_term(2.0, "1/rad")
+    def spin(self, now: Now) -> Float[Tensor, " env"]:
+        """Angular velocity about n, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
+        return self.rate.clamp(max=self.spec.max_spin) * torch.where(self.rate > 0, self.pay, 1.0)
+
+    near = terms.Near.of_task(0.1, width="near_width")
+
+    @reward_term(-1.0, "1/(rad s)", name="tilt")
+    def tilt_angle(self, now: Now) -> Float[Tensor, " env"]:
+        """Tilt of the object, θ."""
+        return self.tilt
+
+    @reward_term(-100.0, "1/(m s)")
+    def object_distance(self, now: Now) -> Float[Tensor, " env"]:
+        """Distance of the object from where it started beyond `free_distance`, max(0, |p − p_0| − r)."""
+        return (self._distance(now) - self.spec.free_distance).clamp(min=0.0)
+
+    contact_force = terms.ContactForce.of_task(-5.0, max_force="max_force")
+
+    @reward_term(-100.0, "1/s")
+    def drop(self, now: Now) -> Float[Tensor, " env"]:
+        """Object dropped in this step."""
+        return self.is_over(now)
+
+    action_rate = terms.ActionRate.of_task(-5e-4)
+    joint_limit = terms.JointLimit.of_task(-40.0)
+    work = terms.Work.of_task(-5e-3)
+    effort = terms.Effort.of_task(0.0)
+    object_speed = terms.ObjectSpeed.of_task(0.0, free_speed="free_speed", free_spin="free_spin")
 
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
         """Begin with all objects where the keyframe has them."""
@@ -242,26 +219,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped."""
-        return vector_norm(now.object.pos - self.start_pos, dim=1) > self.spec.drop_distance
-
-    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return the terms of the reward: see the top of this page."""
-        spec, weights = self.spec, self.spec.rewards
-        distance = vector_norm(now.object.pos - self.start_pos, dim=1)
-        return {
-            "success": weights.success * self.is_reached * self.share,
-            "spin": weights.spin * self.rate.clamp(max=spec.max_spin) * torch.where(self.rate > 0, self.pay, 1.0),
-            "near": weights.near * terms.near(now, spec.near_width),
-            "tilt": weights.tilt * self.tilt,
-            "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
-            "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
-            "drop": weights.drop * (distance > spec.drop_distance),
-            "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
-            "work": weights.work * terms.work(now),
-            "effort": weights.effort * terms.effort(now, self.setup),
-            "object_speed": weights.object_speed * terms.object_speed(now, spec.free_speed, spec.free_spin),
-        }
+        return self._distance(now) > self.spec.drop_distance
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the object has turned in this control step [rad]."""
@@ -284,6 +242,10 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def score(self) -> Float[Tensor, " env"]:
         """Return how many quarter turns were reached."""
         return self.reached
+
+    def _distance(self, now: Now) -> Float[Tensor, " env"]:
+        """Return how far the object is from where it started [m]."""
+        return vector_norm(now.object.pos - self.start_pos, dim=1)
 
     def _goal(self) -> Float[Tensor, " env"]:
         """Return the angle of the next goal [rad]."""

@@ -11,22 +11,9 @@ those of the site at its tip, and j the joints that the policy moves, j_0 at the
 Groups: `priv_obj_state` as in `groups`, and the distance from each probe to the object's surface [m]; `priv_obj_props` friction
 and mass [kg] alone. There is no goal.
 
-The reward is the sum of these terms times Δt; weights are the paper's. On the right what each is worth beside `spin` at 2
-rad/s, which is 20 1/s.
-
-    spin               w · c min(Δψ/Δt, ω_max)                   10 1/rad           w · Δψ/Δt where Δψ < 0
-    near               w · mean_p exp(−max(0, d_p)/λ)            1 1/s              1 1/s if all probes touch
-    alignment          w · (1 − cos θ)                           −400 1/s           −1.5 at 5°, −6 at 10°, −24 at 20°
-    object_distance    w · max(0, |p − p_0| − r)                 −300 1/(m s)       0 up to 6°, −4 at 10°, −14 at 20°
-    hand_pose          w · |j − j_0|²                            −1 1/(rad² s)      −0.7 for eight joints 0.3 rad away
-    drop               w · (dropped in this step)                −100 1/s           −2.5 in all
-    action_rate        w · |a_t − a_{t−1}|²                      −1e-2 1/s          −0.05 for random actions of eight joints
-    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)    −40 1/(rad s)      −1.9 for a finger stretched out
-    work               w · Σ_j |τ_j q̇_j|                         −1e-3 1/J          −0.002 at 2 W
-    contact_force      w · Σ_l max(0, |f_l| − f_max)/f_max       0 1/s
-    effort             w · Σ_j (τ_j/τ_max,j)²                    0 1/s
-
-with c = 1 where the object is held, else `hold.coasting_pay`, 1 by default: see `holding`.
+Weights of the reward's terms are the paper's. Progress pays c, 1 where the object is held, else `hold.coasting_pay`, 1 by
+default: see `holding`. At 2 rad/s `spin` is worth 20 1/s; `near` is worth 1 if all probes touch, `drop` −2.5 in all,
+`joint_limit` −1.9 for a finger stretched out, `action_rate` −0.05 for random actions of eight joints, `work` −0.002 at 2 W.
 
 So a spin of 2 rad/s pays up to a tilt of 15°. An episode ends for good where θ > `drop_tilt` or the tip is out of the screw,
 |s − s_0| > `engagement`. Score: what was turned at a tilt of less than 20°, over the duration of a whole episode [rad/s]: after
@@ -45,8 +32,8 @@ alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
@@ -55,12 +42,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.fields.models import Angle, NonNegative, Positive, PositiveLength, Quantity, SpecModel
+from tgdsl.fields.models import Angle, NonNegative, Positive, PositiveLength, Quantity
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.grasps.spec import GraspSpec
-from tgdsl.rl.spec import TaskSpec, Weight
+from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec, Loss
-from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks import holding
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
 from tgdsl.rl.train.spec import Share, TrainSpec, Whole
@@ -68,33 +55,6 @@ from tgdsl.runtime.simulators.watch import Watch
 
 UPRIGHT = math.radians(20.0)
 """Tilt below which a turn counts for the score [rad]; the paper's."""
-
-
-class Rewards(SpecModel):
-    """Weights of the reward's terms; 0 leaves one out."""
-
-    spin: Weight = 10.0
-    """Angular velocity about the long axis, the right way [1/rad]."""
-    near: Weight = 1.0
-    """How near fingers are to the object [1/s]."""
-    alignment: Weight = -400.0
-    """1 − cos of the tilt [1/s]."""
-    object_distance: Weight = -300.0
-    """Distance of the handle from where it stands upright, beyond `free_distance` [1/(m s)]."""
-    hand_pose: Weight = -1.0
-    """Squared deviation of the joints from where they started [1/(rad² s)]."""
-    drop: Weight = -100.0
-    """Object dropped [1/s]."""
-    action_rate: Weight = -1e-2
-    """Change of the action [1/s]."""
-    joint_limit: Weight = -40.0
-    """Joints near the ends of their ranges [1/(rad s)]."""
-    work: Weight = -1e-3
-    """Power of the drives [1/J]."""
-    contact_force: Weight = 0.0
-    """Force on links beyond `max_force` [1/s]."""
-    effort: Weight = 0.0
-    """Squares of the torques, as shares of the largest ones [1/s]."""
 
 
 class Train(TrainSpec):
@@ -145,8 +105,6 @@ class ScrewdriverSpec(TaskSpec):
     """Duration of an episode [s]."""
     grasps: GraspSpec = GraspSpec()
     """How the grasps are sampled that episodes begin from."""
-    rewards: Rewards = Rewards()
-    """Weights of the reward's terms."""
     tip: str = "tip"
     """The scene's site at the tip."""
     max_spin: Annotated[float, Quantity("number", gt=0.0)] = 6.0
@@ -165,19 +123,17 @@ class ScrewdriverSpec(TaskSpec):
     """Further from where it was, the tip is out of the screw [m]."""
 
 
-def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
-    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
+    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
 
     Args:
         spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `joint_vel`
-            [rad/s], `torque` [N·m], `action`, `distance` [m], `link_force` (step, link, 3) [N]; `low`, `high`, limits [rad];
-            `upright_pos`, `upright_tip` [m], where body and tip are in the keyframe; `limit`, largest torques [N·m], `fingers`,
-            which links are fingers.
+        record: One row per instant, the first that at the start: `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `link_force`
+            (step, link, 3) [N]; `upright_pos`, `upright_tip` [m], where body and tip are in the keyframe; and `fingers`, which
+            links are fingers.
         dt: Δt [s].
     """
-    weights, low, high, quat = spec.rewards, record["low"], record["high"], record["quat"]
-    middle, half, turned, rows = 0.5 * (low + high), 0.5 * (high - low), 0.0, []
+    quat, turned = record["quat"], 0.0
     for t in range(1, len(quat)):
         step = -_turned_about_z(quat[t - 1], quat[t])
         _, x, y, _ = quat[t]
@@ -186,23 +142,16 @@ def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float
         distance = np.linalg.norm(record["pos"][t] - record["upright_pos"])
         away = np.linalg.norm(record["tip"][t] - record["upright_tip"])
         is_over = tilt > spec.drop_tilt or away > spec.engagement
-        joints, force = record["joint_pos"][t], np.linalg.norm(record["link_force"][t], axis=1)
         pay = holding.reference(spec.hold, record["link_force"][t], record["fingers"])
-        row = {
-            "spin": weights.spin * min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
-            "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
-            "alignment": weights.alignment * (1.0 - math.cos(tilt)),
-            "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
-            "hand_pose": weights.hand_pose * np.sum((joints - record["joint_pos"][0]) ** 2),
-            "drop": weights.drop * is_over,
-            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
-            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(joints - middle) - 0.95 * half, 0.0)),
-            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
-            "contact_force": weights.contact_force * sum(max(0.0, f - spec.max_force) / spec.max_force for f in force),
-            "effort": weights.effort * np.sum((record["torque"][t] / record["limit"]) ** 2),
+        yield {
+            "spin": min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
+            "alignment": 1.0 - math.cos(tilt),
+            "object_distance": max(0.0, distance - spec.free_distance),
+            "hand_pose": np.sum((record["joint_pos"][t] - record["joint_pos"][0]) ** 2),
+            "drop": is_over,
+            "is_over": is_over,
+            "score": turned / spec.episode,
         }
-        rows.append(row | {"is_over": is_over, "score": turned / spec.episode})
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def _turned_about_z(before: np.ndarray, after: np.ndarray) -> float:
@@ -219,6 +168,39 @@ class Screwdriver(Task[ScrewdriverSpec]):
     Spec = ScrewdriverSpec
     senses = ("link_contact", "surface_distance")
     score_unit = "rad/s"
+
+    @reward_term(10.0, "1/rad")
+    def spin(self, now: Now) -> Float[Tensor, " env"]:
+        """Angular velocity about the long axis, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
+        return self.rate.clamp(max=self.spec.max_spin) * self._pay(now)
+
+    near = terms.Near.of_task(1.0, width="near_width")
+
+    @reward_term(-400.0, "1/s")
+    def alignment(self, now: Now) -> Float[Tensor, " env"]:
+        """Tilt of the object, 1 − cos θ: −1.5 1/s at 5°, −6 at 10°, −24 at 20°."""
+        return 2.0 * (0.5 * self.tilt).sin().square()
+
+    @reward_term(-300.0, "1/(m s)")
+    def object_distance(self, now: Now) -> Float[Tensor, " env"]:
+        """Distance of the handle from where it stands upright beyond `free_distance`, max(0, |p − p_0| − r): from 6° on."""
+        return ((now.object.pos - self.upright_pos).norm(dim=1) - self.spec.free_distance).clamp(min=0.0)
+
+    @reward_term(-1.0, "1/(rad² s)")
+    def hand_pose(self, now: Now) -> Float[Tensor, " env"]:
+        """Squared deviation of the joints from where they started, |j − j_0|²: −0.7 1/s for eight joints 0.3 rad away."""
+        return (now.joint_pos - self.start_joints).square().sum(dim=1)
+
+    @reward_term(-100.0, "1/s")
+    def drop(self, now: Now) -> Bool[Tensor, " env"]:
+        """Object dropped in this step."""
+        return self.is_over(now)
+
+    action_rate = terms.ActionRate.of_task(-1e-2)
+    joint_limit = terms.JointLimit.of_task(-40.0)
+    work = terms.Work.of_task(-1e-3)
+    contact_force = terms.ContactForce.of_task(0.0, max_force="max_force")
+    effort = terms.Effort.of_task(0.0)
 
     def __init__(self, spec: ScrewdriverSpec, setup: Setup):
         """Begin with all screwdrivers upright, as the keyframe has them.
@@ -263,24 +245,6 @@ class Screwdriver(Task[ScrewdriverSpec]):
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the screwdriver has fallen over, or its tip is out of the screw."""
         return (self.tilt > self.spec.drop_tilt) | (self._tip_distance(now) > self.spec.engagement)
-
-    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return the terms of the reward: see the top of this page."""
-        spec, weights = self.spec, self.spec.rewards
-        distance = (now.object.pos - self.upright_pos).norm(dim=1)
-        return {
-            "spin": weights.spin * self.rate.clamp(max=spec.max_spin) * self._pay(now),
-            "near": weights.near * terms.near(now, spec.near_width),
-            "alignment": weights.alignment * 2.0 * (0.5 * self.tilt).sin().square(),
-            "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
-            "hand_pose": weights.hand_pose * (now.joint_pos - self.start_joints).square().sum(dim=1),
-            "drop": weights.drop * is_over,
-            "action_rate": weights.action_rate * terms.action_rate(now),
-            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.setup),
-            "work": weights.work * terms.work(now),
-            "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
-            "effort": weights.effort * terms.effort(now, self.setup),
-        }
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the screwdriver has turned in this control step [rad]."""

@@ -53,6 +53,7 @@ class Learner:
         """
         self.env, self.ranks = env, ranks or Ranks()
         self.iteration = self.samples = 0
+        self._score: float | None = None  # of the episodes that have ended last
         self._train, self._tally, self._is_begun = loaded.spec.train, EpisodeTally(), False
         wanted = config(loaded, env.groups, self.ranks.rsl_rl)
         self.groups: dict[str, list[str]] = wanted["obs_groups"]
@@ -66,9 +67,12 @@ class Learner:
 
     def iterate(self, share: float = 0.0) -> Iteration:
         """Make a rollout, and learn from it; `share` changes nothing: the rate adapts to the policy, or stays."""
+        self.env.curricula.advance(self.iteration, self._score)
         self.roll()
         self.learn()
-        return self._told()
+        made = self._told()
+        self._score = made.told.get("Episode/score", self._score)
+        return made
 
     @property
     def episode_names(self) -> list[str]:
@@ -111,7 +115,8 @@ class Learner:
     def state_dict(self) -> dict[str, Any]:
         """Return what is learned, and what learning goes on from, as plain values and tensors."""
         algorithm = self.algorithm
-        return {"algorithm": algorithm.save(), "rnd_steps": algorithm.rnd.update_counter if algorithm.rnd else 0}
+        steps = algorithm.rnd.update_counter if algorithm.rnd else 0
+        return {"algorithm": algorithm.save(), "rnd_steps": steps, "score": self._score}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from what was saved; it may hold more than `state_dict` returned. RND that was off until then begins again.
@@ -119,6 +124,7 @@ class Learner:
         Raises:
             RuntimeError: If networks are of other sizes; also ValueError and KeyError.
         """
+        self._score = state.get("score")
         saved, has_rnd = dict(state["algorithm"]), "rnd_state_dict" in state["algorithm"]
         self.algorithm.load(saved, dict.fromkeys(("actor", "critic", "optimizer", "iteration"), True) | {"rnd": has_rnd}, True)
         if self.algorithm.rnd and has_rnd:

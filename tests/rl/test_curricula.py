@@ -1,0 +1,99 @@
+"""Weights and other numbers of terms that follow the progress of learning, in steps that are already compiled too."""
+
+import numpy as np
+import pytest
+import torch
+from tiny_tasks import tiny_env, write_task
+
+from tgdsl.errors import SpecError
+from tgdsl.rl.load import load_task
+
+EFFORT = "terms: {more: {term: linear, of: rewards.effort, first: 10, last: 30, start: 0, end: -0.5}}\n"
+NEAR = """terms:
+  close: {term: near, weight: 2, width: 5 cm}
+  closer: {term: linear, of: terms.close.width, first: 0, last: 4, start: 0.05, end: 0.01}
+"""
+OWN = """from tgdsl.fields.models import Number
+from tgdsl.rl.terms import CurriculumTerm
+
+class Halves(CurriculumTerm):
+    begin: Number
+
+    def value(self, iteration, score):
+        return self.begin * 0.5**iteration
+"""
+
+
+def effort(env):
+    """Return Σ (τ/τ_max)² of each environment, in float64."""
+    return ((env.now.torque.numpy() / env.task.setup.actuators.limit) ** 2).sum(axis=1)
+
+
+@pytest.mark.parametrize(("iteration", "weight"), [(0, 0.0), (10, 0.0), (15, -0.125), (20, -0.25), (30, -0.5), (99, -0.5)])
+def test_a_weight_is_linear_in_iterations(tmp_path, iteration, weight):
+    env = tiny_env(tmp_path, more=EFFORT)
+    env.curricula.advance(iteration, None)
+    made = env.step(torch.full((4, 2), 0.7))
+    expected = weight * env.control_step * effort(env)
+    assert effort(env).min() > 1e-6
+    np.testing.assert_allclose(made.info.terms["effort"], expected, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(("score", "weight"), [(None, 1.0), (0.5, 1.0), (0.2, 2.5), (0.1, 3.0), (0.0, 3.0)])
+def test_a_weight_follows_a_score_of_which_less_is_better(tmp_path, score, weight):
+    env = tiny_env(tmp_path, more=EFFORT.replace("first: 10, last: 30, start: 0, end: -0.5", "by: score, first: 0.5, last: 0.1, start: 1, end: 3"))  # fmt: skip
+    env.curricula.advance(7, score)
+    assert env.curricula.values["rewards.effort"].item() == pytest.approx(weight if score != 0.2 else 1 + 2 * 0.3 / 0.4)
+
+
+def test_a_parameter_of_a_term_follows_too(tmp_path):
+    env = tiny_env(tmp_path, more=NEAR)
+    for iteration, width in ((0, 0.05), (2, 0.03), (4, 0.01)):
+        env.curricula.advance(iteration, None)
+        made = env.step(torch.full((4, 2), 0.3))
+        rate = np.exp(-np.maximum(env.now.distance.numpy(), 0.0) / width).mean(axis=1)
+        np.testing.assert_allclose(made.info.terms["close"], 2 * env.control_step * rate, rtol=1e-6)
+
+
+def test_a_compiled_step_reads_the_number_of_each_iteration(tmp_path):
+    """Without a break of its graph, and without one that is compiled again."""
+    env = tiny_env(tmp_path, more=EFFORT)
+    env.step(torch.full((4, 2), 0.7))
+    graphs = []
+
+    def backend(graph, inputs):
+        graphs.append(graph)
+        return graph
+
+    fused = torch.compile(env.task.reward, fullgraph=True, backend=backend)
+    for iteration, weight in ((0, 0.0), (15, -0.125), (30, -0.5)):
+        env.curricula.advance(iteration, None)
+        terms = fused(env.now, torch.zeros(4, dtype=torch.bool))
+        np.testing.assert_allclose(terms["effort"], weight * effort(env), rtol=1e-9)
+    assert len(graphs) == 1
+
+
+def test_a_curriculum_of_ones_own_and_its_state(tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    more = 'terms: {fade: {term: "own.py:Halves", of: rewards.near, begin: 4}}\n'
+    env, again = tiny_env(tmp_path, more=more), tiny_env(tmp_path, more=more)
+    env.curricula.advance(3, None)
+    again.load_state_dict(env.state_dict())
+    assert again.curricula.values["rewards.near"].item() == 0.5
+    one, two = env.step(torch.zeros(4, 2)), again.step(torch.zeros(4, 2))
+    assert torch.equal(one.info.terms["near"], two.info.terms["near"])
+
+
+@pytest.mark.parametrize(
+    ("change", "path", "says"),
+    [
+        (("rewards.effort", "rewards.efort"), "terms.more.of", 'there is no number "rewards.efort" of a term; did you mean'),
+        (("rewards.effort", "terms.more.end"), "terms.more.of", 'there is no number "terms.more.end" of a term'),
+        (("last: 30", "last: 10"), "terms.more", "first and last are both 10"),
+    ],
+)
+def test_what_is_wrong_with_a_curriculum_is_told_at_its_place(tmp_path, change, path, says):
+    with pytest.raises(SpecError) as caught:
+        load_task(write_task(tmp_path, more=EFFORT.replace(*change)))
+    (problem,) = caught.value.problems
+    assert problem.path == path and says in f"{problem.what}; {problem.hint}"
