@@ -198,7 +198,7 @@ POINT = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": R}
 @pytest.mark.parametrize("backend", ["field", "points"])
 def test_variants_are_as_many_single_runs(tmp_path, backend):
     variants = [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02]}]
-    own = {"backend": backend, "points": 500}
+    own = {"backend": backend} | ({"points": 500} if backend == "points" else {})
     touch = tgdsl.compile(document(tmp_path, [POINT], target={"variants": variants}, **own), dtype=torch.float64)
     at = touch.example_state(4, spread=0.004)
     assert at.body_pos is not None and at.variant is not None

@@ -205,7 +205,7 @@ class Closing:
             beyond = [other for other in path if other != joint and self.segment(joint) in path[other][1:]]
             if beyond and not any(abs(cosine) > PARALLEL for other in beyond for cosine in self._cosines(joint, other)):
                 axes += [(joint, self.chain[self.segment(i)], axis) for i, axis in self.turned[joint].items()]
-        if {chain for _, chain, _ in axes} == set(self.chain.values()) and _are_around([axis for _, _, axis in axes]):
+        if axes and {chain for _, chain, _ in axes} == set(self.chain.values()) and _are_around([axis for _, _, axis in axes]):
             return {one for one, _, _ in axes}
         return {
             one
