@@ -3,6 +3,7 @@
 import linecache
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
+from types import SimpleNamespace
 
 import pytest
 
@@ -59,11 +60,19 @@ def test_two_of_one_name_are_refused(installed):
 
 def test_what_is_no_thing_is_left_out_with_a_warning_and_refused_where_it_is_given(installed):
     group = installed("NUMBER", "TWO", "missing")
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match="is left out") as caught:
         assert known(group) == ["two"]
     first, second = (str(warning.message) for warning in caught)
     assert first == f'the thing "p0" of an unknown package ({__name__}:NUMBER) is left out: 3 is no thing'
     assert second == f"the thing \"p2\" of an unknown package ({__name__}:missing) is left out: KeyError: 'missing'"
     assert "known(group)" in linecache.getline(caught[0].filename, caught[0].lineno)
-    with pytest.raises(TgdslError, match="^`things`: 3 is no thing$"):
+    with pytest.raises(TgdslError, match=r"^`things`: 3 is no thing$"):
         known("none", given=[NUMBER])
+
+
+def test_packages_are_named_by_their_version(installed, monkeypatch):
+    group = installed("ONE")
+    (point,) = plugins.entry_points(group=group)
+    of_package = point._for(SimpleNamespace(name="fingers", version="1.2"))
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [of_package])
+    assert plugins.installed(group, "thing", wrong) == ((ONE, "fingers 1.2"),)
