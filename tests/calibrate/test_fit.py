@@ -405,5 +405,13 @@ def test_four_loads_are_enough_and_three_are_not():
     force = np.concatenate([np.zeros((1, 3)), 2 * AXES])
     fit = fit_finger(counts_of(force, np.eye(3)), force, axes="signs")
     assert fit.scale == pytest.approx(SCALE) and fit.tare == pytest.approx(TARE)
-    with pytest.raises(FitError, match="^3 frames, expected at least 4$"):
+    with pytest.raises(FitError, match=r"^3 frames, expected at least 4$"):
         fit_finger(counts_of(force, np.eye(3))[:3], force[:3])
+
+
+def test_counts_that_do_not_follow_their_axis():
+    """All eight presses along ±x, ±y and ±z; the counts along x follow the product of x and y, which correlates with none."""
+    presses = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    counts = presses * [0, 1, 1] + presses[:, :1] * presses[:, 1:2] * [1, 0, 0]
+    with pytest.raises(FitError, match="the fingertip's counts along its x do not follow the loads"):
+        fit_finger(counts, presses, axes="signs", tare=np.zeros(3))

@@ -119,7 +119,11 @@ def test_whether_a_file_can_be_written_is_seen_before_anything_is_made(tmp_path)
 
 
 def test_what_a_library_raises_comes_through_when_it_has_removed_its_file(tmp_path):
-    with pytest.raises(ValueError, match="no such format"), atomic_path(tmp_path / "a.usda") as temporary:
-        temporary.unlink()
-        raise ValueError("no such format")
+    def fail() -> None:
+        with atomic_path(tmp_path / "a.usda") as temporary:
+            temporary.unlink()
+            raise ValueError("no such format")
+
+    with pytest.raises(ValueError, match="no such format"):
+        fail()
     assert list(tmp_path.iterdir()) == []
