@@ -415,3 +415,10 @@ def test_counts_that_do_not_follow_their_axis():
     counts = presses * [0, 1, 1] + presses[:, :1] * presses[:, 1:2] * [1, 0, 0]
     with pytest.raises(FitError, match="the fingertip's counts along its x do not follow the loads"):
         fit_finger(counts, presses, axes="signs", tare=np.zeros(3))
+
+
+@pytest.mark.parametrize(("units", "expected"), [("N", 0.5), ("counts", None)])
+def test_a_contact_threshold_is_kept_where_its_unit_stays(units, expected):
+    base = replace(Calibration.none(), units=units, contact_threshold=0.5)
+    result = calibrated(base, {"index": a_fit()}, "index")
+    assert (result.units, result.contact_threshold) == ("N", expected)
