@@ -8,7 +8,7 @@ import pytest
 from hand_logs import random_readings, write_log
 
 import tgdsl
-from tgdsl.calibrate.fit import FitError, fit_finger, time_offset
+from tgdsl.calibrate.fit import FingerFit, FitError, fit_finger, time_offset
 from tgdsl.calibrate.loads import (
     Load,
     Samples,
@@ -389,3 +389,36 @@ def test_the_report_and_the_picture():
     assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["index", "ring"]
     offsets = np.concatenate([points.get_offsets() for points in figure.axes[0].collections])
     assert np.asarray(offsets) == pytest.approx(np.repeat(PRESSES.T.reshape(-1, 1), 2, axis=1), abs=1e-6)
+
+
+def test_errors_are_reported_per_axis():
+    """By hand: forces of variance 1, 4 and 0 N² with errors of 0, ±1 and −3 or 1 N."""
+    force = np.array([[1.0, 2.0, 5.0], [-1.0, -2.0, 5.0]])
+    error = np.array([[0.0, 1.0, -3.0], [0.0, -1.0, 1.0]])
+    fit = FingerFit(np.ones(3), np.eye(3), np.zeros(3), force, error)
+    assert fit.max_error.tolist() == [0.0, 1.0, 3.0]
+    assert fit.rms == pytest.approx([0.0, 1.0, math.sqrt(5)])
+    np.testing.assert_allclose(fit.r_squared, [1.0, 0.75, np.nan])
+
+
+def test_four_loads_are_enough_and_three_are_not():
+    force = np.concatenate([np.zeros((1, 3)), 2 * AXES])
+    fit = fit_finger(counts_of(force, np.eye(3)), force, axes="signs")
+    assert fit.scale == pytest.approx(SCALE) and fit.tare == pytest.approx(TARE)
+    with pytest.raises(FitError, match=r"^3 frames, expected at least 4$"):
+        fit_finger(counts_of(force, np.eye(3))[:3], force[:3])
+
+
+def test_counts_that_do_not_follow_their_axis():
+    """All eight presses along ±x, ±y and ±z; the counts along x follow the product of x and y, which correlates with none."""
+    presses = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    counts = presses * [0, 1, 1] + presses[:, :1] * presses[:, 1:2] * [1, 0, 0]
+    with pytest.raises(FitError, match="the fingertip's counts along its x do not follow the loads"):
+        fit_finger(counts, presses, axes="signs", tare=np.zeros(3))
+
+
+@pytest.mark.parametrize(("units", "expected"), [("N", 0.5), ("counts", None)])
+def test_a_contact_threshold_is_kept_where_its_unit_stays(units, expected):
+    base = replace(Calibration.none(), units=units, contact_threshold=0.5)
+    result = calibrated(base, {"index": a_fit()}, "index")
+    assert (result.units, result.contact_threshold) == ("N", expected)

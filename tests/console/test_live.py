@@ -37,3 +37,11 @@ def test_a_terminal_is_drawn_over_at_most_once_per_period(monkeypatch):
     assert stream.getvalue() == "a\nb\n\x1b[2A\x1b[Jc\nd\ne\n"
     live.show(["last"], is_last=True)
     assert stream.getvalue().endswith("\x1b[3A\x1b[Jlast\n")
+
+
+def test_what_is_drawn_is_seen_at_once():
+    """The stream holds nothing back."""
+    raw = io.BytesIO()
+    stream = io.TextIOWrapper(raw, encoding="utf-8", newline="\n")
+    LiveTable(stream).show(["a", "b"], is_last=True)
+    assert raw.getvalue() == b"a\nb\n"

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -129,6 +130,7 @@ def test_a_file_that_another_process_removes_first_counts_once(monkeypatch):
 
 PROGRAM = """
 import sys
+import time
 sys.path[:0] = sys.argv[1:3]
 from cache_entries import VALUES, value_of
 import numpy as np
@@ -164,3 +166,30 @@ def test_the_command_shows_and_clears(tmp_path, place, here, monkeypatch):
     assert here(tmp_path, "cache", "--clear") == (0, f"{place}: removed 3 entries, {3 * size} bytes\n", "")
     assert here(tmp_path, "cache", "--clear") == (0, f"{place}: removed 0 entries, 0 bytes\n", "")
     assert [path.name for path in place.iterdir()] == ["mine.txt"]
+
+
+class Marker:
+    """Leaves a file behind where it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_an_entry_runs_no_code_of_who_wrote_it(place, tmp_path):
+    """Several users may share a cache folder: a pickled object in an entry is damage."""
+    place.mkdir()
+    np.savez(place / f"{key(0)}.npz", value=np.array([Marker(tmp_path / "ran")], dtype=object))
+    np.testing.assert_array_equal(value_of(0), np.zeros(VALUES))
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_file_that_is_unfinished_for_an_hour_is_abandoned(place):
+    place.mkdir()
+    now = time.time()
+    for name, hours in ((".0123456789abcdef.npz", 1.1), (".fedcba9876543210.npz", 0.9)):
+        (place / name).write_bytes(bytes(10))
+        os.utime(place / name, (now - 3600 * hours,) * 2)
+    assert [entry.file.name for entry in cache.entries()] == [".0123456789abcdef.npz"]

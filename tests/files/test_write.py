@@ -10,7 +10,7 @@ from joint_scenes import ALL, ROBOT_XML, joint_module
 
 import tgdsl
 from tgdsl.errors import FileError
-from tgdsl.files.write import atomic_path, atomic_write, atomic_write_all, new_folder
+from tgdsl.files.write import atomic_path, atomic_write, atomic_write_all, check_writable, new_folder
 from tgdsl.formats.robot import export_model
 from tgdsl.runtime.rollout import Recorder
 
@@ -99,3 +99,31 @@ def test_a_folder_that_something_was_put_into_stays(tmp_path):
         (tmp_path / "a" / "other").touch()
         raise ZeroDivisionError
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "other"]
+
+
+def test_whether_a_file_can_be_written_is_seen_before_anything_is_made(tmp_path):
+    """Its folder need not be there, but what is there of the way to it is a folder; the file itself is none."""
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    for target in (tmp_path / "new", tmp_path / "file", tmp_path / "a" / "b" / "new", tmp_path / "folder" / "new"):
+        assert check_writable(target) == target
+    for target, says in (
+        (tmp_path / "file" / "a" / "new", f"{tmp_path / 'file'} is a file, expected a folder"),
+        (tmp_path / "folder", "this is a folder, expected a file's name"),
+    ):
+        with pytest.raises(FileError) as caught:
+            check_writable(target)
+        assert str(caught.value).startswith(str(target)) and says in str(caught.value)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_what_a_library_raises_comes_through_when_it_has_removed_its_file(tmp_path):
+    def fail() -> None:
+        with atomic_path(tmp_path / "a.usda") as temporary:
+            temporary.unlink()
+            raise ValueError("no such format")
+
+    with pytest.raises(ValueError, match="no such format"):
+        fail()
+    assert list(tmp_path.iterdir()) == []

@@ -102,3 +102,21 @@ def test_an_id_is_of_every_bit_and_name_but_groups():
     ids = {taxels_id(layout) for layout in [LAYOUT, *others]}
     assert len(ids) == 1 + len(others)
     assert taxels_id(changed(tangent=LAYOUT.tangent * [1, -1, 1])) == taxels_id(LAYOUT)  # −0 is 0
+
+
+def test_areas_are_compared_with_the_larger_one():
+    """5 % of the larger: 1 and 0.951 are the same whichever is where, 1 and 0.949 are not; nothing is the same as nothing."""
+    for share, is_same in ((0.951, True), (0.949, False)):
+        other = changed(area=LAYOUT.area * share)
+        for here, there in ((LAYOUT, other), (other, LAYOUT)):
+            if is_same:
+                check_same_rows(columns_of(here), columns_of(there), "x")
+            else:
+                assert message(here, there).startswith("x: 4 of 4 rows are other taxels")
+    check_same_rows(columns_of(changed(area=np.zeros(4))), columns_of(changed(area=np.zeros(4))), "x")
+
+
+def test_the_same_taxels_in_another_order_are_known_by_place_whatever_the_sign_of_zero():
+    order, signs = [0, 2, 1, 3], np.where(LAYOUT.pos == 0, -1.0, 1.0)
+    other = changed(**{name: getattr(LAYOUT, name)[order] for name in ("normal", "cell")}, pos=(LAYOUT.pos * signs)[order])
+    assert ", the same ones in another order; the first is row 1" in message(other)

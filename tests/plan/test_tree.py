@@ -1,7 +1,7 @@
 """Trees of frozen dataclasses with arrays as leaves: names, values and types come back, and nothing else is taken for them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
@@ -16,7 +16,7 @@ Array = TypeVar("Array")
 @dataclass(frozen=True, eq=False)
 class Leaf(Generic[Array]):
     name: str
-    values: Mapping[str, Array] = tree.inline()
+    values: Mapping[str, Array] = field(metadata=tree.INLINE)
     extra: Array | None = None
 
 

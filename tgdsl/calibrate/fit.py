@@ -168,7 +168,7 @@ def _expect_loads(force: Forces, has_tare: bool) -> None:
     """Raise an error that says along which axis, or else in which direction, there was no load."""
     strength, directions = _spread(force)
     limit = _LOADED * strength.max()
-    if strength.min() > limit and limit > 0:
+    if strength.min() > limit:
         return
     along = np.sqrt(np.mean(force**2, axis=0))
     missing = [name for name, size in zip("xyz", along, strict=True) if size <= limit]
@@ -184,7 +184,7 @@ def _expect_loads(force: Forces, has_tare: bool) -> None:
 
 def _expect_response(counts: Forces) -> None:
     strength, directions = _spread(counts)
-    if strength.min() > 1e-3 * strength.max() and strength.max() > 0:
+    if strength.min() > 1e-3 * strength.max():
         return
     weak = directions[int(np.argmin(strength))]
     which = "xyz"[int(np.argmax(abs(weak)))]

@@ -98,7 +98,7 @@ def _same(name: str, here: Shaped[np.ndarray, "row ..."], there: Shaped[np.ndarr
 
 def _places(table: Columns) -> list[tuple[Any, ...]]:
     """Return links and positions to a tenth of a millimetre, sorted: nearly always alike for the same taxels in any order."""
-    rounded = np.round(np.asarray(table["pos"], dtype=np.float64), 4) + 0.0
+    rounded = np.round(np.asarray(table["pos"], dtype=np.float64), 4)
     return sorted((str(link), *pos) for link, pos in zip(table["link"], rounded.tolist(), strict=True))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from tgdsl.fields.indices import indices
 from tgdsl.layout.layout import Link
-from tgdsl.plan.tree import inline
+from tgdsl.plan.tree import INLINE
 
 Array = TypeVar("Array")
 
@@ -76,7 +76,7 @@ class PlannedNoise(Generic[Array]):
 
     terms: tuple[str, ...]
     streams: tuple[int, ...]
-    constants: Mapping[str, Array] = inline()
+    constants: Mapping[str, Array] = field(metadata=INLINE)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class PlannedSensor(Generic[Array]):
     signal: tuple[str, ...]
     readings: tuple[PlannedReading, ...]
     axes: tuple[PlannedAxis, ...]
-    constants: Mapping[str, Array] = inline()
+    constants: Mapping[str, Array] = field(metadata=INLINE)
     noise: PlannedNoise[Array] | None
     period: float
     history: PlannedHistory | None

@@ -17,13 +17,10 @@ from tgdsl.errors import ArtifactError
 
 LEAF = "array"
 """Key of what stands for an array in JSON: its name."""
+INLINE = {"inline": True}
+"""Metadata of a dataclass's field for a mapping whose keys follow on the path of what holds it."""
 DTYPES = (np.float64, np.float32, np.int64, np.int32)
 """Dtypes that arrays of the Plan have."""
-
-
-def inline() -> Any:
-    """Return a dataclass's field for a mapping whose keys follow on the path of what holds it."""
-    return dataclasses.field(metadata={"inline": True})
 
 
 def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
