@@ -59,3 +59,8 @@ def test_a_table_of_links_stands_once_for_sensors_on_the_same_taxels():
     assert first.split("\n")[1].split("  ")[0] == "link"
     assert [line.split() for line in first.split("\n")[3:]] == [["tip", "t", "2", "1–2.5", "5"], ["pad", "p", "1", "0", "1"]]
     assert [line.split() for line in second.split("\n")[3:]] == [["tip", "t", "1", "1", "2"]]
+
+
+def test_names_are_not_broken():
+    long = "-".join(["part"] * 40)
+    assert listing([("a", f"first {long}")]).split("\n") == ["  a  first", f"     {long}"]
