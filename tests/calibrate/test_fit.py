@@ -19,7 +19,7 @@ from tgdsl.calibrate.loads import (
     samples_under_loads,
     simulated_tip_forces,
 )
-from tgdsl.calibrate.report import calibrated, drawing, report
+from tgdsl.calibrate.report import calibrated, drawing, picture, report
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.log.log import open_log
@@ -422,3 +422,11 @@ def test_a_contact_threshold_is_kept_where_its_unit_stays(units, expected):
     base = replace(Calibration.none(), units=units, contact_threshold=0.5)
     result = calibrated(base, {"index": a_fit()}, "index")
     assert (result.units, result.contact_threshold) == ("N", expected)
+
+
+def test_a_picture_shows_the_errors_of_each_finger_below(tmp_path):
+    fit = fit_finger(counts_of(PRESSES, np.eye(3)) + np.random.default_rng(0).normal(size=PRESSES.shape), PRESSES)
+    _, below = drawing({"index": fit}, "a.npz").axes
+    offsets = np.concatenate([np.asarray(points.get_offsets()) for points in below.collections])
+    np.testing.assert_allclose(offsets, np.stack([fit.force.T.ravel(), fit.error.T.ravel()], axis=1), atol=1e-12)
+    assert picture({"index": fit}, tmp_path / "fit.png", "a.npz").read_bytes().startswith(b"\x89PNG")

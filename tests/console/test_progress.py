@@ -141,3 +141,18 @@ def test_a_command_on_a_terminal(folder):
     assert text.endswith("\r\x1b[K")
     assert "drawing" not in said
     assert said.splitlines()[-1] == "overview: out/overview.png"
+
+
+def test_a_status_line_is_seen_at_once():
+    """The stream holds nothing back, neither of what is drawn nor of what is wiped."""
+
+    class Screen(io.TextIOWrapper):
+        def isatty(self) -> bool:
+            return True
+
+    raw = io.BytesIO()
+    line = StatusLine(Screen(raw, encoding="utf-8", newline="\n"))
+    line("working")
+    assert raw.getvalue() == b"\r\x1b[Kworking"
+    line.wipe()
+    assert raw.getvalue() == b"\r\x1b[Kworking\r\x1b[K"

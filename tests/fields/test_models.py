@@ -1,0 +1,15 @@
+"""Quantities that must be more than zero take any that are, however small."""
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from tgdsl.fields.models import Angle, Area, Frequency, Positive, Pressure
+
+
+@pytest.mark.parametrize("kind", [Area, Angle, Frequency, Pressure, Positive])
+def test_what_must_be_more_than_zero(kind):
+    adapter = TypeAdapter(kind)
+    assert adapter.validate_python(1e-9) == 1e-9
+    for value in (0, -1.0):
+        with pytest.raises(ValidationError, match="is out of range, expected more than 0"):
+            adapter.validate_python(value)
