@@ -332,7 +332,7 @@ def test_models_that_no_environment_has_any_more_are_forgotten(tmp_path):
     rng = np.random.default_rng(0)
     for _ in range(5):
         sim.set_objects(sizes={"item": rng.uniform(0.01, 0.02, (4, 3))})
-    scenes = sim._objects._scenes
+    scenes = sim._objects.scenes
     assert len(scenes._models) == 4
     sim.step()
     assert np.isfinite(sim.batch.qpos).all()

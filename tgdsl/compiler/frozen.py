@@ -24,8 +24,8 @@ def all_layouts(
         RobotError: If the robot cannot be read, or holds what is not supported.
         TgdslError: If the layout has no such resolution.
     """
-    known = known_kinds(())
-    loaded = load(document, overrides, known, needs_sensors=False)
+    kinds = known_kinds(())
+    loaded = load(document, overrides, kinds, needs_sensors=False)
     if loaded.layout is None:
         if loaded.is_without_layout:
             hint = "only a layout has taxels to write down"
@@ -35,6 +35,6 @@ def all_layouts(
     for name in resolutions:
         if name not in spec.resolutions:
             raise TgdslError(f'the layout has no resolution "{name}"; {did_you_mean(name, spec.resolutions, "resolutions")}')
-    wanted = dict.fromkeys(resolutions or spec.resolutions)
-    each = {name: load(document, {**overrides, "resolution": name}, known, needs_sensors=False) for name in wanted}
-    return spec, {name: taxels_of_all_links(own) for name, own in each.items()}
+    names = dict.fromkeys(resolutions or spec.resolutions)
+    each = {name: load(document, {**overrides, "resolution": name}, kinds, needs_sensors=False) for name in names}
+    return spec, {name: taxels_of_all_links(resolved) for name, resolved in each.items()}

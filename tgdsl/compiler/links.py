@@ -48,11 +48,11 @@ def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) 
     """Return the joints that a pattern matches, in their order; that there are none is noted."""
     hits = matching(pattern, [name for name in own.joints if name])
     if not hits:
-        known = [name for name in (*own.joints, *own.others) if name]
-        what, hint = f'no joint of the robot matches "{pattern}"', did_you_mean(pattern, known, "joints")
+        joint_names = [name for name in (*own.joints, *own.others) if name]
+        problem, hint = f'no joint of the robot matches "{pattern}"', did_you_mean(pattern, joint_names, "joints")
         if matching(pattern, own.others):
-            what, hint = f'"{pattern}" is a ball or free joint', "it has no single position; expected hinges and slides"
-        loaded.problems.append(loaded.problem(path, what, hint))
+            problem, hint = f'"{pattern}" is a ball or free joint', "it has no single position; expected hinges and slides"
+        loaded.problems.append(loaded.problem(path, problem, hint))
     return hits
 
 
@@ -65,12 +65,12 @@ def joints_chosen(loaded: Loaded, path: Path, patterns: Sequence[str] | None, ow
         patterns: Names and wildcards; None: there is no such list.
         own: The robot's joints.
     """
-    wanted: dict[str, None] = {}
+    selected: dict[str, None] = {}
     if patterns is None:
-        wanted = dict.fromkeys(own.joints[: own.num_actuated])
+        selected = dict.fromkeys(own.joints[: own.num_actuated])
     for k, pattern in enumerate(patterns or ()):
-        wanted |= dict.fromkeys(joints_matching(loaded, (*path, k), pattern, own))
-    return tuple(wanted)
+        selected |= dict.fromkeys(joints_matching(loaded, (*path, k), pattern, own))
+    return tuple(selected)
 
 
 def sensor_joints(loaded: Loaded, own: RobotJoints) -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -78,15 +78,15 @@ def sensor_joints(loaded: Loaded, own: RobotJoints) -> Iterator[tuple[str, tuple
     for name, spec in loaded.spec.sensors.items():
         if not isinstance(spec, OnJointsSpec):
             continue
-        before = len(loaded.problems)
-        chosen = joints_chosen(loaded, ("sensors", name, "joints"), spec.joints, own)
-        if len(loaded.problems) == before and not chosen:
-            what, hint = "the robot has no actuated joints", 'name them: joints: ["*"]' if own.joints else ""
-            loaded.problems.append(loaded.problem(("sensors", name), what, hint))
-        if "" in chosen:
-            what = "an actuated joint of the robot has no name"
-            loaded.problems.append(loaded.problem(("sensors", name), what, "name it in the robot's file, or list `joints`"))
-        yield name, chosen
+        num_problems = len(loaded.problems)
+        selected = joints_chosen(loaded, ("sensors", name, "joints"), spec.joints, own)
+        if len(loaded.problems) == num_problems and not selected:
+            problem, hint = "the robot has no actuated joints", 'name them: joints: ["*"]' if own.joints else ""
+            loaded.problems.append(loaded.problem(("sensors", name), problem, hint))
+        if "" in selected:
+            problem = "an actuated joint of the robot has no name"
+            loaded.problems.append(loaded.problem(("sensors", name), problem, "name it in the robot's file, or list `joints`"))
+        yield name, selected
 
 
 def check_named_bodies(loaded: Loaded, scene: Model) -> None:
@@ -94,6 +94,6 @@ def check_named_bodies(loaded: Loaded, scene: Model) -> None:
     for name, spec in loaded.spec.sensors.items():
         for field, body in spec.named_bodies.items():
             if body not in scene.bodies:
-                what = f'the scene has no body "{body}"'
+                problem = f'the scene has no body "{body}"'
                 hint = did_you_mean(body, scene.bodies, "bodies")
-                loaded.problems.append(loaded.problem(("sensors", name, field), what, hint))
+                loaded.problems.append(loaded.problem(("sensors", name, field), problem, hint))

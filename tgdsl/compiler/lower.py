@@ -69,8 +69,8 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
         touched = set().union(*(resolved.objects[name].touched for name in objects))
         deep = sensor.taxels[is_deep[sensor.taxels]]
         for body in dict.fromkeys(names[deep]):
-            own = [geom.id for geom in resolved.scene.rigid_geoms(resolved.link_bodies[body]) if geom.is_colliding]
-            is_kept_out[deep[names[deep] == body]] |= resolved.scene.geoms_can_collide(own, touched)
+            geoms = [geom.id for geom in resolved.scene.rigid_geoms(resolved.link_bodies[body]) if geom.is_colliding]
+            is_kept_out[deep[names[deep] == body]] |= resolved.scene.geoms_can_collide(geoms, touched)
     within = replace(
         within,
         is_collided=~is_deaf | (layout.radius == 0),
@@ -89,12 +89,12 @@ def warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
         num_taxels: Number of all taxels.
     """
     if found:
-        what = f"{len(unfelt_ids(found))} of {num_taxels} taxels cannot feel: {'; '.join(map(str, found[:SHOWN]))}"
-        what += f"; and {len(found) - SHOWN} more, see `explain`" if len(found) > SHOWN else ""
+        problem = f"{len(unfelt_ids(found))} of {num_taxels} taxels cannot feel: {'; '.join(map(str, found[:SHOWN]))}"
+        problem += f"; and {len(found) - SHOWN} more, see `explain`" if len(found) > SHOWN else ""
         hints = {BURIED: "`surface: collision`", COVERED: "`exposed: true`"}
-        wanted = [hint for reason, hint in hints.items() if any(own.reason == reason for own in found)]
-        what += f"; in the layout {' and '.join(wanted)} would place them elsewhere" if wanted else ""
-        warnings.warn(f"{file}: {what}", UnfeltWarning, stacklevel=3)
+        matching_hints = [hint for reason, hint in hints.items() if any(taxels.reason == reason for taxels in found)]
+        problem += f"; in the layout {' and '.join(matching_hints)} would place them elsewhere" if matching_hints else ""
+        warnings.warn(f"{file}: {problem}", UnfeltWarning, stacklevel=3)
 
 
 Parts = Mapping[str, Any]
@@ -128,18 +128,18 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     joined, quantities = passes.join(sensors), quantities_of(kinds)
     shared = passes.share(sensors, joined, resolved.layout, quantities)
     numbered = passes.number(pruned, resolved.objects, shared.uses, quantities)
-    asked = tuple(quantity for quantity in quantities if quantity.name in shared.uses)
-    parts = _quantities(loaded, resolved, pruned, numbered, shared, asked, read, progress)
+    requested = tuple(quantity for quantity in quantities if quantity.name in shared.uses)
+    parts = _quantities(loaded, resolved, pruned, numbered, shared, requested, read, progress)
     loaded.raise_problems()
-    planned = tuple(_sensor(sensor, joined, shared, parts, asked) for sensor in sensors)
+    planned = tuple(_sensor(sensor, joined, shared, parts, requested) for sensor in sensors)
     seen = observed(loaded, resolved, planned, {sensor.name: sensor.layout for sensor in sensors}, read)
     loaded.raise_problems()
     unfelt = unfelt_taxels(resolved, sensors, pruned)
     warn_of_unfelt(loaded.source.file, unfelt, resolved.layout.num_taxels)
     never = [(f"pair {pair.link} – {pair.object}", "they can never be in contact") for pair in pruned.dropped]
-    made = Plan(
+    result = Plan(
         origin=origin,
-        inputs=_inputs(resolved, sensors, pruned, numbered, shared, parts, asked, touched, seen, read),
+        inputs=_inputs(resolved, sensors, pruned, numbered, shared, parts, requested, touched, seen, read),
         layout=resolved.layout,
         objects=numbered.objects,
         pairs=numbered.table,
@@ -151,7 +151,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         unfelt=unfelt,
         scene=SceneFile("", {}, ()),
     )
-    return tree.mapped(made, tree.frozen)
+    return tree.mapped(result, tree.frozen)
 
 
 def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
@@ -160,11 +160,11 @@ def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
         spec = loaded.spec.sensors[sensor]
         path: Path = ("sensors", sensor, "feels", list(spec.objects).index(target))
         if spec.is_gated:
-            what, hint = "the simulator does not collide them", "let them collide, or use `gate: geometric`"
-            what = f'"{target}" can never be in contact with a link of this sensor: {what}'
+            problem, hint = "the simulator does not collide them", "let them collide, or use `gate: geometric`"
+            problem = f'"{target}" can never be in contact with a link of this sensor: {problem}'
         else:
-            what, hint = f'"{target}" and the links of this sensor are one rigid body', "put a joint between them"
-        loaded.problems.append(loaded.problem(path, what, hint))
+            problem, hint = f'"{target}" and the links of this sensor are one rigid body', "put a joint between them"
+        loaded.problems.append(loaded.problem(path, problem, hint))
 
 
 class ContactParts(NamedTuple):
@@ -183,8 +183,8 @@ def _contact_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[Lowered
             loaded.problems.append(loaded.problem(at, what, hint))
 
         felt = resolved.objects[name]
-        own = contact_parts(resolved.scene, felt.bodies, felt.touched, report)
-        objects |= {name: own} if own != (ContactPart("body", felt.body),) else {}
+        parts = contact_parts(resolved.scene, felt.bodies, felt.touched, report)
+        objects |= {name: parts} if parts != (ContactPart("body", felt.body),) else {}
     for sensor in sensors:
         for request in (request for request in sensor.requests if request.wants_contacts):
             _check_shared(loaded, resolved, sensor, request)
@@ -212,9 +212,9 @@ def _check_shared(loaded: Loaded, resolved: Resolved, sensor: LoweredSensor, req
     for (_, first), (i, second) in itertools.combinations(enumerate(request.objects), 2):
         one, two = resolved.objects[first].touched, resolved.objects[second].touched
         if one & two and not (one <= two or two <= one):
-            what = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
+            problem = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
             path: Path = ("sensors", sensor.sensor, "feels", i)
-            loaded.problems.append(loaded.problem(path, what, "give each a sensor of its own, or surfaces apart"))
+            loaded.problems.append(loaded.problem(path, problem, "give each a sensor of its own, or surfaces apart"))
 
 
 def _quantities(
@@ -268,8 +268,8 @@ def _check_parts(parts: Parts, asked: Sequence[Quantity]) -> None:
     for quantity in asked:
         part = parts[quantity.name]
         if not isinstance(part, quantity.part):
-            what = f"`plan` returns {type(part).__name__}, expected its part, {quantity.part.__name__}"
-            raise TgdslError(f'quantity "{quantity.name}": {what}')
+            problem = f"`plan` returns {type(part).__name__}, expected its part, {quantity.part.__name__}"
+            raise TgdslError(f'quantity "{quantity.name}": {problem}')
         if unknown := sorted(set(quantity.fields(part)) - set(FIELDS)):
             hint = did_you_mean(unknown[0], FIELDS, "fields")
             raise TgdslError(f'quantity "{quantity.name}" reads the field {unknown[0]}; {hint}')
@@ -328,8 +328,8 @@ def _sensor(
 ) -> PlannedSensor[np.ndarray]:
     """Return a sensor as the Plan has it."""
     lowered, spec, bodies = sensor.lowered, sensor.spec, body_axis(sensor.layout)
-    own = {key: lowered.report_rows.get(key, bodies) for key in lowered.reports}
-    reports = [_reading(f"{sensor.sensor}/{key}", own[key], channels, 0) for key, channels in lowered.reports.items()]
+    report_rows = {key: lowered.report_rows.get(key, bodies) for key in lowered.reports}
+    reports = [_reading(f"{sensor.sensor}/{key}", report_rows[key], channels, 0) for key, channels in lowered.reports.items()]
     readings = [_reading(name, sensor.rows, lowered.channels, _steps(sensor)) for name in sensor.readings]
     signal = tuple(channel.name for channel in lowered.signal or lowered.channels)
     noise = sensor.noise
@@ -346,7 +346,7 @@ def _sensor(
         state=_state(sensor, shared, parts, asked, (len(signal), sensor.rows.size)),
         signal=signal,
         readings=(*readings, *reports),
-        axes=(*[_axis(sensor.rows)] * len(readings), *[_axis(rows) for rows in own.values()]),
+        axes=(*[_axis(sensor.rows)] * len(readings), *[_axis(rows) for rows in report_rows.values()]),
         noise=None if noise is None else PlannedNoise(noise.terms, noise.streams, dict(sorted(noise.constants.items()))),
         period=0.0 if spec.rate is None else 1.0 / spec.rate,
         history=None if spec.history is None else PlannedHistory(spec.history.length, spec.history.reduce, spec.history.view),

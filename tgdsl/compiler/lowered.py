@@ -35,7 +35,7 @@ def measured_spec(spec: AnySensorSpec, knobs: Sequence[Knobs]) -> AnySensorSpec:
     Raises:
         LowerError: If such a knob does not fit the sensor.
     """
-    released = [own.release_threshold for own in knobs if own.release_threshold is not None]
+    released = [knob.release_threshold for knob in knobs if knob.release_threshold is not None]
     if not released:
         return spec
     lowest, highest = min(low for low, _ in released), max(high for _, high in released)
@@ -43,8 +43,8 @@ def measured_spec(spec: AnySensorSpec, knobs: Sequence[Knobs]) -> AnySensorSpec:
     if threshold is None:
         raise LowerError("release_threshold is of a sensor with a threshold, and this one has none", "noise", "leave it out")
     if highest > threshold:
-        what = f"release_threshold {highest:g} m is above the sensor's threshold {threshold:g} m"
-        raise LowerError(what, field="noise", hint="expected at most that")
+        problem = f"release_threshold {highest:g} m is above the sensor's threshold {threshold:g} m"
+        raise LowerError(problem, field="noise", hint="expected at most that")
     return spec.model_copy(update={"release_threshold": min(lowest, np.nextafter(threshold, 0.0))})
 
 
@@ -52,11 +52,11 @@ def knobs_of(loaded: Loaded, resolved: Resolved, name: str, layout: Layout, kind
     """Return the knobs of each link that carries a sensor; a pattern that matches none is a mistake."""
     spec = loaded.spec.sensors[name]
     base, apart = resolve_noise(spec.noise, kind.name, loaded.spec.noise)
-    own = [base] * len(layout.links)
+    of_links = [base] * len(layout.links)
     for pattern, knobs in apart:
         for i in _matching(loaded, resolved, name, layout.links, pattern):
-            own[i] = knobs.over(own[i])
-    return own
+            of_links[i] = knobs.over(of_links[i])
+    return of_links
 
 
 def _matching(loaded: Loaded, resolved: Resolved, name: str, links: Sequence[Link], pattern: str) -> list[int]:
@@ -73,9 +73,9 @@ def _matching(loaded: Loaded, resolved: Resolved, name: str, links: Sequence[Lin
         return select(Selection(include=(pattern,)), names, groups, lambda _, what, hint: report.append((what, hint)))
 
     chosen(among, missing)
-    for what, hint in missing:
+    for problem, hint in missing:
         path = ("sensors", name, "noise", "links", pattern) if in_line else ("sensors", name, "noise")
-        loaded.problems.append(loaded.problem(path, what if in_line else f'in the profile "{spec.noise}": {what}', hint))
+        loaded.problems.append(loaded.problem(path, problem if in_line else f'in the profile "{spec.noise}": {problem}', hint))
     return chosen(links, [])
 
 
@@ -104,28 +104,28 @@ def imperfections(
     Raises:
         LowerError: If a knob names a quantity that the sensor does not read.
     """
-    if not any(own.active() for own in knobs):
+    if not any(knob.active() for knob in knobs):
         if built_in(spec.noise, named) == "noisy":
             warnings.warn(f'sensor "{name}": the profile "noisy" has no knobs for {kind.name}, so it reads clean', stacklevel=2)
         return None
-    different = list(dict.fromkeys(own.model_dump_json() for own in knobs))
-    of_link = np.array([different.index(own.model_dump_json()) for own in knobs])
+    different = list(dict.fromkeys(knob.model_dump_json() for knob in knobs))
+    of_link = np.array([different.index(knob.model_dump_json()) for knob in knobs])
     sets = [knobs[int(np.flatnonzero(of_link == i)[0])] for i in range(len(different))]
-    if any(own.release_threshold is not None for own in sets):
+    if any(knob.release_threshold is not None for knob in sets):
         release = getattr(spec, "release", 0.0)
         sets = [
-            Knobs.model_validate({"release_threshold": release}).over(own) if own.release_threshold is None else own
-            for own in sets
+            Knobs.model_validate({"release_threshold": release}).over(knob) if knob.release_threshold is None else knob
+            for knob in sets
         ]
     if rows.link_id is None and len(different) > 1:
-        what = f"its rows are on no link (they are of a {rows.name} each), so noise cannot differ between links"
-        raise LowerError(what, field="noise", hint="leave `links` of the noise out")
+        problem = f"its rows are on no link (they are of a {rows.name} each), so noise cannot differ between links"
+        raise LowerError(problem, field="noise", hint="leave `links` of the noise out")
     which = of_link[rows.link_id] if rows.link_id is not None else np.zeros(rows.size, dtype=np.int64)
-    if rows.name != "taxel" and any(own.crosstalk is not None for own in knobs):
-        what = f"crosstalk mixes neighbouring taxels, and what this sensor reads is of a {rows.name} each"
-        raise LowerError(what, field="noise", hint="leave `crosstalk` out")
+    if rows.name != "taxel" and any(knob.crosstalk is not None for knob in knobs):
+        problem = f"crosstalk mixes neighbouring taxels, and what this sensor reads is of a {rows.name} each"
+        raise LowerError(problem, field="noise", hint="leave `crosstalk` out")
     channels = [channel.name for channel in lowered.signal or lowered.channels]
-    sets = [_without_idle(name, kind, own) for own in sets]
+    sets = [_without_idle(name, kind, knob) for knob in sets]
     noise = lower_noise(sets, which, channels, layout)
     return noise if noise.terms else None
 
@@ -270,34 +270,36 @@ def _fitted(sensor: LoweredSensor, fitting: Fitting) -> LoweredSensor:
         check_lowered(sensor.kind, lowered, sensor.spec)
     for name, other in fitting.upstream.items():
         if other.lowered.substeps != lowered.substeps:
-            own, read = lowered.substeps, other.lowered.substeps
-            what = f'it is advanced at {own} physics steps of a call, and reads "{name}", which is at {read}'
-            raise TgdslError(f'kind "{sensor.kind.name}": {what}; expected as many')
+            substeps, read = lowered.substeps, other.lowered.substeps
+            problem = f'it is advanced at {substeps} physics steps of a call, and reads "{name}", which is at {read}'
+            raise TgdslError(f'kind "{sensor.kind.name}": {problem}; expected as many')
     return dataclasses.replace(sensor, lowered=lowered, upstream=tuple(fitting.upstream))
 
 
 def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[LoweredSensor]) -> tuple[str, ...]:
     """Return the names of the sensors that one reads, the way without noise of each; what is wrong with them is noted."""
-    asked = sensor.lowered.upstream
-    if asked is None:
+    upstream = sensor.lowered.upstream
+    if upstream is None:
         return ()
-    able = {own.sensor: own for own in sensors if asked.planes <= own.lowered.provides}  # of two ways the second is clean
-    if not asked.sensors:
+    able = {
+        candidate.sensor: candidate for candidate in sensors if upstream.planes <= candidate.lowered.provides
+    }  # of two ways the second is clean
+    if not upstream.sensors:
         if not able:
-            what = f"no sensor of the document makes {asked.what}, so there is none to read"
-            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), what))
-        return tuple(own.name for own in able.values())
-    for i, name in enumerate(asked.sensors):
+            problem = f"no sensor of the document makes {upstream.what}, so there is none to read"
+            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), problem))
+        return tuple(candidate.name for candidate in able.values())
+    for i, name in enumerate(upstream.sensors):
         path: Path = ("sensors", sensor.sensor, sensor.kind.reads, i)
-        kinds = {own.sensor: own.kind.name for own in sensors}
+        kinds = {candidate.sensor: candidate.kind.name for candidate in sensors}
         if name not in kinds:
             loaded.problems.append(loaded.problem(path, f'unknown sensor "{name}"', did_you_mean(name, kinds, "sensors")))
         elif name not in able:
-            what = f'"{name}" ({kinds[name]}) makes no {asked.what}, as it is written'
-            loaded.problems.append(loaded.problem(path, what, f"those that do: {', '.join(able) or 'none'}"))
-        elif name in asked.sensors[:i]:
+            problem = f'"{name}" ({kinds[name]}) makes no {upstream.what}, as it is written'
+            loaded.problems.append(loaded.problem(path, problem, f"those that do: {', '.join(able) or 'none'}"))
+        elif name in upstream.sensors[:i]:
             loaded.problems.append(loaded.problem(path, f'sensor "{name}" is listed twice', "name it once"))
-    return tuple(able[name].name for name in asked.sensors if name in able)
+    return tuple(able[name].name for name in upstream.sensors if name in able)
 
 
 def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: AnySensorSpec, resolved: Resolved) -> None:
@@ -310,27 +312,29 @@ def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: AnySensorS
         if request.wants_contacts and not request.objects:
             raise TgdslError(f'kind "{kind.name}": {type(request).__name__} is asked of no objects, expected at least one')
         if unknown := [name for name in request.objects if name not in resolved.objects]:
-            what = f'{type(request).__name__} is asked of "{unknown[0]}", which is none of the objects that its spec has'
-            raise TgdslError(f'kind "{kind.name}": {what}; its `objects`: {", ".join(spec.objects) or "none"}')
+            problem = f'{type(request).__name__} is asked of "{unknown[0]}", which is none of the objects that its spec has'
+            raise TgdslError(f'kind "{kind.name}": {problem}; its `objects`: {", ".join(spec.objects) or "none"}')
     rows = rows_of(lowered, layout, spec)
     sizes = {"taxel": layout.num_taxels, "body": len(layout.bodies)}
     if sizes.get(rows.name, rows.size) != rows.size:
-        what = f"its rows are {rows.size}, each called a {rows.name}, but the sensor has {sizes[rows.name]}"
-        raise TgdslError(f'kind "{kind.name}": {what}; give them another name, `Axis("…", {rows.size})`')
-    own = rows.link_id
-    if own is not None and (own.shape != (rows.size,) or ((own < 0) | (own >= len(layout.links))).any()):
-        what = f"`link_id` of its rows has shape {own.shape}, expected ({rows.size},) of numbers below {len(layout.links)}"
-        raise TgdslError(f'kind "{kind.name}": {what}')
+        problem = f"its rows are {rows.size}, each called a {rows.name}, but the sensor has {sizes[rows.name]}"
+        raise TgdslError(f'kind "{kind.name}": {problem}; give them another name, `Axis("…", {rows.size})`')
+    link_id = rows.link_id
+    if link_id is not None and (link_id.shape != (rows.size,) or ((link_id < 0) | (link_id >= len(layout.links))).any()):
+        problem = (
+            f"`link_id` of its rows has shape {link_id.shape}, expected ({rows.size},) of numbers below {len(layout.links)}"
+        )
+        raise TgdslError(f'kind "{kind.name}": {problem}')
 
 
 def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
     """Note sensors that are advanced at another number of physics steps than those before them."""
     blocks = [sensor for sensor in sensors if sensor.lowered.substeps]
     for sensor in blocks[1:]:
-        first, own = blocks[0], sensor.lowered.substeps
-        if own != first.lowered.substeps:
-            what = f'it is advanced at {own} physics steps of a call, "{first.sensor}" at {first.lowered.substeps}'
-            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), what, "expected as many of all"))
+        first, substeps = blocks[0], sensor.lowered.substeps
+        if substeps != first.lowered.substeps:
+            problem = f'it is advanced at {substeps} physics steps of a call, "{first.sensor}" at {first.lowered.substeps}'
+            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), problem, "expected as many of all"))
 
 
 def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
@@ -371,25 +375,27 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: P
 
 def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
     """Note a sensor's `accuracy` that is not of what it reads."""
-    own = loaded.spec.sensors[name].accuracy
-    if own is None:
+    accuracy = loaded.spec.sensors[name].accuracy
+    if accuracy is None:
         return
     units = {quantity(channel.name): channel.unit for channel in lowered.channels}
     at: Path = ("sensors", name, "accuracy")
-    shown = listed([f"{found} [{unit}]" for found, unit in units.items()])
-    for key, bound in own.bounds:
+    quantities = listed([f"{quantity} [{unit}]" for quantity, unit in units.items()])
+    for key, bound in accuracy.bounds:
         path = (*at, key) if key else at
         if key and key not in units:
-            what = f'the reading has no quantity "{key}"'
-            loaded.problems.append(loaded.problem(path, what, did_you_mean(key, units, "quantities"), on_key=True))
-        wrong = [found for found in ([key] if key in units else [] if key else units) if not _is_of(bound, units[found])]
+            problem = f'the reading has no quantity "{key}"'
+            loaded.problems.append(loaded.problem(path, problem, did_you_mean(key, units, "quantities"), on_key=True))
+        wrong = [
+            quantity for quantity in ([key] if key in units else [] if key else units) if not _is_of(bound, units[quantity])
+        ]
         if wrong:
-            what = f'"{bound.text}" is in {bound.unit}, and the reading has {shown}'
-            loaded.problems.append(loaded.problem(path, what, _hint(units)))
-    missing = [found for found in units if own.of(found) is None]
+            problem = f'"{bound.text}" is in {bound.unit}, and the reading has {quantities}'
+            loaded.problems.append(loaded.problem(path, problem, _hint(units)))
+    missing = [quantity for quantity in units if accuracy.of(quantity) is None]
     if missing:
-        what = f"nothing is said of {listed(missing)}, which the reading has too"
-        loaded.problems.append(loaded.problem(at, what, "expected a bound of each quantity"))
+        problem = f"nothing is said of {listed(missing)}, which the reading has too"
+        loaded.problems.append(loaded.problem(at, problem, "expected a bound of each quantity"))
 
 
 def _is_of(bound: Bound, unit: str) -> bool:

@@ -53,17 +53,17 @@ class Wanted:
 
 def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
     """Return the joints and actuators that a document reads."""
-    own, chosen, before = resolved.joints, {}, len(loaded.problems)
-    asked: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
+    all_joints, selected, num_problems = resolved.joints, {}, len(loaded.problems)
+    requested: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
     for group, i, spec in _terms(loaded):
         if isinstance(spec, JointObservation):
-            chosen[group, i] = _rows(loaded, ("observations", group, i), spec, own)
-            asked[PROPRIOCEPTION[spec.type].rows].update(chosen[group, i])
-    joints = tuple(name for name in own.joints if name in asked["joint"])
-    actuators = tuple(actuator.name for actuator in own.actuators if actuator.name in asked["actuator"])
-    problems = tuple(loaded.problems[before:])
-    del loaded.problems[before:]
-    return Wanted(chosen, joints, actuators, problems)
+            selected[group, i] = _rows(loaded, ("observations", group, i), spec, all_joints)
+            requested[PROPRIOCEPTION[spec.type].rows].update(selected[group, i])
+    joints = tuple(name for name in all_joints.joints if name in requested["joint"])
+    actuators = tuple(actuator.name for actuator in all_joints.actuators if actuator.name in requested["actuator"])
+    problems = tuple(loaded.problems[num_problems:])
+    del loaded.problems[num_problems:]
+    return Wanted(selected, joints, actuators, problems)
 
 
 def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
@@ -88,12 +88,12 @@ def observed(
         read: The joints and actuators that are read.
     """
     loaded.problems += read.problems
-    specs, own, joints, actuators = _terms(loaded), resolved.joints, read.joints, read.actuators
-    found = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
+    specs, all_joints, joints, actuators = _terms(loaded), resolved.joints, read.joints, read.actuators
+    reading_of = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
     terms: list[PlannedObservation] = []
     for group, i, spec in specs:
         if isinstance(spec, OfReading):
-            terms += _of_reading(loaded, group, i, spec, found)
+            terms += _of_reading(loaded, group, i, spec, reading_of)
         elif isinstance(spec, JointObservation):
             rows = joints if PROPRIOCEPTION[spec.type].rows == "joint" else actuators
             terms.append(_of_joints(group, i, spec, read.rows[group, i], rows))
@@ -101,7 +101,7 @@ def observed(
             count = observations.HAND_ONLY.get(spec.type, 0)
             terms.append(PlannedObservation(group, i, spec.type, None, (), count, {}))
     types = {spec.type for _, _, spec in specs}
-    return Observed(tuple(terms), _proprioception(types, joints, actuators, own))
+    return Observed(tuple(terms), _proprioception(types, joints, actuators, all_joints))
 
 
 def _of_reading(
@@ -123,9 +123,9 @@ def _of_reading(
     else:
         wanted, rows = observations.WANTED[spec.type]
         if reading.rows != rows or not set(wanted) <= set(reading.channels):
-            what = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
+            problem = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
             has = f"it reads {', '.join(reading.channels)} of each {reading.rows}"
-            loaded.problems.append(loaded.problem(path, what, has))
+            loaded.problems.append(loaded.problem(path, problem, has))
             return []
     constants = observations.lower(spec, layout)
     channels = tuple(reading.channels.index(channel) for channel in wanted)
@@ -137,40 +137,40 @@ def _of_reading(
 
 def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: PlannedReading) -> tuple[str, ...]:
     """Return the channels that a `reading` takes, each once, in the order in which they are first named."""
-    wanted: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for k, pattern in enumerate(spec.channels or ("*",)):
         hits = matching(pattern, reading.channels)
         if not hits:
-            what = f'no channel of "{reading.name}" matches "{pattern}"'
+            problem = f'no channel of "{reading.name}" matches "{pattern}"'
             hint = did_you_mean(pattern, reading.channels, "channels")
-            loaded.problems.append(loaded.problem((*path, "channels", k), what, hint))
-        wanted |= dict.fromkeys(hits)
-    return tuple(wanted)
+            loaded.problems.append(loaded.problem((*path, "channels", k), problem, hint))
+        selected |= dict.fromkeys(hits)
+    return tuple(selected)
 
 
 def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tuple[str, ...]:
     """Return the joints, or for a `last_action` the actuators, that an observation is of, in its order."""
     is_of_joints = PROPRIOCEPTION[spec.type].rows == "joint"
-    wanted: dict[str, None] = {}
+    selected: dict[str, None] = {}
     if spec.joints is None:
         names = own.joints[: own.num_actuated] if is_of_joints else tuple(actuator.name for actuator in own.actuators)
-        wanted = dict.fromkeys(names)
+        selected = dict.fromkeys(names)
         if not names:
             hint = 'name them: joints: ["*"]' if is_of_joints and own.joints else ""
-            what = f"the robot has no actuated joints, so there is no {spec.type} of them"
-            loaded.problems.append(loaded.problem(path, what, hint))
+            problem = f"the robot has no actuated joints, so there is no {spec.type} of them"
+            loaded.problems.append(loaded.problem(path, problem, hint))
     for k, pattern in enumerate(spec.joints or ()):
         hits = joints_matching(loaded, (*path, "joints", k), pattern, own)
         if not is_of_joints and hits:
             joints, hits = hits, [actuator.name for actuator in own.actuators if set(actuator.joints) & set(hits)]
             if not hits:
-                what = f"no actuator acts on {', '.join(joints)}"
-                loaded.problems.append(loaded.problem((*path, "joints", k), what, "so there is no last action of it"))
-        wanted |= dict.fromkeys(hits)
-    if "" in wanted:
-        what = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
-        loaded.problems.append(loaded.problem(path, what, "name it in the robot's file"))
-    return tuple(wanted)
+                problem = f"no actuator acts on {', '.join(joints)}"
+                loaded.problems.append(loaded.problem((*path, "joints", k), problem, "so there is no last action of it"))
+        selected |= dict.fromkeys(hits)
+    if "" in selected:
+        problem = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
+        loaded.problems.append(loaded.problem(path, problem, "name it in the robot's file"))
+    return tuple(selected)
 
 
 def _proprioception(

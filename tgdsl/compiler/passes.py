@@ -51,25 +51,25 @@ def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], link_bodies: Lin
         scene: The scene.
     """
     geoms = {link: [geom.id for geom in scene.rigid_geoms(bodies) if geom.is_colliding] for link, bodies in link_bodies.items()}
-    wanted: set[Pair] = set()
+    can_meet: set[Pair] = set()
     touching: set[Pair] = set()
     never: set[Pair] = set()
     hopeless: list[tuple[str, str]] = []
     for sensor in sensors:
         for target in dict.fromkeys(name for request in sensor.requests for name in request.objects):
-            own = [request for request in sensor.requests if target in request.objects]
+            requests = [request for request in sensor.requests if target in request.objects]
             pairs, felt = {Pair(body, target) for body in sensor.layout.bodies}, sensed[target]
             meeting = {p for p in pairs if scene.geoms_can_collide(geoms[p.link], felt.touched)}
-            is_gated = any(request.is_gated for request in own)
-            if is_gated or any(request.wants_contacts for request in own):
+            is_gated = any(request.is_gated for request in requests)
+            if is_gated or any(request.wants_contacts for request in requests):
                 touching |= meeting
             itself = {p for p in pairs if scene.compiled.body(p.link).id in felt.bodies}
             apart = pairs - meeting if is_gated else itself
-            wanted |= pairs - apart
+            can_meet |= pairs - apart
             never |= apart
             if apart == pairs:
                 hopeless.append((sensor.sensor, target))
-    return Pruned(_sorted(wanted), _sorted(touching), _sorted(never - wanted), tuple(hopeless))
+    return Pruned(_sorted(can_meet), _sorted(touching), _sorted(never - can_meet), tuple(hopeless))
 
 
 def _sorted(pairs: set[Pair]) -> tuple[Pair, ...]:
@@ -107,11 +107,11 @@ def _equation(sensor: LoweredSensor) -> Hashable | None:
     """Return what sensors that can be computed as one have in common; None of one that never can."""
     lowered, kind = sensor.lowered, sensor.kind
     has_own = lowered.state or lowered.reports or sensor.radius_noise or any(c.ndim for c in lowered.constants.values())
-    others = lowered.provides or lowered.upstream or lowered.substeps
-    if not kind.is_pointwise or has_own or others or kind.is_timed or not _is_measuring(sensor):
+    is_coupled = lowered.provides or lowered.upstream or lowered.substeps
+    if not kind.is_pointwise or has_own or is_coupled or kind.is_timed or not _is_measuring(sensor):
         return None
-    asked = tuple(request.join_key() for request in sensor.requests)
-    return kind.name, sensor.name != sensor.sensor, asked, lowered.channels, tuple(sorted(lowered.constants))
+    request_keys = tuple(request.join_key() for request in sensor.requests)
+    return kind.name, sensor.name != sensor.sensor, request_keys, lowered.channels, tuple(sorted(lowered.constants))
 
 
 class Shared(NamedTuple):
@@ -135,23 +135,23 @@ def share(sensors: Sensors, joined: Joined, layout: Layout, quantities: Sequence
     for sensor in sensors:
         group = joined.get(sensor.name, (sensor,))
         taxels = np.concatenate([other.taxels for other in group])
-        own = layout.take(taxels) if len(taxels) else sensor.layout
+        use_layout = layout.take(taxels) if len(taxels) else sensor.layout
         pos = places.setdefault(taxels.tobytes(), np.ascontiguousarray(layout.pos[taxels].T))
         for i, request in enumerate(sensor.requests):
             request = _of_group([other.requests[i] for other in group]) if len(group) > 1 else request
             noise = sensor.name if request.is_within_radii and sensor.radius_noise > 0 else ""
             name = _quantity_of(request, quantities).name
-            key = taxels.tobytes(), tuple(own.links), noise, request.key()
-            before = result.get(key)
-            merged = request if before is None else before.request.merged(request)
-            users = (*(before.sensors if before is not None else ()), sensor.sensor)
+            key = taxels.tobytes(), tuple(use_layout.links), noise, request.key()
+            earlier = result.get(key)
+            merged = request if earlier is None else earlier.request.merged(request)
+            users = (*(earlier.sensors if earlier is not None else ()), sensor.sensor)
             shift = sensor.radius_noise if noise else 0.0
-            result[key] = Use(merged, tuple(dict.fromkeys(users)), own.links, taxels, pos, noise, shift)
+            result[key] = Use(merged, tuple(dict.fromkeys(users)), use_layout.links, taxels, pos, noise, shift)
             order = keys.setdefault(name, [])
             if key not in order:
                 order.append(key)
             of_sensor.setdefault(sensor.name, {})[name] = order.index(key)
-    return Shared({name: [result[key] for key in own] for name, own in keys.items()}, of_sensor)
+    return Shared({name: [result[key] for key in use_keys] for name, use_keys in keys.items()}, of_sensor)
 
 
 def _of_group(requests: Sequence[Request]) -> Request:
@@ -169,8 +169,8 @@ def _quantity_of(request: Request, quantities: Sequence[Quantity]) -> Quantity:
 def rows_of(sensor: LoweredSensor, joined: Joined) -> tuple[int, int]:
     """Return which rows of its uses a sensor has: the first, and one beyond the last."""
     group = joined.get(sensor.name, ())
-    before = sum(len(other.taxels) for other in group[: group.index(sensor)]) if group else 0
-    return before, before + (len(sensor.taxels) or sensor.rows.size)
+    first_row = sum(len(other.taxels) for other in group[: group.index(sensor)]) if group else 0
+    return first_row, first_row + (len(sensor.taxels) or sensor.rows.size)
 
 
 class Numbered(NamedTuple):
@@ -192,9 +192,9 @@ def number(
     varied = [name for name in names if sensed[name].is_sized or len(sensed[name].variants) > 1]
     objects = []
     for name in names:
-        own = [i for i, pair in enumerate(pruned.pairs) if pair.object == name]
+        pair_ids = [i for i, pair in enumerate(pruned.pairs) if pair.object == name]
         place = varied.index(name) if name in varied else -1
-        counts = own[0], len(own), len(sensed[name].variants)
+        counts = pair_ids[0], len(pair_ids), len(sensed[name].variants)
         objects.append(PairedObject(name, body_of[name], *counts, sensed[name].is_sized, place))
     gate = {pair: i for i, pair in enumerate(pruned.contact_pairs)}
     table = PairTable(

@@ -105,13 +105,13 @@ def patches_of(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: d
         check_regions(layout, placement, path, robot, loaded.problems)
         hits = matched(robot, pattern)
         if not hits:
-            known = [name for names in names_of(robot) for name in names]
-            what = f'no body, geom or mesh matches "{pattern}"'
-            loaded.problems.append(layout.problem(path, what, did_you_mean(pattern, known, "links"), on_key=True))
+            all_names = [name for names in names_of(robot) for name in names]
+            problem = f'no body, geom or mesh matches "{pattern}"'
+            loaded.problems.append(layout.problem(path, problem, did_you_mean(pattern, all_names, "links"), on_key=True))
         for link, geoms in hits:
             if link.name in result:
-                what = f'link "{link.name}" already has a layout, by "{result[link.name].path[-1]}"'
-                loaded.problems.append(layout.problem(path, what, "give each link one", on_key=True))
+                problem = f'link "{link.name}" already has a layout, by "{result[link.name].path[-1]}"'
+                loaded.problems.append(layout.problem(path, problem, "give each link one", on_key=True))
             elif not geoms:
                 loaded.problems.append(layout.problem(path, f'link "{link.name}" has no geoms', on_key=True))
             else:
@@ -134,9 +134,9 @@ def matched(robot: Model, pattern: str) -> list[tuple[Link, tuple[Geom, ...]]]:
             of_mesh.setdefault((geom.mesh, geom.body), []).append(geom)
     meshes = [mesh for mesh, _ in of_mesh]
     links = []
-    for (mesh, body), own in of_mesh.items():
+    for (mesh, body), places in of_mesh.items():
         name = mesh if meshes.count(mesh) == 1 else f"{body}/{mesh}"
-        links.append((Link(name, body), tuple(geom for geom in own if geom.is_colliding) or tuple(own)))
+        links.append((Link(name, body), tuple(geom for geom in places if geom.is_colliding) or tuple(places)))
     return links
 
 
@@ -172,8 +172,8 @@ def sampled(
             drawn = pools.setdefault((patch.as_collided, *(geom.id for geom in patch.geoms)), {})
             parts.append(sample(surface, patch.placement, layout.folder, name, covered, drawn))
         except SampleError as error:
-            what = f'link "{patch.link.name}": {error.what}'
-            loaded.problems.append(layout.problem(patch.path, what, error.hint))
+            problem = f'link "{patch.link.name}": {error.what}'
+            loaded.problems.append(layout.problem(patch.path, problem, error.hint))
     loaded.raise_problems()
     if not parts:  # all sensors are on links, whatever their taxels
         return Layout.of_links((), {})
@@ -207,7 +207,7 @@ def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, 
     candidates = [[patch.link.name, patch.link.body] for patch in patches]
     groups: dict[str, tuple[str, ...]] = {}
     for group, selection in sorted(layout.spec.groups.items()):
-        chosen = select(selection, candidates, layout.spec.groups, lambda where, what, hint: None)
-        if chosen:
-            groups[group] = tuple(patches[i].link.name for i in chosen)
+        members = select(selection, candidates, layout.spec.groups, lambda where, what, hint: None)
+        if members:
+            groups[group] = tuple(patches[i].link.name for i in members)
     return groups

@@ -47,7 +47,9 @@ class Choice:
 
     def noted(self, plan: Plan) -> Plan:
         """Return a Plan that says why its fields are what they are."""
-        sensors = [dataclasses.replace(own, notes=(*own.notes, *self.notes.get(own.name, ()))) for own in plan.sensors]
+        sensors = [
+            dataclasses.replace(sensor, notes=(*sensor.notes, *self.notes.get(sensor.name, ()))) for sensor in plan.sensors
+        ]
         return dataclasses.replace(plan, sensors=tuple(sensors))
 
 
@@ -78,12 +80,12 @@ def compile_plan(
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
         TgdslError: If a sensor has an `accuracy` and nothing was chosen.
     """
-    known, tell = known_kinds(kinds), progress or silent
-    loaded = load(document, {**(overrides or {}), **choice.changes}, known, sensors=sensors)
+    all_kinds, tell = known_kinds(kinds), progress or silent
+    loaded = load(document, {**(overrides or {}), **choice.changes}, all_kinds, sensors=sensors)
     resolved = resolve(loaded, tell)
     _check_chosen(loaded, choice)
-    written = _written(document, overrides, known, sensors) if choice.changes else loaded
-    plan = lower.plan(loaded, resolved, known, _origin(written), tell)
+    written = _written(document, overrides, all_kinds, sensors) if choice.changes else loaded
+    plan = lower.plan(loaded, resolved, all_kinds, _origin(written), tell)
     tell("compiling the scene")
     scene = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
     return choice.noted(dataclasses.replace(plan, scene=scene))
@@ -97,8 +99,8 @@ def _check_chosen(loaded: Loaded, choice: Choice) -> None:
     """
     names = [name for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None and name not in choice.notes]
     if names:
-        what = f"{listed(names)}: `accuracy` takes a run of the scene"
-        raise TgdslError(f"{loaded.source.file}: {what}; compile with `tgdsl.compile`, or set it to null")
+        problem = f"{listed(names)}: `accuracy` takes a run of the scene"
+        raise TgdslError(f"{loaded.source.file}: {problem}; compile with `tgdsl.compile`, or set it to null")
 
 
 def _written(
@@ -156,24 +158,24 @@ def placed(
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
         TgdslError: If the layout has no such resolution.
     """
-    chosen, known = overrides or {}, known_kinds(kinds)
-    loaded = load(document, chosen, known, needs_sensors=False)
+    all_overrides, all_kinds = overrides or {}, known_kinds(kinds)
+    loaded = load(document, all_overrides, all_kinds, needs_sensors=False)
     if loaded.layout is None:
         return Placed(resolve(loaded).scene.compiled, {}, {})  # which says all that is wrong, if a layout is needed
-    names, own = list(loaded.layout.spec.resolutions), loaded.resolution
-    wanted = list(resolutions) or ([own] if own is not None else names)
+    names, only = list(loaded.layout.spec.resolutions), loaded.resolution
+    shown_names = list(resolutions) or ([only] if only is not None else names)
     for name in resolutions:
         if name not in names:
             raise TgdslError(f'the layout has no resolution "{name}"; {did_you_mean(name, names, "resolutions")}')
     parsed = {
-        name: loaded if name == own else load(document, {**chosen, "resolution": name}, known, needs_sensors=False)
-        for name in wanted
+        name: loaded if name == only else load(document, {**all_overrides, "resolution": name}, all_kinds, needs_sensors=False)
+        for name in shown_names
     }
     progress("reading robot and scene")
-    models = models_of(parsed[wanted[0]])
-    each = {name: resolve(parsed[name], progress, models) for name in wanted}
-    result = {name: unfelt(own.colliders, own.layout, own.reach) for name, own in each.items()}
-    return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, result)
+    models = models_of(parsed[shown_names[0]])
+    each = {name: resolve(parsed[name], progress, models) for name in shown_names}
+    result = {name: unfelt(placement.colliders, placement.layout, placement.reach) for name, placement in each.items()}
+    return Placed(each[shown_names[0]].scene.compiled, {name: placement.layout for name, placement in each.items()}, result)
 
 
 def _origin(loaded: Loaded) -> Origin:

@@ -57,17 +57,17 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
         def report(place: Path, what: str, hint: str = "", name: str = name) -> None:
             loaded.problems.append(loaded.problem(("objects", name, *place), what, hint))
 
-        others = [other for other, part in body_of.items() if part == body and other != name]
+        same_body = [other for other, part in body_of.items() if part == body and other != name]
         rigid = [scene.compiled.body(i).name for i in scene.rigid_bodies(body, _others(loaded, body))]
         if carrying := [part for part in rigid if part in links]:
             report(("body",), f'body "{carrying[0]}" carries taxels, so its geoms cannot be others')
-        elif others:
-            report(("body",), f'the geoms of body "{body}" are this object\'s, but object "{others[0]}" has it too')
+        elif same_body:
+            report(("body",), f'the geoms of body "{body}" are this object\'s, but object "{same_body[0]}" has it too')
         elif not any(geom.body == body for geom in scene.geoms):
             report(("body",), f'body "{body}" has no geom', "its first geom says what `geom` does not, such as friction")
         else:
-            own = scene_object(name, target, loaded.folder, meshes, report)
-            objects.append(replace(own, others=tuple(sorted(_others(loaded, body)))))
+            new_body = scene_object(name, target, loaded.folder, meshes, report)
+            objects.append(replace(new_body, others=tuple(sorted(_others(loaded, body)))))
     return scene, OwnObjects(bodies, tuple(objects), meshes)
 
 
@@ -84,13 +84,13 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
     contype, conaffinity = bits_that_meet(scene.spec.geoms)
     for name, target in loaded.spec.objects.items():
         if target.body is None and name in scene.bodies:
-            what = f'the scene has a body "{name}" already'
-            loaded.problems.append(loaded.problem(("objects", name), what, f"`body: {name}` gives that one these geoms"))
+            problem = f'the scene has a body "{name}" already'
+            loaded.problems.append(loaded.problem(("objects", name), problem, f"`body: {name}` gives that one these geoms"))
         elif target.body is None:
             pos, quat = target.pos or (0.0, 0.0, 0.0), target.quat or (1.0, 0.0, 0.0, 0.0)
             bits = [
-                default if own is None else own
-                for own, default in ((target.contype, contype), (target.conaffinity, conaffinity))
+                default if given_bits is None else given_bits
+                for given_bits, default in ((target.contype, contype), (target.conaffinity, conaffinity))
             ]
             new.append(NewBody(name, pos, quat, target.joint != "fixed", group, *bits))
     return tuple(new)
@@ -116,9 +116,9 @@ def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, S
             loaded.problems.append(loaded.problem(at, what, hint))
 
         variants = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else []
-        found = sensed_object(name, body, target, scene, variants, _others(loaded, body), report)
+        sensed = sensed_object(name, body, target, scene, variants, _others(loaded, body), report)
         if name in felt:
-            objects[name] = found
+            objects[name] = sensed
     return objects
 
 
@@ -216,10 +216,10 @@ class Resolved:
             LowerError: If one of its geoms has no bounded surface.
         """
         parts = []
-        for own in self.objects[name].variants[0]:
-            mesh = own.surface if own.mesh is None else own.mesh
+        for geom in self.objects[name].variants[0]:
+            mesh = geom.surface if geom.mesh is None else geom.mesh
             try:
-                placed = self.scene.surface((own.geom,)) if mesh is None else mesh.placed(own.geom.pos, own.geom.rotation)
+                placed = self.scene.surface((geom.geom,)) if mesh is None else mesh.placed(geom.geom.pos, geom.geom.rotation)
             except RobotError as error:
                 raise LowerError(str(error), field="feels") from error
             parts.append(placed)
@@ -260,9 +260,11 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, SensedObject] = {}
-    own, primitives = OwnObjects(), ()
+    new_objects, primitives = OwnObjects(), ()
     joints, on_joints = RobotJoints((), 0, frozenset(), (), ()), {}
-    on_links = frozenset(name for name, own in loaded.spec.sensors.items() if loaded.is_without_layout or not own.is_on_taxels)
+    on_links = frozenset(
+        name for name, sensor_spec in loaded.spec.sensors.items() if loaded.is_without_layout or not sensor_spec.is_on_taxels
+    )
     if robot is not None and loaded.is_without_layout:
         links = _sensor_links(loaded, {}, robot, [], on_links)
     elif robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
@@ -273,16 +275,16 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
             links = _sensor_links(loaded, loaded.layout.spec.groups, robot, patches, on_links)
     if robot is not None and scene is not None:
         _check_bodies(loaded, robot, scene, patches)
-        scene, own = own_objects(loaded, scene, {patch.link.body for patch in patches})
+        scene, new_objects = own_objects(loaded, scene, {patch.link.body for patch in patches})
         primitives = _primitives(loaded, scene)
         scene = scene.changed(lambda spec: with_colliders(spec, primitives)) if primitives else scene
-        objects = sensed_objects(loaded, scene, own)
+        objects = sensed_objects(loaded, scene, new_objects)
         check_named_bodies(loaded, scene)
         joints = robot_joints(robot, scene)
         on_joints = dict(sensor_joints(loaded, joints))
     loaded.raise_problems()
     assert robot is not None and scene is not None
-    needed = {link for name, own in links.items() for link in own if name not in on_links}
+    needed = {link for name, sensor_links in links.items() for link in sensor_links if name not in on_links}
     needed = needed if links else {patch.link.name for patch in patches}
     colliders, felt = models.colliders, _object_bodies(loaded, robot)
     layout = Layout.of_links((), {})
@@ -299,7 +301,7 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     unused += [(f"body {body}", why) for body, why in _unlisted(robot, scene, listed_bodies, rigid)]
     by_link, within = {p.link.name: p for p in patches}, reach(colliders, layout, felt)
     own_links = (on_links, parts_of, joints, on_joints, primitives)
-    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
+    return Resolved(layout, links, objects, new_objects, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
 
 
 def taxels_of_all_links(loaded: Loaded) -> Layout:
@@ -336,22 +338,26 @@ def _unlisted(robot: Model, scene: Model, listed: Collection[str], rigid: Collec
         listed: Names of the objects' bodies.
         rigid: Indices of bodies that are parts of objects or links.
     """
-    model, known = scene.compiled, {*robot.bodies[1:], *listed}
-    own = {robot.body_path(i) for i in range(1, robot.compiled.nbody)}
+    model, listed_bodies = scene.compiled, {*robot.bodies[1:], *listed}
+    robot_bodies = {robot.body_path(i) for i in range(1, robot.compiled.nbody)}
     for i in range(model.nbody):
         name = scene.body_path(i)
-        is_known = name in known or i in rigid or (not model.body(i).name and name in own)
+        is_known = name in listed_bodies or i in rigid or (not model.body(i).name and name in robot_bodies)
         if model.body_geomnum[i] and not is_known:
             yield name, "not listed under `objects`" if model.body(i).name else "no name, so `objects` cannot list it"
 
 
 def models_of(loaded: Loaded) -> Models:
     """Load the robot, and the scene if there is one; a file that does not exist is a mistake of the document."""
-    wanted = loaded.spec.robot.model
+    model_name = loaded.spec.robot.model
     robot = scene = None
     if loaded.robot_file is None:
-        hint = did_you_mean(wanted, robot_names(), "robots") if "/" not in wanted else "paths are relative to this document"
-        loaded.problems.append(loaded.problem(("robot", "model"), f'there is no file or robot "{wanted}"', hint))
+        hint = (
+            did_you_mean(model_name, robot_names(), "robots")
+            if "/" not in model_name
+            else "paths are relative to this document"
+        )
+        loaded.problems.append(loaded.problem(("robot", "model"), f'there is no file or robot "{model_name}"', hint))
     else:
         robot = load_model(loaded.robot_file)
     if loaded.spec.scene is None:
@@ -361,8 +367,8 @@ def models_of(loaded: Loaded) -> Models:
     if is_file(scene_file):
         scene = load_model(scene_file)
     else:
-        what = f'there is no file "{loaded.spec.scene.model}"'
-        loaded.problems.append(loaded.problem(("scene", "model"), what, "paths are relative to this document"))
+        problem = f'there is no file "{loaded.spec.scene.model}"'
+        loaded.problems.append(loaded.problem(("scene", "model"), problem, "paths are relative to this document"))
     return Models(robot, scene)
 
 
@@ -373,18 +379,18 @@ def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
     place, file = ("robot", "collision"), colliders_file(loaded.robot_file)
     if file is None:
         beside = loaded.robot_file.with_name("colliders.yaml")
-        what = f'"{loaded.spec.robot.model}" has no primitive colliders: there is no file {beside}'
-        loaded.problems.append(loaded.problem(place, what, "expected `collision: mesh`, or such a file"))
+        problem = f'"{loaded.spec.robot.model}" has no primitive colliders: there is no file {beside}'
+        loaded.problems.append(loaded.problem(place, problem, "expected `collision: mesh`, or such a file"))
         return ()
     try:
         result = load_colliders(file)
     except SpecError as error:
         loaded.problems += error.problems
         return ()
-    unknown = [own.body for own in result if own.body not in scene.bodies]
+    unknown = [collider.body for collider in result if collider.body not in scene.bodies]
     if unknown:
-        what = f'{file.name} has colliders of "{unknown[0]}", which is no body of the scene'
-        loaded.problems.append(loaded.problem(place, what, did_you_mean(unknown[0], scene.bodies, "bodies")))
+        problem = f'{file.name} has colliders of "{unknown[0]}", which is no body of the scene'
+        loaded.problems.append(loaded.problem(place, problem, did_you_mean(unknown[0], scene.bodies, "bodies")))
         return ()
     return result
 
@@ -394,9 +400,9 @@ def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
     keys = list(dict.fromkeys(key for placements in layout.spec.resolutions.values() for key in placements))
     if len(keys) < 2 or any(matched(robot, key) for key in keys):
         return False
-    what = f"this layout is for another robot: {robot.file.name} has none of its {len(keys)} links"
+    problem = f"this layout is for another robot: {robot.file.name} has none of its {len(keys)} links"
     hint = f"the layout has {listed(keys, 4)}; the robot has {listed([b for b in robot.bodies if b != 'world'], 4)}"
-    loaded.problems.append(loaded.problem(("robot", "layout"), what, hint))
+    loaded.problems.append(loaded.problem(("robot", "layout"), problem, hint))
     return True
 
 
@@ -406,7 +412,7 @@ def _sensor_links(
     """Return the names of each sensor's links: of those with taxels, or of bodies if it is `on_links`."""
     candidates = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
     on_robot = names_of(robot)
-    known = [name for names in (*on_robot, *candidates) for name in names]
+    link_names = [name for names in (*on_robot, *candidates) for name in names]
     links: dict[str, tuple[str, ...]] = {}
     for name, sensor in loaded.spec.sensors.items():
         path: Path = ("sensors", name, "links")
@@ -418,17 +424,17 @@ def _sensor_links(
             links[name] = _links_chosen(loaded, groups, robot, name)
             continue
         missing: list[Problem] = []
-        chosen = select(sensor.links, candidates, groups, reporter(loaded, path, missing), elsewhere=known)
+        selected = select(sensor.links, candidates, groups, reporter(loaded, path, missing), elsewhere=link_names)
         if missing:
             # A name that the robot has but the layout does not is another mistake than a name nobody has.
             unknown: list[Problem] = []
-            select(sensor.links, on_robot, groups, reporter(loaded, path, unknown), elsewhere=known)
-            what = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
+            select(sensor.links, on_robot, groups, reporter(loaded, path, unknown), elsewhere=link_names)
+            problem = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
             hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
-            loaded.problems += unknown or [loaded.problem(path, what, hint)]
-        elif not chosen:
+            loaded.problems += unknown or [loaded.problem(path, problem, hint)]
+        elif not selected:
             loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
-        links[name] = tuple(patches[i].link.name for i in chosen)
+        links[name] = tuple(patches[i].link.name for i in selected)
     return links
 
 
@@ -436,17 +442,17 @@ def _links_chosen(loaded: Loaded, groups: Mapping[str, Selection], robot: Model,
     """Return the bodies of a sensor that has a place on each link."""
     path: Path = ("sensors", name, "links")
     bodies = [body for body in robot.bodies if body != "world"]
-    own = [[body, *(n for g in robot.geoms if g.body == body for n in g.names)] for body in bodies]
-    before = len(loaded.problems)
-    chosen = select(loaded.spec.sensors[name].links, own, groups, reporter(loaded, path, loaded.problems))
-    if not chosen and len(loaded.problems) == before:
+    body_names = [[body, *(n for g in robot.geoms if g.body == body for n in g.names)] for body in bodies]
+    num_problems = len(loaded.problems)
+    selected = select(loaded.spec.sensors[name].links, body_names, groups, reporter(loaded, path, loaded.problems))
+    if not selected and len(loaded.problems) == num_problems:
         loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
-    return tuple(bodies[i] for i in chosen)
+    return tuple(bodies[i] for i in selected)
 
 
 def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patch]) -> None:
     missing = [patch.link.body for patch in patches if patch.link.body not in scene.bodies]
     if missing:
-        what = f'the scene has no body "{missing[0]}", which the robot has'
+        problem = f'the scene has no body "{missing[0]}", which the robot has'
         hint = did_you_mean(missing[0], scene.bodies, "bodies")
-        loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
+        loaded.problems.append(loaded.problem(("scene", "model"), problem, f"a scene keeps the robot's names; {hint}"))

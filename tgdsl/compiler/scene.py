@@ -53,20 +53,20 @@ def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
         RobotError: If the model lacks a body, or is compiled already.
     """
     if not isinstance(spec, mujoco.MjSpec):
-        what = f"tgdsl.instrument wants a mujoco.MjSpec, found {type(spec).__name__}: a compiled model takes no more sensors"
-        raise RobotError(f"{what}; read it with mujoco.MjSpec.from_file, and compile it afterwards")
+        problem = f"tgdsl.instrument wants a mujoco.MjSpec, found {type(spec).__name__}: a compiled model takes no more sensors"
+        raise RobotError(f"{problem}; read it with mujoco.MjSpec.from_file, and compile it afterwards")
     present = {sensor.name for sensor in spec.sensors}
-    for own in _contact_sensors(inputs, spec):
-        if own.name not in present:
-            fields = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{part.upper()}")) for part in own.data)
+    for contact_sensor in _contact_sensors(inputs, spec):
+        if contact_sensor.name not in present:
+            fields = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{part.upper()}")) for part in contact_sensor.data)
             spec.add_sensor(
-                name=own.name,
+                name=contact_sensor.name,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=OBJECT_TYPES[own.between.object.kind],
-                objname=own.between.object.name,
-                reftype=OBJECT_TYPES[own.between.link.kind],
-                refname=own.between.link.name,
-                intprm=[fields, REDUCTIONS.index(own.reduce), own.num],
+                objtype=OBJECT_TYPES[contact_sensor.between.object.kind],
+                objname=contact_sensor.between.object.name,
+                reftype=OBJECT_TYPES[contact_sensor.between.link.kind],
+                refname=contact_sensor.between.link.name,
+                intprm=[fields, REDUCTIONS.index(contact_sensor.reduce), contact_sensor.num],
             )
     return spec
 
@@ -107,7 +107,7 @@ def _contact_sensors(inputs: Inputs, spec: mujoco.MjSpec) -> Iterator[ContactSen
 def _margins(spec: mujoco.MjSpec, between: Touching) -> tuple[set[tuple[float, float]], bool]:
     """Return the margins [m] of all pairs of geoms of an object and a link, and whether any of them has a gap."""
     first, second = (_geoms(spec, part) for part in between)
-    names = [{geom.name for geom in own} for own in (first, second)]
+    names = [{geom.name for geom in geoms} for geoms in (first, second)]
     ways = (names, names[::-1])
     pairs = [pair for pair in spec.pairs if any(pair.geomname1 in a and pair.geomname2 in b for a, b in ways)]
     margins = {(float(a.margin), float(b.margin)) for a in first for b in second}
@@ -156,8 +156,8 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
     for sensor in _contact_sensors(inputs, model.spec):
         one, two = sensor.between
         ends = {f"{one.kind}1": one.name, f"{two.kind}2": two.name}
-        shown = {"data": " ".join(sensor.data), "reduce": sensor.reduce, "num": str(sensor.num)}
-        ET.SubElement(sensors, "contact", {"name": sensor.name, **ends, **shown})
+        attributes = {"data": " ".join(sensor.data), "reduce": sensor.reduce, "num": str(sensor.num)}
+        ET.SubElement(sensors, "contact", {"name": sensor.name, **ends, **attributes})
     scene = SceneFile(
         mjcf=ET.tostring(main, encoding="unicode"),
         parts=dict(sorted(kept.parts.items())),

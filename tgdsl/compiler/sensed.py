@@ -49,19 +49,23 @@ def sensed_object(
     if target.compounds:
         touched = scene.touchable(body)
         parts = [tuple(geom for geom in model.geoms if geom.name in names) for model, names in variants]
-        felt = [_felt(own, body, target, model, report) for own, (model, _) in zip(parts, variants, strict=True)]
+        felt = [
+            _felt(variant_geoms, body, target, model, report) for variant_geoms, (model, _) in zip(parts, variants, strict=True)
+        ]
     else:
-        own = scene.rigid_geoms(bodies)
-        chosen = _chosen(own, body, target, report)
-        touched = tuple(geom for geom in chosen if geom.is_colliding) or tuple(geom for geom in own if geom.is_colliding)
-        felt = [_felt(chosen, body, target, scene, report)]
-        parts = [own]
+        rigid_geoms = scene.rigid_geoms(bodies)
+        selected = _chosen(rigid_geoms, body, target, report)
+        touched = tuple(geom for geom in selected if geom.is_colliding) or tuple(
+            geom for geom in rigid_geoms if geom.is_colliding
+        )
+        felt = [_felt(selected, body, target, scene, report)]
+        parts = [rigid_geoms]
     if target.size == "per_env":
         for geoms in parts:
             if len(geoms) != 1 or geoms[0].shape not in NUM_SIZES:
-                found = ", ".join(geom.shape for geom in geoms)
+                shapes = ", ".join(geom.shape for geom in geoms)
                 hint = f"primitives: {', '.join(NUM_SIZES)}"
-                report(f'with `size: per_env` the body "{body}" has one geom, a primitive; found {found}', hint)
+                report(f'with `size: per_env` the body "{body}" has one geom, a primitive; found {shapes}', hint)
                 break
     return SensedObject(
         name=name,
@@ -79,10 +83,10 @@ def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, 
     """Return what the flow of heat needs to know of an object; None if the document does not say what it is made of."""
     if target.material is None or not all(felt):
         return None
-    for own in itertools.chain(*felt):
-        if own.shape not in ("mesh", *PRIMITIVES):
+    for geom in itertools.chain(*felt):
+        if geom.shape not in ("mesh", *PRIMITIVES):
             hint = f"give `material` to bodies of {', '.join(PRIMITIVES)}, mesh"
-            report(f'{own.geom.shown} of body "{body}" has no volume that could hold heat', hint)
+            report(f'{geom.geom.shown} of body "{body}" has no volume that could hold heat', hint)
             return None
     each = [bulk(geoms) for geoms in felt]
     if not all(one.volume > LEAST_VOLUME * one.area**1.5 for one in each):
@@ -112,21 +116,21 @@ def contact_parts(scene: Model, bodies: Sequence[int], touched: Set[int], report
         report: Called where a geom has no name that would tell it apart.
     """
     model, first = scene.compiled, bodies[0]
-    own = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in bodies}
+    body_geoms = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in bodies}
     below = [first]
     for i in range(first + 1, model.nbody if first else 0):
         below += [i] if model.body_parentid[i] in below else []
-    if below == list(bodies) and set().union(*own.values()) <= touched:
+    if below == list(bodies) and set().union(*body_geoms.values()) <= touched:
         return (ContactPart("subtree" if len(below) > 1 else "body", model.body(first).name),)
     parts = []
-    for body, geoms in own.items():
+    for body, geoms in body_geoms.items():
         if geoms and geoms <= touched and model.body(body).name:
             parts.append(ContactPart("body", model.body(body).name))
             continue
         for geom in (geom for geom in scene.rigid_geoms((body,)) if geom.id in geoms & touched):
             if not geom.name:
-                what = f"{geom.shown} has no name of its own, so the solver's contacts on it cannot be told from others"
-                report(what, "name it, or its body, in the scene")
+                problem = f"{geom.shown} has no name of its own, so the solver's contacts on it cannot be told from others"
+                report(problem, "name it, or its body, in the scene")
             parts.append(ContactPart("geom", geom.name))
     return tuple(parts) or (ContactPart("body", model.body(first).name),)
 
@@ -140,8 +144,8 @@ def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, re
         elif geom.shape in SHAPES:
             felt.append(SurfaceGeom(geom, None))
         else:
-            what = f'{geom.shown} of body "{body}" is of type {geom.shape}, which cannot be felt'
-            report(what, f"types that can: {', '.join(SHAPES)}, mesh")
+            problem = f'{geom.shown} of body "{body}" is of type {geom.shape}, which cannot be felt'
+            report(problem, f"types that can: {', '.join(SHAPES)}, mesh")
     return tuple(felt)
 
 

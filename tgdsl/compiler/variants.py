@@ -131,8 +131,8 @@ def as_worldbody(bodies: Sequence[NewBody]) -> ET.Element:
             ET.SubElement(body, "freejoint", {"align": "false"})
         ET.SubElement(body, "inertial", {name: " ".join(map(repr, value)) for name, value in INERTIAL.items()})
         numbers = new.geom | {"size": (PLACEHOLDER, 0, 0), "density": (WATER,)}
-        shown = {name: " ".join(map(repr, value)) for name, value in numbers.items()}
-        ET.SubElement(body, "geom", {"name": placeholder_name(new.name), "type": "sphere"} | shown)
+        attributes = {name: " ".join(map(repr, value)) for name, value in numbers.items()}
+        ET.SubElement(body, "geom", {"name": placeholder_name(new.name), "type": "sphere"} | attributes)
     return world
 
 

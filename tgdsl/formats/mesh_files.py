@@ -81,8 +81,8 @@ def refuse_unreadable(model_file: Path, spec: mujoco.MjSpec) -> None:
     """
     named = {mesh.file for mesh in spec.meshes if mesh.file and not mesh.content_type}
     if wrong := sorted(name for name in named if Path(name).suffix.lower() not in BY_MUJOCO):
-        what = f"MJCF's meshes are files of {listed(BY_MUJOCO)}, found {listed(wrong)}"
-        raise RobotError(f"{model_file}: {what}; convert them, such as by trimesh.load_scene(FILE).to_mesh().export(OTHER)")
+        problem = f"MJCF's meshes are files of {listed(BY_MUJOCO)}, found {listed(wrong)}"
+        raise RobotError(f"{model_file}: {problem}; convert them, such as by trimesh.load_scene(FILE).to_mesh().export(OTHER)")
 
 
 def _check_extensions(file: Path) -> None:

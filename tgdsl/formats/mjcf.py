@@ -45,8 +45,8 @@ def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
             spec.assets[key], files[key] = content, file
             mesh.name, mesh.file = mesh.name or file.stem, key
     if whole:
-        what = "MuJoCo reads the first object of an OBJ file alone; here those with several are read whole"
-        warnings.warn(f"{what}: {listed(whole)}; other programs simulate the first of them", stacklevel=5)
+        problem = "MuJoCo reads the first object of an OBJ file alone; here those with several are read whole"
+        warnings.warn(f"{problem}: {listed(whole)}; other programs simulate the first of them", stacklevel=5)
     return files
 
 

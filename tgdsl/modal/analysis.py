@@ -64,8 +64,10 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progr
     decay = (mass_damping + stiffness_damping * omega**2) / 2
     rings = decay < omega
     if not rings.any():
-        what = f'none of the modes of "{name}" rings: {material.name} damps the lowest one, at {omega[0] / (2 * np.pi):.4g} Hz'
-        raise LowerError(what, field="modes", hint="give another material, or list its modes")
+        problem = (
+            f'none of the modes of "{name}" rings: {material.name} damps the lowest one, at {omega[0] / (2 * np.pi):.4g} Hz'
+        )
+        raise LowerError(problem, field="modes", hint="give another material, or list its modes")
     kept = rings & (omega <= 2 * np.pi * below * (1 + 1e-12))
     if not kept.any():
         kept = np.arange(len(omega)) == int(np.argmax(rings))
@@ -93,13 +95,13 @@ def _shapes(found: Spectrum, size: float, middle: np.ndarray) -> ModeShapes:
 def _known(name: str, material: Material) -> tuple[float, float, float, float]:
     """Return stiffness, Poisson's ratio and damping of a material."""
     values = [getattr(material, field) for field in WANTED]
-    if missing := [what for what, value in zip(WANTED.values(), values, strict=True) if value is None]:
+    if missing := [problem for problem, value in zip(WANTED.values(), values, strict=True) if value is None]:
         shown = " and no ".join(dict.fromkeys(missing))
         hint = (
             f"give {', '.join(field for field, value in zip(WANTED, values, strict=True) if value is None)}, or list its modes"
         )
         raise LowerError(f'modes of "{name}": {material.name} has no {shown}', field="modes", hint=hint)
     if values[1] > MAX_POISSON:
-        what = f'modes of "{name}": Poisson\'s ratio of {material.name} is {values[1]:g}, expected at most {MAX_POISSON:g}'
-        raise LowerError(what, field="modes", hint="what is incompressible has no modes by this method")
+        problem = f'modes of "{name}": Poisson\'s ratio of {material.name} is {values[1]:g}, expected at most {MAX_POISSON:g}'
+        raise LowerError(problem, field="modes", hint="what is incompressible has no modes by this method")
     return values[0], values[1], values[2], values[3]

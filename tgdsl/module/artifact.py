@@ -61,16 +61,16 @@ def load(
         TgdslError: If it uses a kind that is neither installed nor given, or there is no such dtype or device.
     """
     dtype, device = dtype_of(dtype), device_of(device)
-    known = known_kinds(kinds)
-    plan = load_plan(path, quantities_of(known))
-    by_sensor = kinds_by_sensor(known, {sensor.name: sensor.kind for sensor in plan.sensors})
+    all_kinds = known_kinds(kinds)
+    plan = load_plan(path, quantities_of(all_kinds))
+    by_sensor = kinds_by_sensor(all_kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
     try:
         for sensor in plan.sensors:
             counts = by_sensor[sensor.name].indices(sensor.constants, len(sensor.taxels))
             ranges.check_constants(f"sensors/{sensor.name}", sensor.constants, counts)
     except ArtifactError as error:
         raise ArtifactError(f"{path}: {error}") from error
-    touch = TactileModule(plan, known, dtype)
+    touch = TactileModule(plan, all_kinds, dtype)
     if taxels is not None:
         check_taxels(touch, taxels, str(path))
     return touch.to(device)

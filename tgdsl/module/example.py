@@ -52,7 +52,7 @@ def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, 
     if inputs.substeps > 1:
         one = dataclasses.replace(inputs, substeps=1, fields=tuple(name for name in inputs.fields if name != "dt"))
         seeds = torch.randint(2**62, (inputs.substeps - 1,), generator=generator).tolist()
-        values["substeps"] = tuple(example_state(one, num_envs, own, dtype, spread) for own in seeds)
+        values["substeps"] = tuple(example_state(one, num_envs, substep_seed, dtype, spread) for substep_seed in seeds)
     return SceneState(**values)
 
 

@@ -75,7 +75,9 @@ class OperationCounter(TorchDispatchMode):
 
     def _operations(self, func: Any, args: Any, kwargs: Any, result: Any) -> int:
         name = func.__name__.split(".")[0].lstrip("_")
-        written = [own for own in (result if isinstance(result, (tuple, list)) else [result]) if isinstance(own, torch.Tensor)]
+        written = [
+            output for output in (result if isinstance(result, (tuple, list)) else [result]) if isinstance(output, torch.Tensor)
+        ]
         if name in _FREE or not written:
             return 0
         if func._overloadpacket in self._products:
@@ -126,29 +128,29 @@ def explain(touch: Explained) -> str:
     lines += _links(touch) + [""]
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
-    lines += [line for asked in touch.quantities for line in _account(touch, asked)]
+    lines += [line for each in touch.quantities for line in _account(touch, each)]
     lines += [""] + _observations(touch) + _inputs(touch)
-    lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
+    lines += ["left out"] + [f"  {problem}: {why}" for problem, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
     if plan.unfelt:
-        lines += [f"{len(unfelt_ids(plan.unfelt))} taxels cannot feel", *(f"  {own}" for own in plan.unfelt), ""]
+        lines += [f"{len(unfelt_ids(plan.unfelt))} taxels cannot feel", *(f"  {taxels}" for taxels in plan.unfelt), ""]
     return "\n".join(lines + _costs(touch))
 
 
 def _account(touch: Explained, asked: Quantity) -> list[str]:
     """Return what was measured of what a quantity computes beforehand."""
     result = asked.account(touch.plan.quantities[asked.name], touch.plan.objects)
-    return [line for headline, lines in result.items() for line in ["", headline, *(f"  {own}" for own in lines)]]
+    return [line for headline, lines in result.items() for line in ["", headline, *(f"  {line}" for line in lines)]]
 
 
 def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:
     """Return what a sensor asks of the scene; what is asked alike is found once."""
     lines = []
-    for asked in (own for own in touch.quantities if own.name in sensor.uses):
-        use = sensor.uses[asked.name]
-        others = [o.name for o in touch.plan.sensors if o is not sensor and o.uses.get(asked.name) == use]
-        shared = f" (found once for {', '.join(others)} too)" if others else ""
-        said = asked.explain(touch.plan.quantities[asked.name], use, touch.plan.objects)
+    for requested in (each for each in touch.quantities if each.name in sensor.uses):
+        use = sensor.uses[requested.name]
+        sharing = [o.name for o in touch.plan.sensors if o is not sensor and o.uses.get(requested.name) == use]
+        shared = f" (found once for {', '.join(sharing)} too)" if sharing else ""
+        said = requested.explain(touch.plan.quantities[requested.name], use, touch.plan.objects)
         lines += [f"asks for {line}{shared}" for line in said]
     return lines
 
@@ -165,15 +167,17 @@ def _links(touch: Explained) -> list[str]:
 
 
 def _sensor(touch: Explained, sensor: PlannedSensor) -> list[str]:
-    what, rows = len(sensor.taxels) or len(sensor.links), sensor.readings[0].rows
-    where = f"{what} {'taxels' if len(sensor.taxels) else 'joints' if rows == 'joint' else 'links'}" if what else "on no link"
+    problem, rows = len(sensor.taxels) or len(sensor.links), sensor.readings[0].rows
+    where = (
+        f"{problem} {'taxels' if len(sensor.taxels) else 'joints' if rows == 'joint' else 'links'}" if problem else "on no link"
+    )
     lines = [f"{sensor.name}: {sensor.kind}, {where}, {_remembers(touch, sensor)}"]
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))
         lines.append(f"  {reading.name}: {channels} of each {reading.rows}")
     lines += [f"  {line}" for line in (*_asks(touch, sensor), *sensor.notes)]
-    if others := [name for name in sensor.joined if name != sensor.name]:
-        lines.append(f"  computed as one with {', '.join(others)}")
+    if joined_names := [name for name in sensor.joined if name != sensor.name]:
+        lines.append(f"  computed as one with {', '.join(joined_names)}")
     lines += [f"  noise: {line}" for line in _noise(touch, sensor)]
     if sensor.period > 0:
         lines.append(f"  rate: {1 / sensor.period:g} Hz")
@@ -185,17 +189,17 @@ def _sensor(touch: Explained, sensor: PlannedSensor) -> list[str]:
 def _remembers(touch: Explained, sensor: PlannedSensor) -> str:
     """Return what a sensor carries from one call to the next, and its size; the clock, which all share, is not in it."""
     fixed, ring = _sizes(touch, sensor)
-    own = [name if "/" not in name else " ".join(name.split("/")[:2]) for name in sensor.state]
+    names = [name if "/" not in name else " ".join(name.split("/")[:2]) for name in sensor.state]
     if sensor.windows:
-        own.append("history")
-    if not own:
+        names.append("history")
+    if not names:
         return "remembers the clock alone" if sensor.wants_clock else "no state"
     reading = sensor.readings[0]
     size = f"({fixed} bytes per environment), {fixed / reading.num_rows:.3g} per {reading.rows}"
     if ring:
         past = max(memory.past for memory in sensor.state.values())
         size += f", and for each call of the last {past:g} s {ring} bytes, {ring / reading.num_rows:.3g} per {reading.rows}"
-    return f"remembers {', '.join(dict.fromkeys(own))} {size}"
+    return f"remembers {', '.join(dict.fromkeys(names))} {size}"
 
 
 def _sizes(touch: Explained, sensor: PlannedSensor) -> tuple[int, int]:
@@ -214,14 +218,14 @@ def _noise(touch: Explained, sensor: PlannedSensor) -> list[str]:
         return []
     lines, constants = [], sensor.noise.constants
     for stage in stages_of(sensor.noise.terms):
-        shown = {}
+        stage_lines = {}
         for name, number in stage.numbers.items():
             if name in constants and number.label is not None:
                 value = constants[name]
                 label = "stuck at " if name == "dead_low" and "dead_high" not in constants else number.label
                 amount = _amplitudes(sensor, value) if number.unit is None else _value(value[..., 0, :]) + number.unit
-                shown[name] = label + amount
-        parts = shown.items() if len(stage.terms) > 1 else [(stage.name, ", ".join(shown.values()))]
+                stage_lines[name] = label + amount
+        parts = stage_lines.items() if len(stage.terms) > 1 else [(stage.name, ", ".join(stage_lines.values()))]
         lines += [f"{term} {part}" for term, part in parts]
     return lines
 
@@ -229,12 +233,12 @@ def _noise(touch: Explained, sensor: PlannedSensor) -> list[str]:
 def _amplitudes(sensor: PlannedSensor, value: Shaped[np.ndarray, "*end channel row"]) -> str:
     """Return a knob's value for each quantity of a sensor's signal."""
     units = {name: f" {unit}" for r in sensor.readings for name, unit in zip(r.channels, r.units, strict=True)}
-    shown: dict[str, str] = {}
+    amplitudes: dict[str, str] = {}
     for c, channel in enumerate(sensor.signal):
-        own = value[..., c if value.shape[-2] > 1 else 0, :]
+        channel_value = value[..., c if value.shape[-2] > 1 else 0, :]
         name = quantity(channel)
-        shown.setdefault(name, f"{name} {_value(own)}{units.get(channel, '')}")
-    return ", ".join(shown.values())
+        amplitudes.setdefault(name, f"{name} {_value(channel_value)}{units.get(channel, '')}")
+    return ", ".join(amplitudes.values())
 
 
 def _value(value: Shaped[np.ndarray, "*end row"]) -> str:
@@ -250,8 +254,8 @@ def _observations(touch: Explained) -> list[str]:
     groups: dict[str, list[str]] = {}
     for term in touch.plan.observations:
         of = f" of {term.reading}" if term.reading not in (None, *PROPRIOCEPTION) else ""
-        what = f"{term.type}{of} ({term.num_features})" if term.reading else term.type
-        groups.setdefault(term.group, []).append(what)
+        problem = f"{term.type}{of} ({term.num_features})" if term.reading else term.type
+        groups.setdefault(term.group, []).append(problem)
     if not groups:
         return []
     return ["observations"] + [f"  {group}: {', '.join(terms)}" for group, terms in groups.items()] + [""]
@@ -284,8 +288,8 @@ def _costs(touch: Explained) -> list[str]:
     outputs = sum(math.prod(output.shape) for output in outputs_of(touch.plan))
     state = example_state(touch.plan.inputs, 1, 0, torch.float64, 0.03)
     sizes = [_sizes(touch, sensor) for sensor in touch.plan.sensors]
-    fixed = sum(own for own, _ in sizes) + (_CLOCK_BYTES if touch.memory.clock.is_wanted else 0)
-    ring = sum(own for _, own in sizes)
+    fixed = sum(state_bytes for state_bytes, _ in sizes) + (_CLOCK_BYTES if touch.memory.clock.is_wanted else 0)
+    ring = sum(ring_bytes for _, ring_bytes in sizes)
     beside = f", and {ring} for each call of the delays" if ring else ""
     read = sum(getattr(state, n).numel() * 8 for n in touch.plan.inputs.fields if n != "dt")
     constants = sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers())

@@ -84,22 +84,22 @@ def scene_of(
 
 def gather(quantities: Sequence[Quantity], own: Tree, scene: Scene) -> dict[str, tuple[Any, ...]]:
     """Return the values of all uses of each quantity, by its name."""
-    found = {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
-    for name, values in found.items():
+    values_of = {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
+    for name, values in values_of.items():
         if not isinstance(values, (tuple, list)):
-            what = f"expected a tuple with a value for each use, found {type(values).__name__}"
-            raise TgdslError(f'`gather` of the quantity "{name}": {what}')
-    return found
+            problem = f"expected a tuple with a value for each use, found {type(values).__name__}"
+            raise TgdslError(f'`gather` of the quantity "{name}": {problem}')
+    return values_of
 
 
 def gathered_of(sensor: PlannedSensor, quantities: Sequence[Quantity], values: Mapping[str, tuple[Any, ...]]) -> Gathered:
     """Return what a sensor asked for."""
-    own = [quantity for quantity in quantities if quantity.name in sensor.uses]
-    for name in (quantity.name for quantity in own):
+    used = [quantity for quantity in quantities if quantity.name in sensor.uses]
+    for name in (quantity.name for quantity in used):
         if sensor.uses[name] >= len(values[name]):
-            what = f'{len(values[name])} values, and sensor "{sensor.name}" has use {sensor.uses[name]} (from 0)'
-            raise TgdslError(f'`gather` of the quantity "{name}" returns {what}; expected one for each use')
-    return Gathered({quantity.request: values[quantity.name][sensor.uses[quantity.name]] for quantity in own})
+            problem = f'{len(values[name])} values, and sensor "{sensor.name}" has use {sensor.uses[name]} (from 0)'
+            raise TgdslError(f'`gather` of the quantity "{name}" returns {problem}; expected one for each use')
+    return Gathered({quantity.request: values[quantity.name][sensor.uses[quantity.name]] for quantity in used})
 
 
 def _pairs(table: PairTable[Tensor], tensors: Tensors, dtype: torch.dtype) -> Pairs:

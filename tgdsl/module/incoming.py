@@ -35,8 +35,8 @@ class SlotWatch:
     def __init__(self, inputs: Inputs):
         """Begin; nothing has been seen."""
         self._inputs = inputs
-        wanted = {"contact_found", "contact_force", "contact_netforce"}
-        self._num_pairs = len(inputs.pairs) if inputs.slots and wanted <= set(inputs.fields) else 0
+        fields = {"contact_found", "contact_force", "contact_netforce"}
+        self._num_pairs = len(inputs.pairs) if inputs.slots and fields <= set(inputs.fields) else 0
         self._warned: set[int] = set()
         self._num_calls = 0
         self._wanted: Tensor | None = None
@@ -61,10 +61,10 @@ class SlotWatch:
         with torch.no_grad():
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
             size = whole.abs().amax(dim=-1) + force.abs().amax(dim=(2, 3))
-            wanted = found.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
+            slots = found.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
             is_crowded = (found > self._inputs.slots) & (force.abs().amax(dim=(2, 3)) > 0)
-            wanted = torch.where((lacking > TOLERANCE * size) | is_crowded, wanted, 0.0)
-            self._wanted.copy_(torch.cat([self._wanted[None], wanted]).amax(dim=0))
+            slots = torch.where((lacking > TOLERANCE * size) | is_crowded, slots, 0.0)
+            self._wanted.copy_(torch.cat([self._wanted[None], slots]).amax(dim=0))
 
     def warn(self) -> None:
         """Warn of what has been noted. A GPU is not waited for: what it notes may be seen a call or more later."""
@@ -92,14 +92,14 @@ class SlotWatch:
             return None
         if self._copied is not None and not self._copied.query():
             return None
-        shown = None if self._copied is None or self._seen is None else self._seen.clone()
+        seen = None if self._copied is None or self._seen is None else self._seen.clone()
         with torch.inference_mode(False):
             if self._seen is None:
                 self._seen = torch.zeros(self._wanted.shape, dtype=torch.float32, pin_memory=True)
             self._seen.copy_(self._wanted, non_blocking=True)
         self._copied = torch.cuda.Event()
         self._copied.record(torch.cuda.current_stream(self._wanted.device))
-        return shown
+        return seen
 
 
 SAME_TIME = 1e-9
@@ -141,8 +141,8 @@ class Incoming:
         """
         inputs = self._plan.inputs
         if not isinstance(state, SceneState):
-            what = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
-            raise StateError(f"{what}; expected sim.state(), or one that holds {', '.join(inputs.fields)}")
+            problem = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
+            raise StateError(f"{problem}; expected sim.state(), or one that holds {', '.join(inputs.fields)}")
         tensors = state.checked(inputs, device)
         if state.dt is not None and "dt" in inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt, dtype, device)
@@ -166,8 +166,8 @@ class Incoming:
         if mask is not None and env_ids is not None:
             raise StateError("found both `mask` and `env_ids`, expected one of them")
         if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):
-            found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
-            raise StateError(f"mask: found {found}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
+            given_type = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
+            raise StateError(f"mask: found {given_type}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
         return env_mask(mask if mask is not None else env_ids, num_envs, device, StateError, waits=False)
 
     def _substeps(self, state: SceneState, device: torch.device, num_envs: int) -> dict[str, Tensor]:
@@ -176,9 +176,9 @@ class Incoming:
         if not (isinstance(state.substeps, (tuple, list)) and all(isinstance(part, SceneState) for part in state.substeps)):
             raise StateError("SceneState.substeps: expected a tuple of tgdsl.SceneState")
         if len(state.substeps) != inputs.substeps - 1:
-            what = f"SceneState.substeps holds {len(state.substeps)} states, expected {inputs.substeps - 1}"
+            problem = f"SceneState.substeps holds {len(state.substeps)} states, expected {inputs.substeps - 1}"
             raise StateError(
-                f"{what}: this module reads each of {inputs.substeps} physics steps of a call, the last one itself"
+                f"{problem}: this module reads each of {inputs.substeps} physics steps of a call, the last one itself"
             )
         for i, part in enumerate(state.substeps):
             for name, value in part.checked(inputs, device, with_dt=False).items():
@@ -194,8 +194,8 @@ class Incoming:
         if is_bad.any():
             self._warned.add("poses")
             envs = listed([str(env) for env in is_bad.nonzero().flatten().tolist()])
-            what = f"poses of bodies are not finite in environments {envs}: their readings mean nothing"
-            warnings.warn(f"{what}; this is said once, and not of states on a GPU", stacklevel=7)
+            problem = f"poses of bodies are not finite in environments {envs}: their readings mean nothing"
+            warnings.warn(f"{problem}; this is said once, and not of states on a GPU", stacklevel=7)
 
     def _dt_tensor(self, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Return dt as a tensor that is written only when it changes.
@@ -216,17 +216,17 @@ class Incoming:
     def _retime(self, dt: float) -> None:
         """Make constants again that are made for another time between the calls of a kind, and warn of it the first time."""
         for sensor in (sensor for sensor in self._plan.sensors if sensor.name in self._timesteps):
-            own, retimed = dt / max(sensor.substeps, 1), self._kinds[sensor.name].retimed
-            if math.isclose(own, self._timesteps[sensor.name], rel_tol=SAME_TIME):
+            step_dt, retimed = dt / max(sensor.substeps, 1), self._kinds[sensor.name].retimed
+            if math.isclose(step_dt, self._timesteps[sensor.name], rel_tol=SAME_TIME):
                 continue
-            if math.isclose(own, sensor.timestep, rel_tol=SAME_TIME):
-                own = sensor.timestep
+            if math.isclose(step_dt, sensor.timestep, rel_tol=SAME_TIME):
+                step_dt = sensor.timestep
             elif sensor.sensor not in self._warned:
                 self._warned.add(sensor.sensor)
-                what = f'"{sensor.sensor}" is compiled for {sensor.substeps or 1} steps of {sensor.timestep:g} s per call'
-                warnings.warn(f"{what}, and the state's dt is {dt:g} s: it counts steps of {own:g} s", stacklevel=6)
-            self._timesteps[sensor.name] = own
-            for name, value in ({} if retimed is None else retimed(sensor.constants, own)).items():
+                problem = f'"{sensor.sensor}" is compiled for {sensor.substeps or 1} steps of {sensor.timestep:g} s per call'
+                warnings.warn(f"{problem}, and the state's dt is {dt:g} s: it counts steps of {step_dt:g} s", stacklevel=6)
+            self._timesteps[sensor.name] = step_dt
+            for name, value in ({} if retimed is None else retimed(sensor.constants, step_dt)).items():
                 self._constants.overwrite(f"sensors/{sensor.name}/{name}", value)
 
     def _look_at_rates(self, dt: float) -> None:
@@ -234,5 +234,5 @@ class Incoming:
         for sensor in self._plan.sensors:
             if 0 < sensor.period < (1 - 1e-6) * dt and sensor.sensor not in self._warned:
                 self._warned.add(sensor.sensor)
-                what = f'"{sensor.sensor}" has a rate of {1 / sensor.period:g} Hz but is called every {dt:g} s'
-                warnings.warn(f"{what}: it takes a sample at every call", stacklevel=5)
+                problem = f'"{sensor.sensor}" has a rate of {1 / sensor.period:g} Hz but is called every {dt:g} s'
+                warnings.warn(f"{problem}: it takes a sample at every call", stacklevel=5)

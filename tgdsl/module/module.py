@@ -68,7 +68,7 @@ class TactileModule(HookedModule):
         self.plan = plan
         self.saved_taxels = SavedTaxels(plan)
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
-        self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
+        self._quantities = tuple(quantity for quantity in quantities_of(kinds) if quantity.name in plan.quantities)
         self._stages = {sensor.name: stages_of(sensor.noise.terms if sensor.noise else ()) for sensor in plan.sensors}
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan, self._kinds))
         self.memory = Memory(plan.sensors, plan.readings(), self._kinds)
@@ -100,8 +100,8 @@ class TactileModule(HookedModule):
     @property
     def taxels(self) -> dict[str, TaxelTable]:
         """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
-        own = [sensor for sensor in self.plan.sensors if len(sensor.taxels)]
-        return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in own})
+        with_taxels = [sensor for sensor in self.plan.sensors if len(sensor.taxels)]
+        return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in with_taxels})
 
     @property
     def taxels_id(self) -> str:
@@ -213,8 +213,8 @@ class TactileModule(HookedModule):
         tensors = self.incoming.tensors(state, self.dtype, self.device)
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
-            what = f"this module holds the state of {held} environments, the scene has {num_envs}"
-            raise StateError(f"{what}; `free()` lets go of it")
+            problem = f"this module holds the state of {held} environments, the scene has {num_envs}"
+            raise StateError(f"{problem}; `free()` lets go of it")
         return tensors, num_envs
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -240,8 +240,8 @@ class TactileModule(HookedModule):
     def flat_core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core` as `reading/<name>`, and the new state as `state/<name>`."""
         readings, updated = self.core(tensors, memory)
-        made = {f"reading/{name}": readings[name] for name in self.plan.readings()}
-        return made | {f"state/{name}": value for name, value in updated.items()}
+        outputs = {f"reading/{name}": readings[name] for name in self.plan.readings()}
+        return outputs | {f"state/{name}": value for name, value in updated.items()}
 
     def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and leave the state as it is."""

@@ -44,10 +44,10 @@ def observation_terms(plan: Plan) -> dict[str, tuple[ObservationTerm, ...]]:
     groups: dict[str, list[ObservationTerm]] = {}
     plain = [(term.group, term.reading or term.type) for term in plan.observations]
     for term, (group, name) in zip(plan.observations, plain, strict=True):
-        before = groups.setdefault(group, [])
-        start = before[-1].slice.stop if before else 0
-        shown = name if plain.count((group, name)) == 1 else f"{name}[{term.index}]"
-        before.append(ObservationTerm(shown, term.type, term.num_features, slice(start, start + term.num_features)))
+        earlier = groups.setdefault(group, [])
+        start = earlier[-1].slice.stop if earlier else 0
+        term_name = name if plain.count((group, name)) == 1 else f"{name}[{term.index}]"
+        earlier.append(ObservationTerm(term_name, term.type, term.num_features, slice(start, start + term.num_features)))
     return Observations({group: tuple(terms) for group, terms in groups.items()})
 
 
@@ -70,13 +70,13 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
     num_envs = _checked(plan, readings)
     groups: dict[str, list[Tensor]] = {}
     for term in plan.observations:
-        found = [torch.empty((num_envs, 0), dtype=constants.dtype, device=constants.device)]
+        features = [torch.empty((num_envs, 0), dtype=constants.dtype, device=constants.device)]
         if term.reading is not None:
             folded = constants.tree["observations"][term.key]
             reading = readings[term.reading]
             steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-            found = [observations.observe(term.type, step, term.channels, folded) for step in steps]
-        groups.setdefault(term.group, []).extend(found)
+            features = [observations.observe(term.type, step, term.channels, folded) for step in steps]
+        groups.setdefault(term.group, []).extend(features)
     return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 
 
@@ -86,7 +86,7 @@ def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
     Raises:
         ObservationError: As `observe`.
     """
-    known = plan.readings()
+    all_readings = plan.readings()
     for term in plan.observations:
         if term.type in observations.HAND_ONLY:
             raise observations.hand_only_error(term.group, term.index, term.type)
@@ -94,15 +94,15 @@ def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
             continue
         where = f"observation {term.group}[{term.index}] ({term.type})"
         if term.reading not in readings:
-            found = f"found {', '.join(readings)}" if readings else "found none"
-            raise ObservationError(f'{where} wants the reading "{term.reading}"; {found}')
-        _check(where, known[term.reading], readings[term.reading])
+            given_names = f"found {', '.join(readings)}" if readings else "found none"
+            raise ObservationError(f'{where} wants the reading "{term.reading}"; {given_names}')
+        _check(where, all_readings[term.reading], readings[term.reading])
     if not readings:
         raise ObservationError("there are no readings, so nothing says how many environments there are")
-    counts = {name: len(reading) for name, reading in readings.items() if name in known}
+    counts = {name: len(reading) for name, reading in readings.items() if name in all_readings}
     if not counts:
         unknown = next(iter(readings))
-        raise ObservationError(f'this module has no reading "{unknown}"; {did_you_mean(unknown, known, "readings")}')
+        raise ObservationError(f'this module has no reading "{unknown}"; {did_you_mean(unknown, all_readings, "readings")}')
     first = next(iter(counts))
     for name, count in counts.items():
         if count != counts[first]:

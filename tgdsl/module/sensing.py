@@ -49,7 +49,9 @@ def joined_signal(
     if names := tuple(sensors[0].constants):
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
         value = operator.getitem if kind.constants is None else getattr
-        rows = [torch.cat([value(own, name).expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
+        rows = [
+            torch.cat([value(values, name).expand(n) for values, n in zip(constants, counts, strict=True)]) for name in names
+        ]
         of_taxels = dict(zip(names, materialised(torch.stack(rows)).unbind(), strict=True))
     result, _ = kind.forward(gathered, UNTIMED, kind.typed(of_taxels), {})
     return _stacked(result, "signal", sensors[0].signal)
@@ -94,21 +96,21 @@ def read(
     signal = clean = _stacked(result, "signal", sensor.signal) if joined is None else joined
     signal, noted = disturb(signal, stages, drawn, f"{path}noise/", memory, now)
     new |= noted
-    own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
+    signal_readings = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
     readings: Tensors = {} if sensor.noise is None else {f"{sensor.name}/signal": clean}
-    for reading, which, made in zip(own, ("measured", "clean"), (signal, clean), strict=False):
+    for reading, which, planes_now in zip(signal_readings, ("measured", "clean"), (signal, clean), strict=False):
         if now.is_sample is not None:
-            made = torch.where(now.is_sample[..., None], made, memory[f"{path}sample/{which}"])
-            new[f"{path}sample/{which}"] = made
+            planes_now = torch.where(now.is_sample[..., None], planes_now, memory[f"{path}sample/{which}"])
+            new[f"{path}sample/{which}"] = planes_now
         if kind.decide is not None:
             released = {"release_threshold": drawn[RELEASE.name].release_threshold[:, 0]} if RELEASE in stages else {}
-            planes = dict(zip(sensor.signal, made.unbind(1), strict=True))
+            planes = dict(zip(sensor.signal, planes_now.unbind(1), strict=True))
             own_constants = {**constants, **released} if kind.constants is None else replace(constants, **released)
             planes, decided = kind.decide(planes, own_constants, state)
-            made = torch.stack([planes[name] for name in reading.channels], dim=1)
+            planes_now = torch.stack([planes[name] for name in reading.channels], dim=1)
             new |= {path + name: value for name, value in decided.items()}
-        readings[reading.name] = made.transpose(1, 2)
-    for reading in sensor.readings[len(own) :]:
+        readings[reading.name] = planes_now.transpose(1, 2)
+    for reading in sensor.readings[len(signal_readings) :]:
         report = reading.name.rpartition("/")[2]
         readings[reading.name] = _stacked(result, f"{report}/signal", reading.channels).transpose(1, 2)
     if now.period is not None:
@@ -137,15 +139,15 @@ def block(
         memory: The state of all sensors, by `sensor:name`.
     """
     samples, answers, state = [], [], _kind_state(sensor, memory)
-    for own, context in zip(gathered, contexts, strict=True):
-        found, new = _answer(sensor, kind, own, context, constants, state)
+    for part, context in zip(gathered, contexts, strict=True):
+        outputs, new = _answer(sensor, kind, part, context, constants, state)
         state = {**state, **new}
-        made = _stacked(found, "signal", sensor.signal)
-        samples.append(made if made.ndim == 4 else made[:, None])
-        answers.append(found)
-    made = samples[0] if len(samples) == 1 else torch.cat(samples, dim=1)
+        block_signal = _stacked(outputs, "signal", sensor.signal)
+        samples.append(block_signal if block_signal.ndim == 4 else block_signal[:, None])
+        answers.append(outputs)
+    block_signal = samples[0] if len(samples) == 1 else torch.cat(samples, dim=1)
     new = {f"{sensor.name}:{name}": value for name, value in state.items()}
-    return {sensor.name: made.transpose(2, 3)}, new, answers
+    return {sensor.name: block_signal.transpose(2, 3)}, new, answers
 
 
 def _answer(
@@ -167,20 +169,20 @@ def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None
     where = f'sensor "{sensor.name}": `forward` of the kind "{sensor.kind}" returns'
     if not (isinstance(answer, tuple) and len(answer) == 2 and all(isinstance(part, Mapping) for part in answer)):
         raise TgdslError(f"{where} {type(answer).__name__}, expected planes by channel, and the new state by name")
-    found, new = answer
-    if missing := [name for name in sensor.provides if name not in found]:
-        raise TgdslError(f"{where} {listed(list(found)) or 'nothing'}, without {missing[0]}, which the kind provides")
-    if missing := [name for name in sensor.signal if name not in found and "signal" not in found]:
-        raise TgdslError(f"{where} {listed(list(found)) or 'nothing'}, without the channel {missing[0]}")
+    outputs, new = answer
+    if missing := [name for name in sensor.provides if name not in outputs]:
+        raise TgdslError(f"{where} {listed(list(outputs)) or 'nothing'}, without {missing[0]}, which the kind provides")
+    if missing := [name for name in sensor.signal if name not in outputs and "signal" not in outputs]:
+        raise TgdslError(f"{where} {listed(list(outputs)) or 'nothing'}, without the channel {missing[0]}")
     num_rows = sensor.readings[0].num_rows
-    for name in ("signal",) if "signal" in found else sensor.signal:
-        if found[name].shape[-1] != num_rows:
-            shape = tuple(found[name].shape)
+    for name in ("signal",) if "signal" in outputs else sensor.signal:
+        if outputs[name].shape[-1] != num_rows:
+            shape = tuple(outputs[name].shape)
             raise TgdslError(f"{where} {name} of shape {shape}, expected {num_rows} rows as its reading has, (env, {num_rows})")
     for name, value in new.items():
         if name not in state:
-            known = listed(list(state)) or "none"
-            raise TgdslError(f'{where} the state "{name}", which `Lowered.state` does not have: {known}')
+            state_names = listed(list(state)) or "none"
+            raise TgdslError(f'{where} the state "{name}", which `Lowered.state` does not have: {state_names}')
         if value.shape != state[name].shape:
             shapes = f"{tuple(value.shape)}, expected {tuple(state[name].shape)}"
             raise TgdslError(f'{where} the state "{name}" of shape {shapes} as the old one')
@@ -266,9 +268,9 @@ def sense(
             contexts = [sensing.clock.context(sensor, memory, dt, i) for i in range(sensor.substeps)]
             each = [*(part[sensor.name] for part in earlier), gathered[sensor.name]]
             each = [_with_upstream(sensor, part, answers, i) for i, part in enumerate(each)]
-            found, new, answered = block(sensor, kind, each, contexts, constants, memory)
+            outputs, new, answered = block(sensor, kind, each, contexts, constants, memory)
         else:
-            signal, asked = None, _with_upstream(sensor, gathered[sensor.name], answers, -1)
+            signal, inputs = None, _with_upstream(sensor, gathered[sensor.name], answers, -1)
             if sensor.joined:
                 if sensor.joined not in joined:
                     joined[sensor.joined] = _joined(sensing, own, sensor, gathered[sensor.name])
@@ -276,12 +278,12 @@ def sense(
             context = sensing.clock.context(sensor, memory, dt)
             noise = sensing.stages[sensor.name], drawn.get(sensor.name, {})
             now = nows.get(sensor.name, NO_CLOCK)
-            found, new, answer = read(sensor, kind, asked, context, constants, *noise, memory, now, signal)
+            outputs, new, answer = read(sensor, kind, inputs, context, constants, *noise, memory, now, signal)
             answered = [answer]
         if sensor.provides:
             answers[sensor.name] = answered
         updated |= new
-        readings |= _with_history(sensor, found, memory, updated)
+        readings |= _with_history(sensor, outputs, memory, updated)
     for reading in plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
         readings[reading.name] = tensors[reading.name].to(dtype, copy=True).unsqueeze(2)
     return readings, updated

@@ -146,10 +146,10 @@ class SceneState:
 
 def _check_choices(field: str, tensors: Mapping[str, Tensor], names: Sequence[str], counts: Sequence[int]) -> None:
     for i, (name, num) in enumerate(zip(names, counts, strict=True) if field in tensors else ()):
-        own = tensors[field][:, i]
-        if ((own < 0) | (own >= num)).any():
-            found = sorted({int(v) for v in own.tolist() if not 0 <= v < num})
-            raise StateError(f"SceneState.{field} of object {name} is {found[0]}, expected 0 to {num - 1}")
+        column = tensors[field][:, i]
+        if ((column < 0) | (column >= num)).any():
+            invalid = sorted({int(v) for v in column.tolist() if not 0 <= v < num})
+            raise StateError(f"SceneState.{field} of object {name} is {invalid[0]}, expected 0 to {num - 1}")
 
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
@@ -163,7 +163,7 @@ def _checked(name: str, value: Any, inputs: Inputs, device: torch.device) -> Ten
         raise StateError(f"SceneState.{name} is a {type(value).__name__}, expected a torch tensor")
     if value.ndim != len(want) + 1 or tuple(value.shape[1:]) != want:
         expected = ", ".join(map(str, want))
-        names = "".join(f"; {axis}: {listed(own)}" for axis, own in inputs.names.items() if axis in SHAPES[name])
+        names = "".join(f"; {axis}: {listed(axis_names)}" for axis, axis_names in inputs.names.items() if axis in SHAPES[name])
         raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected}){names}")
     if value.device != device:
         raise StateError(f"SceneState.{name} is on {value.device}, the module on {device}")

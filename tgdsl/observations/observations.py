@@ -202,8 +202,8 @@ def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
 
 def hand_only_error(group: str, index: int, type_: str) -> ObservationError:
     """Return the error of an observation that only the real hand has."""
-    what = f'observation {group}[{index}] is "{type_}", which only a real XHand1 has'
-    return ObservationError(f'{what}, and no simulation; read one with tgdsl.connect(touch, "xhand1")')
+    problem = f'observation {group}[{index}] is "{type_}", which only a real XHand1 has'
+    return ObservationError(f'{problem}, and no simulation; read one with tgdsl.connect(touch, "xhand1")')
 
 
 def num_features(type_: str, num_channels: int, num_rows: int, num_links: int) -> int:

@@ -269,15 +269,15 @@ def _known_faults(known: Sequence[Package]) -> list[Finding]:
     results = []
     mujoco, warp = versions.get("mujoco"), versions.get("mujoco-warp")
     if mujoco and Version(mujoco) == Version("4.0.0"):
-        what = "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse"
-        results.append(Finding("fault", what, "forces are wrong there: take another version"))
+        problem = "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse"
+        results.append(Finding("fault", problem, "forces are wrong there: take another version"))
     if mujoco and warp and Version(mujoco).release[:2] != Version(warp).release[:2]:
-        what = f"MuJoCo {mujoco} beside MuJoCo Warp {warp}"
-        results.append(Finding("fault", what, "their models differ between such versions: take the same of both"))
+        problem = f"MuJoCo {mujoco} beside MuJoCo Warp {warp}"
+        results.append(Finding("fault", problem, "their models differ between such versions: take the same of both"))
     torch = versions.get("torch")
     if torch and Version(torch) >= Version("2.11"):
-        what = f"torch {torch} compiles a copy wrongly whose source is changed after it (pytorch#198131)"
-        results.append(Finding("note", what, "tgdsl compiles nothing that does so; look out in a step of your own"))
+        problem = f"torch {torch} compiles a copy wrongly whose source is changed after it (pytorch#198131)"
+        results.append(Finding("note", problem, "tgdsl compiles nothing that does so; look out in a step of your own"))
     return results
 
 

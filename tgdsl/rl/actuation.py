@@ -74,8 +74,10 @@ class ActionSpec(SpecModel):
         for name, unit in (("scale", "rad"), ("slide_scale", "m")):
             value = getattr(self, name)
             if self.mode == "absolute" and value != type(self).model_fields[name].default:
-                what = f"{name} is {value:g} {unit}, but absolute actions have none: their ends are those of the joint's range"
-                raise ValueError(f"{what}; leave it out, or take mode relative or offset")
+                problem = (
+                    f"{name} is {value:g} {unit}, but absolute actions have none: their ends are those of the joint's range"
+                )
+                raise ValueError(f"{problem}; leave it out, or take mode relative or offset")
         if self.smoothing >= 1.0:
             raise ValueError(f"smoothing is {self.smoothing:g}, expected less than 1: targets would never move")
         return self
@@ -188,8 +190,8 @@ def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
         and model.actuator_gear[i, 0] == 1
     )
     if not is_position or not model.jnt_limited[joint.id]:
-        what = f'the actuator of joint "{name}" is no position servo of gear 1, or the joint has no range'
-        raise SimulationError(f"{what}; a policy's actions are targets within it")
+        problem = f'the actuator of joint "{name}" is no position servo of gear 1, or the joint has no range'
+        raise SimulationError(f"{problem}; a policy's actions are targets within it")
     limit = float(model.actuator_forcerange[i, 1]) if model.actuator_forcelimited[i] else np.inf
     dof = int(model.jnt_dofadr[joint.id])
     passive = float(model.dof_damping[dof])

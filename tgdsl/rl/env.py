@@ -238,8 +238,8 @@ class TouchEnv:
             self._has_stepped = True
             env, joint = divmod(int(action.abs().nan_to_num(posinf=0.0).argmax()), self.num_actions)
             if abs(value := float(action[env, joint])) > FAR_BEYOND:
-                what = f"action of {self.joint_names[joint]} is {value:g} in environment {env}, and clipped to [-1, 1]"
-                warnings.warn(f"{what}; later steps are not looked at", stacklevel=2)
+                problem = f"action of {self.joint_names[joint]} is {value:g} in environment {env}, and clipped to [-1, 1]"
+                warnings.warn(f"{problem}; later steps are not looked at", stacklevel=2)
         with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too
             self._action.copy_(action)
             made, self._instant = self._call()

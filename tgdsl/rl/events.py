@@ -36,8 +36,8 @@ class Events:
         self._sim, self._setup, self.memory = sim, setup, dict[str, Tensor]()
         for name, term in self._terms.items():
             if term.interval[0] < setup.control_step:
-                what = f'the event "{name}" comes every {term.interval[0]:g} s, more often than control steps'
-                raise SimulationError(f"{what} of {setup.control_step:g} s; expected an interval of at least one")
+                problem = f'the event "{name}" comes every {term.interval[0]:g} s, more often than control steps'
+                raise SimulationError(f"{problem} of {setup.control_step:g} s; expected an interval of at least one")
             for kind in ("left", "count"):
                 self.memory[f"{name}/{kind}"] = torch.zeros(setup.num_envs, dtype=torch.int64, device=setup.device)
 
@@ -74,6 +74,6 @@ class Events:
     def _wait(self, name: str, term: EventTerm, chosen: Bool[Tensor, " env"]) -> None:
         """Draw how many control steps there are before the next one."""
         first, last = (round(end / self._setup.control_step) for end in term.interval)
-        what = f"event {name} interval"
-        share = self._setup.draws.shares({what: 1}, self.memory[f"{name}/count"], chosen)[what]
+        problem = f"event {name} interval"
+        share = self._setup.draws.shares({problem: 1}, self.memory[f"{name}/count"], chosen)[problem]
         put_rows(self.memory[f"{name}/left"], chosen, whole(share, first, last)[:, 0])

@@ -76,10 +76,10 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
     if not isinstance(source.value, dict) or not isinstance(source.value.get("task"), str):
-        what = 'missing key "task", one of: ' + ", ".join(TASKS)
+        problem = 'missing key "task", one of: ' + ", ".join(TASKS)
         if isinstance(source.value, dict) and "sensors" in source.value:
-            what = "this is a document of sensors, which a task's document names: `document: …`"
-        raise SpecError([*source.problems, source.problem(("task",), what, on_key=True)])
+            problem = "this is a document of sensors, which a task's document names: `document: …`"
+        raise SpecError([*source.problems, source.problem(("task",), problem, on_key=True)])
     task = _task_class(source, folder)
     problems: list[Problem] = list(source.problems)
     spec = validate(source, (), task.Spec, problems, REQUIRED)
@@ -111,8 +111,8 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
     known = numbers(spec, terms)
     for name, term in terms.items():
         if isinstance(term, CurriculumTerm) and term.of not in known:
-            what = f'there is no number "{term.of}" of a term'
-            problems.append(source.problem(("terms", name, "of"), what, did_you_mean(term.of, known, "numbers")))
+            problem = f'there is no number "{term.of}" of a term'
+            problems.append(source.problem(("terms", name, "of"), problem, did_you_mean(term.of, known, "numbers")))
     return terms
 
 
@@ -151,8 +151,8 @@ def _class_of(
         own = _own_module(module, folder)
     except Exception as error:  # whatever a user's code raises
         line = f"{raised_at(str((folder / module).resolve()), error)}: " if module.endswith(".py") else ""
-        what = f'cannot import "{name}": {line}{type(error).__name__}: {error}'
-        raise SpecError([source.problem(place, what)]) from error
+        problem = f'cannot import "{name}": {line}{type(error).__name__}: {error}'
+        raise SpecError([source.problem(place, problem)]) from error
     result = getattr(own, class_, None)
     if result is None:
         classes = [key for key, value in vars(own).items() if isinstance(value, type) and issubclass(value, base)]

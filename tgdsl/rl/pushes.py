@@ -68,8 +68,8 @@ class Pushes:
             SimulationError: If pushes would follow one another within a control step.
         """
         if spec.interval[0] < control_step:
-            what = f"pushes every {spec.interval[0]:g} s, more often than control steps of {control_step:g} s"
-            raise SimulationError(f"{what}; expected an interval of at least one")
+            problem = f"pushes every {spec.interval[0]:g} s, more often than control steps of {control_step:g} s"
+            raise SimulationError(f"{problem}; expected an interval of at least one")
         self._applied, self._body, self._draws, self.spec = arrays["xfrc_applied"], body, draws, spec
         num_envs, device, dtype = len(self._applied), self._applied.device, self._applied.dtype
         self.force = torch.zeros((num_envs, 3), device=device, dtype=dtype)

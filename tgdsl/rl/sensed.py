@@ -187,8 +187,8 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
         own = [felt for felt, carrier in felts.items() if carrier == sensor]
         noises = list(dict.fromkeys(felt.noise for felt in own if felt.noise != CLEAN))
         if len(noises) > 1:
-            what = f"noise {listed(noises)} of one sensor in one simulation, expected one beside {CLEAN}"
-            raise loaded.error(("noise",), what)
+            problem = f"noise {listed(noises)} of one sensor in one simulation, expected one beside {CLEAN}"
+            raise loaded.error(("noise",), problem)
         is_both = bool(noises) and any(felt.noise == CLEAN for felt in own)
         result[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in own))
         result[f"sensors.{sensor}.noise"] = noises[0] if noises else CLEAN
@@ -224,8 +224,8 @@ def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, sensor: str) -
     rows = np.flatnonzero([name in names for name in links]) if is_per_link else taxels
     num_rows = len(links) if is_per_link else layout.num_taxels
     if not num_rows or size % num_rows:
-        what = f'"{felt.type}" cannot be felt at {felt.placement} beside other links: its numbers are not of taxels'
-        raise loaded.error(("placement",), what)
+        problem = f'"{felt.type}" cannot be felt at {felt.placement} beside other links: its numbers are not of taxels'
+        raise loaded.error(("placement",), problem)
     columns = (np.arange(size // num_rows)[:, None] * num_rows + rows).ravel()
     return Source(observation, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
 
@@ -276,8 +276,8 @@ def _variants(loaded: LoadedTask, document: Loaded) -> list[Any]:
         raise loaded.error(("variants",), f'the object "{spec.object}" of "{spec.document}" has no variants', "leave it out")
     for place, variant in enumerate(spec.variants):
         if variant >= len(known) or variant in spec.variants[:place]:
-            what = f"variant {variant}, expected each once, from 0 to {len(known) - 1}"
-            raise loaded.error(("variants", place), what)
+            problem = f"variant {variant}, expected each once, from 0 to {len(known) - 1}"
+            raise loaded.error(("variants", place), problem)
     return [known[variant] for variant in spec.variants]
 
 
@@ -295,8 +295,8 @@ def sensors_document(loaded: LoadedTask) -> Loaded:
     document = load(file, kinds=known_kinds())
     document.raise_problems()
     if spec.object not in document.spec.objects:
-        what = f'"{spec.document}" has no object "{spec.object}", only {listed(list(document.spec.objects))}'
-        raise loaded.error(("object",), what)
+        problem = f'"{spec.document}" has no object "{spec.object}", only {listed(list(document.spec.objects))}'
+        raise loaded.error(("object",), problem)
     return document
 
 
@@ -322,8 +322,8 @@ def _sensors_of(loaded: LoadedTask, kinds: Mapping[str, str], wanted: Mapping[st
             sensor[kind] = names[0]
             continue
         which = f"the sensors {listed(names)}" if names else "no sensor"
-        what = f'"{loaded.spec.document}" has {which} of kind "{kind}", expected one'
-        problems += loaded.error((key,), what).problems
+        problem = f'"{loaded.spec.document}" has {which} of kind "{kind}", expected one'
+        problems += loaded.error((key,), problem).problems
     if problems:
         raise SpecError(problems)
     return sensor

@@ -38,8 +38,8 @@ def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
     problems: list[Problem] = []
     for i, pattern in enumerate(loaded.spec.joints):
         if not matching(pattern, known):
-            what = f'no actuated joint {"is called" if is_plain(pattern) else "matches"} "{pattern}"'
-            problems.append(loaded.source.problem(("joints", i), what, did_you_mean(pattern, known, "joints")))
+            problem = f'no actuated joint {"is called" if is_plain(pattern) else "matches"} "{pattern}"'
+            problems.append(loaded.source.problem(("joints", i), problem, did_you_mean(pattern, known, "joints")))
     try:
         keyframe_id(model, loaded.spec.keyframe)
     except SimulationError as error:

@@ -262,8 +262,8 @@ def _set_control_step(sim: Simulation, control_step: float) -> None:
     timestep = float(sim.model.opt.timestep)
     sim.substeps = round(control_step / timestep)
     if sim.substeps < 1 or abs(sim.control_step - control_step) > 1e-6 * timestep:
-        what = f"a control step of {control_step:g} s"
-        raise SimulationError(f"{what}, expected a whole number of the scene's physics steps of {timestep:g} s")
+        problem = f"a control step of {control_step:g} s"
+        raise SimulationError(f"{problem}, expected a whole number of the scene's physics steps of {timestep:g} s")
 
 
 def _stepping(scene: SteppedScene, control_step: float) -> SteppedScene:
@@ -283,8 +283,8 @@ def _refuse_unfit_steps(control_step: float, motion: MotionLimits | None, timing
     """Raise an error for control steps that are shorter than an exchange on the line, or longer than the watchdog waits."""
     shortest = (timing or SerialTiming()).exchange_s
     if 0 < control_step < shortest:
-        what = f"control steps of {1e3 * control_step:g} ms ({1 / control_step:.0f} per second)"
-        raise HandError(f"{what}, and an exchange takes {1e3 * shortest:.2f} ms: at most {1 / shortest:.0f} per second")
+        problem = f"control steps of {1e3 * control_step:g} ms ({1 / control_step:.0f} per second)"
+        raise HandError(f"{problem}, and an exchange takes {1e3 * shortest:.2f} ms: at most {1 / shortest:.0f} per second")
     refuse_beyond_watchdog(control_step, None if motion is None else motion.watchdog_s)
 
 

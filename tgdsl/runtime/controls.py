@@ -54,8 +54,8 @@ def warn_of_range(control: Tensor | np.ndarray, model: mujoco.MjModel) -> bool:
         return False
     env, i = far[0]
     where = f"environment {env}" if len(values) > 1 else "all environments"
-    what = f'control of actuator "{model.actuator(int(i)).name}" is {values[env, i]:g} in {where}'
-    warnings.warn(f"{what}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; this is said once", stacklevel=4)
+    problem = f'control of actuator "{model.actuator(int(i)).name}" is {values[env, i]:g} in {where}'
+    warnings.warn(f"{problem}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; this is said once", stacklevel=4)
     return True
 
 

@@ -54,8 +54,8 @@ def simulate(
     kind = simulator_for(device)
     known = keyword_options(kind.simulate)
     if unknown := [name for name, value in options.items() if name not in known and value]:
-        what = f'"{kind.name}", which simulates on "{device}", has no option {listed(unknown)}'
-        raise SimulationError(f"{what}; it knows {listed(known)}")
+        problem = f'"{kind.name}", which simulates on "{device}", has no option {listed(unknown)}'
+        raise SimulationError(f"{problem}; it knows {listed(known)}")
     return kind.simulate(touch, num_envs, **{n: v for n, v in {**options, "device": device}.items() if n in known})
 
 

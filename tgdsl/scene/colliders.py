@@ -73,8 +73,8 @@ def _refuse_pairs(spec: mujoco.MjSpec, replaced: Sequence[mujoco.MjsGeom]) -> No
     names = {geom.name for geom in replaced if geom.name}
     for pair in spec.pairs:
         if named := names & {pair.geomname1, pair.geomname2}:
-            what = f'the scene has a contact pair of geom "{sorted(named)[0]}", whose place primitive colliders take'
-            raise RobotError(f"{what}; expected pairs of other geoms")
+            problem = f'the scene has a contact pair of geom "{sorted(named)[0]}", whose place primitive colliders take'
+            raise RobotError(f"{problem}; expected pairs of other geoms")
 
 
 def _refuse_lost(body: str, replaced: Sequence[mujoco.MjsGeom], others: Sequence[mujoco.MjsGeom]) -> None:
@@ -82,8 +82,8 @@ def _refuse_lost(body: str, replaced: Sequence[mujoco.MjsGeom], others: Sequence
     for other in others:
         met = any(meets(own.contype, own.conaffinity, other) for own in replaced)
         if met and not meets(0, replaced[0].conaffinity, other):
-            what = f'geom "{other.name}" (body "{other.parent.name}") collides with "{body}" by its `conaffinity` alone'
-            raise RobotError(f"{what}; primitive colliders meet what has one of their bits in its `contype`")
+            problem = f'geom "{other.name}" (body "{other.parent.name}") collides with "{body}" by its `conaffinity` alone'
+            raise RobotError(f"{problem}; primitive colliders meet what has one of their bits in its `contype`")
 
 
 def _add(spec: mujoco.MjSpec, collider: Collider, i: int, like: mujoco.MjsGeom, core: int) -> None:

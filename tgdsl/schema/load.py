@@ -34,9 +34,9 @@ def warn_of_unusual(source: Source, spec: BaseModel) -> None:
     """
     found = {}
     for path, usual, value in _marked(spec, ()):
-        if (what := usual.doubt(value)) is not None:
+        if (problem := usual.doubt(value)) is not None:
             path = _place(source, path)
-            found[path, what] = str(source.problem(path, *what))
+            found[path, problem] = str(source.problem(path, *problem))
     for message in found.values():
         warnings.warn(message, stacklevel=4)
 
@@ -129,9 +129,9 @@ def load(
     if source.value is None:
         raise SpecError(source.problems)
     if isinstance(source.value, dict) and "task" in source.value and "sensors" not in source.value:
-        what = "this is a task's document, expected one of sensors"
+        problem = "this is a task's document, expected one of sensors"
         hint = f"its own is {source.value['document']}" if "document" in source.value else ""
-        raise SpecError([source.problem(("task",), what, hint, on_key=True)])
+        raise SpecError([source.problem(("task",), problem, hint, on_key=True)])
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
     if sensors is not None:

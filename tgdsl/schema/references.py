@@ -44,8 +44,8 @@ def _observation_problems(loaded: Loaded) -> list[Problem]:
     """Return sensors that have the name of a reading that none makes, and observations of sensors that are not there."""
     source, sensors, problems = loaded.source, _names(loaded, "sensors") or [], []
     for name in PROPRIOCEPTION.keys() & set(sensors):
-        what = f'"{name}" is the name of a reading that no sensor makes'
-        problems.append(source.problem(("sensors", name), what, "give the sensor another name", on_key=True))
+        problem = f'"{name}" is the name of a reading that no sensor makes'
+        problems.append(source.problem(("sensors", name), problem, "give the sensor another name", on_key=True))
     for group in _names(loaded, "observations") or []:
         terms = source.get(("observations", group))
         for i, term in enumerate(terms if isinstance(terms, list) else []):
@@ -61,8 +61,8 @@ def _observation_problems(loaded: Loaded) -> list[Problem]:
 def _resolution_problems(loaded: Loaded) -> list[Problem]:
     """Return that the resolution is not one of the layout's, or that one must be named."""
     if loaded.is_without_layout and loaded.resolution is not None:
-        what = f'there is no layout, which could have a resolution "{loaded.resolution}"'
-        return [loaded.source.problem(("resolution",), what, "leave it out, or give the robot a layout")]
+        problem = f'there is no layout, which could have a resolution "{loaded.resolution}"'
+        return [loaded.source.problem(("resolution",), problem, "leave it out, or give the robot a layout")]
     if loaded.layout is None:
         return []
     resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})

@@ -118,8 +118,8 @@ def _problem(
         fields = known[id(parent)].model_fields if id(parent) in known else {}
         return source.problem(full, f'unknown key "{path[-1]}"', did_you_mean(str(path[-1]), fields, "keys"), on_key=True)
     if error["loc"][-1:] == ("[key]",):
-        what = f'"{path[-1]}" is not a name, expected letters, digits, "_" and "-", first a letter or "_"'
-        return source.problem(full, what, on_key=True)
+        problem = f'"{path[-1]}" is not a name, expected letters, digits, "_" and "-", first a letter or "_"'
+        return source.problem(full, problem, on_key=True)
     if kind == "missing" and isinstance(path[-1], int):
         return source.problem(full[:-1], f"found {_brief(found)}, value {path[-1] + 1} is missing")
     if kind == "missing":

@@ -87,25 +87,27 @@ def check_lowered(kind: Kind, lowered: Lowered, spec: AnySensorSpec) -> None:
     _check_parts(kind, lowered)
     channels = [*lowered.channels, *(lowered.signal or ()), *(c for report in lowered.reports.values() for c in report)]
     if any(channel.name == "signal" for channel in channels):
-        what = 'what `forward` returns as "signal" is all channels in one tensor'
-        raise TgdslError(f'kind "{kind.name}" has a channel called "signal"; rename it: {what}')
-    for name, what in (("signal", "the reading before its noise"), ("clean", "the reading without noise")):
+        problem = 'what `forward` returns as "signal" is all channels in one tensor'
+        raise TgdslError(f'kind "{kind.name}" has a channel called "signal"; rename it: {problem}')
+    for name, problem in (("signal", "the reading before its noise"), ("clean", "the reading without noise")):
         if name in lowered.reports:
-            raise TgdslError(f'kind "{kind.name}" has a report called "{name}"; rename it: "<sensor>/{name}" is {what}')
+            raise TgdslError(f'kind "{kind.name}" has a report called "{name}"; rename it: "<sensor>/{name}" is {problem}')
     types = [type(request) for request in lowered.requests]
     if twice := [kind.__name__ for kind in types if types.count(kind) > 1]:
         raise TgdslError(f'kind "{kind.name}" makes the request {twice[0]} twice; expected at most one of each type')
     if (lowered.substeps or lowered.samples) and not (lowered.substeps and not kind.knobs and kind.decide is None):
-        what = "a block of samples wants `substeps` above 0, `knobs=frozenset()` and no `decide`"
-        raise TgdslError(f'kind "{kind.name}": {what}: noise, rates and thresholds are of single readings')
+        problem = "a block of samples wants `substeps` above 0, `knobs=frozenset()` and no `decide`"
+        raise TgdslError(f'kind "{kind.name}": {problem}: noise, rates and thresholds are of single readings')
     if lowered.substeps and (spec.rate is not None or spec.history is not None):
         field = "rate" if spec.rate is not None else "history"
         raise LowerError("this sensor reads a block of samples at each call", field, f"leave `{field}` out")
     if lowered.substeps and spec.readout == "both":
         raise LowerError("this sensor reads a block of samples, which has no noise", "readout", "leave `readout` out")
     if lowered.provides - kind.provides or bool(lowered.sound) != (lowered.provides >= SOUND):
-        what = f"it provides {', '.join(sorted(lowered.provides)) or 'nothing'}, {lowered.sound} samples of sound"
-        raise TgdslError(f'kind "{kind.name}": {what}; expected planes of `Kind.provides`, and samples if these are of sound')
+        problem = f"it provides {', '.join(sorted(lowered.provides)) or 'nothing'}, {lowered.sound} samples of sound"
+        raise TgdslError(
+            f'kind "{kind.name}": {problem}; expected planes of `Kind.provides`, and samples if these are of sound'
+        )
     if lowered.substeps and lowered.reports:
         raise TgdslError(f'kind "{kind.name}" has reports and reads blocks; a block has none')
 
@@ -150,8 +152,8 @@ def _check_parts(kind: Kind, lowered: Any) -> None:
         refuse("rows", lowered.rows, "an Axis, such as `body_axis(layout)`")
     for name, column in lowered.rows.table.items():
         if len(column) != lowered.rows.size:
-            what = f'the column "{name}" of its rows has {len(column)} entries, expected one for each of {lowered.rows.size}'
-            raise TgdslError(f'kind "{kind.name}": {what}')
+            problem = f'the column "{name}" of its rows has {len(column)} entries, expected one for each of {lowered.rows.size}'
+            raise TgdslError(f'kind "{kind.name}": {problem}')
 
 
 def _wrong(kind: object) -> str:

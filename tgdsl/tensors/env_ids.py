@@ -34,8 +34,8 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
     try:
         found = np.asarray(torch.as_tensor(env_ids).cpu())
     except (TypeError, ValueError, RuntimeError) as wrong:
-        what = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
-        raise error(f"env_ids: found {env_ids!r}, expected {what}") from wrong
+        problem = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
+        raise error(f"env_ids: found {env_ids!r}, expected {problem}") from wrong
     if found.dtype == bool and found.shape == (num_envs,):
         return np.flatnonzero(found)
     # Numbers of 8 bits are a mask that is not boolean rather than indices.
@@ -43,10 +43,10 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
         found.dtype.kind in "iu" and found.dtype.itemsize > 1 and found.ndim == 1 and ((found >= 0) & (found < num_envs)).all()
     )
     if found.size and not is_index:
-        what = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
+        problem = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
         is_mask = found.dtype == bool
         seen = f"a mask of {' x '.join(map(str, found.shape))}" if is_mask else listed([str(value) for value in found.ravel()])
-        raise error(f"env_ids: found {seen}, expected {what}")
+        raise error(f"env_ids: found {seen}, expected {problem}")
     return found.reshape(-1).astype(np.int64)
 
 

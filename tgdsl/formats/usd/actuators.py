@@ -192,8 +192,8 @@ def write_actuators(writer: StageWriter, actuators: list[int]) -> None:
         ends = _ends(writer, actuator, kind)
         if ends is None or model.actuator_plugin[actuator] >= 0:
             shown = f'actuator "{name}"' if name else f"unnamed actuator {actuator}"
-            what = "a plugin" if ends else "on what USD has no prim for (a free joint)"
-            writer.unsupported.append(f"{writer.file}: {shown} is {what}: left out")
+            problem = "a plugin" if ends else "on what USD has no prim for (a free joint)"
+            writer.unsupported.append(f"{writer.file}: {shown} is {problem}: left out")
             continue
         prim = writer.define("MjcActuator", name or "actuator", name)
         set_custom(prim, "order", actuator)

@@ -221,8 +221,8 @@ TENDON: Table = {
         for name in ("armature", "damping", "frictionloss", "stiffness", "margin", "group", "limited")
     },
     "springlength": mjc("springlength", array="tendon_lengthspring"),
-    **{f"sol{what}limit": mjc(f"sol{what}limit", array=f"tendon_sol{what}_lim") for what in ("ref", "imp")},
-    **{f"sol{what}friction": mjc(f"sol{what}friction", array=f"tendon_sol{what}_fri") for what in ("ref", "imp")},
+    **{f"sol{problem}limit": mjc(f"sol{problem}limit", array=f"tendon_sol{problem}_lim") for problem in ("ref", "imp")},
+    **{f"sol{problem}friction": mjc(f"sol{problem}friction", array=f"tendon_sol{problem}_fri") for problem in ("ref", "imp")},
     "range": mjc("range", array="tendon_range", is_range=True),
     "actuatorfrclimited": mjc("actuatorfrclimited", array="tendon_actfrclimited"),
     "actuatorfrcrange": mjc("actuatorfrcrange", array="tendon_actfrcrange", is_range=True),

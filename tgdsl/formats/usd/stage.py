@@ -306,8 +306,8 @@ def open_stage(path: Path) -> Iterator[Stage]:
         stage = Stage(path, usd, modules)
         _check_composition(stage)
         yield stage
-        for what, paths in stage.dropped.items():
-            warnings.warn(f"{path}: {what}: {listed(paths)}", stacklevel=4)
+        for problem, paths in stage.dropped.items():
+            warnings.warn(f"{path}: {problem}: {listed(paths)}", stacklevel=4)
         for diagnostic in printed.TakeUncoalescedDiagnostics():
             warnings.warn(f"{path}: USD: {' '.join(diagnostic.commentary.split())}", stacklevel=4)
     finally:

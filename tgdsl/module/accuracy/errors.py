@@ -81,9 +81,9 @@ def magnitude_of(expected: Readings, quantities: Sequence[str]) -> Magnitude:
     """
     rest = np.median(expected.reshape(-1, expected.shape[-1]), axis=0)
     away = np.abs(expected - rest)
-    own = away.max(axis=(0, 1, 2), initial=0.0)
+    largest = away.max(axis=(0, 1, 2), initial=0.0)
     names = np.array(quantities)
-    scale = np.array([own[names == name].max() for name in quantities])
+    scale = np.array([largest[names == name].max() for name in quantities])
     return Magnitude(rest, np.where(scale > 0, scale, 1.0), away > 0)
 
 
@@ -104,11 +104,11 @@ def errors_of(found: Readings, expected: Readings, magnitude: Magnitude, is_rela
     error = np.where(np.isfinite(error), error, np.inf)
     squares, worst = (error**2).sum(axis=(0, 2, 3)), error.max(axis=(0, 2, 3), initial=0.0)
     counts = magnitude.active.sum(axis=(0, 2, 3))
-    chosen = np.random.default_rng(seed).integers(error.shape[1], size=(RESAMPLES, error.shape[1]))
-    rms = np.sqrt(squares[chosen].sum(axis=1) / np.maximum(counts[chosen].sum(axis=1), 1))
+    sampled = np.random.default_rng(seed).integers(error.shape[1], size=(RESAMPLES, error.shape[1]))
+    rms = np.sqrt(squares[sampled].sum(axis=1) / np.maximum(counts[sampled].sum(axis=1), 1))
     return Errors(
         rms=_interval(float(np.sqrt(squares.sum() / max(counts.sum(), 1))), rms),
-        largest=_interval(float(worst.max(initial=0.0)), worst[chosen].max(axis=1)),
+        largest=_interval(float(worst.max(initial=0.0)), worst[sampled].max(axis=1)),
         p99=_exceeded_by(error, int(counts.sum()) // 100),
         is_finite=is_finite,
     )

@@ -48,13 +48,13 @@ class ReferenceModule:
         self.plan = plan
         self.kind = kind
         self.spec = spec
-        self.sensor = next(own for own in plan.sensors if sensor in (None, own.name))
+        self.sensor = next(planned for planned in plan.sensors if sensor in (None, planned.name))
         self.layout = plan.layout_of(self.sensor)
         self.quantities = [quantity for quantity in quantities_of([kind]) if quantity.name in self.sensor.uses]
         self.memory: Memory = {}
         self.num_calls = 0
-        known = others or {}
-        self.upstream = {name: ReferenceModule(plan, *known[name], known, name) for name in self.sensor.upstream}
+        other_kinds = others or {}
+        self.upstream = {name: ReferenceModule(plan, *other_kinds[name], other_kinds, name) for name in self.sensor.upstream}
         self._after: Memory = {}
 
     def __call__(self, state: SceneState, shift: np.ndarray) -> tuple[np.ndarray, Memory]:
@@ -65,13 +65,13 @@ class ReferenceModule:
     def _run(self, state: SceneState, shift: np.ndarray) -> tuple[np.ndarray, Memory, list[list[Planes]]]:
         """Return the same, and by environment and substep the planes that the kind provides."""
         assert state.body_pos is not None
-        others = {name: other._run(state, shift)[2] for name, other in self.upstream.items()}
+        upstream = {name: other._run(state, shift)[2] for name, other in self.upstream.items()}
         readings, memories, planes = [], {}, []
         for env in range(state.body_pos.shape[0]):
             rest = {name: np.full(memory.shape, memory.rest) for name, memory in self.sensor.state.items()}
             memory, samples, provided = self.memory.get(env, rest), [], []
             for i, part in enumerate([*state.substeps, state] if self.sensor.substeps else [state]):
-                read = {name: found[env][i] for name, found in others.items()}
+                read = {name: values[env][i] for name, values in upstream.items()}
                 gathered, context = self.gathered(part, env, shift, read), self.context(state, i, env)
                 reading, memory, *rest_of_it = self.kind.reference(self.spec, self.layout, gathered, context, memory)
                 samples.append(reading)

@@ -105,8 +105,8 @@ def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
     there = _rows_at(own, other, name)
     channels = None
     if one.channels != two.channels:
-        known = {channel: i for i, channel in enumerate(two.channels)}
-        channels = np.array([known.get(channel, -1) for channel in one.channels])
+        channel_index = {channel: i for i, channel in enumerate(two.channels)}
+        channels = np.array([channel_index.get(channel, -1) for channel in one.channels])
     samples, more = (output.shape[0] if len(output.shape) > 2 else 1 for output in (one, two))
     if samples == more:
         return Common(None, there if there is None else _repeated(there, samples, two.shape[-2]), channels)

@@ -71,17 +71,19 @@ def variants_of(
         alternatives: How distances to meshes may be found.
     """
     fields = _variants((f"sensors.{name}",), (spec,), kind.alternatives(spec))
-    ways = _variants(tuple(f"objects.{own}" for own in queries), tuple(queries.values()), alternatives) if queries else ()
+    ways = _variants(tuple(f"objects.{query}" for query in queries), tuple(queries.values()), alternatives) if queries else ()
     labels = [variant.label for variant in (*fields, *ways) if variant.is_own]
     return Variants(Variant(", ".join(labels) or "as written", {}, True), fields, ways)
 
 
 def _variants(paths: Sequence[str], specs: Sequence[Any], alternatives: Sequence[Alternative]) -> tuple[Variant, ...]:
     results = []
-    for own in alternatives:
-        is_own = all(is_taken(spec, own) for spec in specs)
-        changes = {f"{path}.{key}": value for path in paths for key, value in own.changes.items()}
-        results.append(Variant(own.label, changes, is_own, all(is_free(spec, own) for spec in specs), own.is_exact))
+    for alternative in alternatives:
+        is_own = all(is_taken(spec, alternative) for spec in specs)
+        changes = {f"{path}.{key}": value for path in paths for key, value in alternative.changes.items()}
+        results.append(
+            Variant(alternative.label, changes, is_own, all(is_free(spec, alternative) for spec in specs), alternative.is_exact)
+        )
     return tuple(results)
 
 
@@ -101,7 +103,7 @@ def is_free(spec: Any, alternative: Alternative) -> bool:
 
 def written_of(spec: Any, alternatives: Sequence[Alternative]) -> list[str]:
     """Return the fields of a spec that somebody wrote and some alternative would change."""
-    changed = {key for own in alternatives for key in (*own.changes, *own.unused)}
+    changed = {key for alternative in alternatives for key in (*alternative.changes, *alternative.unused)}
     return sorted(key for key in spec.model_fields_set & changed if getattr(spec, key) is not None)
 
 

@@ -44,9 +44,9 @@ class Clock(HookedModule):
         super().__init__()
         self._sensors = [sensor for sensor in sensors if sensor.wants_clock]
         self._has_history = any(sensor.windows for sensor in sensors)
-        noisy = dict.fromkeys(own.sensor for own in self._sensors if own.noise is not None and own.noise.streams)
+        noisy = dict.fromkeys(sensor.sensor for sensor in self._sensors if sensor.noise is not None and sensor.noise.streams)
         self._drawing = list(noisy)
-        self._keyed = list(noisy | dict.fromkeys(own.sensor for own in self._sensors if own.is_random))
+        self._keyed = list(noisy | dict.fromkeys(sensor.sensor for sensor in self._sensors if sensor.is_random))
         self._seed, self._first_env = 0, None
         self.home = torch.empty(0)
 
@@ -134,8 +134,8 @@ class Clock(HookedModule):
         ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
         drawn: dict[str, Mapping[int, Stream]] = {}
         if self._drawing:
-            found = streams(memory["clock/keys"][: len(self._drawing)], _env(memory), step[:, 0], memory["clock/episode"])
-            drawn = dict(zip(self._drawing, found, strict=True))
+            streams_now = streams(memory["clock/keys"][: len(self._drawing)], _env(memory), step[:, 0], memory["clock/episode"])
+            drawn = dict(zip(self._drawing, streams_now, strict=True))
         nows = {}
         for i, sensor in enumerate(self._sensors):
             phase, is_due, period = memory.get(f"{sensor.name}:sample/phase"), None, None
@@ -158,14 +158,14 @@ class Clock(HookedModule):
             return UNTIMED
         assert dt is not None
         count = max(sensor.substeps, 1)
-        age, own = memory["clock/age"][:, None], dt / count if count > 1 else dt
-        time = torch.where(age == 0, 0.0, memory["clock/time"][:, None] + (substep + 1) * own)
+        age, step_dt = memory["clock/age"][:, None], dt / count if count > 1 else dt
+        time = torch.where(age == 0, 0.0, memory["clock/time"][:, None] + (substep + 1) * step_dt)
         is_first = (age == 0) & (substep == 0)
         stream = None
         if sensor.is_random:
             key = memory["clock/keys"][self._keyed.index(sensor.sensor)]
             stream = kind_stream(key, _env(memory), memory["clock/step"] * count + substep)
-        return Context(own, memory["clock/step"][:, None], substep, time, is_first, stream)
+        return Context(step_dt, memory["clock/step"][:, None], substep, time, is_first, stream)
 
     @staticmethod
     def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Tensor]:

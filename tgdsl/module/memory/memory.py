@@ -32,7 +32,7 @@ class StateWatch:
 
     def __init__(self, sensors: Sequence[PlannedSensor], kinds: Mapping[str, Kind]):
         """Note what is to be looked at."""
-        rows = {own.name: [f"{own.sensor}[{i}]" for i in range(own.readings[0].num_rows)] for own in sensors}
+        rows = {sensor.name: [f"{sensor.sensor}[{i}]" for i in range(sensor.readings[0].num_rows)] for sensor in sensors}
         self._watched = [
             (f"{own.name}:{state}", own, tuple(row for name in own.upstream for row in rows[name]), warn)
             for own in sensors
@@ -48,8 +48,8 @@ class StateWatch:
             return
         self._num_calls += 1
         for path, sensor, rows, warn in self._watched:
-            found = self._shown(path, memory[path])
-            for message in () if found is None else warn(sensor.sensor, sensor.constants, rows, found):
+            shown = self._shown(path, memory[path])
+            for message in () if shown is None else warn(sensor.sensor, sensor.constants, rows, shown):
                 if message not in self._said:
                     self._said.add(message)
                     warnings.warn(message, stacklevel=6)
@@ -60,11 +60,11 @@ class StateWatch:
             return state.detach().amax(dim=0).numpy()
         if torch.cuda.is_current_stream_capturing():
             return None
-        before = self._copies.get(path)
-        if before is not None and before[1].query():
+        last_copy = self._copies.get(path)
+        if last_copy is not None and last_copy[1].query():
             del self._copies[path]
-            return before[0].numpy()
-        if before is None and self._num_calls % EVERY == 1:
+            return last_copy[0].numpy()
+        if last_copy is None and self._num_calls % EVERY == 1:
             with torch.inference_mode(False), torch.no_grad():
                 largest = state.amax(dim=0)
                 copy = torch.empty(largest.shape, dtype=largest.dtype, pin_memory=True)
@@ -164,8 +164,8 @@ class Memory(HookedModule):
         held = held_buffers(self)
         for path, (sensor, planned) in self._rings.items():
             if _calls(planned, dt)[0] > held[path].shape[1]:
-                what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
-                raise StateError(f"{what} {planned.past:g} s of so many calls; begin with the shortest dt")
+                problem = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
+                raise StateError(f"{problem} {planned.past:g} s of so many calls; begin with the shortest dt")
         self._watch.look(held)
         return held | self.clock.tensors()
 
@@ -195,8 +195,8 @@ class Memory(HookedModule):
             raise StateError("nothing was handed out yet for the environments left out: read all of them first")
         if not self._is_filled:
             if changed := [name for name, (reading, version) in self._last.items() if num_writes(reading) != version]:
-                what = f"the readings {listed(changed)} that were handed out last have been written into since"
-                raise StateError(f"{what}, and the environments left out are to have them: write into clones")
+                problem = f"the readings {listed(changed)} that were handed out last have been written into since"
+                raise StateError(f"{problem}, and the environments left out are to have them: write into clones")
             with torch.inference_mode(False), torch.no_grad():
                 for name, (reading, _) in self._last.items():
                     if name in self._kept:
@@ -241,14 +241,16 @@ class Memory(HookedModule):
 
         Buffers that have the shape already stay where they are: captured graphs go on with them.
         """
-        found = {path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)}
+        loaded = {
+            path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)
+        }
         has_clock = f"{prefix}clock.age" in state_dict
-        if found or has_clock:
-            errors.extend(self._misfits(found, state_dict.get(f"{prefix}clock.age"), prefix))
+        if loaded or has_clock:
+            errors.extend(self._misfits(loaded, state_dict.get(f"{prefix}clock.age"), prefix))
         if errors:
             return  # nothing is loaded, nor by the clock
         with torch.inference_mode(False):
-            for path, value in found.items():
+            for path, value in loaded.items():
                 if path not in (held := held_buffers(self)) or held[path].shape != value.shape:
                     self.register_buffer(path, torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device))
         self._last, self._is_filled = {}, False  # what is replaced has handed them out
@@ -285,16 +287,16 @@ def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
 
 def kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return what is kept of readings that are handed out, if anything is."""
-    return {f"{KEPT}{name}": made.transpose(-2, -1) for name, made in readings.items() if f"{KEPT}{name}" in memory}
+    return {f"{KEPT}{name}": reading.transpose(-2, -1) for name, reading in readings.items() if f"{KEPT}{name}" in memory}
 
 
 def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mask: Tensor) -> dict[str, Tensor]:
     """Return new state of the environments of a mask, and the old one of all others."""
-    chosen = {}
+    selected = {}
     for name, value in updated.items():
         old = memory[name] if value.ndim == memory[name].ndim else memory[name][_entry_of(memory, name)]
-        chosen[name] = torch.where(broadcast_over(mask, value), value, old)
-    return chosen
+        selected[name] = torch.where(broadcast_over(mask, value), value, old)
+    return selected
 
 
 def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:

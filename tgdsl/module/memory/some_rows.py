@@ -72,15 +72,15 @@ def read_rows(
         memory: State of all environments, and what was handed out before, by name.
     """
     held = {name: value if name in SHARED else value[rows] for name, value in memory.items()}
-    made = core(dict(tensors), held | {ENV: rows})
-    for path, value in made.items():
+    outputs = core(dict(tensors), held | {ENV: rows})
+    for path, value in outputs.items():
         part, _, name = path.partition("/")
         if part == "state" and value.ndim < memory[name].ndim:
             memory[name].index_put_((rows, held["clock/step"] % memory[name].shape[1]), value)
         elif part == "state":
             memory[name][rows] = value
     readings: Tensors = {}
-    for path, value in made.items():
+    for path, value in outputs.items():
         part, _, name = path.partition("/")
         if part != "reading":
             continue

@@ -58,12 +58,12 @@ def check_taxels(touch: HasPlan, expected: Taxels, what: str = "this module") ->
         _check_id(plan, expected, what)
         return
     tables = _tables(expected)
-    own = plan_tables(plan)
+    module_tables = plan_tables(plan)
     for sensor, table in tables.items():
-        if sensor not in own:
-            hint = did_you_mean(sensor, own, "sensors with taxels")
+        if sensor not in module_tables:
+            hint = did_you_mean(sensor, module_tables, "sensors with taxels")
             raise TaxelError(f'{what}: there is no sensor "{sensor}", whose taxels are expected; {hint}')
-        check_same_rows(own[sensor], table, f'{what}: sensor "{sensor}"')
+        check_same_rows(module_tables[sensor], table, f'{what}: sensor "{sensor}"')
 
 
 def plan_tables(plan: Plan) -> dict[str, dict[str, np.ndarray]]:
@@ -152,7 +152,9 @@ def _rollout_tables(path: Path) -> dict[str, dict[str, np.ndarray]]:
         with np.load(path, allow_pickle=False) as archive:
             places = [key.rpartition(":")[0] for key in archive.files if key.endswith(":pos") and f"{key[:-4]}:link" in archive]
             keys = {name: [key for key in archive.files if key.rpartition(":")[0] == name] for name in places}
-            result = {name.partition("/")[0]: {k.rpartition(":")[2]: archive[k] for k in own} for name, own in keys.items()}
+            result = {
+                name.partition("/")[0]: {k.rpartition(":")[2]: archive[k] for k in keys_of} for name, keys_of in keys.items()
+            }
     except (OSError, EOFError, ValueError, BadZipFile) as error:
         raise TgdslError(f"{path}: expected the .npz file of a rollout: {error}") from error
     if not result:

@@ -90,12 +90,12 @@ def image_indices(layout: Layout) -> Mapping[str, Int[np.ndarray, "row column"]]
     """
     result: dict[str, np.ndarray] = {}
     for i, link in enumerate(layout.links):
-        own = np.flatnonzero(layout.link_id == i)
-        rows, columns = layout.cell[own].T
+        link_rows = np.flatnonzero(layout.link_id == i)
+        rows, columns = layout.cell[link_rows].T
         if (rows < 0).any():
             continue
         image = np.full((rows.max() + 1, columns.max() + 1), -1, dtype=np.int64)
-        image[rows, columns] = np.where(layout.radius[own] > 0, own, -1)
+        image[rows, columns] = np.where(layout.radius[link_rows] > 0, link_rows, -1)
         result[link.name] = image
     if not result:
         names = ", ".join(link.name for link in layout.links)

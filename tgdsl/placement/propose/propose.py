@@ -125,8 +125,8 @@ def propose(
     found, surfaces = _sampled_hands(sampler, include, progress)
     left_out = tuple(sampler.left_out)
     if not surfaces:
-        what = "; ".join(f'"{name}": {why}' for name, why in left_out)
-        raise TgdslError(f"{robot.file}: no link has a surface for taxels" + (f" ({what})" if what else ""))
+        problem = "; ".join(f'"{name}": {why}' for name, why in left_out)
+        raise TgdslError(f"{robot.file}: no link has a surface for taxels" + (f" ({problem})" if problem else ""))
     names = {int(robot.compiled.body(name).id): name for name in surfaces}
     sides = {names[b]: flexion.inner_side(b) for flexion in found for b in (*flexion.hand.mounts, *flexion.hand.fingers)}
     asked_for = InnerSide(None, "asked for with --include")

@@ -55,7 +55,7 @@ def included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[st
         if not own:
             barred = [name for name in left_out if name == pattern or name in matching(pattern, [name])]
             why = [f'"{name}" can have no taxels: {left_out[name]}' for name in barred]
-            what = "; ".join(why) or f'no link matches "{pattern}"; {did_you_mean(pattern, names, "links")}'
-            raise TgdslError(f"--include: {what}")
+            problem = "; ".join(why) or f'no link matches "{pattern}"; {did_you_mean(pattern, names, "links")}'
+            raise TgdslError(f"--include: {problem}")
         result |= own
     return result

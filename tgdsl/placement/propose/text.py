@@ -80,8 +80,8 @@ def new_layout(
         raise TgdslError(f"--density: {error}") from error
     if per_area <= 0:
         raise TgdslError(f"--density: {density} is out of range, expected more than 0")
-    if (what := units.doubt(per_area, "density", *USUAL_DENSITY)) is not None:
-        warnings.warn(f"--density {density}: {'; '.join(what)}", stacklevel=2)
+    if (problem := units.doubt(per_area, "density", *USUAL_DENSITY)) is not None:
+        warnings.warn(f"--density {density}: {'; '.join(problem)}", stacklevel=2)
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
     check_writable(out)

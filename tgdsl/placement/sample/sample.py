@@ -90,8 +90,8 @@ def _grid(surface: Surface, placement: Grid, is_covered: Covered | None) -> Samp
     region = Region.of(surface, placement.region, is_covered)
     rectangle = visible_rectangle(view, region)
     if rectangle is None:
-        what = "the region" if placement.region else "the link's exposed surface" if is_covered else "the link's surface"
-        raise SampleError(f"no part of {what} is seen along {_shown(placement.direction)}", "turn `direction`")
+        problem = "the region" if placement.region else "the link's exposed surface" if is_covered else "the link's surface"
+        raise SampleError(f"no part of {problem} is seen along {_shown(placement.direction)}", "turn `direction`")
     cell = np.stack(np.divmod(np.arange(placement.rows * placement.columns), placement.columns), axis=-1)
     num = np.array([placement.columns, placement.rows])
     low, high = rectangle
@@ -123,8 +123,8 @@ def _grid_axes(placement: Grid) -> Float[np.ndarray, "3 3"]:
         return frame(direction)
     columns = unit(np.array(placement.columns_along))
     if np.linalg.norm(np.cross(direction, columns)) < 1e-6:
-        what = f"`columns_along` {_shown(placement.columns_along)} is parallel to `direction`"
-        raise SampleError(f"{what} {_shown(placement.direction)}", "choose an axis across it")
+        problem = f"`columns_along` {_shown(placement.columns_along)} is parallel to `direction`"
+        raise SampleError(f"{problem} {_shown(placement.direction)}", "choose an axis across it")
     return frame(direction, columns)
 
 
@@ -136,8 +136,8 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
     if placement.count is None:
         return np.arange(len(cell))
     if placement.count > len(cell):
-        what = f"only {len(cell)} of the grid's {total} cells hit the surface, expected `count` {placement.count}"
-        raise SampleError(what, "lower `count`, or give more `rows` and `columns`")
+        problem = f"only {len(cell)} of the grid's {total} cells hit the surface, expected `count` {placement.count}"
+        raise SampleError(problem, "lower `count`, or give more `rows` and `columns`")
     from_center = (cell + 0.5 - np.array([placement.rows, placement.columns]) / 2) * pitch[::-1]
     distance = np.linalg.norm(from_center, axis=1)
     order = np.argsort(distance, kind="stable")
@@ -170,8 +170,8 @@ def _poisson(
         raise SampleError(f"the region holds too little of the link's {part} for `count` {placement.count}", hint)
     if placement.spacing is not None and pool.area / placement.spacing**2 > MAX_DENSITY:
         least = np.sqrt(pool.area / MAX_DENSITY)
-        what = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
-        raise SampleError(what, f"expected at least {least:.2g} m")
+        problem = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
+        raise SampleError(problem, f"expected at least {least:.2g} m")
     chosen = poisson.choose(pool, placement.count, placement.spacing)
     normal = pool.normal[chosen]
     return Samples(

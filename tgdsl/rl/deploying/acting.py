@@ -124,8 +124,8 @@ class HandActor:
         """
         action = self._policy(obs).to(self.action)
         if not bool(action.isfinite().all()):
-            what = f"at control step {self.steps} this policy returns {action[0].tolist()}, expected finite actions"
-            raise refuse_policy(self._prepared.saved.file, what)
+            problem = f"at control step {self.steps} this policy returns {action[0].tolist()}, expected finite actions"
+            raise refuse_policy(self._prepared.saved.file, problem)
         self._actuation.command(action)
         self.action = action.clamp(-1.0, 1.0)
         self.steps += 1

@@ -145,8 +145,8 @@ class Deployment:
         own = self.prepared
         if not self.has_scene and own.loaded.task.goal_units and own.goal is None and _needs_goal(own):
             units = ", ".join(own.loaded.task.goal_units)
-            what = f'the task "{own.loaded.spec.task}" draws what it asks for by what is in its scene, and {source} has none'
-            raise DeployError(f"{policy}: {what}; say what to ask for: a goal [{units}]")
+            problem = f'the task "{own.loaded.spec.task}" draws what it asks for by what is in its scene, and {source} has none'
+            raise DeployError(f"{policy}: {problem}; say what to ask for: a goal [{units}]")
         motion = motion(own.model) if callable(motion) else motion
         if is_emulated and motion is None:
             motion = emulated_limits(own)

@@ -182,9 +182,9 @@ def _refuse_unknowable(policy: Path, loaded: LoadedTask, names: Sequence[str]) -
     known = ("proprio", GROUP, *loaded.task.hand_groups)
     others = [name for name in names if name not in known]
     if others:
-        what = f'this policy sees {listed(others)} of the task "{loaded.spec.task}", which only a scene knows'
+        problem = f'this policy sees {listed(others)} of the task "{loaded.spec.task}", which only a scene knows'
         hint = f"on a hand there are {listed(known)}; teach a student that sees no more: tgdsl distill"
-        raise DeployError(f"{policy}: {what}; {hint}")
+        raise DeployError(f"{policy}: {problem}; {hint}")
 
 
 def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple[float, ...] | None]:

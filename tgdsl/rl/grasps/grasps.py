@@ -119,6 +119,6 @@ def read_grasps(file: Path, scene: str, object: str) -> Grasps:
     if grasps.object != object:
         raise SimulationError(f'{file}: grasps of the object "{grasps.object}", expected "{object}"')
     if grasps.scene != scene:
-        what = f"grasps of another scene ({grasps.scene[:12]}, expected {scene[:12]})"
-        raise SimulationError(f"{file}: {what}: robot, scene or object have changed; sample them again with `tgdsl grasps`")
+        problem = f"grasps of another scene ({grasps.scene[:12]}, expected {scene[:12]})"
+        raise SimulationError(f"{file}: {problem}: robot, scene or object have changed; sample them again with `tgdsl grasps`")
     return grasps

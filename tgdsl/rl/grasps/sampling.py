@@ -79,8 +79,10 @@ def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -
             kept[v] += [own for own in grasps if own.variant == v]
             tried = (round_ + 1) * int((trials.variant == v).sum())
             if len(kept[v]) < min(wanted[v], LEAST_SHARE * tried) and tried >= ENOUGH:
-                what = f"only {len(kept[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
-                raise loaded.error(("grasps",), what, "start the hand nearer to the object, or ask for less")
+                problem = (
+                    f"only {len(kept[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
+                )
+                raise loaded.error(("grasps",), problem, "start the hand nearer to the object, or ask for less")
         found(sum(min(len(own), most) for own, most in zip(kept, wanted, strict=True)), spec.num)
         if all(len(own) >= most for own, most in zip(kept, wanted, strict=True)):
             break
@@ -143,7 +145,7 @@ class _Trials:
     @property
     def failures(self) -> str:
         """Why trials were not kept, in words."""
-        return ", ".join(f"{num} {what}" for what, num in self._failed.items())
+        return ", ".join(f"{num} {problem}" for problem, num in self._failed.items())
 
     def made(self, round_: int) -> list[_Kept]:
         """Make a round of trials, and return the grasps that hold."""
@@ -162,8 +164,8 @@ class _Trials:
         tilted, moved = (near[0][i] | near[1][i] for i in (0, 1))
         reasons = (sim.faults, tilted, moved, ~presses)
         holds = torch.ones_like(presses)
-        for what, failed in zip(self._failed, reasons, strict=True):
-            self._failed[what] += int((holds & failed).sum())
+        for problem, failed in zip(self._failed, reasons, strict=True):
+            self._failed[problem] += int((holds & failed).sum())
             holds &= ~failed
         return [_Kept(int(self.variant[i]), grasp[i].numpy(), ctrl[i].numpy()) for i in torch.nonzero(holds).flatten().tolist()]
 

@@ -80,8 +80,8 @@ class GraspTable:
         variants = variant.cpu().numpy()
         lacking = sorted({int(v) for v in variants} - {int(v) for v in grasps.variant})
         if lacking:
-            what = f"there are no grasps of variant {listed([str(v) for v in lacking])} of {grasps.object}"
-            raise SimulationError(f"{what}; sample as many as it has variants, or more")
+            problem = f"there are no grasps of variant {listed([str(v) for v in lacking])} of {grasps.object}"
+            raise SimulationError(f"{problem}; sample as many as it has variants, or more")
         order = np.argsort(grasps.variant, kind="stable")
         own = grasps.variant[order]
         device, dtype = sim.qpos.device, sim.qpos.dtype

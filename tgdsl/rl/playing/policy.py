@@ -99,8 +99,8 @@ def read_policy(file: Path) -> PolicyFile:
         if _is_checkpoint(content):
             policy = f"the policy of a run is its {POLICY}, that of rsl_rl's runner what `export_policy_to_jit` writes"
             raise PolicyError(f"{file}: this is a checkpoint, from which learning goes on; {policy}") from error
-        what = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
-        raise PolicyError(f"{file}: {what}: {str(error).strip().splitlines()[0]}") from error
+        problem = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
+        raise PolicyError(f"{file}: {problem}: {str(error).strip().splitlines()[0]}") from error
     if card is not None:
         _check_fields(card, file)
     return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
@@ -185,8 +185,8 @@ class Policy(Actor):
                 made = self._module(torch.zeros((num_envs, total), dtype=torch.float32, device=device))
         except Exception as error:  # whatever TorchScript raises
             last = str(error).strip().splitlines()[-1]
-            what = f"this policy does not take {taken} numbers of {num_envs} environments"
-            raise PolicyError(f"{file}: {what}: {last}") from error
+            problem = f"this policy does not take {taken} numbers of {num_envs} environments"
+            raise PolicyError(f"{file}: {problem}: {last}") from error
         if not isinstance(made, Tensor) or tuple(made.shape) != (num_envs, num_actions):
             found = f"actions {tuple(made.shape)}" if isinstance(made, Tensor) else f"a {type(made).__name__}"
             raise PolicyError(f"{file}: this policy returns {found}, expected ({num_envs}, {num_actions}): joints are others")

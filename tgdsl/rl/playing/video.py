@@ -119,8 +119,8 @@ def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
             warnings.simplefilter("ignore")  # of GLFW, which then raises as well
             return mujoco.Renderer(drawn, height=HEIGHT, width=WIDTH)
     except Exception as error:  # each of MuJoCo's ways to OpenGL raises errors of its own
-        what = f"OpenGL cannot be started ({type(error).__name__}: {error})"
-        raise VideoError(f"{what}; without a display set the environment variable MUJOCO_GL to egl or osmesa") from error
+        problem = f"OpenGL cannot be started ({type(error).__name__}: {error})"
+        raise VideoError(f"{problem}; without a display set the environment variable MUJOCO_GL to egl or osmesa") from error
 
 
 def _encoder() -> str:

@@ -69,11 +69,11 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
     for name in chosen:
         if name not in known:
             raise StudentError(f'there is no type "{name}"; {did_you_mean(name, known, "types")}')
-    for what, names in (("types", chosen), ("placements", placements), ("noise", noises)):
+    for problem, names in (("types", chosen), ("placements", placements), ("noise", noises)):
         if len(set(names)) < len(names):
-            raise StudentError(f"{what} {', '.join(names)}: one is named twice")
+            raise StudentError(f"{problem} {', '.join(names)}: one is named twice")
         if not names:
-            raise StudentError(f"{what}: expected one at least")
+            raise StudentError(f"{problem}: expected one at least")
     if seeds < 1:
         raise StudentError(f"{seeds} seeds, expected 1 at least")
     felts = [
@@ -120,8 +120,8 @@ def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
     others = [name for name in groups if not name.startswith(f"{GROUP}/")]
     for i, name in enumerate(named or ()):
         if name not in others:
-            what = f'there is no group of observations "{name}" beside what each student feels'
-            raise loaded.error(("distill", "groups", i), what, did_you_mean(name, others, "groups"))
+            problem = f'there is no group of observations "{name}" beside what each student feels'
+            raise loaded.error(("distill", "groups", i), problem, did_you_mean(name, others, "groups"))
     if named:
         return [*named, GROUP]
     return [name for name in ACTOR_GROUPS if name in groups or name == GROUP]
@@ -181,8 +181,8 @@ def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
     except TgdslError as error:
         raise StudentError(f"{felt.group}: {error}; take networks.touch_kind mlp") from error
     if missing := [link.name for link in layout.links if link.name not in images]:
-        what = f"the taxels of {', '.join(missing)} are on no grid, and have no image"
-        raise StudentError(f"{felt.group}: {what}; take networks.touch_kind mlp")
+        problem = f"the taxels of {', '.join(missing)} are on no grid, and have no image"
+        raise StudentError(f"{felt.group}: {problem}; take networks.touch_kind mlp")
     shape = (len(images), max(len(image) for image in images.values()), max(image.shape[1] for image in images.values()))
     cells = np.full(shape, -1, dtype=np.int64)
     for link, image in enumerate(images.values()):

@@ -340,8 +340,8 @@ class Distiller:
         known = list(self.env.task.decoded(self.env.now)) if named else []
         for name in named:
             if name not in known:
-                what = f'the task has no privileged number "{name}"'
-                raise loaded.error(("distill", "decoders", name), what, did_you_mean(name, known, "numbers"))
+                problem = f'the task has no privileged number "{name}"'
+                raise loaded.error(("distill", "decoders", name), problem, did_you_mean(name, known, "numbers"))
         return named
 
 

@@ -113,10 +113,10 @@ class DistillSpec(SpecModel):
         if self.steps % self.gradient_length:
             raise ValueError(f"steps is {self.steps}, expected a multiple of gradient_length, {self.gradient_length}")
         if self.final_learning_rate is not None and self.final_learning_rate > self.learning_rate:
-            what = (
+            problem = (
                 f"final_learning_rate is {self.final_learning_rate:g}, expected at most learning_rate, {self.learning_rate:g}"
             )
-            raise ValueError(what)
+            raise ValueError(problem)
         if len(set(self.groups or ())) < len(self.groups or ()):
             raise ValueError("groups names a group twice")
         return self

@@ -52,8 +52,8 @@ class Teacher:
             found, wanted = theirs["resolution"], ours["resolution"]
             raise PolicyError(f"{file}: this teacher feels with other taxels: resolution {found}, here {wanted}")
         if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
-            what = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
-            raise PolicyError(f"{file}: {what}; learn it again, or take distill.loss=mse")
+            problem = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
+            raise PolicyError(f"{file}: {problem}; learn it again, or take distill.loss=mse")
         self.changes = changes_since(card, loaded.spec, OF_TOUCH)
         self._loaded = loaded
 
@@ -95,8 +95,8 @@ class BoundTeacher:
         for name, size in card["groups"].items():
             found = env.groups.get(names[name])
             if found != size:
-                what = "is not there" if found is None else f"has {found} numbers, not {size}: probes or objects are others"
-                raise PolicyError(f'{file}: this teacher sees the group "{name}", which {what}')
+                problem = "is not there" if found is None else f"has {found} numbers, not {size}: probes or objects are others"
+                raise PolicyError(f'{file}: this teacher sees the group "{name}", which {problem}')
         self.groups = tuple(names.values())
         groups = {name: env.groups[name] for name in self.groups}
         self._policy = Policy(teacher.saved, groups, env.num_envs, env.num_actions, env.device)

@@ -195,8 +195,8 @@ class GripForce(Task[GripForceSpec]):
         self.weight = float(np.linalg.norm(setup.model.opt.gravity))
         self.first, self.last = (round(end / setup.control_step) for end in spec.change)
         if self.first < 1:
-            what = f"commands change every {spec.change[0]:g} s, more often than control steps of {setup.control_step:g} s"
-            raise LowerError(what, "change", "expected at least one")
+            problem = f"commands change every {spec.change[0]:g} s, more often than control steps of {setup.control_step:g} s"
+            raise LowerError(problem, "change", "expected at least one")
         self.settled = math.ceil(spec.settling / setup.control_step - 0.5)
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
         self.command, self.error = self.keep("command"), self.keep("error")
@@ -266,8 +266,8 @@ def _keyframes(spec: GripForceSpec, setup: Setup, field: str) -> Float[Tensor, "
         LowerError: If there is no such keyframe, or not one for each variant.
     """
     if len(spec.starts) != setup.num_variants:
-        what = f"{len(spec.starts)} starts, and the object has {setup.num_variants} variants"
-        raise LowerError(what, "starts", "expected a keyframe for each")
+        problem = f"{len(spec.starts)} starts, and the object has {setup.num_variants} variants"
+        raise LowerError(problem, "starts", "expected a keyframe for each")
     rows = []
     for name in spec.starts:
         try:

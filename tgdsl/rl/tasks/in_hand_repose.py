@@ -109,8 +109,8 @@ class InHandReposeSpec(TaskSpec):
             expected = f"more than goal_tolerance, {self.goal_tolerance:g} rad, and at most a half turn"
             raise ValueError(f"goal_step is {self.goal_step:g} rad, expected {expected}")
         if self.goal_hold * control_step > self.goal_timeout:
-            what = f"goal_hold, {self.goal_hold} control steps of {control_step:g} s, takes longer than goal_timeout"
-            raise ValueError(f"{what}, {self.goal_timeout:g} s: no goal could be reached in time")
+            problem = f"goal_hold, {self.goal_hold} control steps of {control_step:g} s, takes longer than goal_timeout"
+            raise ValueError(f"{problem}, {self.goal_timeout:g} s: no goal could be reached in time")
         return self
 
 

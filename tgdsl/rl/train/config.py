@@ -127,8 +127,8 @@ def _given(loaded: LoadedTask, groups: Mapping[str, int], place: tuple[str, ...]
         result = getattr(result, key)
     for i, name in enumerate(result or ()):
         if name not in groups:
-            what = f'there is no group of observations "{name}"'
-            raise loaded.error(("train", *place, i), what, did_you_mean(name, groups, "groups"))
+            problem = f'there is no group of observations "{name}"'
+            raise loaded.error(("train", *place, i), problem, did_you_mean(name, groups, "groups"))
         if groups[name] == 0:
             raise loaded.error(("train", *place, i), f'the group of observations "{name}" is empty')
     return list(result or ())

@@ -131,8 +131,8 @@ class RunFolder:
         """
         free = shutil.disk_usage(self.path).free
         if free < COPIES * size:
-            what = f"{free / 2**20:.2f} MiB are free on the disk, checkpoints take {COPIES * size / 2**20:.2f} MiB"
-            raise FileError(self.checkpoint, what)
+            problem = f"{free / 2**20:.2f} MiB are free on the disk, checkpoints take {COPIES * size / 2**20:.2f} MiB"
+            raise FileError(self.checkpoint, problem)
 
     def begin(self, made_from: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
         """Write what a run is made from, or that it is made to go on; starts that made no run are discarded.
@@ -220,8 +220,8 @@ class RunFolder:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            what = "another process runs in this folder; wait until it has ended, or give another --out"
-            raise TgdslError(f"{self.path}: {what}") from error
+            problem = "another process runs in this folder; wait until it has ended, or give another --out"
+            raise TgdslError(f"{self.path}: {problem}") from error
 
     def _read(self) -> dict[str, Any]:
         try:
@@ -287,7 +287,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskS
     lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
     told = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
-    return lines + [what for name, what in told.items() if before[name] != now[name]]
+    return lines + [problem for name, problem in told.items() if before[name] != now[name]]
 
 
 def versions() -> dict[str, str]:

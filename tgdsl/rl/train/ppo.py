@@ -71,8 +71,8 @@ class CapturedPPO(PPO):
         _refuse(actor, critic, options)
         rows, parts = storage.num_envs * storage.num_transitions_per_env, options.get("num_mini_batches", 1)
         if rows < max(2, parts):
-            what = f"{storage.num_transitions_per_env} steps in {storage.num_envs} environments are {rows} rows of a rollout"
-            raise TgdslError(f"{what}, expected at least {max(2, parts)}: train.mini_batches is {parts}")
+            problem = f"{storage.num_transitions_per_env} steps in {storage.num_envs} environments are {rows} rows of a rollout"
+            raise TgdslError(f"{problem}, expected at least {max(2, parts)}: train.mini_batches is {parts}")
         kind = next(actor.parameters()).dtype
         self.rate = torch.zeros((), dtype=torch.float32 if torch.device(device).type == "cuda" else kind, device=device)
         super().__init__(actor, critic, storage, learning_rate=learning_rate, device=device, rnd_cfg=None, **options)

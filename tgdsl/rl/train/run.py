@@ -184,9 +184,9 @@ class Run:
         wrong: dict[str, Any] = {name: value for name, value in made.told.items() if name.startswith("Loss/")}
         wrong = {name: value for name, value in wrong.items() if not math.isfinite(value)}
         if wrong:
-            what = ", ".join(f"{name} is {value}" for name, value in wrong.items())
+            problem = ", ".join(f"{name} is {value}" for name, value in wrong.items())
             raise DivergedError(
-                f"iteration {self._learner.iteration}: {what}; {self._folder.checkpoint} is from before: try a smaller "
+                f"iteration {self._learner.iteration}: {problem}; {self._folder.checkpoint} is from before: try a smaller "
                 f"{self._learner.rates}"
             )
 

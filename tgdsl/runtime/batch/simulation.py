@@ -58,8 +58,8 @@ class ContactSensors:
 
     def __init__(self, model: mujoco.MjModel, inputs: Inputs):
         if inputs.pairs and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
-            what = "the scene has sensors disabled, and contacts are read of sensors: they would read 0"
-            raise SimulationError(f'{what}; take <flag sensor="disable"/> out of its <option>')
+            problem = "the scene has sensors disabled, and contacts are read of sensors: they would read 0"
+            raise SimulationError(f'{problem}; take <flag sensor="disable"/> out of its <option>')
         self._fields = [name for name in CONTACT_FIELDS if name in inputs.fields]
         self._shapes = {name: shape_of(name, inputs) for name in self._fields}
         self._num_slots = inputs.slots
@@ -274,16 +274,16 @@ class BatchSimulation(Simulation):
         try:
             importlib.import_module("mujoco.batch")
         except ImportError as error:
-            what = f"MuJoCo {mujoco.__version__} has no `mujoco.batch`, by which tgdsl simulates on a CPU"
-            raise SimulationError(f'{what}: pip install "mujoco>=3.17"') from error
+            problem = f"MuJoCo {mujoco.__version__} has no `mujoco.batch`, by which tgdsl simulates on a CPU"
+            raise SimulationError(f'{problem}: pip install "mujoco>=3.17"') from error
         if unknown := [word for word in options.get("per_env", ()) if word not in PER_ENV]:
             hint = did_you_mean(unknown[0], PER_ENV, "words")
             raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {hint}')
         return checked_device(device, ("cpu",))
 
     def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
-        what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
-        refuse_two_instants(self.model, f'{what}; take <flag sleep="enable"/> out of its <option>')
+        problem = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
+        refuse_two_instants(self.model, f'{problem}; take <flag sleep="enable"/> out of its <option>')
         refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
         self.batch = mujoco.batch.Batch(self.model, num_envs, options.get("threads", 0))
         self._keyframe, self._warnings = keyframe, StepWarnings()

@@ -163,8 +163,8 @@ def closing_of(touch: TactileModule) -> Closing | str:
     with muted_mujoco():
         scene = Model(Path(touch.plan.origin.robot), spec, spec.compile(), is_urdf=False)
     if angles_are_misread(scene.compiled):
-        what = f"{touch.plan.origin.robot}: no hinge turns by more than 2π degrees"
-        warnings.warn(f'{what}: is `angle="radian"` missing in its <compiler>? The hand hardly moves', stacklevel=2)
+        problem = f"{touch.plan.origin.robot}: no hinge turns by more than 2π degrees"
+        warnings.warn(f'{problem}: is `angle="radian"` missing in its <compiler>? The hand hardly moves', stacklevel=2)
     links = {link.body for sensor in touch.plan.sensors for link in touch.plan.layout_of(sensor).links}
     moving = movement(scene, frozenset(links))
     if not moving.ends:
@@ -279,6 +279,8 @@ def _resting_group(disabled: int, others: set[int]) -> int:
     """Return a group of actuators that is disabled already, by the bits of `disableactuator`, or that no other is in."""
     groups = [group for group in range(NUM_GROUPS) if disabled >> group & 1 or group not in others]
     if not groups:
-        what = f"the scene's actuators that are not the hand's are in all {NUM_GROUPS} groups"
-        raise SimulationError(f"{what}, and the hand's have to rest in one; leave one of the groups 0 to {NUM_GROUPS - 1} free")
+        problem = f"the scene's actuators that are not the hand's are in all {NUM_GROUPS} groups"
+        raise SimulationError(
+            f"{problem}, and the hand's have to rest in one; leave one of the groups 0 to {NUM_GROUPS - 1} free"
+        )
     return groups[0]

@@ -107,5 +107,5 @@ class EnvFaults:
             return
         self._has_warned = True
         kinds = ", ".join(text.format(num=num) for text, num in zip(_COUNTS, counts, strict=True) if num)
-        what = "had faults" if self.on_fault == "note" else "had faults and were restarted"
-        warnings.warn(f"environments {what}: {kinds}; this is said once, `fault_counts` counts on", stacklevel=4)
+        problem = "had faults" if self.on_fault == "note" else "had faults and were restarted"
+        warnings.warn(f"environments {problem}: {kinds}; this is said once, `fault_counts` counts on", stacklevel=4)

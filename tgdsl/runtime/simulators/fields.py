@@ -36,8 +36,8 @@ def warn_of_mocap(inputs: Inputs, model: mujoco.MjModel) -> None:
         return
     mocap = [name for name in inputs.bodies if model.body_mocapid[model.body_rootid[element_id(model, "body", name)]] >= 0]
     if mocap:
-        what = "MuJoCo gives a mocap body that is moved no velocity: shear, slip and sound of its motion are not felt"
-        warnings.warn(f"{what}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=4)
+        problem = "MuJoCo gives a mocap body that is moved no velocity: shear, slip and sound of its motion are not felt"
+        warnings.warn(f"{problem}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=4)
 
 
 class BodyFields:

@@ -99,9 +99,9 @@ class SubstepStates:
         """
         if substeps != self._wanted:
             steps = f"{self._wanted} physics step{'' if self._wanted == 1 else 's'}"
-            what = f"this module has sensors that are advanced at {steps} per call"
+            problem = f"this module has sensors that are advanced at {steps} per call"
             raise SimulationError(
-                f"{what}, and this simulation makes {substeps} per control step; simulate with substeps={self._wanted}"
+                f"{problem}, and this simulation makes {substeps} per control step; simulate with substeps={self._wanted}"
             )
         self._earlier, self._restarted = [], None
 
@@ -637,8 +637,8 @@ def _refuse_unfit(touch: TactileModule, num_envs: int, options: SimOptions) -> N
     if num_envs < 1 or substeps < 1:
         raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
     if options.get("model") is not None and touch.inputs.objects:
-        what = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
-        raise SimulationError(f"{what}; leave `model` out")
+        problem = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
+        raise SimulationError(f"{problem}; leave `model` out")
     if options.get("model") is not None and options.get("options"):
         raise SimulationError("`options` are for the artefact's scene; a model of your own has them in its `opt`")
     if not touch.has_state:
@@ -651,8 +651,8 @@ def _refuse_unfit(touch: TactileModule, num_envs: int, options: SimOptions) -> N
             "give this one a module of its own: tgdsl.compile(...) again, or copy.deepcopy(touch)"
         )
     if touch.num_envs not in (None, num_envs):
-        what = f"this module holds the state of {touch.num_envs} environments, and num_envs is {num_envs}"
-        raise SimulationError(f"{what}; touch.free() frees it")
+        problem = f"this module holds the state of {touch.num_envs} environments, and num_envs is {num_envs}"
+        raise SimulationError(f"{problem}; touch.free() frees it")
 
 
 def refuse_two_instants(model: mujoco.MjModel, sleep: str) -> None:

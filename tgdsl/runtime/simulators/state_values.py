@@ -118,9 +118,9 @@ class StateTable:
         shape = tuple(self._arrays[name].shape[1:])
         num_rows = self._num_envs if ids is None else len(ids)
         if tuple(result.shape) not in ((num_rows, *shape), shape):
-            what = "a row per environment" if ids is None else "a row for each index"
+            problem = "a row per environment" if ids is None else "a row for each index"
             raise SimulationError(
-                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *shape)}, {what}, or {shape} for all"
+                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *shape)}, {problem}, or {shape} for all"
             )
         if ids is not None and result.ndim > len(shape) and len(np.unique(ids)) < len(ids):
             twice = sorted({str(env) for env in ids.tolist() if (ids == env).sum() > 1})
@@ -154,7 +154,7 @@ class StateTable:
             return
         chosen = torch.zeros(self._num_envs, dtype=torch.bool)
         chosen[torch.from_numpy(env_indices(env_ids, self._num_envs))] = True
-        for what, where in zip(("is not finite", "holds a quaternion of length 0"), bad.cpu() & chosen, strict=True):
+        for problem, where in zip(("is not finite", "holds a quaternion of length 0"), bad.cpu() & chosen, strict=True):
             if where.any():
                 envs = listed([str(env) for env in torch.nonzero(where).flatten().tolist()])
-                raise SimulationError(f"{name} {what} in environments {envs}")
+                raise SimulationError(f"{name} {problem} in environments {envs}")

@@ -54,8 +54,8 @@ def _part(mjw: Any, path: str) -> Any:
         return reduce(getattr, path.split("."), mjw._src)
     except AttributeError as error:
         tried = ", ".join(TRIED)
-        what = f"MuJoCo Warp {version('mujoco-warp')} has no `{path}`, which contacts are read with"
-        raise SimulationError(f"{what}; tried was {tried}") from error
+        problem = f"MuJoCo Warp {version('mujoco-warp')} has no `{path}`, which contacts are read with"
+        raise SimulationError(f"{problem}; tried was {tried}") from error
 
 
 # pyright: reportInvalidTypeForm=false

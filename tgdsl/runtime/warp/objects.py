@@ -124,8 +124,8 @@ class WorldObjects:
             if not isinstance(here, Array) or field.name in OBJECT_FIELDS or field.name in IGNORED_FIELDS:
                 continue
             if not np.array_equal(here, getattr(model, field.name)):
-                what = f"objects {', '.join(self._names)}: their variants differ in MuJoCo's `{field.name}`"
-                raise SimulationError(f"{what}, which MuJoCo Warp shares among all environments; simulate on the CPU")
+                problem = f"objects {', '.join(self._names)}: their variants differ in MuJoCo's `{field.name}`"
+                raise SimulationError(f"{problem}, which MuJoCo Warp shares among all environments; simulate on the CPU")
 
 
 def shared_model(scenes: SceneModels, inputs: Inputs) -> mujoco.MjModel:
@@ -181,8 +181,8 @@ class WorldProperties(ObjectProperties):
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         self._check("mass")
         if not target.is_tree:
-            what = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
-            raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
+            problem = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
+            raise SimulationError(f"{problem}: what follows of its mass is not a matter of scale; simulate on the CPU")
         mass_field, inertia, subtree, body, dof = (self._fields[name] for name in MASS_FIELDS)
         bodies, above, dofs = (self._index(target, name) for name in ("bodies", "above", "dofs"))
         parts = [(mass_field, bodies), (inertia, bodies), (subtree, bodies), (body, bodies), (dof, dofs)]

@@ -58,8 +58,8 @@ class HandConnection(Connection):
             values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
             target = self._actuators.targets(values)
         elif control is not None and self._name:
-            what = f"{self._name} was connected for reading alone: its controls go nowhere"
-            warnings.warn(f"{what}; to move it, connect with motion=MotionLimits(...)", stacklevel=3)
+            problem = f"{self._name} was connected for reading alone: its controls go nowhere"
+            warnings.warn(f"{problem}; to move it, connect with motion=MotionLimits(...)", stacklevel=3)
             self._name = ""
         self._hand.step(target)
         self._observer.note(control)

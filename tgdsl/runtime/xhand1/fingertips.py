@@ -74,8 +74,8 @@ def warn_of_noise(plan: Plan) -> None:
     observed = [plan.sensor_of(term.reading) for term in plan.observations if term.reading not in (None, *PROPRIOCEPTION)]
     noisy = sorted({sensor.sensor for sensor in observed if sensor.noise is not None})
     if noisy:
-        what = f"the noise of {', '.join(noisy)} is that of a simulated sensor"
-        warnings.warn(f"{what}: it is not added to what a hand says", stacklevel=3)
+        problem = f"the noise of {', '.join(noisy)} is that of a simulated sensor"
+        warnings.warn(f"{problem}: it is not added to what a hand says", stacklevel=3)
 
 
 def finger_of(body: str) -> int | None:

@@ -106,8 +106,8 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
     names = [model.joint(i).name for i in range(model.njnt)]
     results = [[i for i, name in enumerate(names) if name == joint or name.endswith(f"_hand_{joint}")] for joint in JOINTS]
     if lacking := [joint for joint, ids in zip(JOINTS, results, strict=True) if len(ids) != 1 or not model.jnt_limited[ids[0]]]:
-        what = f"an XHand1, real or emulated, is a whole hand: expected one joint with a range for each of {listed(lacking)}"
-        raise MotionError(f"{what}; the robot has {listed(names) or 'none'}")
+        problem = f"an XHand1, real or emulated, is a whole hand: expected one joint with a range for each of {listed(lacking)}"
+        raise MotionError(f"{problem}; the robot has {listed(names) or 'none'}")
     return np.array(results)[:, 0]
 
 
@@ -149,8 +149,8 @@ def check_ranges(model: mujoco.MjModel, limits: MotionLimits) -> None:
     ranges = model.jnt_range[joint_ids(model)]
     for name, lower, upper, (least, largest) in zip(JOINTS, limits.lower, limits.upper, ranges, strict=True):
         if lower < least - ROUNDING or upper > largest + ROUNDING:
-            what = f"{name}: limits from {lower:g} to {upper:g} rad"
-            raise MotionError(f"{what}, expected them within the robot file's {least:g} to {largest:g}")
+            problem = f"{name}: limits from {lower:g} to {upper:g} rad"
+            raise MotionError(f"{problem}, expected them within the robot file's {least:g} to {largest:g}")
 
 
 def _actuator(model: mujoco.MjModel, name: str, joint: int) -> int:
@@ -202,8 +202,8 @@ class Motion:
         outside = ~((target >= lower - ROUNDING) & (target <= upper + ROUNDING))
         if outside.any():
             i = int(np.argmax(outside))
-            what = f"{JOINTS[i]}: target {target[i]:g} rad, expected {lower[i]:g} to {upper[i]:g}"
-            raise self.stop(MotionError(what))
+            problem = f"{JOINTS[i]}: target {target[i]:g} rad, expected {lower[i]:g} to {upper[i]:g}"
+            raise self.stop(MotionError(problem))
         if self._target is None:
             if measured is None:
                 raise self.stop(MotionError("where the joints are is not known, so no set-point can start from there"))

@@ -280,8 +280,8 @@ class XHand1Source(HandSource):
 def refuse_beyond_watchdog(control_step: float, watchdog_s: float | None) -> None:
     """Raise an error unless commands, one per control step, come before a watchdog bites."""
     if watchdog_s is not None and control_step >= watchdog_s:
-        what = f"a control step of {1e3 * control_step:g} ms, and the watchdog bites after {1e3 * watchdog_s:g} ms"
-        raise MotionError(f"{what}; expected a shorter step")
+        problem = f"a control step of {1e3 * control_step:g} ms, and the watchdog bites after {1e3 * watchdog_s:g} ms"
+        raise MotionError(f"{problem}; expected a shorter step")
 
 
 def is_chosen(env_ids: EnvIds) -> bool:

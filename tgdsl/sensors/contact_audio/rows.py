@@ -81,8 +81,8 @@ def ringing(
     rows = names_of(spec, layout)
     for pattern in spec.bodies:
         if not any(fnmatchcase(name, pattern) for _, names in rows for name in names):
-            what = f'`bodies`: no {spec.of} of the sensor matches "{pattern}"'
-            raise LowerError(what, field="bodies", hint=f"it has {listed([name for name, _ in rows])}")
+            problem = f'`bodies`: no {spec.of} of the sensor matches "{pattern}"'
+            raise LowerError(problem, field="bodies", hint=f"it has {listed([name for name, _ in rows])}")
     below, each, notes = highest(spec.samples, step), [], []
     for name, names in rows:
         modes = modes_of(_given(spec, names), name, lambda own=name: surface(own), below, progress)
@@ -92,8 +92,8 @@ def ringing(
         if not is_heard.all():
             notes.append(f"{name}: {_dropped(modes.frequency[~is_heard])}: the sample rate is {spec.samples / step:g} Hz")
         if spec.gains == "contact" and modes.shapes is None:
-            what = f'`gains: contact` wants mode shapes, and the modes of "{name}" are listed'
-            raise LowerError(what, "gains", "give `modes: {material: …}`, or `gains: mean`")
+            problem = f'`gains: contact` wants mode shapes, and the modes of "{name}" are listed'
+            raise LowerError(problem, "gains", "give `modes: {material: …}`, or `gains: mean`")
         each.append((modes, is_heard))
     for note in notes:
         warnings.warn(f"contact audio of {note}, and frequencies up to {HIGHEST:g} of it are heard", stacklevel=2)
@@ -144,6 +144,6 @@ def _unheard(name: str, modes: Modes, spec: ContactAudioSpec, step: float) -> Lo
     if not len(modes.frequency):
         return LowerError(f'"{name}" has no mode below {highest(spec.samples, step):.5g} Hz', "samples", "take more samples")
     lowest = float(modes.frequency.min())
-    what = f'the lowest mode of "{name}" is at {lowest:.5g} Hz, and {spec.samples} samples of a step of {step:g} s hold '
+    problem = f'the lowest mode of "{name}" is at {lowest:.5g} Hz, and {spec.samples} samples of a step of {step:g} s hold '
     needed = math.ceil(lowest * step / HIGHEST * (1 - 1e-12))
-    return LowerError(f"{what}{highest(spec.samples, step):.5g} Hz", "samples", f"it needs `samples: {needed}`")
+    return LowerError(f"{problem}{highest(spec.samples, step):.5g} Hz", "samples", f"it needs `samples: {needed}`")

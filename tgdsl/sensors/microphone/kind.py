@@ -87,8 +87,8 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
     blocks = {name: own.lowered.sound for name, own in fitting.upstream.items()}
     for name, count in blocks.items():
         if count != blocks[first]:
-            what = f'"{name}" makes {count} samples per physics step, "{first}" {blocks[first]}'
-            raise LowerError(what, "hears", "a microphone hears sources of one sample rate: expected as many of all")
+            problem = f'"{name}" makes {count} samples per physics step, "{first}" {blocks[first]}'
+            raise LowerError(problem, "hears", "a microphone hears sources of one sample rate: expected as many of all")
     for name in spec.levels:
         if name not in fitting.upstream:
             raise LowerError(f'it does not hear "{name}"', "levels", did_you_mean(name, fitting.upstream, "sources"))

@@ -85,7 +85,7 @@ def _table(stage: Stage, knobs: Knobs, channels: Sequence[str]) -> dict[str, Flo
     for name, value in stage.values_of(knobs).items():
         for own in () if isinstance(value, tuple) else value:
             if own != ALL and own not in known:
-                what = f'"{stage.numbers[name].knob or name}" names "{own}", which this sensor does not read'
-                raise LowerError(what, field="noise", hint=did_you_mean(own, known, "quantities"))
+                problem = f'"{stage.numbers[name].knob or name}" names "{own}", which this sensor does not read'
+                raise LowerError(problem, field="noise", hint=did_you_mean(own, known, "quantities"))
         result[name] = np.array([range_of(value, channel) for channel in channels]).T
     return result

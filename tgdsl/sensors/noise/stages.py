@@ -65,8 +65,8 @@ def more_stages() -> tuple[AnyStage, ...]:
         draws = [number.draw for number in stage.numbers.values() if number.draw is not None]
         for name in (*stage.Knobs.model_fields, *(f"number {name}" for name in stage.numbers), *draws):
             if (other := names.setdefault(name, stage.name)) != stage.name:
-                what = f"the draw {name}" if isinstance(name, int) else f'"{name}"'
-                raise TgdslError(f'the noise stages "{other}" and "{stage.name}" both have {what}; expected another one')
+                problem = f"the draw {name}" if isinstance(name, int) else f'"{name}"'
+                raise TgdslError(f'the noise stages "{other}" and "{stage.name}" both have {problem}; expected another one')
     return more
 
 
@@ -96,8 +96,8 @@ def stages_of(terms: Sequence[str]) -> tuple[AnyStage, ...]:
     """
     known = known_stages()
     if missing := set(terms).difference(*(stage.terms for stage in known)):
-        what = f'the noise stage "{min(missing)}" is not known'
-        raise TgdslError(f"{what}; install its package, or `tgdsl.sensors.noise.register` it")
+        problem = f'the noise stage "{min(missing)}" is not known'
+        raise TgdslError(f"{problem}; install its package, or `tgdsl.sensors.noise.register` it")
     return tuple(stage for stage in known if set(stage.terms) & set(terms))
 
 

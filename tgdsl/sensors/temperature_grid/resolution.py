@@ -60,8 +60,8 @@ def warn_of_coarse(
         if abs(lost_error(finer, size, ratio, exposed)) <= LARGEST_ERROR:
             enough = f"{_times(finer)} cells hold {100 * LARGEST_ERROR:g} %"
             break
-    what = f"what its faces lose is {100 * errors[worst]:.2g} % wrong with {_times(count[worst])} cells"
-    warnings.warn(f"heat of {names[worst]}: {what}; {enough}", CoarseCellsWarning, stacklevel=2)
+    problem = f"what its faces lose is {100 * errors[worst]:.2g} % wrong with {_times(count[worst])} cells"
+    warnings.warn(f"heat of {names[worst]}: {problem}; {enough}", CoarseCellsWarning, stacklevel=2)
 
 
 def _times(count: Int[np.ndarray, " axis"]) -> str:

@@ -87,8 +87,8 @@ class SimulatedTips:
         for term in terms:
             missing = [FINGERS[finger] for finger in term.fingers if finger not in self._places]
             if missing:
-                what = f"{term.label}: the emulator's {', '.join(missing)} would feel nothing"
-                raise ObservationError(f"{what}; give an observation agg_force that says what force its fingertips feel")
+                problem = f"{term.label}: the emulator's {', '.join(missing)} would feel nothing"
+                raise ObservationError(f"{problem}; give an observation agg_force that says what force its fingertips feel")
 
     def forces(self, readings: Mapping[str, Tensor]) -> Float[np.ndarray, "finger 3"]:
         """Return the force on each fingertip, along its link's axes [unit of `agg_force`]; 0 where none is observed."""
@@ -106,8 +106,8 @@ class SimulatedTips:
     def _take(self, finger: int, place: _Place) -> None:
         known = self._places.setdefault(finger, place)
         if known.operator(self._touch.plan) != place.operator(self._touch.plan):
-            what = f"{known.term.label} and {place.term.label} differ, but the hand has one force on its {FINGERS[finger]}"
-            raise ObservationError(f"{what}; give them the same `scale` and sensor")
+            problem = f"{known.term.label} and {place.term.label} differ, but the hand has one force on its {FINGERS[finger]}"
+            raise ObservationError(f"{problem}; give them the same `scale` and sensor")
 
 
 class SimulatedBody:
@@ -265,8 +265,8 @@ class EmulatedSource(XHand1Source):
         if self.body.clipped and not self._has_warned:
             self._has_warned = True
             who = ", ".join(sorted(self.body.clipped))
-            what = f"the emulated {who} felt more than counts of -128…127 along x and y and 0…255 along z can say"
-            warnings.warn(f"{what}; see the calibration's scale and rotation", stacklevel=2)
+            problem = f"the emulated {who} felt more than counts of -128…127 along x and y and 0…255 along z can say"
+            warnings.warn(f"{problem}; see the calibration's scale and rotation", stacklevel=2)
 
     def close(self) -> None:
         """Close the hand, pull the plug and end the simulation."""
