@@ -70,7 +70,7 @@ class Problem:
         line: Line of the mistake, from 1; 0 where the document did not come from a file.
         column: Column of the mistake, from 1.
         path: Where it is in the document, such as `sensors.touch.links`.
-        what: What was found and what was expected.
+        what: The actual and the expected value, in words.
         hint: What would be right, or empty.
     """
 
@@ -107,7 +107,7 @@ class SampleError(TgdslError):
     """A placement that a surface cannot satisfy.
 
     Attributes:
-        what: What was found and what was expected.
+        what: The actual and the expected value, in words.
         hint: What would be right, or empty.
     """
 
@@ -121,7 +121,7 @@ class LowerError(TgdslError):
     """What a kind of sensor cannot do on the links that it was put on.
 
     Attributes:
-        what: What was found and what was expected.
+        what: The actual and the expected value, in words.
         field: The field of the sensor's spec that is at fault, or empty.
         hint: What would be right, or empty.
     """

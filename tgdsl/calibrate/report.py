@@ -28,7 +28,7 @@ def calibrated(base: Calibration, fits: Mapping[str, FingerFit], others: str | N
     Args:
         base: What stays of fingers that were not fitted.
         fits: Fits by finger.
-        others: A finger whose scale and rotation those that were not fitted shall have, with a tare of their own.
+        others: A finger whose scale and rotation the unfitted ones get, with their own tare.
 
     A threshold of contact in counts means nothing in N, and is left out.
 

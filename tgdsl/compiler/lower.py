@@ -115,7 +115,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         resolved: What it means on its robot.
         kinds: The kinds that it may use.
         origin: What it was made of.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it

@@ -158,7 +158,7 @@ def sampled(
         patches: The links.
         objects: Bodies of the robot's file that are no links, but objects.
         pools: Points that were drawn on the links before; those that are drawn are added.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If a surface cannot satisfy a placement; all mistakes found so far.

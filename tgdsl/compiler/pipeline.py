@@ -70,8 +70,8 @@ def compile_plan(
     Args:
         document: A YAML file, or the same as a mapping.
         overrides: By dotted path YAML text, or a plain value, set before anything is read: `{"resolution": "high"}`.
-        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
-        progress: Is told in a line what is being done, each time that something begins.
+        kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
+        progress: Called with a line of text for each long job.
         sensors: Names of the document's sensors that are wanted; default: all.
         choice: What was chosen where sensors have an `accuracy`: see `tuning.compile`, which chooses.
 
@@ -150,8 +150,8 @@ def placed(
         document: A YAML file, or the same as a mapping; without sensors, all taxels of its layout count.
         overrides: YAML text, or plain values, by dotted path.
         resolutions: Default: the document's own, or all of the layout's if it names none.
-        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
-        progress: Is told what is done.
+        kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.

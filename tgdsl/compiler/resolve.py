@@ -150,11 +150,11 @@ class Resolved:
     Attributes:
         layout: Taxels of the links that some sensor has; of all links if the document has no sensors.
         links: Names of each sensor's links.
-        objects: What can be felt of each object that is felt.
+        objects: The geoms of each object that count.
         own: The objects with geoms or sizes of their own.
         scene: The model that holds robot and objects.
         robot: The robot's own model.
-        unused: What has taxels or can be felt but is not needed, and why.
+        unused: Links and objects that are not needed, and why.
         patches: The links that carry taxels.
         colliders: What the simulator collides of the robot.
         reach: What that leaves of each taxel.
@@ -162,7 +162,7 @@ class Resolved:
         link_bodies: The bodies of each link that carries taxels or is a sensor's.
         joints: The robot's joints and actuators.
         on_joints: Names of the joints of each sensor that is on joints.
-        primitives: What links collide with in the scene in place of their own geoms.
+        primitives: Collision shapes of links, instead of their own geoms.
     """
 
     layout: Layout
@@ -247,7 +247,7 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
 
     Args:
         loaded: The document.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
         models: Robot and scene of the same document, read before; default: they are read.
 
     Raises:

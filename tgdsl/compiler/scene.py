@@ -136,7 +136,7 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
     the scene does not depend on where they lie. It is compiled again and compared, so that nothing goes missing unnoticed.
 
     Raises:
-        RobotError: If a file cannot be found, or what is kept is not what was loaded.
+        RobotError: If a file is missing, or differs from the one that was loaded.
     """
     own = OwnObjects() if own is None else own
     kept = _Kept(start_qpos(own.bodies))

@@ -31,7 +31,7 @@ def sensed_object(
     others: Collection[str],
     report: Report,
 ) -> SensedObject:
-    """Return what is felt of an object: the geoms that collide, those that are seen, those named, or its own.
+    """Return an object's geoms that count: the colliding, the visible, the named, or its own ones.
 
     Bodies that are welded to its body from below are part of it, and the solver's contacts with it are those on its geoms that
     collide. A surface that is only seen has none of its own: contacts with it are those of the whole object.

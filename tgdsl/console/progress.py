@@ -25,7 +25,7 @@ class StatusLine:
         self._is_shown = self._stream.isatty()
 
     def __call__(self, what: str) -> None:
-        """Show what is being done, in place of what was done before."""
+        """Show the current job instead of the last one."""
         if self._is_shown:
             width = shutil.get_terminal_size().columns - 1
             self._stream.write(f"\r\x1b[K{what[:width]}")

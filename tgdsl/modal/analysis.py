@@ -47,7 +47,7 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progr
         surface: Its surface, in its frame; of several geoms, all of theirs.
         given: What the document says of its modes.
         below: Frequency beyond which no mode is wanted [Hz].
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         LowerError: If the surface encloses no solid that can be analysed, the material is not known well enough, or none of its

@@ -88,7 +88,7 @@ def spectrum(
         poissons_ratio: Less than 1/2.
         count: Most modes of distinct frequency.
         unknowns: Number of unknowns that the cells are made small for; default: `UNKNOWNS`.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         LowerError: If the surface has no inside, the body falls into parts, or needs more cells than are allowed.

@@ -51,7 +51,7 @@ def bind(plan: Plan, kinds: Mapping[str, Kind], tensor_of: Callable[[str], Tenso
 
 
 def _stays_on_host(record: Any) -> bool:
-    """Return whether a part of the plan is no constant of a module: what is made of it is, and is kept there."""
+    """Return whether a part of the plan is no constant of a module, but the source of one."""
     return getattr(record, "stays_on_host", False)
 
 

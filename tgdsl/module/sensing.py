@@ -325,7 +325,7 @@ def _joined(sensing: Sensing, own: Tree, sensor: PlannedSensor, gathered: Gather
 
 
 def _with_history(sensor: PlannedSensor, found: Tensors, memory: Mapping[str, Tensor], updated: Tensors) -> Tensors:
-    """Return readings with those of the last calls, if that is what is read; what they are made of goes to `updated`."""
+    """Return readings, stacked with those of the last calls where a history is read; the history goes to `updated`."""
     for reading in sensor.windows:
         assert sensor.history is not None
         path = f"{WINDOW}{reading.name}"

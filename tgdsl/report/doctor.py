@@ -77,7 +77,7 @@ class Finding:
 
     Attributes:
         level: How bad it is.
-        what: What was found.
+        what: The result, in words.
         then: What follows, or what to do.
     """
 

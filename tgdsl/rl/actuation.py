@@ -355,7 +355,7 @@ class Actuation:
         arrays["qfrc_applied"][:, self._index["dof"]] = torque - plain
 
     def memory(self) -> dict[str, Tensor]:
-        """Return what is kept, by name: live tensors."""
+        """Return the memory by name: live tensors."""
         own = {"target": self.target, "start": self.start, "torque": self.torque}
         own |= {"play": self._play, "past": self._past, "count": self._count}
         return own | {f"drawn/{name}": value for name, value in self.drawn.items()}

@@ -17,7 +17,7 @@ class Curricula:
 
     Attributes:
         values: The numbers that they change, by dotted path: tensors without axes.
-        spec: The task's document, these weights in place of its own.
+        spec: The task's document, with these weights instead of its own.
         terms: The terms that it adds, in the same way.
     """
 
@@ -39,7 +39,7 @@ class Curricula:
         """Write the numbers at an iteration; a GPU is not waited for.
 
         Args:
-            iteration: How many iterations were made.
+            iteration: Number of iterations so far.
             score: Mean score of the episodes that have ended last; None: none has ended yet.
         """
         for term in self._terms.values():

@@ -65,7 +65,7 @@ class TouchEnv:
         pushes: Forces that push the object.
         curricula: Numbers of terms that change while a policy is learned: whoever learns calls `advance`.
         groups: Size of each group of observations.
-        felt: Where those of what is felt come from.
+        felt: Sources of the groups of touch.
         steps: Control steps of each environment's present episode; may be written.
     """
 
@@ -101,8 +101,8 @@ class TouchEnv:
             first_env: Number of the first environment among those of all processes: of it, random numbers and variants.
             feels: What several policies feel, each a group of observations `Felt.group`, in place of the document's `touch`,
                 `placement` and `noise`, and of `tactile_sensors`.
-            sensed: What `compile_sensed` made of the task, in place of the document's sensors; its module is taken as it is.
-            progress: Is told in a line what is being done.
+            sensed: The result of `compile_sensed`, instead of the document's sensors; its module is used as it is.
+            progress: Called with a line of text for each long job.
 
         Raises:
             SpecError: All mistakes of the document, at their places.
@@ -311,7 +311,7 @@ class TouchEnv:
         self.sim.close()
 
     def _memory(self) -> dict[str, dict[str, Tensor]]:
-        """Return what is kept besides simulation and module: live tensors by part and name."""
+        """Return the memory outside simulation and module: live tensors by part and name."""
         actions = {"used": self._used, "before": self._before}
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         kept = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}

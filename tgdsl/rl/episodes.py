@@ -159,7 +159,7 @@ class Episodes:
             self.terms, self.sums = terms, self.total.new_zeros((len(terms), len(self.total)))
 
     def with_matching_sums(self, saved: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return what is kept here, and what was saved, both with the sums that either has: before the first step none are."""
+        """Return the current and the saved memory, each with the sums that either has: before the first step there are none."""
         own, before = self.memory(), dict(saved)
         for one, other in ((own, saved), (before, self.memory())):
             if not any(name.startswith("sums/") for name in one):
@@ -167,7 +167,7 @@ class Episodes:
         return own, before
 
     def memory(self) -> dict[str, Tensor]:
-        """Return what is kept, by name: live tensors."""
+        """Return the memory by name: live tensors."""
         own = {name: getattr(self, name) for name in ("number", "steps", "friction", "mass", "total")}
         return own | {f"sums/{name}": total for name, total in zip(self.terms, self.sums, strict=True)}
 

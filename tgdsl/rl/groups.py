@@ -47,7 +47,7 @@ class MeasuredVelocity:
         self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
 
     def memory(self) -> dict[str, Tensor]:
-        """Return what is kept, by name: live tensors."""
+        """Return the memory by name: live tensors."""
         return {"before": self._before, "value": self.value}
 
 

@@ -105,7 +105,7 @@ class Pushes:
         self._applied[:, self._body, :3] = self.force
 
     def memory(self) -> dict[str, Tensor]:
-        """Return what is kept, by name: live tensors."""
+        """Return the memory by name: live tensors."""
         return {"force": self.force, "left": self._left, "count": self._count}
 
     def _interval(self, share: Float[Tensor, "env 1"]) -> Int[Tensor, " env"]:

@@ -35,7 +35,7 @@ class Felt(NamedTuple):
     """One of several things that policies feel in one simulation.
 
     Attributes:
-        type: What is felt, a `TouchType` but "none".
+        type: The type of touch, any `TouchType` except "none".
         placement: Links that feel: a link group, or a link's name, with shell wildcards.
         noise: A noise profile.
     """
@@ -126,8 +126,8 @@ def compile_sensed(
     Args:
         loaded: The task's document.
         device: Where the module lives.
-        progress: Is told in a line what is being done.
-        only: Kinds of sensors that are taken instead of those that the policy feels and the task looks at.
+        progress: Called with a line of text for each long job.
+        only: Kinds of sensors to use, instead of the policy's and the task's.
         feels: What policies feel, in place of the document's `touch`, `placement` and `noise`.
         also: Groups of observations that the module has besides, as a document has them: `{"q": [{"type": "joint_pos"}]}`.
 

@@ -132,7 +132,7 @@ class Event:
 
     Attributes:
         sim: The simulation; its `arrays` and `properties` may be changed, of the chosen environments alone.
-        setup: What the task is made for.
+        setup: The setup of the environments.
         chosen: The environments in which it happens: decide by this mask, not by `if`.
         count: How often it has happened in each environment, above that the episode.
         name: Its name in the document.
@@ -190,7 +190,7 @@ class CurriculumTerm(Term):
         """Return the number.
 
         Args:
-            iteration: How many iterations were made.
+            iteration: Number of iterations so far.
             score: Mean score of the episodes that have ended last, in `Task.score_unit`; None: none has ended yet.
         """
 

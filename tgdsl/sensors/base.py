@@ -63,7 +63,7 @@ class AnySensorSpec(SpecModel):
 
     @property
     def is_gated(self) -> bool:
-        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
+        """Whether an object counts only while the simulator has it in contact with the taxel's link."""
         return False
 
 
@@ -111,7 +111,7 @@ class ContactProbeSpec(ProbeSpec):
 
     @property
     def is_gated(self) -> bool:
-        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
+        """Whether an object counts only while the simulator has it in contact with the taxel's link."""
         return self.gate == "contact_pair"
 
 

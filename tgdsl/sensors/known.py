@@ -1,4 +1,4 @@
-"""The kinds that a document may use: those of tgdsl, those that installed packages bring, and those that a caller gives.
+"""The kinds that a document may use: tgdsl's, those of installed packages, and those a caller gives.
 
 A package brings a kind by an entry point, in its pyproject.toml:
 

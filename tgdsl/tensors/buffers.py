@@ -18,7 +18,7 @@ class Constants(HookedModule):
     """Arrays as buffers, by name. A change of dtype starts from the arrays' own float64, so that nothing is rounded twice.
 
     Attributes:
-        tree: What was made of the buffers by `bind`, and is made again when they are replaced.
+        tree: The result of `bind` on the buffers; rebuilt when they are replaced.
     """
 
     def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype, bind: Callable[[Callable[[str], Tensor]], Any]):

@@ -52,7 +52,7 @@ def device_of(device: torch.device | str) -> torch.device:
 
 
 def why_there_is_none(device: object, error: Exception, known: Sequence[str] = ("cpu", "cuda")) -> str:
-    """Return what is to be said of a device that torch does not have: what is expected in place of it, or torch's own words.
+    """Return the message for a device that torch lacks: the available ones, or torch's own words.
 
     Args:
         device: The device.

@@ -60,7 +60,7 @@ def overview(
         touch: The module.
         sim: The scene, at the instant of the readings.
         readings: What the module read, by name.
-        path: PNG file to write; its folder is made if need be.
+        path: PNG file to write; its folder is created if necessary.
         env: Which environment.
         title: What to write above it all.
         view: From where, as in `view.picture`.

@@ -52,7 +52,7 @@ def picture(
         touch: The module.
         sim: The scene, at the instant of the readings.
         readings: What the module read, by name.
-        path: PNG file to write; its folder is made if need be.
+        path: PNG file to write; its folder is created if necessary.
         env: Which environment.
         reading: Which reading of taxels; default: a kinematic taxel's, if there is any, or else the first.
         title: What to write above it all; default: the reading's name.

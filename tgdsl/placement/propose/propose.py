@@ -115,7 +115,7 @@ def propose(
         density: Taxels per area at `med` [1/m²].
         with_groups: Whether to propose link groups.
         include: Names or shell wildcards of links outside its hands that are to have taxels too.
-        progress: Called with what is done next.
+        progress: Called with a line of text for each long job.
 
     Raises:
         TgdslError: If no link can be sampled, if the density asks for more taxels than a link can have, or if a name to include

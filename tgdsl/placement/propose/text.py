@@ -68,7 +68,7 @@ def new_layout(
         out: The file.
         is_forced: Whether it may be replaced.
         include: Names or shell wildcards of links outside the hands that are to have taxels too.
-        progress: Called with what is done next.
+        progress: Called with a line of text for each long job.
 
     Raises:
         TgdslError: If the density is none, the file is there already or cannot be written, the robot has no link that can carry

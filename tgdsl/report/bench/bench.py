@@ -60,7 +60,7 @@ def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], 
 
     Args:
         what: What is measured.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
         begun: Is told how much is done of how much, each time that something is.
 
     Raises:

@@ -74,7 +74,7 @@ def measure_physics(
         steps: Control steps, about.
         substeps: Physics steps of each.
         seed: Of what differs between environments.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SimulationError: If the scene cannot be simulated.

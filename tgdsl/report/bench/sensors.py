@@ -78,7 +78,7 @@ def measure(sensor: Sensor, recording: Recording, options: Options, progress: Pr
         sensor: The sensor.
         recording: States of the document's scene.
         options: How to measure.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         StateError: If the states are of another document.

@@ -117,7 +117,7 @@ class Deployment:
             motion: Leave for a real hand to move, or what makes it of the scene's model; default: none. An emulated one always
                 has.
             lockstep: Whether an emulator's scene waits for each step, and a log is read as fast as possible.
-            progress: Is told in a line what is being done.
+            progress: Called with a line of text for each long job.
             **options: Other options of `tgdsl.connect`.
 
         Raises:

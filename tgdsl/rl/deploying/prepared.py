@@ -120,7 +120,7 @@ def prepare(
         overrides: Values of the document to set first by dotted path.
         device: Where the module computes.
         is_emulated: Whether an emulated hand has to feel what the fingertips would.
-        progress: Is told in a line what is being done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: All mistakes of the documents, at their places.

@@ -71,7 +71,7 @@ class Report:
         inference: From a sample to set-points: what it took to observe and to choose.
         latency: Age and inference, of each step together; None where there is no age.
         control_rate: Control steps per second that the task asks for [Hz].
-        rate: Those that were made [Hz].
+        rate: Achieved rate [Hz].
         late_steps: Control steps that began after they should have ended.
         moves: Whether set-points went to joints.
     """

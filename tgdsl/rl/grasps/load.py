@@ -26,7 +26,7 @@ def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneF
         loaded: The task's document.
         sim: The environments.
         scene: Their scene.
-        progress: Is told in a line what is being done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If the document's file of grasps is none of this scene, hardly any grasp holds, or a variant has none.
@@ -58,7 +58,7 @@ def kept_grasps(
         scene: The scene.
         joints: The joints that the policy moves.
         found: Is told how many were sampled.
-        progress: Is told in a line what else is being done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If there is no such keyframe, the object cannot be held as asked, or hardly any grasp holds.

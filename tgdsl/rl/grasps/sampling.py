@@ -62,7 +62,7 @@ def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -
     Args:
         loaded: The task's document.
         found: Is told how many were found.
-        progress: Is told in a line what else is being done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If there is no such keyframe, the object cannot be turned or moved as asked, or hardly any trial holds.

@@ -102,7 +102,7 @@ class GraspTable:
         return Drawn({"qpos": self.qpos[index], "ctrl": self.ctrl[index]}, contacts, self.pos[index], self.quat[index])
 
     def _evaluated(self, sim: Simulation, body: str, variants: Int[np.ndarray, " env"]) -> dict[str, Tensor]:
-        """Return what is felt in each grasp, and where the object is: zeros in those of variants that no environment has."""
+        """Return the touch in each grasp, and the object's place: zeros for variants that no environment has."""
         rank, num = np.zeros_like(variants), np.zeros_like(variants)
         for v in np.unique(variants):
             rank[variants == v], num[variants == v] = np.arange((variants == v).sum()), (variants == v).sum()

@@ -273,7 +273,7 @@ def _without_folder(task: str) -> str:
 
 
 def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
-    """Whether groups are those of a card, in its order; that of touch may be named by what is felt, as `Felt.group`."""
+    """Whether groups equal a card's, in its order; the group of touch may be named as `Felt.group` does."""
     pairs = zip(card.items(), groups.items(), strict=False)
     return len(card) == len(groups) and all(
         size == result and (name == other or (name == GROUP and other.startswith(f"{GROUP}/")))

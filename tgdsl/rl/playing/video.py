@@ -62,7 +62,7 @@ def video(
         control_step: Duration of a control step [s].
         path: The file to write, `.mp4`.
         camera: A camera of the scene; default: its first one, or MuJoCo's free camera where it has none.
-        progress: Is told in a line what is being done.
+        progress: Called with a line of text for each long job.
         trace: What the taxels read at each control step: they are drawn, and a bar for each link.
 
     Raises:

@@ -41,7 +41,7 @@ class Distiller:
         ranks: The processes: one.
         rollouts: The students by stack, in the order of their blocks.
         groups: Groups of observations of each student by name.
-        iteration: How many iterations were made.
+        iteration: Number of iterations so far.
         samples: How many control steps these took in all environments.
     """
 
@@ -91,7 +91,7 @@ class Distiller:
 
     @property
     def episode_names(self) -> list[str]:
-        """What iterations tell of the episodes that ended, in those that had any."""
+        """Numbers of the episodes that ended, from iterations in which any did."""
         return [*self._tally.names, *(f"Score/{key.name}" for key in self.keys)]
 
     def set_rate(self, share: float) -> None:

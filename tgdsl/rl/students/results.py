@@ -140,7 +140,7 @@ def write_students(
         command: How to make the run again.
         found: How good each student is; empty: that is not known.
         folder: Where to.
-        progress: Is told what is being done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         FileError: If one cannot be written.

@@ -44,7 +44,7 @@ def placed(
     Objects of other heights than the first variant, which the keyframe has, stand where that one stands.
 
     Args:
-        setup: What the task is made for.
+        setup: The setup of the environments.
         spec: What is random.
         chosen: The environments; rows of the others mean nothing.
         episode: How often each environment was reset.

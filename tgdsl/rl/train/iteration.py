@@ -82,7 +82,7 @@ class Learning(Protocol):
         env: The environments.
         ranks: The processes.
         groups: Groups of observations of each network.
-        iteration: How many iterations were made.
+        iteration: Number of iterations so far.
         samples: How many control steps these took, over all processes and environments.
         rates: What of the document makes smaller steps.
     """
@@ -96,7 +96,7 @@ class Learning(Protocol):
 
     @property
     def episode_names(self) -> list[str]:
-        """What iterations tell of the episodes that ended, in those that had any."""
+        """Numbers of the episodes that ended, from iterations in which any did."""
         ...
 
     def iterate(self, share: float = 0.0) -> Iteration:

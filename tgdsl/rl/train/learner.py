@@ -32,7 +32,7 @@ class Learner:
         env: The environments.
         algorithm: PPO.
         groups: Groups of observations of actor, critic and random network distillation.
-        iteration: How many iterations were made.
+        iteration: Number of iterations so far.
         samples: How many control steps these took, over all processes and environments.
     """
 
@@ -76,7 +76,7 @@ class Learner:
 
     @property
     def episode_names(self) -> list[str]:
-        """What iterations tell of the episodes that ended, in those that had any."""
+        """Numbers of the episodes that ended, from iterations in which any did."""
         return self._tally.names
 
     def roll(self) -> None:

@@ -74,7 +74,7 @@ class HandConnection(Connection):
         return is_chosen(env_ids)
 
     def resume(self) -> None:
-        """Allow a hand that was made passive by an error to move again."""
+        """Let a hand move again after an error made it passive."""
         self._hand.resume()
 
 

@@ -148,7 +148,7 @@ class HandSource(ABC):
         """Reset, but for the speeds."""
 
     def resume(self) -> None:
-        """Allow a hand that was made passive by an error to move again."""
+        """Let a hand move again after an error made it passive."""
         return
 
     @abstractmethod
@@ -236,7 +236,7 @@ class XHand1Source(HandSource):
         return self.sample().reading.age_s()
 
     def resume(self) -> None:
-        """Allow a hand that was made passive by an error to move again."""
+        """Let a hand move again after an error made it passive."""
         self.hand.resume()
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ def modes_of(given: ModesField, name: str, surface: Callable[[], Surface], below
         name: What the body is called in messages.
         surface: Returns its surface in its frame; called where its shape is wanted.
         below: Frequency beyond which a mode is not heard [Hz]. Those that are listed are returned all the same.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         LowerError: If its shape gives none.

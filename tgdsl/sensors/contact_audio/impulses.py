@@ -39,7 +39,7 @@ def impulses(
     Args:
         force: F [N].
         constants: The sensor's.
-        state: What was remembered.
+        state: The memory.
         share: Of each mode, s; the impulses are then those of each mode, (env, body, object, mode).
     """
     above, kept = force - state["steady"], constants["kept"]
@@ -71,7 +71,7 @@ def rises(
         force: F [N].
         context: When.
         constants: The sensor's.
-        state: What was remembered.
+        state: The memory.
         share: Of each mode, s.
     """
     load = of_rows(force if share is None else force[..., None] * share, constants)

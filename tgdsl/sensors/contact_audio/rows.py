@@ -72,7 +72,7 @@ def ringing(
         layout: Its links.
         step: The time step [s].
         surface: Returns surfaces.
-        progress: Is told what is done.
+        progress: Called with a line of text for each long job.
 
     Raises:
         LowerError: If a pattern matches nothing, a body has no mode that is heard at the sample rate, or mode shapes are wanted

@@ -130,7 +130,7 @@ class ElastomerSpec(ContactProbeSpec):
 
     @property
     def is_gated(self) -> bool:
-        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
+        """Whether an object counts only while the simulator has it in contact with the taxel's link."""
         return super().is_gated and self.standoff == 0.0
 
     @property

@@ -38,7 +38,7 @@ def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants, x: Tenso
 
     Args:
         patches: Which there are.
-        rows: What the rows are made of.
+        rows: Materials of the rows.
         constants: What `lower` folded.
         x: What the rows' modes decay by in the step.
     """

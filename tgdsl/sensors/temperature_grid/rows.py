@@ -64,7 +64,7 @@ def rows_of(constants: Constants, patches: ContactPatch, is_smooth: bool) -> Row
 
     Args:
         constants: What `lower` folded.
-        patches: What links touch, and what that is made of.
+        patches: The links' contact patches, and the materials there.
         is_smooth: Whether modes decay as those of the continuous solid.
     """
     objects, grids = patches.objects, list(patches.topology.grids)

@@ -46,8 +46,8 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
     Args:
         cells: Temperatures of the rows' cells above ambient (env, row, x, y, z) [K].
         nodes: Those of the objects of one temperature (env, node) [K].
-        rows: What the rows are made of.
-        patches: What links touch, and what that is made of.
+        rows: Materials of the rows.
+        patches: The links' contact patches, and the materials there.
         constants: What `lower` folded.
         dt: Δt [s].
     """

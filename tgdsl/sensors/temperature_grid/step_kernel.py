@@ -58,7 +58,7 @@ def heat_step(
         films: Resistance between a cell and its faces across each axis, and what modes lose there, (row, 6); the share of that
             which is radiation (row,).
         emissivity: Of the rows; None if nothing radiates.
-        source: What is made in each cell (row, x, y, z) [W].
+        source: Heat source in each cell (row, x, y, z) [W].
         modes: Modes (row, mode, cell) of three axes, then their sums, then what αΔt/Δ² is multiplied with, (row, mode) each.
         objects: Heat capacity by volume, volume, area, conductivity and emissivity (env or 1, node).
         around: Δt and the temperature of the surroundings [°C], scalars.
