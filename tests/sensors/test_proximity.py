@@ -182,13 +182,14 @@ SCENE = (
 
 
 def document(folder, probes, feels=("item",), target=None, **sensor):
+    coarse = {} if sensor.get("backend") == "points" else {"tolerance": COARSE}
     (folder / "scene.xml").write_text(SCENE)
     layout = {"resolutions": {"r": {"pad": {"method": "points", "points": probes}}}}
     return {
         "tgdsl": 1,
         "robot": {"model": str(folder / "scene.xml"), "layout": layout},
         "objects": {"item": {"body": "item", **(target or {})}, "floor": {"body": "floor"}},
-        "sensors": {"s": {"kind": "proximity", "links": "pad", "feels": list(feels), "tolerance": COARSE, **sensor}},
+        "sensors": {"s": {"kind": "proximity", "links": "pad", "feels": list(feels), **coarse, **sensor}},
     }
 
 

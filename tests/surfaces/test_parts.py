@@ -4,7 +4,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from surfaces import ball, box, surface_of
+from oracles.setups.solids import ball, box, surface_of
 
 from tgdsl.surfaces.meshlab import outer_shell
 from tgdsl.surfaces.parts import outward

@@ -163,11 +163,11 @@ class Actuators:
         Raises:
             SimulationError: If there is no such joint, it has no limits, or no position actuator of its own.
         """
-        known = [model.joint(i).name for i in range(model.njnt)]
+        joint_names = [model.joint(i).name for i in range(model.njnt)]
         rows = []
         for name in names:
-            if name not in known:
-                raise SimulationError(f'the scene has no joint "{name}"; {did_you_mean(name, known, "joints")}')
+            if name not in joint_names:
+                raise SimulationError(f'the scene has no joint "{name}"; {did_you_mean(name, joint_names, "joints")}')
             rows.append(_actuator_row(model, name))
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         return cls(tuple(names), *columns)
@@ -176,10 +176,10 @@ class Actuators:
 def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
     """Return the columns of `Actuators` for one joint."""
     joint = model.joint(name)
-    own = np.flatnonzero((model.actuator_trnid[:, 0] == joint.id) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT))
-    if len(own) != 1:
-        raise SimulationError(f'joint "{name}" has {len(own)} actuators, expected one position actuator')
-    i = int(own[0])
+    actuators = np.flatnonzero((model.actuator_trnid[:, 0] == joint.id) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT))
+    if len(actuators) != 1:
+        raise SimulationError(f'joint "{name}" has {len(actuators)} actuators, expected one position actuator')
+    i = int(actuators[0])
     stiffness, (bias, spring, damper) = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, :3]
     is_position = (
         model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
@@ -304,12 +304,12 @@ class Actuation:
         """
         low, high, action = self._values["low"], self._values["high"], action.to(self.target.dtype).clamp(-1.0, 1.0)
         if self.action.mode == "absolute":
-            wanted = low + 0.5 * (action + 1.0) * (high - low)
+            command = low + 0.5 * (action + 1.0) * (high - low)
         else:
             origin = self.start if self.action.mode == "offset" else self.target
-            wanted = torch.minimum(torch.maximum(origin + self._scale * action, low), high)
-        wanted = torch.lerp(wanted, self.target, self.action.smoothing)
-        self._take(torch.where(action.isfinite(), wanted, self.target))
+            command = torch.minimum(torch.maximum(origin + self._scale * action, low), high)
+        command = torch.lerp(command, self.target, self.action.smoothing)
+        self._take(torch.where(action.isfinite(), command, self.target))
 
     def follow(self, control: Float[Tensor, "env actuator"]) -> None:
         """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too.
@@ -329,26 +329,26 @@ class Actuation:
 
     def drive(self) -> None:
         """Make a torque of each target, before a physics step: see the top of this page."""
-        arrays, own, drawn = self._arrays, self._values, self.drawn
+        arrays, values, drawn = self._arrays, self._values, self.drawn
         pos, speed = (arrays[name].index_select(1, self._index[which]) for name, which in (("qpos", "qpos"), ("qvel", "dof")))
-        wanted, half = self._arrived() + drawn["bias"], 0.5 * drawn["backlash"]
-        self._play.copy_(torch.minimum(torch.maximum(self._play, wanted - half), wanted + half))
+        delayed, half = self._arrived() + drawn["bias"], 0.5 * drawn["backlash"]
+        self._play.copy_(torch.minimum(torch.maximum(self._play, delayed - half), delayed + half))
         error = self._play - pos
         error = error.sign() * (error.abs() - drawn["deadband"]).clamp(min=0.0)
         # MuJoCo clips controls to the joint's range: what is beyond it is part of the force on the joint.
-        control = torch.minimum(torch.maximum(pos + error, own["low"]), own["high"])
-        plain = _within(own["stiffness"] * (control - pos) - own["damping"] * speed, own["limit"])
-        torque = drawn["gain"] * own["stiffness"] * error - drawn["damping"] * own["damping"] * speed
-        torque = _within(torque, drawn["strength"] * own["limit"])
+        control = torch.minimum(torch.maximum(pos + error, values["low"]), values["high"])
+        plain = _within(values["stiffness"] * (control - pos) - values["damping"] * speed, values["limit"])
+        torque = drawn["gain"] * values["stiffness"] * error - drawn["damping"] * values["damping"] * speed
+        torque = _within(torque, drawn["strength"] * values["limit"])
         torque = torch.where(speed.abs() < BREAKAWAY_SPEED, drawn["kick"] * torque, torque)
         if self.spec.top_speed is not None:
             share = (1.0 - speed.abs() / self._top_speed).clamp(min=0.0)
-            torque = torch.where(torque * speed > 0, _within(torque, share * own["limit"]), torque)
+            torque = torch.where(torque * speed > 0, _within(torque, share * values["limit"]), torque)
         if self.spec.torque_noise:
             share = self._draws.shares_ahead("torque_noise", self._count, torque.shape[1], self._ahead)
             noise = within(share, -1.0, 1.0)
-            torque = torque + self.spec.torque_noise * own["limit"] * noise.to(torque.dtype)
-        torque = _within(torque, drawn["strength"] * own["limit"])
+            torque = torque + self.spec.torque_noise * values["limit"] * noise.to(torque.dtype)
+        torque = _within(torque, drawn["strength"] * values["limit"])
         self._count += 1
         self.torque.copy_(torque)
         arrays["ctrl"][:, self._index["actuator"]] = control
@@ -356,17 +356,17 @@ class Actuation:
 
     def memory(self) -> dict[str, Tensor]:
         """Return the memory by name: live tensors."""
-        own = {"target": self.target, "start": self.start, "torque": self.torque}
-        own |= {"play": self._play, "past": self._past, "count": self._count}
-        return own | {f"drawn/{name}": value for name, value in self.drawn.items()}
+        memory = {"target": self.target, "start": self.start, "torque": self.torque}
+        memory |= {"play": self._play, "past": self._past, "count": self._count}
+        return memory | {f"drawn/{name}": value for name, value in self.drawn.items()}
 
     def _ends(self, which: int) -> Float[Tensor, "drawn joint"]:
         """Return the lower or upper ends of what is drawn; of delays, which are rounded down, that of the last one's share."""
         ends = torch.zeros((len(self._random), len(self._is_slide)), dtype=torch.float64)
-        for name, own in zip(self._random, ends, strict=True):
-            own += getattr(self.spec, name)[which] + (which if name == "delay" else 0)
+        for name, bounds in zip(self._random, ends, strict=True):
+            bounds += getattr(self.spec, name)[which] + (which if name == "delay" else 0)
             if name in _ANGLES:
-                own[torch.from_numpy(self._is_slide)] = 0.0
+                bounds[torch.from_numpy(self._is_slide)] = 0.0
         return ends
 
     def _arrived(self) -> Float[Tensor, "env joint"]:

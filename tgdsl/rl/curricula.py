@@ -29,9 +29,9 @@ class Curricula:
         if weights := self._changed("rewards."):
             rewards = getattr(loaded.spec, "rewards")  # noqa: B009 (of the task's own model)
             self.spec = loaded.spec.model_copy(update={"rewards": rewards.model_copy(update=weights)})
-        others = {name: term for name, term in loaded.terms.items() if name not in self._terms}
+        other_terms = {name: term for name, term in loaded.terms.items() if name not in self._terms}
         self.terms: Mapping[str, Term] = {
-            name: term.model_copy(update=self._changed(f"terms.{name}.")) for name, term in others.items()
+            name: term.model_copy(update=self._changed(f"terms.{name}.")) for name, term in other_terms.items()
         }
         self.advance(0, None)
 

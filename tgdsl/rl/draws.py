@@ -104,7 +104,7 @@ class Draws:
         streams = self._streams(sizes)
         if not self._is_on_host:
             return self._shares(*streams, counter)
-        begun, purpose, index, counts = (own.numpy() for own in (*streams, counter))
+        begun, purpose, index, counts = (tensor.numpy() for tensor in (*streams, counter))
         rows = None if chosen is None else few_ids(chosen)
         if rows is None:
             return torch.from_numpy(uniform_on_host(_hash_on_host(begun, purpose, index, counts)))
@@ -119,15 +119,15 @@ class Draws:
         """
         if not self._is_on_host:
             return self.shares({what: num}, counter)[what]
-        made = self._ahead.get((what, num))
-        if made is None or not made.left or not torch.equal(counter, made.counter):
-            begun, purpose, index, counts = (own.numpy() for own in (*self._streams({what: num}), counter))
+        prefetched = self._ahead.get((what, num))
+        if prefetched is None or not prefetched.left or not torch.equal(counter, prefetched.counter):
+            begun, purpose, index, counts = (tensor.numpy() for tensor in (*self._streams({what: num}), counter))
             each = (counts[:, None] + np.arange(ahead)).ravel()
-            found = uniform_on_host(_hash_on_host(begun.repeat(ahead, axis=0), purpose, index, each))
-            found = found.reshape(len(counts), ahead, num).transpose(1, 0, 2)
-            made = _Prefetched(counter, list(torch.from_numpy(np.ascontiguousarray(found)).unbind()))
-        self._ahead[what, num] = _Prefetched(counter + 1, made.left[1:])
-        return made.left[0]
+            numbers = uniform_on_host(_hash_on_host(begun.repeat(ahead, axis=0), purpose, index, each))
+            numbers = numbers.reshape(len(counts), ahead, num).transpose(1, 0, 2)
+            prefetched = _Prefetched(counter, list(torch.from_numpy(np.ascontiguousarray(numbers)).unbind()))
+        self._ahead[what, num] = _Prefetched(counter + 1, prefetched.left[1:])
+        return prefetched.left[0]
 
     def uniform(
         self, what: str, counter: Int[Tensor, " env"], num: int, low: float = 0.0, high: float = 1.0
@@ -154,12 +154,12 @@ class Draws:
 
     def _streams(self, sizes: Mapping[str, int]) -> _Streams:
         """Return what the numbers of some purposes begin from."""
-        asked = tuple(sizes.items())
-        if asked not in self._known:  # at the first call: a graph that is captured later copies nothing from the host
-            purpose = torch.tensor([i for i, (_, num) in enumerate(asked) for _ in range(num)], device=self._device)
-            index = torch.tensor([i for _, num in asked for i in range(num)], dtype=torch.int32, device=self._device)
-            self._known[asked] = _Streams(self._begun(list(sizes)), purpose, index)
-        return self._known[asked]
+        requests = tuple(sizes.items())
+        if requests not in self._known:  # at the first call: a graph that is captured later copies nothing from the host
+            purpose = torch.tensor([i for i, (_, num) in enumerate(requests) for _ in range(num)], device=self._device)
+            index = torch.tensor([i for _, num in requests for i in range(num)], dtype=torch.int32, device=self._device)
+            self._known[requests] = _Streams(self._begun(list(sizes)), purpose, index)
+        return self._known[requests]
 
     def _begun(self, names: list[str]) -> Int[Tensor, "env purpose half"]:
         keys = torch.tensor([sensor_key(self.seed, problem) for problem in names], dtype=torch.int32, device=self._device)
@@ -182,7 +182,9 @@ class Draws:
         counter: Int[Tensor, " env"],
     ) -> Int[Tensor, "env num"]:
         if self._is_on_host:
-            return torch.from_numpy(_hash_on_host(*(own.numpy() for own in (begun, purpose, index, counter))).view(np.int32))
+            return torch.from_numpy(
+                _hash_on_host(*(tensor.numpy() for tensor in (begun, purpose, index, counter))).view(np.int32)
+            )
         low, high = (half.to(torch.int32)[:, None, None] for half in (counter, counter >> 32))
         mixed = mix(torch.cat([begun ^ low, high.expand(-1, 1, 2)], dim=1))  # both at once
         first, second = mix(mixed[:, :-1] ^ mixed[:, -1:])[:, purpose].unbind(-1)
@@ -198,9 +200,9 @@ def _hash_on_host(
     """Return the same words, uint32, by NumPy."""
     low, high = counter.astype(np.uint32)[:, None, None], (counter >> 32).astype(np.uint32)[:, None, None]
     keys = mix_on_host(mix_on_host(begun.view(np.uint32) ^ low) ^ mix_on_host(high))
-    own = keys if keys.shape[1] == 1 else keys[:, purpose]
-    word = mix_on_host(index.view(np.uint32) ^ own[:, :, 0])
-    word ^= own[:, :, 1]
+    key = keys if keys.shape[1] == 1 else keys[:, purpose]
+    word = mix_on_host(index.view(np.uint32) ^ key[:, :, 0])
+    word ^= key[:, :, 1]
     return word
 
 

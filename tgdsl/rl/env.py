@@ -146,7 +146,9 @@ class TouchEnv:
         is_plain = not (is_compiled or is_cuda)
         is_small = is_plain and num_envs * self.touch.plan.layout.num_taxels <= SINGLE_THREAD_MAX_TAXELS
         self._dispatch = below_autograd if is_plain else nullcontext
-        self._step_by, self._logic_by = (one_thread if own else nullcontext for own in (is_small, is_plain and not is_small))
+        self._step_by, self._logic_by = (
+            one_thread if is_alone else nullcontext for is_alone in (is_small, is_plain and not is_small)
+        )
         self._has_stepped = True
         self._prepare(progress or silent, is_compiled)
         self._has_stepped = False
@@ -242,10 +244,10 @@ class TouchEnv:
                 warnings.warn(f"{problem}; later steps are not looked at", stacklevel=2)
         with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too
             self._action.copy_(action)
-            made, self._instant = self._call()
-            made = saving.copied(made) if self.device.type == "cuda" else made
-        self._obs, self._is_loaded = made.obs, False
-        return made._replace(obs=dict(made.obs))
+            step, self._instant = self._call()
+            step = saving.copied(step) if self.device.type == "cuda" else step
+        self._obs, self._is_loaded = step.obs, False
+        return step._replace(obs=dict(step.obs))
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
@@ -263,9 +265,9 @@ class TouchEnv:
             now = self._instant = self._now(self.sim.read())
             self._measure(now)
             self.task.advance_healthy(now, self.sim.faults)
-            made = self._judged(now, self.sim.faults)
-        self._obs, self._is_loaded = made.obs, False
-        return made
+            step = self._judged(now, self.sim.faults)
+        self._obs, self._is_loaded = step.obs, False
+        return step
 
     def images(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what the policy feels as one image per link, and where its pixels are taxels: see `TactileModule.images`.
@@ -282,9 +284,9 @@ class TouchEnv:
 
         Another `TouchEnv` of the same document and number of environments goes on from it: on a CPU bit for bit.
         """
-        kept = {part: saving.saved(memory) for part, memory in self._memory().items()}
-        kept |= {"sim": self.sim.state_dict(), "touch": saving.saved(self.touch.state_dict()), "obs": saving.saved(self._obs)}
-        return kept | {"seed": {"seed": torch.tensor(self._draws.seed)}}
+        state = {part: saving.saved(memory) for part, memory in self._memory().items()}
+        state |= {"sim": self.sim.state_dict(), "touch": saving.saved(self.touch.state_dict()), "obs": saving.saved(self._obs)}
+        return state | {"seed": {"seed": torch.tensor(self._draws.seed)}}
 
     def load_state_dict(self, state: Mapping[str, Mapping[str, Tensor]]) -> Observations:
         """Go on where environments of the same document and number were saved; return the observations there.
@@ -295,7 +297,7 @@ class TouchEnv:
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
         own["episodes"], saved = self._episodes.with_matching_sums(state.get("episodes", {}))
         state = {**state, "episodes": saved} if "episodes" in state else state
-        saving.refuse_other_parts(own, {part: kept for part, kept in state.items() if part != "sim"})
+        saving.refuse_other_parts(own, {part: saved_part for part, saved_part in state.items() if part != "sim"})
         self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
         self._episodes.expect(tuple(name.removeprefix("sums/") for name in saved if name.startswith("sums/")))
         for part, memory in self._memory().items():
@@ -314,10 +316,10 @@ class TouchEnv:
         """Return the memory outside simulation and module: live tensors by part and name."""
         actions = {"used": self._used, "before": self._before}
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
-        kept = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
-        kept |= {"speeds": self._speeds.memory()} if self._speeds else {}
-        kept |= {"curricula": self.curricula.values} if self.curricula.values else {}
-        return kept | ({"events": self._events.memory} if self._events.memory else {})
+        memory = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
+        memory |= {"speeds": self._speeds.memory()} if self._speeds else {}
+        memory |= {"curricula": self.curricula.values} if self.curricula.values else {}
+        return memory | ({"events": self._events.memory} if self._events.memory else {})
 
     def _prepare(self, tell: Progress, is_compiled: bool) -> None:
         """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
@@ -356,13 +358,13 @@ class TouchEnv:
         sim, now = self.sim, self._now(readings)
         self._measure(now)
         self.task.advance_healthy(now, sim.faults)
-        made = self._judged(now, sim.faults)
-        if may_be_nonempty(made.info.ended):
-            self._begin(made.info.ended)
-            now = self._now(sim.read(made.info.ended))
-            self._measure(now, made.info.ended)
-            made = made._replace(obs=self._observed(now))
-        return made, now
+        step = self._judged(now, sim.faults)
+        if may_be_nonempty(step.info.ended):
+            self._begin(step.info.ended)
+            now = self._now(sim.read(step.info.ended))
+            self._measure(now, step.info.ended)
+            step = step._replace(obs=self._observed(now))
+        return step, now
 
     def _command(self, action: Float[Tensor, "env joint"], ctrl: Float[Tensor, "env nu"]) -> Float[Tensor, "env nu"]:
         """Take an action over; return the simulation's controls, which are no numbers where an action is none."""
@@ -414,9 +416,9 @@ class TouchEnv:
             SimulationError: If it is of another shape.
         """
         if not isinstance(value, Tensor) or value.ndim != ndim or len(value) != len(like):
-            found = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             expected = f"({len(like)},)" if ndim == 1 else f"({len(like)}, …)"
-            raise SimulationError(f'the term "{name}" returns {found}, expected a tensor {expected}')
+            raise SimulationError(f'the term "{name}" returns {given}, expected a tensor {expected}')
         return value
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
@@ -447,8 +449,10 @@ class TouchEnv:
         felt = self._sensed.observe(now.readings)
         exact = groups.proprio(now)
         proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
-        own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
+        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
         terms = {name: term for name, term in self.curricula.terms.items() if isinstance(term, ObservationTerm)}
-        own |= {name: self._checked(name, term.observe(now, self.task.setup), proprio, ndim=2) for name, term in terms.items()}
-        own |= self.task.checked_observations(now, own)
-        return {name: value.to(self.device, torch.float32) for name, value in own.items()}
+        result |= {
+            name: self._checked(name, term.observe(now, self.task.setup), proprio, ndim=2) for name, term in terms.items()
+        }
+        result |= self.task.checked_observations(now, result)
+        return {name: value.to(self.device, torch.float32) for name, value in result.items()}

@@ -160,23 +160,23 @@ class Episodes:
 
     def with_matching_sums(self, saved: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return the current and the saved memory, each with the sums that either has: before the first step there are none."""
-        own, before = self.memory(), dict(saved)
-        for one, other in ((own, saved), (before, self.memory())):
+        current, saved_memory = self.memory(), dict(saved)
+        for one, other in ((current, saved), (saved_memory, self.memory())):
             if not any(name.startswith("sums/") for name in one):
                 one |= {name: torch.zeros_like(self.total) for name in other if name.startswith("sums/")}
-        return own, before
+        return current, saved_memory
 
     def memory(self) -> dict[str, Tensor]:
         """Return the memory by name: live tensors."""
-        own = {name: getattr(self, name) for name in ("number", "steps", "friction", "mass", "total")}
-        return own | {f"sums/{name}": total for name, total in zip(self.terms, self.sums, strict=True)}
+        memory = {name: getattr(self, name) for name in ("number", "steps", "friction", "mass", "total")}
+        return memory | {f"sums/{name}": total for name, total in zip(self.terms, self.sums, strict=True)}
 
     def _draw(self, chosen: Bool[Tensor, " env"]) -> Start:
         """Draw friction, mass and how the task begins."""
         self.number += chosen
         ranges = {name: getattr(self._random, name) for name, rest in REST.items() if getattr(self._random, name) != rest}
-        found = self._draws.shares(dict.fromkeys(ranges, 1), self.number, chosen) if ranges else {}
-        for name, share in found.items():
+        shares = self._draws.shares(dict.fromkeys(ranges, 1), self.number, chosen) if ranges else {}
+        for name, share in shares.items():
             drawn = within(share, *ranges[name])[:, 0]
             if name == "friction":
                 put_rows(self.friction, chosen, self._friction * drawn)

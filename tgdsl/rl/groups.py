@@ -68,8 +68,8 @@ def priv_proprio(now: Now, own: Float[Tensor, "env shared"]) -> Float[Tensor, "e
 
 def object_state(now: Now) -> Float[Tensor, "env feature"]:
     """Return the object's position [m], six numbers of its orientation, velocity [m/s] and angular velocity [rad/s]."""
-    own = now.object
-    return torch.cat([own.pos, six_numbers(own.quat), own.linvel, own.angvel], dim=1)
+    body = now.object
+    return torch.cat([body.pos, six_numbers(body.quat), body.linvel, body.angvel], dim=1)
 
 
 def object_props(now: Now) -> Float[Tensor, "env feature"]:

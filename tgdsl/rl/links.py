@@ -24,7 +24,7 @@ def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray,
     joints = [_joints_above(model, element_id(model, "body", link)) for link in links]
     of_all = set.intersection(*joints) if joints else set()
     slides = {joint for joint in of_all if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)}
-    return np.array([bool(own - slides) for own in joints], dtype=bool)
+    return np.array([bool(joint_ids - slides) for joint_ids in joints], dtype=bool)
 
 
 def _joints_above(model: mujoco.MjModel, body: int) -> set[int]:

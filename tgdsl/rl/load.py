@@ -108,11 +108,11 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
             )
         elif isinstance(term, Term):
             terms[name] = term
-    known = numbers(spec, terms)
+    numbers_of = numbers(spec, terms)
     for name, term in terms.items():
-        if isinstance(term, CurriculumTerm) and term.of not in known:
+        if isinstance(term, CurriculumTerm) and term.of not in numbers_of:
             problem = f'there is no number "{term.of}" of a term'
-            problems.append(source.problem(("terms", name, "of"), problem, did_you_mean(term.of, known, "numbers")))
+            problems.append(source.problem(("terms", name, "of"), problem, did_you_mean(term.of, numbers_of, "numbers")))
     return terms
 
 
@@ -148,14 +148,14 @@ def _class_of(
         hint = f"{did_you_mean(name, known, which)}; one of your own is package.module:Class or file.py:Class"
         raise SpecError([source.problem(place, f'there is no {which[:-1]} "{name}"', hint)])
     try:
-        own = _own_module(module, folder)
+        user_module = _own_module(module, folder)
     except Exception as error:  # whatever a user's code raises
         line = f"{raised_at(str((folder / module).resolve()), error)}: " if module.endswith(".py") else ""
         problem = f'cannot import "{name}": {line}{type(error).__name__}: {error}'
         raise SpecError([source.problem(place, problem)]) from error
-    result = getattr(own, class_, None)
+    result = getattr(user_module, class_, None)
     if result is None:
-        classes = [key for key, value in vars(own).items() if isinstance(value, type) and issubclass(value, base)]
+        classes = [key for key, value in vars(user_module).items() if isinstance(value, type) and issubclass(value, base)]
         raise SpecError(
             [source.problem(place, f'{module} has no class "{class_}"', did_you_mean(class_, classes, f"{which} in it"))]
         )
@@ -171,19 +171,19 @@ def _own_module(name: str, folder: Path) -> Any:
     if not name.endswith(".py"):
         return importlib.import_module(name)
     file = (folder / name).resolve()
-    known = f"tgdsl_task_{file.stem}_{abs(hash(str(file)))}"
-    if known in sys.modules:
-        return sys.modules[known]
-    made = importlib.util.spec_from_file_location(known, file)
-    if made is None or made.loader is None or not file.is_file():
+    module_name = f"tgdsl_task_{file.stem}_{abs(hash(str(file)))}"
+    if module_name in sys.modules:
+        return sys.modules[module_name]
+    module_spec = importlib.util.spec_from_file_location(module_name, file)
+    if module_spec is None or module_spec.loader is None or not file.is_file():
         raise FileNotFoundError("there is no such file")
-    module = importlib.util.module_from_spec(made)
-    sys.modules[known] = module
+    module = importlib.util.module_from_spec(module_spec)
+    sys.modules[module_name] = module
     sys.path.insert(0, str(file.parent))  # modules beside it, as where Python runs the file
     try:
-        made.loader.exec_module(module)
+        module_spec.loader.exec_module(module)
     except BaseException:
-        del sys.modules[known]
+        del sys.modules[module_name]
         raise
     finally:
         sys.path.remove(str(file.parent))

@@ -98,9 +98,9 @@ class Pushes:
         if not may_be_nonempty(changes := begins | ends):
             return
         self._count += ends
-        found = self._draws.shares(_DRAWN, self._count, changes)
-        put_rows(self._left, ends, self._interval(found["push interval"]))
-        put_rows(self.force, begins, self._low + found["push"].to(self.force.dtype) * (self._high - self._low))
+        shares = self._draws.shares(_DRAWN, self._count, changes)
+        put_rows(self._left, ends, self._interval(shares["push interval"]))
+        put_rows(self.force, begins, self._low + shares["push"].to(self.force.dtype) * (self._high - self._low))
         put_rows(self.force, ends, 0.0)
         self._applied[:, self._body, :3] = self.force
 

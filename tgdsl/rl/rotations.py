@@ -31,7 +31,7 @@ def between(one: Quat, other: Quat) -> Float[Tensor, "*n"]:
 
     Of unit length they are 2 |sin θ/4| and 2 |cos θ/4| apart, as q and −q are the same rotation.
     """
-    apart, against = (vector_norm(own, dim=-1) for own in (one - other, one + other))
+    apart, against = (vector_norm(difference, dim=-1) for difference in (one - other, one + other))
     return 4.0 * torch.atan2(torch.minimum(apart, against), torch.maximum(apart, against))
 
 

@@ -19,15 +19,21 @@ def task_schema() -> dict[str, Any]:
     definitions: dict[str, Any] = {}
     for model in (TaskSpec, *dict.fromkeys(specs.values())):
         schema = model.model_json_schema(ref_template="#/$defs/{model}")
-        own = schema.pop("$defs", {})
-        others = {name: f"{model.__name__}.{name}" for name, made in own.items() if definitions.get(name, made) != made}
-        schema, own = _renamed(schema, others), _renamed({others.get(name, name): made for name, made in own.items()}, others)
-        definitions |= own
+        task_spec = schema.pop("$defs", {})
+        others = {name: f"{model.__name__}.{name}" for name, made in task_spec.items() if definitions.get(name, made) != made}
+        schema, task_spec = (
+            _renamed(schema, others),
+            _renamed({others.get(name, name): made for name, made in task_spec.items()}, others),
+        )
+        definitions |= task_spec
         schema.pop("title", None)
         definitions[model.__name__] = schema
-    own = definitions["TaskSpec"]
-    own["additionalProperties"] = True
-    own["properties"]["randomise"] = {"type": "object", "description": own["properties"]["randomise"]["description"]}
+    task_spec = definitions["TaskSpec"]
+    task_spec["additionalProperties"] = True
+    task_spec["properties"]["randomise"] = {
+        "type": "object",
+        "description": task_spec["properties"]["randomise"]["description"],
+    }
     definitions = {name: conditional(definition, definitions) for name, definition in definitions.items()}
     chain: dict[str, Any] = {"$ref": "#/$defs/TaskSpec"}
     for name, model in reversed(specs.items()):

@@ -92,9 +92,11 @@ class Sensed:
         """Return the groups of observations of what is felt."""
         if not self.groups:
             return {}
-        made = self.touch.observe(readings)
-        chosen = {name: (made[own.observation], own.columns) for name, own in self.groups.items()}
-        return {name: value if own is None else value.index_select(1, own) for name, (value, own) in chosen.items()}
+        observed = self.touch.observe(readings)
+        columns_of = {name: (observed[source.observation], source.columns) for name, source in self.groups.items()}
+        return {
+            name: value if columns is None else value.index_select(1, columns) for name, (value, columns) in columns_of.items()
+        }
 
     def forces(
         self, readings: Mapping[str, Tensor], like: Float[Tensor, "env joint"]
@@ -162,12 +164,12 @@ def compile_sensed(
     overrides["observations"] = {**overrides["observations"], **(also or {})}
     contact = by_kind.get("link_contact")
     if contact:
-        own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
-        wanted = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
-        overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*own, *wanted)))
+        outputs = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
+        forces = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
+        overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*outputs, *forces)))
     touch = compile_document(file, sensors=set(sensor.values()) or None, overrides=overrides, device=device, progress=progress)
     body = document.spec.objects[spec.object].body_of(spec.object)
-    channels = next((own.channels for own in touch.outputs if own.name == contact), ())
+    channels = next((output.channels for output in touch.outputs if output.name == contact), ())
     groups = {each.group: _source(loaded, touch, each, name) for each, name in felts.items()}
     if felt:
         groups[GROUP] = Source(GROUP, None, _layout(touch, felt))
@@ -184,16 +186,16 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
     """
     result: dict[str, Any] = {"observations": {}}
     for sensor in dict.fromkeys(felts.values()):
-        own = [felt for felt, carrier in felts.items() if carrier == sensor]
-        noises = list(dict.fromkeys(felt.noise for felt in own if felt.noise != CLEAN))
+        carried = [felt for felt, carrier in felts.items() if carrier == sensor]
+        noises = list(dict.fromkeys(felt.noise for felt in carried if felt.noise != CLEAN))
         if len(noises) > 1:
             problem = f"noise {listed(noises)} of one sensor in one simulation, expected one beside {CLEAN}"
             raise loaded.error(("noise",), problem)
-        is_both = bool(noises) and any(felt.noise == CLEAN for felt in own)
-        result[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in own))
+        is_both = bool(noises) and any(felt.noise == CLEAN for felt in carried)
+        result[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in carried))
         result[f"sensors.{sensor}.noise"] = noises[0] if noises else CLEAN
         result[f"sensors.{sensor}.readout"] = "both" if is_both else "measured"
-        for felt in own:
+        for felt in carried:
             reading = f"{sensor}/clean" if is_both and felt.noise == CLEAN else sensor
             result["observations"][_observation(felt)] = [{"type": SENSED[felt.type][1], "of": reading}]
     return result
@@ -204,7 +206,7 @@ def _observation(felt: Felt) -> str:
 
 
 def _layout(touch: TactileModule, sensor: str) -> Layout:
-    return touch.plan.layout_of(next(own for own in touch.plan.sensors if own.name == sensor))
+    return touch.plan.layout_of(next(planned for planned in touch.plan.sensors if planned.name == sensor))
 
 
 def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, sensor: str) -> Source:
@@ -271,14 +273,14 @@ def _variants(loaded: LoadedTask, document: Loaded) -> list[Any]:
     """
     spec = loaded.spec
     assert spec.variants is not None
-    known = document.raw(("objects", spec.object, "variants")) or []
-    if not known:
+    all_variants = document.raw(("objects", spec.object, "variants")) or []
+    if not all_variants:
         raise loaded.error(("variants",), f'the object "{spec.object}" of "{spec.document}" has no variants', "leave it out")
     for place, variant in enumerate(spec.variants):
-        if variant >= len(known) or variant in spec.variants[:place]:
-            problem = f"variant {variant}, expected each once, from 0 to {len(known) - 1}"
+        if variant >= len(all_variants) or variant in spec.variants[:place]:
+            problem = f"variant {variant}, expected each once, from 0 to {len(all_variants) - 1}"
             raise loaded.error(("variants", place), problem)
-    return [known[variant] for variant in spec.variants]
+    return [all_variants[variant] for variant in spec.variants]
 
 
 def sensors_document(loaded: LoadedTask) -> Loaded:
@@ -317,7 +319,7 @@ def _sensors_of(loaded: LoadedTask, kinds: Mapping[str, str], wanted: Mapping[st
     """
     sensor, problems = {}, []
     for key, kind in dict.fromkeys((key, kind) for key, some in wanted.items() for kind in some):
-        names = [name for name, own in kinds.items() if own == kind]
+        names = [name for name, other in kinds.items() if other == kind]
         if len(names) == 1:
             sensor[kind] = names[0]
             continue

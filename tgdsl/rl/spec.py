@@ -85,8 +85,8 @@ class PhysicsSpec(SpecModel):
     @property
     def options(self) -> dict[str, Any]:
         """MuJoCo's options that differ from the scene's."""
-        given = self.model_dump(exclude={"collision", "substeps", "nconmax", "njmax"}, exclude_none=True)
-        return {name: value.lower() if isinstance(value, str) else value for name, value in given.items()}
+        options = self.model_dump(exclude={"collision", "substeps", "nconmax", "njmax"}, exclude_none=True)
+        return {name: value.lower() if isinstance(value, str) else value for name, value in options.items()}
 
     @property
     def capacities(self) -> dict[str, int]:

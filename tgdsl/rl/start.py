@@ -34,19 +34,19 @@ def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
     """
     model = SceneModels(sensed.touch.plan.scene).model({})
     of_actuators = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
-    known = list(dict.fromkeys(model.joint(int(i)).name for i in of_actuators))
+    joint_names = list(dict.fromkeys(model.joint(int(i)).name for i in of_actuators))
     problems: list[Problem] = []
     for i, pattern in enumerate(loaded.spec.joints):
-        if not matching(pattern, known):
+        if not matching(pattern, joint_names):
             problem = f'no actuated joint {"is called" if is_plain(pattern) else "matches"} "{pattern}"'
-            problems.append(loaded.source.problem(("joints", i), problem, did_you_mean(pattern, known, "joints")))
+            problems.append(loaded.source.problem(("joints", i), problem, did_you_mean(pattern, joint_names, "joints")))
     try:
         keyframe_id(model, loaded.spec.keyframe)
     except SimulationError as error:
         problems.append(loaded.source.problem(("keyframe",), str(error)))
     if problems:
         raise SpecError(problems)
-    return tuple(name for name in known if any(matching(pattern, [name]) for pattern in loaded.spec.joints))
+    return tuple(name for name in joint_names if any(matching(pattern, [name]) for pattern in loaded.spec.joints))
 
 
 def make_simulation(
@@ -87,12 +87,12 @@ def make_simulation(
     )
     random = spec.randomise
     per_env = [name for name, value, rest in (("mass", random.mass, ZERO), ("friction", random.friction, ONE)) if value != rest]
-    given: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
-    given |= {"watch": watch, "on_fault": "note", "device": device, "per_env": per_env, "threads": threads}
-    given |= spec.physics.capacities
+    options: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
+    options |= {"watch": watch, "on_fault": "note", "device": device, "per_env": per_env, "threads": threads}
+    options |= spec.physics.capacities
     kind = simulator_for(device, simulator)
-    known = keyword_options(kind.simulate)
-    sim = kind.simulate(sensed.touch, num_envs, **{name: value for name, value in given.items() if name in known})
+    keywords = keyword_options(kind.simulate)
+    sim = kind.simulate(sensed.touch, num_envs, **{name: value for name, value in options.items() if name in keywords})
     num_variants = _num_variants(sensed, spec.object)
     if first_env % num_variants:
         sim.set_objects({spec.object: (np.arange(num_envs) + first_env) % num_variants})
@@ -170,12 +170,12 @@ def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]
     state = mujoco.MjData(model)
     state.qpos[:] = qpos
     mujoco.mj_kinematics(model, state)
-    own = model.body(body)
-    lowest = state.xpos[own.id, 2]
+    mj_body = model.body(body)
+    lowest = state.xpos[mj_body.id, 2]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    for geom in range(int(own.geomadr[0]), int(own.geomadr[0]) + int(own.geomnum[0])):
+    for geom in range(int(mj_body.geomadr[0]), int(mj_body.geomadr[0]) + int(mj_body.geomnum[0])):
         if not is_absent(model, geom) and (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             center, half = np.split(model.geom_aabb[geom], 2)
             corners = state.geom_xpos[geom] + (center + signs * half) @ state.geom_xmat[geom].reshape(3, 3).T
             lowest = min(lowest, corners[:, 2].min())
-    return float(state.xpos[own.id, 2] - lowest)
+    return float(state.xpos[mj_body.id, 2] - lowest)

@@ -253,9 +253,9 @@ class Task(ABC, Generic[S]):
     def __init_subclass__(cls, **options: Any) -> None:
         """Collect the terms of the reward, and add `rewards`, their weights, to the model of the document."""
         super().__init_subclass__(**options)
-        own = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
-        cls.terms = {**cls.terms, **own}
-        if cls.terms and (own or "Spec" in vars(cls)):
+        terms_of_class = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
+        cls.terms = {**cls.terms, **terms_of_class}
+        if cls.terms and (terms_of_class or "Spec" in vars(cls)):
             weight: Any = Weight
             fields: dict[str, Any] = {
                 name: (weight | None, Field(term.weight, description=f"{term.summary} [{term.unit}]."))
@@ -289,8 +289,8 @@ class Task(ABC, Generic[S]):
     def begin(self, chosen: Bool[Tensor, " env"], **values: Tensor | float) -> None:
         """Set what is remembered of some environments, by name."""
         for name, value in values.items():
-            own = self.memory[name]
-            put_rows(own, chosen, value.to(own.dtype) if isinstance(value, Tensor) else value)
+            tensor = self.memory[name]
+            put_rows(tensor, chosen, value.to(tensor.dtype) if isinstance(value, Tensor) else value)
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
@@ -307,9 +307,9 @@ class Task(ABC, Generic[S]):
 
     def advance_healthy(self, now: Now, faults: Bool[Tensor, " env"]) -> None:
         """Bring what is remembered up to date, but for environments with a fault, whose instant is none."""
-        kept = {name: value.clone() for name, value in self.memory.items()} if may_be_nonempty(faults) else {}
+        saved_memory = {name: value.clone() for name, value in self.memory.items()} if may_be_nonempty(faults) else {}
         self.advance(now)
-        for name, value in kept.items():
+        for name, value in saved_memory.items():
             put_rows(self.memory[name], faults, value)
 
     @abstractmethod

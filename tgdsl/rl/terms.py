@@ -167,7 +167,8 @@ def event_term(function: Callable[..., None]) -> type[EventTerm]:
     """Return the term of a function of an `Event`: its other parameters, with annotations and defaults, are the term's."""
     parameters = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
     fields: dict[str, Any] = {
-        own.name: (own.annotation, ... if own.default is own.empty else own.default) for own in parameters
+        parameter.name: (parameter.annotation, ... if parameter.default is parameter.empty else parameter.default)
+        for parameter in parameters
     }
 
     def apply(self: EventTerm, event: Event) -> None:
@@ -278,8 +279,10 @@ class ObjectSpeed(RewardTerm):
     """ω_free: the same for its angular velocity [rad/s]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        own, free = (now.object.linvel, now.object.angvel), (self.free_speed, self.free_spin)
-        speed, spin = ((vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(own, free, strict=True))
+        velocities, free = (now.object.linvel, now.object.angvel), (self.free_speed, self.free_spin)
+        speed, spin = (
+            (vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(velocities, free, strict=True)
+        )
         return speed + spin
 
     def reference(self, row: Row) -> float | np.floating:

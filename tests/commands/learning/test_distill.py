@@ -307,6 +307,11 @@ def test_a_teacher_of_something_else_is_refused(base, fails, change, message):
 def test_a_teacher_of_other_taxels_or_without_a_card_is_refused(base, fails):
     task = load_task(base / "task.yaml")
     teacher(base / "teacher.pt", task, ["proprio", "tactile_sensors"], taxels="0")
+    extra = {"card.json": "", "taxels.csv": ""}
+    module = torch.jit.load(base / "teacher.pt", _extra_files=extra)
+    lines = extra["taxels.csv"].decode().splitlines(keepends=True)
+    extra["taxels.csv"] = "".join([lines[0], *lines[2:], lines[1]])  # the first taxel comes last
+    torch.jit.save(module, base / "teacher.pt", _extra_files=extra)
     assert "teacher.pt: this policy feels with other taxels" in fails(*TEACHER, *FIVE, "--envs", "10")
     torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), base / "teacher.pt")
     assert "this policy has no card that says how it was learned" in fails(*TEACHER, *FIVE, "--envs", "10")

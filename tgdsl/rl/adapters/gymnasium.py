@@ -97,9 +97,9 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
             raise TgdslError(f"seed is {seed!r}: expected one whole number for all environments, which makes those of each")
         if options:
             raise TgdslError(f"reset has no options, found {', '.join(map(repr, options))}: all environments begin again")
-        chosen = None if seed is None else index(seed)
-        super().reset(seed=chosen)
-        return self._obs(self.touch_env.reset(chosen)), {}
+        new_seed = None if seed is None else index(seed)
+        super().reset(seed=new_seed)
+        return self._obs(self.touch_env.reset(new_seed)), {}
 
     def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
         """Make one control step.
@@ -112,8 +112,8 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         """
         action = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
         obs, reward, terminated, truncated, info = self.touch_env.step(action)
-        told = self._told_in_numpy(info) if self._is_numpy else self._told_in_torch(info)
-        return self._obs(obs), self._given(reward), self._given(terminated), self._given(truncated), told
+        entries = self._told_in_numpy(info) if self._is_numpy else self._told_in_torch(info)
+        return self._obs(obs), self._given(reward), self._given(terminated), self._given(truncated), entries
 
     def close_extras(self, **_: Any) -> None:
         """Close the environments."""
@@ -126,23 +126,26 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         return {group: self._given(obs[group]) for group in self._groups}
 
     def _told_in_torch(self, info: StepInfo) -> dict[str, Any]:
-        told = {name: getattr(info, name) for name in TOLD}
-        final = {"final_obs": {group: info.final_obs[group] for group in self._groups}, "final_info": _masked(told, info.ended)}
-        return _masked(told, ~info.ended) | final | {f"_{name}": info.ended for name in final}
+        entries = {name: getattr(info, name) for name in TOLD}
+        final = {
+            "final_obs": {group: info.final_obs[group] for group in self._groups},
+            "final_info": _masked(entries, info.ended),
+        }
+        return _masked(entries, ~info.ended) | final | {f"_{name}": info.ended for name in final}
 
     def _told_in_numpy(self, info: StepInfo) -> dict[str, Any]:
         ended = info.ended.cpu().numpy()
-        told = {name: _in_numpy(getattr(info, name)) for name in TOLD}
-        given = {} if ended.all() else _masked(told, ~ended)
+        entries = {name: _in_numpy(getattr(info, name)) for name in TOLD}
+        present = {} if ended.all() else _masked(entries, ~ended)
         if not ended.any():
-            return given
+            return present
         rows = np.flatnonzero(ended)
         last = {group: info.final_obs[group].cpu().numpy()[rows] for group in self._groups}
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i, row in enumerate(rows):
             final_obs[row] = {group: values[i] for group, values in last.items()}
-        final = {"final_obs": final_obs, "final_info": _masked(told, ended)}
-        return given | final | {f"_{name}": ended.copy() for name in final}
+        final = {"final_obs": final_obs, "final_info": _masked(entries, ended)}
+        return present | final | {f"_{name}": ended.copy() for name in final}
 
 
 def _in_numpy(value: Tensor | Mapping[str, Tensor]) -> Any:
@@ -153,11 +156,11 @@ def _in_numpy(value: Tensor | Mapping[str, Tensor]) -> Any:
 
 def _masked(values: Mapping[str, Any], mask: Any) -> dict[str, Any]:
     """Return values and their mask as `VectorEnv._add_info` does: arrays are zero where it is false, tensors as they are."""
-    given: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
-            given[name] = _masked(value, mask)
+            result[name] = _masked(value, mask)
         else:
-            given[name] = np.where(mask, value, value.dtype.type(0)) if isinstance(value, np.ndarray) else value
-        given[f"_{name}"] = mask
-    return given
+            result[name] = np.where(mask, value, value.dtype.type(0)) if isinstance(value, np.ndarray) else value
+        result[f"_{name}"] = mask
+    return result

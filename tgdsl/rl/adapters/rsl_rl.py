@@ -110,11 +110,11 @@ class TouchVecEnv(VecEnv):
 
 def _log(info: StepInfo, ids: Int[Tensor, " ended"]) -> dict[str, Tensor]:
     """Return what is told of episodes that have ended, one number each: rsl_rl takes the mean over an iteration's."""
-    told = {
+    entries = {
         "Episode/return": info.episode_return,
         "Episode/steps": info.episode_steps.float(),
         "Episode/score": info.score,
         "Episode/fault": info.faults.float(),
         **{f"Reward/{name}": total for name, total in info.episode_terms.items()},
     }
-    return {name: value[ids].to(torch.float32) for name, value in told.items()}
+    return {name: value[ids].to(torch.float32) for name, value in entries.items()}

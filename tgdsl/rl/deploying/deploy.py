@@ -142,32 +142,34 @@ class Deployment:
             is_emulated=is_emulated,
             progress=progress,
         )
-        own = self.prepared
-        if not self.has_scene and own.loaded.task.goal_units and own.goal is None and _needs_goal(own):
-            units = ", ".join(own.loaded.task.goal_units)
-            problem = f'the task "{own.loaded.spec.task}" draws what it asks for by what is in its scene, and {source} has none'
+        prepared = self.prepared
+        if not self.has_scene and prepared.loaded.task.goal_units and prepared.goal is None and _needs_goal(prepared):
+            units = ", ".join(prepared.loaded.task.goal_units)
+            problem = (
+                f'the task "{prepared.loaded.spec.task}" draws what it asks for by what is in its scene, and {source} has none'
+            )
             raise DeployError(f"{policy}: {problem}; say what to ask for: a goal [{units}]")
-        motion = motion(own.model) if callable(motion) else motion
+        motion = motion(prepared.model) if callable(motion) else motion
         if is_emulated and motion is None:
-            motion = emulated_limits(own)
+            motion = emulated_limits(prepared)
         self.moves = kind.name != "log" and (motion is not None or "motion" not in kind.options)
-        self._start = None if start is None else own.model.key_ctrl[keyframe_id(own.model, start)]
+        self._start = None if start is None else prepared.model.key_ctrl[keyframe_id(prepared.model, start)]
         self._seed, self._progress = seed, progress
         self._options = options | {"calibration": calibration, "motion": motion, "lockstep": lockstep}
         self._sums = _Sums()
 
     def scene(self, episode: int) -> TaskScene:
         """Return the scene of an episode: that of the environment of this number."""
-        own = self.prepared
+        prepared = self.prepared
         env = TouchEnv(
-            own.loaded,
+            prepared.loaded,
             1,
             device=self._device,
             seed=self._seed,
             simulator=self._simulator,
             threads=1,
             first_env=episode,
-            sensed=own.sensed,
+            sensed=prepared.sensed,
             progress=self._progress,
         )
         return TaskScene(env)
@@ -219,7 +221,7 @@ class Deployment:
         if not sums.inferences:
             raise DeployError(f"{self.source}: not one control step was made")
         ages = [age for age in sums.ages if age is not None]
-        pairs = [age + own for age, own in zip(sums.ages, sums.inferences, strict=True) if age is not None]
+        pairs = [age + inference for age, inference in zip(sums.ages, sums.inferences, strict=True) if age is not None]
         return Report(
             task=spec.task,
             policy=str(self.prepared.saved.file),
@@ -243,8 +245,10 @@ class Deployment:
         with ExitStack() as opened:
             if scene is not None:
                 opened.callback(scene.close)
-            own = self.prepared
-            result = connect(own.sensed.touch, self.source, control_step=own.control_step, scene=scene, **self._options)
+            prepared = self.prepared
+            result = connect(
+                prepared.sensed.touch, self.source, control_step=prepared.control_step, scene=scene, **self._options
+            )
             opened.pop_all()
         return result
 
@@ -264,12 +268,12 @@ class Deployment:
         """Make the steps of one episode."""
         sums = self._sums
         late = getattr(connection.source, "num_late_steps", 0)
-        asked = torch.tensor([self.prepared.goal or ()], dtype=torch.float64)
+        goal = torch.tensor([self.prepared.goal or ()], dtype=torch.float64)
         index, judged = 0, None if scene is None else scene.judged
         while (num_steps is None or index < num_steps) and not connection.is_over:
             began = time.monotonic()
             age = connection.age_s
-            obs = actor.observe(connection.observe(), asked if judged is None else judged.goal)
+            obs = actor.observe(connection.observe(), goal if judged is None else judged.goal)
             control = actor.act(obs)
             inference = time.monotonic() - began
             connection.step(control)

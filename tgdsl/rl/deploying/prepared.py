@@ -133,12 +133,12 @@ def prepare(
     changes: Sequence[str] = ()
     if card is not None:
         check_learned(card, policy, loaded.spec)
-        own = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
-        loaded = _with(loaded, own)
+        overrides_of_card = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
+        loaded = _with(loaded, overrides_of_card)
         changes = changes_since(card, loaded.spec)
     names = tuple(groups) or tuple(card["groups"] if card else _default_groups(loaded))
     _refuse_unknowable(policy, loaded, names)
-    loaded, asked = _asked(loaded, goal)
+    loaded, goal_numbers = _asked(loaded, goal)
     spec = loaded.spec
     felt = Felt(spec.touch, spec.placement, spec.noise) if GROUP in names and spec.touch != "none" else None
     feels = [] if felt is None else [felt]
@@ -155,9 +155,9 @@ def prepare(
         actuators = Actuators.of(model, moved)
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
-    sizes = {name: _size(name, card, sensed, felt, len(moved), asked) for name in names}
+    sizes = {name: _size(name, card, sensed, felt, len(moved), goal_numbers) for name in names}
     actuator_id = _actuators(model, joints)
-    result = Prepared(saved, loaded, sensed, felt, sizes, asked, model, joints, actuator_id, actuators, changes)
+    result = Prepared(saved, loaded, sensed, felt, sizes, goal_numbers, model, joints, actuator_id, actuators, changes)
     result.policy()
     return result
 
@@ -179,11 +179,11 @@ def _refuse_unknowable(policy: Path, loaded: LoadedTask, names: Sequence[str]) -
     Raises:
         DeployError: If there are some; all are named.
     """
-    known = ("proprio", GROUP, *loaded.task.hand_groups)
-    others = [name for name in names if name not in known]
-    if others:
-        problem = f'this policy sees {listed(others)} of the task "{loaded.spec.task}", which only a scene knows'
-        hint = f"on a hand there are {listed(known)}; teach a student that sees no more: tgdsl distill"
+    group_names = ("proprio", GROUP, *loaded.task.hand_groups)
+    unknown = [name for name in names if name not in group_names]
+    if unknown:
+        problem = f'this policy sees {listed(unknown)} of the task "{loaded.spec.task}", which only a scene knows'
+        hint = f"on a hand there are {listed(group_names)}; teach a student that sees no more: tgdsl distill"
         raise DeployError(f"{policy}: {problem}; {hint}")
 
 

@@ -105,9 +105,9 @@ class Report:
         if self.scores is None:
             why = "no episode has ended" if self.has_scene else f"{self.source} has no scene that knows what happened"
             return f"no score: {why}; {count}"
-        own = self.scores
-        between = f" (95 %: {own.interval[0]:.4f} to {own.interval[1]:.4f})" if len(own.each) > 1 else ""
-        return f"score {own.mean:.4f} {self.unit}{between}, {own.held:.1%} of full length; {count}"
+        scores = self.scores
+        between = f" (95 %: {scores.interval[0]:.4f} to {scores.interval[1]:.4f})" if len(scores.each) > 1 else ""
+        return f"score {scores.mean:.4f} {self.unit}{between}, {scores.held:.1%} of full length; {count}"
 
     def _timed(self) -> str:
         rate = f"{self.rate:.1f} of {self.control_rate:.1f} control steps per second"

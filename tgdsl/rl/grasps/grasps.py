@@ -76,10 +76,10 @@ def settings_of(spec: TaskSpec, joints: tuple[str, ...]) -> str:
         spec: The task's document.
         joints: The joints that the policy moves.
     """
-    own = grasp_spec(spec)
-    assert own is not None
+    grasps = grasp_spec(spec)
+    assert grasps is not None
     physics = {"options": spec.physics.options, "substeps": spec.physics.substeps}
-    settings = {"grasps": own.model_dump(mode="json", exclude={"file"}), "physics": physics}
+    settings = {"grasps": grasps.model_dump(mode="json", exclude={"file"}), "physics": physics}
     return json.dumps(settings | {"object": spec.object, "joints": joints, "keyframe": spec.keyframe}, sort_keys=True)
 
 
@@ -110,8 +110,8 @@ def read_grasps(file: Path, scene: str, object: str) -> Grasps:
         SimulationError: If it cannot be read, or holds something else.
     """
     try:
-        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as found:
-            grasps = Grasps.unpacked(found)
+        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
+            grasps = Grasps.unpacked(archive)
     except OSError as error:
         raise SimulationError(f"{file}: cannot read this file: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:

@@ -71,27 +71,26 @@ def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -
     assert spec is not None
     trials = _Trials(loaded, sensed, spec)
     num = trials.num_variants
-    wanted = [spec.num // num + (v < spec.num % num) for v in range(num)]
-    kept: list[list[_Kept]] = [[] for _ in range(num)]
+    counts = [spec.num // num + (v < spec.num % num) for v in range(num)]
+    of_variant: list[list[_Kept]] = [[] for _ in range(num)]
     for round_ in itertools.count():
         grasps = trials.made(round_)
         for v in range(num):
-            kept[v] += [own for own in grasps if own.variant == v]
+            of_variant[v] += [grasp for grasp in grasps if grasp.variant == v]
             tried = (round_ + 1) * int((trials.variant == v).sum())
-            if len(kept[v]) < min(wanted[v], LEAST_SHARE * tried) and tried >= ENOUGH:
-                problem = (
-                    f"only {len(kept[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
-                )
+            if len(of_variant[v]) < min(counts[v], LEAST_SHARE * tried) and tried >= ENOUGH:
+                which = f"{tried} grasps of variant {v} of {loaded.spec.object}"
+                problem = f"only {len(of_variant[v])} of {which} hold: {trials.failures}"
                 raise loaded.error(("grasps",), problem, "start the hand nearer to the object, or ask for less")
-        found(sum(min(len(own), most) for own, most in zip(kept, wanted, strict=True)), spec.num)
-        if all(len(own) >= most for own, most in zip(kept, wanted, strict=True)):
+        found(sum(min(len(grasps_of), most) for grasps_of, most in zip(of_variant, counts, strict=True)), spec.num)
+        if all(len(grasps_of) >= most for grasps_of, most in zip(of_variant, counts, strict=True)):
             break
     trials.sim.close()
-    chosen = [own for each, most in zip(kept, wanted, strict=True) for own in each[:most]]
+    selected = [grasp for each, most in zip(of_variant, counts, strict=True) for grasp in each[:most]]
     return Grasps(
-        qpos=np.stack([own.qpos for own in chosen]),
-        ctrl=np.stack([own.ctrl for own in chosen]),
-        variant=np.array([own.variant for own in chosen], dtype=np.int64),
+        qpos=np.stack([grasp.qpos for grasp in selected]),
+        ctrl=np.stack([grasp.ctrl for grasp in selected]),
+        variant=np.array([grasp.variant for grasp in selected], dtype=np.int64),
         scene=scene_digest(sensed.touch.plan.scene),
         object=loaded.spec.object,
         settings=settings_of(loaded.spec, trials.joints),
@@ -248,22 +247,22 @@ class _Place:
         """
         spec = grasp_spec(loaded.spec)
         assert spec is not None
-        own = model.body(body)
+        mj_body = model.body(body)
         self._yaw, self._offset = spec.yaw, spec.offset
-        joints = range(int(own.jntadr[0]), int(own.jntadr[0]) + int(own.jntnum[0]))
+        joints = range(int(mj_body.jntadr[0]), int(mj_body.jntadr[0]) + int(mj_body.jntnum[0]))
         free, ball = (
             [j for j in joints if int(model.jnt_type[j]) == int(kind)]
             for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
         )
-        if not own.jntnum[0]:
+        if not mj_body.jntnum[0]:
             raise loaded.error(("object",), f'the object\'s body "{body}" has no joint, and cannot be grasped')
         if not (free or ball) and any(spec.yaw):
             raise loaded.error(("grasps", "yaw"), f'the object\'s body "{body}" has neither a free nor a ball joint')
         if not free and any(spec.offset):
             raise loaded.error(("grasps", "offset"), f'the object\'s body "{body}" has no free joint')
-        first, dof = int(model.jnt_qposadr[joints[0]]), int(own.dofadr[0])
+        first, dof = int(model.jnt_qposadr[joints[0]]), int(mj_body.dofadr[0])
         last = int(model.jnt_qposadr[joints[-1]]) + (7 if free else 4 if ball and ball[0] == joints[-1] else 1)
-        self._qpos, self._qvel = slice(first, last), slice(dof, dof + int(own.dofnum[0]))
+        self._qpos, self._qvel = slice(first, last), slice(dof, dof + int(mj_body.dofnum[0]))
         self._pos = slice(first, first + 3) if free else None
         self._quat = slice(last - 4, last) if free or ball else None
 

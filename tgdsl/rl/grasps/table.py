@@ -75,24 +75,24 @@ class GraspTable:
         """
         shape = (sim.model.nq, sim.model.nu)
         if (grasps.qpos.shape[1], grasps.ctrl.shape[1]) != shape:
-            found = (grasps.qpos.shape[1], grasps.ctrl.shape[1])
-            raise SimulationError(f"grasps of {found[0]} positions and {found[1]} controls, expected {shape[0]} and {shape[1]}")
+            sizes = (grasps.qpos.shape[1], grasps.ctrl.shape[1])
+            raise SimulationError(f"grasps of {sizes[0]} positions and {sizes[1]} controls, expected {shape[0]} and {shape[1]}")
         variants = variant.cpu().numpy()
         lacking = sorted({int(v) for v in variants} - {int(v) for v in grasps.variant})
         if lacking:
             problem = f"there are no grasps of variant {listed([str(v) for v in lacking])} of {grasps.object}"
             raise SimulationError(f"{problem}; sample as many as it has variants, or more")
         order = np.argsort(grasps.variant, kind="stable")
-        own = grasps.variant[order]
+        variants_in_order = grasps.variant[order]
         device, dtype = sim.qpos.device, sim.qpos.dtype
         self.qpos = torch.from_numpy(grasps.qpos[order]).to(device, dtype)
         self.ctrl = torch.from_numpy(grasps.ctrl[order]).to(device, dtype)
-        self.first = torch.from_numpy(np.searchsorted(own, variants)).to(device)
-        self.count = torch.from_numpy(np.searchsorted(own, variants, side="right")).to(device) - self.first
+        self.first = torch.from_numpy(np.searchsorted(variants_in_order, variants)).to(device)
+        self.count = torch.from_numpy(np.searchsorted(variants_in_order, variants, side="right")).to(device) - self.first
         self._draws = draws
-        found = self._evaluated(sim, body, variants)
-        self.pos, self.quat = found.pop("pos"), found.pop("quat")
-        self.contacts = found
+        sizes = self._evaluated(sim, body, variants)
+        self.pos, self.quat = sizes.pop("pos"), sizes.pop("quat")
+        self.contacts = sizes
 
     def draw(self, episode: Int[Tensor, " env"]) -> Drawn:
         """Return a grasp of each environment, drawn by its count of episodes."""
@@ -116,8 +116,8 @@ class GraspTable:
             each = {name: getattr(state, name) for name in FIELDS} | {"pos": motion.pos, "quat": motion.quat}
             for name, value in each.items():
                 if value is not None:
-                    own = result.setdefault(
+                    values = result.setdefault(
                         name, torch.zeros((len(self.qpos), *value.shape[1:]), dtype=value.dtype, device=device)
                     )
-                    own[index] = value.to(device)
+                    values[index] = value.to(device)
         return result

@@ -76,18 +76,18 @@ class ScriptActor(Actor):
         Raises:
             ScriptError: If it raises anything, or what it returns does not fit.
         """
-        env, wanted = self._env, (self._env.num_envs, self._env.num_actions)
+        env, shape = self._env, (self._env.num_envs, self._env.num_actions)
         try:
-            found = self._function(env, obs)
+            output = self._function(env, obs)
         except Exception as error:  # whatever a user's code raises
             place = f"{raised_at(self._file, error)}: {self._name}" if self._file else self._name
             raise ScriptError(f"{place}: {type(error).__name__}: {error}") from error
         try:
-            action = torch.as_tensor(found, dtype=torch.float32, device=env.device)
+            action = torch.as_tensor(output, dtype=torch.float32, device=env.device)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise ScriptError(f"{self._name}: actions are {type(found).__name__}, expected {wanted} numbers") from error
-        if tuple(action.shape) != wanted:
-            raise ScriptError(f"{self._name}: actions have shape {tuple(action.shape)}, expected {wanted}")
+            raise ScriptError(f"{self._name}: actions are {type(output).__name__}, expected {shape} numbers") from error
+        if tuple(action.shape) != shape:
+            raise ScriptError(f"{self._name}: actions have shape {tuple(action.shape)}, expected {shape}")
         return action
 
 

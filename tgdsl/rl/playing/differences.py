@@ -45,5 +45,5 @@ def spec_differences(
     """
     with suppress(ValidationError):  # of a version with other names: what it had is told as it was
         before = model.model_validate(before).model_dump(mode="json")
-    own, other = ({name: value for name, value in spec.items() if name not in leave_out} for spec in (before, now))
-    return differences(own, other)
+    left, other = ({name: value for name, value in spec.items() if name not in leave_out} for spec in (before, now))
+    return differences(left, other)

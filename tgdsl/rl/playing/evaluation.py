@@ -120,13 +120,15 @@ def evaluate_each(
         meter.add(is_asked & ~info.ended)
         counts = info.ended & is_asked
         score = info.score.double()
-        told = [score, score.square(), info.is_whole(env.max_steps), info.episode_return, info.episode_steps, info.faults]
-        sums += torch.where(counts, torch.stack([value.double() for value in told]), 0.0)
+        numbers = [score, score.square(), info.is_whole(env.max_steps), info.episode_return, info.episode_steps, info.faults]
+        sums += torch.where(counts, torch.stack([value.double() for value in numbers]), 0.0)
         done += counts
         actor.begin(info.ended)
     each = sums.view(6, blocks, size).sum(dim=2).T.tolist()
     count = min(size, episodes)
-    return [_evaluation(env, own, episodes, count, seed, gait) for own, gait in zip(each, meter.gaits(), strict=True)]
+    return [
+        _evaluation(env, block_sums, episodes, count, seed, gait) for block_sums, gait in zip(each, meter.gaits(), strict=True)
+    ]
 
 
 def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed: int, gait: Gait) -> Evaluation:

@@ -134,11 +134,11 @@ class GaitMeter:
             blocks: How many blocks they are: as many environments each, one block after the other.
         """
         setup, num, device = env.task.setup, env.num_envs, env.sim.qpos.device
-        self._env, self._blocks, own = env, blocks, setup.actuators
-        self._links, self._joints = setup.links, own.names
+        self._env, self._blocks, actuators = env, blocks, setup.actuators
+        self._links, self._joints = setup.links, actuators.names
         self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(device)
-        self._limit, self._rated = (torch.from_numpy(value).to(device) for value in (own.limit, own.top_speed))
-        sizes = {"penetration": 1, "force": len(setup.links), "speed": 1, "spin": 1, "joint_speed": len(own.names)}
+        self._limit, self._rated = (torch.from_numpy(value).to(device) for value in (actuators.limit, actuators.top_speed))
+        sizes = {"penetration": 1, "force": len(setup.links), "speed": 1, "spin": 1, "joint_speed": len(actuators.names)}
         ends = [0]
         for size in sizes.values():
             ends.append(ends[-1] + size)
@@ -148,7 +148,7 @@ class GaitMeter:
         self._first = ((block[:, None] * ends[-1] + torch.arange(ends[-1], device=device)) * NUM_BINS).flatten()
         names = ("steps", "untouched", "any_saturation", "forth", "coasted")
         self._sums = {name: torch.zeros(num, dtype=torch.float64, device=device) for name in names}
-        self._saturated = torch.zeros((num, len(own.names)), dtype=torch.float64, device=device)
+        self._saturated = torch.zeros((num, len(actuators.names)), dtype=torch.float64, device=device)
         self._most = torch.zeros((num, 2), dtype=torch.float64, device=device)
 
     def add(self, counts: Bool[Tensor, " env"]) -> None:
@@ -180,14 +180,16 @@ class GaitMeter:
         force, torque = vector_norm(now.link_force, dim=2).double(), now.torque.double().abs()
         is_untouched = ~((force > TOUCH) & self._fingers).any(dim=1)
         is_saturated = torque >= strength * self._limit
-        found = {"steps": torch.ones_like(is_untouched), "untouched": is_untouched, "any_saturation": is_saturated.any(dim=1)}
+        numbers = {"steps": torch.ones_like(is_untouched), "untouched": is_untouched, "any_saturation": is_saturated.any(dim=1)}
         if progress is not None:
             forth = progress.double().clamp(min=0.0)
-            found |= {"forth": forth, "coasted": torch.where(is_untouched, forth, 0.0)}
-        for name, value in found.items():
+            numbers |= {"forth": forth, "coasted": torch.where(is_untouched, forth, 0.0)}
+        for name, value in numbers.items():
             self._sums[name] += torch.where(counts, value.double(), 0.0)
         self._saturated += torch.where(counts[:, None], is_saturated.double(), 0.0)
-        motion = torch.stack([vector_norm(own.double(), dim=1) for own in (now.object.linvel, now.object.angvel)], dim=1)
+        motion = torch.stack(
+            [vector_norm(velocity.double(), dim=1) for velocity in (now.object.linvel, now.object.angvel)], dim=1
+        )
         self._most = torch.where(counts[:, None], torch.maximum(self._most, motion), self._most)
         depth = -now.distance.double()
         deepest = depth.amax(dim=1, keepdim=True) if depth.shape[1] else torch.zeros_like(motion[:, :1])
@@ -211,8 +213,8 @@ class GaitMeter:
         most, counts = self._most.view(self._blocks, size, 2).amax(dim=1).tolist(), self._counts.cpu()
         results = []
         for block in range(self._blocks):
-            own = {name: value[block] for name, value in sums.items()}
-            results.append(self._gait(own, saturated[block], most[block], counts[block]))
+            block_sums = {name: value[block] for name, value in sums.items()}
+            results.append(self._gait(block_sums, saturated[block], most[block], counts[block]))
         return results
 
     def _gait(self, sums: dict[str, float], saturated: list[float], most: list[float], counts: Tensor) -> Gait:

@@ -174,22 +174,22 @@ class Policy(Actor):
         total = sum(groups.values())
         taken = f"{' + '.join(f'{name} ({size})' for name, size in groups.items())} = {total}"
         first = next((weight.shape[1] for weight in self._module.parameters() if weight.ndim == 2), total)
-        wanted = sum(card["groups"].values()) if card else first
-        if wanted != total:
-            raise PolicyError(f"{file}: this policy takes {wanted} numbers, not {taken}; name its groups, in its order")
+        num_inputs = sum(card["groups"].values()) if card else first
+        if num_inputs != total:
+            raise PolicyError(f"{file}: this policy takes {num_inputs} numbers, not {taken}; name its groups, in its order")
         if card and not _is_in_order(card["groups"], groups):
-            own = " + ".join(f"{name} ({size})" for name, size in card["groups"].items())
-            raise PolicyError(f"{file}: this policy takes {own}, not {taken}; name its groups, in its order")
+            group_sizes = " + ".join(f"{name} ({size})" for name, size in card["groups"].items())
+            raise PolicyError(f"{file}: this policy takes {group_sizes}, not {taken}; name its groups, in its order")
         try:
             with torch.no_grad():
-                made = self._module(torch.zeros((num_envs, total), dtype=torch.float32, device=device))
+                output = self._module(torch.zeros((num_envs, total), dtype=torch.float32, device=device))
         except Exception as error:  # whatever TorchScript raises
             last = str(error).strip().splitlines()[-1]
             problem = f"this policy does not take {taken} numbers of {num_envs} environments"
             raise PolicyError(f"{file}: {problem}: {last}") from error
-        if not isinstance(made, Tensor) or tuple(made.shape) != (num_envs, num_actions):
-            found = f"actions {tuple(made.shape)}" if isinstance(made, Tensor) else f"a {type(made).__name__}"
-            raise PolicyError(f"{file}: this policy returns {found}, expected ({num_envs}, {num_actions}): joints are others")
+        if not isinstance(output, Tensor) or tuple(output.shape) != (num_envs, num_actions):
+            shape = f"actions {tuple(output.shape)}" if isinstance(output, Tensor) else f"a {type(output).__name__}"
+            raise PolicyError(f"{file}: this policy returns {shape}, expected ({num_envs}, {num_actions}): joints are others")
         self.begin(torch.ones(num_envs, dtype=torch.bool))
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
@@ -259,10 +259,10 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
         theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
     if _without_folder(theirs["task"]) != _without_folder(ours["task"]):
         raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
-    steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
-    for name, before, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
-        if not is_close(before, now):
-            texts = (json.dumps(value, ensure_ascii=False) for value in (before, now))
+    steps = [round(physics_of["physics"]["timestep"] * physics_of["physics"]["substeps"], 9) for physics_of in (theirs, ours)]
+    for name, learned, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
+        if not is_close(learned, now):
+            texts = (json.dumps(value, ensure_ascii=False) for value in (learned, now))
             raise PolicyError("{}: this {} was learned with other {}: {}, here {}".format(file, who, name, *texts))
 
 

@@ -50,8 +50,8 @@ class Record:
     def add(self, played: Played) -> None:
         """Keep one step."""
         for name, value in self._row(played).items():
-            kept = self._steps.setdefault(name, np.empty((self._num_steps, *value.shape), value.dtype))
-            kept[played.index] = value
+            column = self._steps.setdefault(name, np.empty((self._num_steps, *value.shape), value.dtype))
+            column[played.index] = value
         info = played.step.info
         rows = np.flatnonzero(info.ended.cpu().numpy())
         own = {"return": info.episode_return, "steps": info.episode_steps, "score": info.score}

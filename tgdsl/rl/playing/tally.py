@@ -25,12 +25,12 @@ class Tally:
 
     def add(self, info: StepInfo) -> None:
         """Add one step."""
-        told = {f"score [{self._env.task.score_unit}]": info.score, "return": info.episode_return}
-        told |= {f"  {name}": total for name, total in info.episode_terms.items()}
+        values = {f"score [{self._env.task.score_unit}]": info.score, "return": info.episode_return}
+        values |= {f"  {name}": total for name, total in info.episode_terms.items()}
         self.num_ended += int(info.ended.sum())
         self.num_faults += int(info.faults.sum())
-        self._now = {name: _mean(value) for name, value in told.items()}
-        for name, value in told.items():
+        self._now = {name: _mean(value) for name, value in values.items()}
+        for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + float(value[info.ended].double().sum())
 
     def lines(self, time: float) -> list[str]:

@@ -150,9 +150,9 @@ def _encode(encoder: str, frames: Iterable[Frame], rate: float, file: Path, targ
     Raises:
         FileError: If it cannot be written.
     """
-    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{rate:.9g}", "-i", "-"]
-    wanted = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file)]
-    command = [encoder, "-y", "-v", "error", *given, *wanted]
+    input_options = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{rate:.9g}", "-i", "-"]
+    output_options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file)]
+    command = [encoder, "-y", "-v", "error", *input_options, *output_options]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe) as process:
         assert process.stdin is not None and process.stderr is not None

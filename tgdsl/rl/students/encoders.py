@@ -159,11 +159,11 @@ class Convolution(Images):
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the embedding."""
-        made = self.marked(x)
+        images = self.marked(x)
         for layer in self.layers:
-            made = nn.functional.elu(layer(made))
-        made = made.unflatten(0, (x.shape[0], -1)) * self.masks()
-        return self.projection(made.flatten(1)), memory
+            images = nn.functional.elu(layer(images))
+        images = images.unflatten(0, (x.shape[0], -1)) * self.masks()
+        return self.projection(images.flatten(1)), memory
 
 
 class RecurrentConvolution(Images):

@@ -64,12 +64,12 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
     Raises:
         StudentError: If there is no such type, something is named twice, two have one name, or nobody is taught.
     """
-    known = [NONE, *SENSED]
-    chosen = [name for type_ in types for name in (known if type_ == "all" else [type_])]
-    for name in chosen:
-        if name not in known:
-            raise StudentError(f'there is no type "{name}"; {did_you_mean(name, known, "types")}')
-    for problem, names in (("types", chosen), ("placements", placements), ("noise", noises)):
+    all_types = [NONE, *SENSED]
+    selected = [name for type_ in types for name in (all_types if type_ == "all" else [type_])]
+    for name in selected:
+        if name not in all_types:
+            raise StudentError(f'there is no type "{name}"; {did_you_mean(name, all_types, "types")}')
+    for problem, names in (("types", selected), ("placements", placements), ("noise", noises)):
         if len(set(names)) < len(names):
             raise StudentError(f"{problem} {', '.join(names)}: one is named twice")
         if not names:
@@ -78,7 +78,7 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
         raise StudentError(f"{seeds} seeds, expected 1 at least")
     felts = [
         None if type_ == NONE else Felt(type_, placement, noise)
-        for type_ in chosen
+        for type_ in selected
         for placement in placements
         for noise in noises
     ]
@@ -117,11 +117,11 @@ def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
         SpecError: If a group that is named is not there.
     """
     named = loaded.spec.distill.groups
-    others = [name for name in groups if not name.startswith(f"{GROUP}/")]
+    other_groups = [name for name in groups if not name.startswith(f"{GROUP}/")]
     for i, name in enumerate(named or ()):
-        if name not in others:
+        if name not in other_groups:
             problem = f'there is no group of observations "{name}" beside what each student feels'
-            raise loaded.error(("distill", "groups", i), problem, did_you_mean(name, others, "groups"))
+            raise loaded.error(("distill", "groups", i), problem, did_you_mean(name, other_groups, "groups"))
     if named:
         return [*named, GROUP]
     return [name for name in ACTOR_GROUPS if name in groups or name == GROUP]
@@ -129,8 +129,8 @@ def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
 
 def seen_by(key: StudentKey, names: Sequence[str]) -> list[str]:
     """Return the groups of observations that a student sees, in their order."""
-    own = [key.felt.group] if key.felt else []
-    return [group for name in names for group in (own if name == GROUP else [name])]
+    touch_group = [key.felt.group] if key.felt else []
+    return [group for name in names for group in (touch_group if name == GROUP else [name])]
 
 
 def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequence[str]) -> Architecture:
@@ -145,16 +145,16 @@ def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequ
     Raises:
         StudentError: If images are wanted of a type whose links are not all on grids.
     """
-    own, parts = loaded.spec.distill.networks, []
+    networks, parts = loaded.spec.distill.networks, []
     for name in seen_by(key, names):
         size = env.groups[name]
         if key.felt is not None and name == key.felt.group:
-            encoder = _touch_encoder(own, key.felt, env.felt[name].layout, size)
+            encoder = _touch_encoder(networks, key.felt, env.felt[name].layout, size)
         else:
-            encoder = Encoder(own.kind, own.encoder.hidden, own.encoder.size)
+            encoder = Encoder(networks.kind, networks.encoder.hidden, networks.encoder.size)
         parts.append((size, encoder))
     heads = tuple(decoder.hidden for decoder in loaded.spec.distill.decoders.values())
-    return Architecture(tuple(parts), own.hidden, env.num_actions, heads, own.eps, own.clip)
+    return Architecture(tuple(parts), networks.hidden, env.num_actions, heads, networks.eps, networks.clip)
 
 
 def _touch_encoder(own: StudentNetworksSpec, felt: Felt, layout: Layout, size: int) -> Encoder:

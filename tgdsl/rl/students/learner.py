@@ -72,8 +72,8 @@ class Distiller:
         self.rollouts: list[Rollout] = []
         for networks, members in stacked.items():
             self.rollouts.append(self._rollout(networks, members, names, env.num_envs // len(keys)))
-        self.keys = [key for own in self.rollouts for key in own.keys]
-        seen = [each for own in self.rollouts for each in own.seen]
+        self.keys = [key for rollout in self.rollouts for key in rollout.keys]
+        seen = [each for rollout in self.rollouts for each in rollout.seen]
         self.groups = {key.name: list(each) for key, each in zip(self.keys, seen, strict=True)}
         self._allocate()
         torch.manual_seed(seed)
@@ -98,15 +98,15 @@ class Distiller:
         """Learn at the rate that stands when a share of the run is over."""
         first, last = self._spec.learning_rate, self._spec.final_learning_rate
         self._rate = first if last is None else first * (last / first) ** share
-        for own in self.rollouts:
-            own.stack.set_rate(self._rate)
+        for rollout in self.rollouts:
+            rollout.stack.set_rate(self._rate)
 
     def roll(self) -> None:
         """Make a rollout; the host does not wait for a GPU, but for captures at the first calls."""
         obs = self._begin()
         self._clock.start()
-        for own in self.rollouts:
-            own.begun.copy_(own.memory)
+        for rollout in self.rollouts:
+            rollout.begun.copy_(rollout.memory)
         for t in range(self._spec.steps):
             self._see(obs)
             self._chosen()
@@ -128,9 +128,9 @@ class Distiller:
             self._gathered.append([value.clone() for value in self._of_rollout()])
         for i in range(self._spec.epochs):
             if i and self._gathered:
-                chosen = self._chance.randrange(len(self._gathered))
-                copy_each(self._of_rollout(), self._gathered[chosen])
-                if self._spec.clip is not None and chosen < len(self._gathered) - 1:
+                index = self._chance.randrange(len(self._gathered))
+                copy_each(self._of_rollout(), self._gathered[index])
+                if self._spec.clip is not None and index < len(self._gathered) - 1:
                     self._answered()
             self._learned()
         if self._gathered:
@@ -141,7 +141,7 @@ class Distiller:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is learned, and what learning goes on from."""
-        return {"stacks": [own.stack.state_dict() for own in self.rollouts]}
+        return {"stacks": [rollout.stack.state_dict() for rollout in self.rollouts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from what was saved.
@@ -149,8 +149,8 @@ class Distiller:
         Raises:
             RuntimeError: If networks are of other sizes; also ValueError and KeyError.
         """
-        for own, saved in zip(self.rollouts, state["stacks"], strict=True):
-            own.stack.load_state_dict(saved)
+        for rollout, saved in zip(self.rollouts, state["stacks"], strict=True):
+            rollout.stack.load_state_dict(saved)
         for captured in (self._chosen, self._answered, self._learned, self._looked):
             captured.forget()
 
@@ -167,10 +167,10 @@ class Distiller:
 
     def student(self, index: int) -> Student:
         """Return a copy of a student, on the CPU, by its number among `keys`."""
-        for own in self.rollouts:
-            if index < len(own.keys):
-                return own.stack.student(index)
-            index -= len(own.keys)
+        for rollout in self.rollouts:
+            if index < len(rollout.keys):
+                return rollout.stack.student(index)
+            index -= len(rollout.keys)
         raise IndexError(index)
 
     def acting(self) -> Actor:
@@ -182,7 +182,7 @@ class Distiller:
     def _choose(self) -> None:
         """Have the teacher say what should be done, and each student act."""
         with torch.no_grad():
-            acting = [partial(self._act, own, x) for own, x in zip(self.rollouts, self._inputs, strict=True)]
+            acting = [partial(self._act, rollout, x) for rollout, x in zip(self.rollouts, self._inputs, strict=True)]
             self._beside([lambda: self._label.copy_(self._teacher(self._seen)), *acting])
             self._action.copy_(self._asked)
             if self._spec.std:
@@ -191,58 +191,58 @@ class Distiller:
     def _act(self, own: Rollout, x: Tensor) -> None:
         """Have a stack act."""
         x.copy_(own.inputs(self._seen))
-        made = own.stack(x, own.memory)
-        own.memory.copy_(made.memory)
-        self._asked[own.envs].copy_(made.action.flatten(0, 1))
+        action = own.stack(x, own.memory)
+        own.memory.copy_(action.memory)
+        self._asked[own.envs].copy_(action.action.flatten(0, 1))
 
     def _answer(self) -> None:
         """Have the students say what they would ask for now in the rollout: an earlier one's a_0 bounds nothing any more."""
         with torch.no_grad():
-            self._beside([partial(self._answer_by, own) for own in self.rollouts])
+            self._beside([partial(self._answer_by, rollout) for rollout in self.rollouts])
 
     def _answer_by(self, own: Rollout) -> None:
         memory = own.begun
-        for x, before, ended in zip(own.x, own.before, self._ended, strict=True):
-            made = own.stack(x, memory)
-            before.copy_(made.action)
-            memory = forgotten(made.memory, own.split(ended))
+        for x, target, ended in zip(own.x, own.before, self._ended, strict=True):
+            action = own.stack(x, memory)
+            target.copy_(action.action)
+            memory = forgotten(action.memory, own.split(ended))
 
     def _epoch(self) -> None:
         """Go through the rollout once."""
-        each = self._losses.split([len(own.keys) for own in self.rollouts])
-        self._beside([partial(self._pass, own, errors) for own, errors in zip(self.rollouts, each, strict=True)])
+        each = self._losses.split([len(rollout.keys) for rollout in self.rollouts])
+        self._beside([partial(self._pass, rollout, errors) for rollout, errors in zip(self.rollouts, each, strict=True)])
 
     def _pass(self, own: Rollout, errors: Float[Tensor, " student"]) -> None:
         """Have a stack go through the rollout once; add the errors of its actions."""
         memory = own.begun
         for first in range(0, self._spec.steps, self._spec.gradient_length):
-            found, memory = self._descend(own, slice(first, first + self._spec.gradient_length), memory)
-            errors += found
+            step_error, memory = self._descend(own, slice(first, first + self._spec.gradient_length), memory)
+            errors += step_error
 
     def _descend(self, own: Rollout, steps: slice, memory: Tensor) -> tuple[Float[Tensor, " student"], Tensor]:
         """Take one gradient step of a stack; return the errors of its actions, and what it remembers then."""
         spec = self._spec
-        told = total = torch.zeros(len(own.keys), device=memory.device)
+        detached = total = torch.zeros(len(own.keys), device=memory.device)
         parts = [steps] if own.stack.memory == 0 else [slice(t, t + 1) for t in range(steps.start, steps.stop)]
         with torch.enable_grad():
             for part in parts:  # without memory all steps are rows
-                x, before = (joined(values[part]) for values in (own.x, own.before))
+                x, target = (joined(values[part]) for values in (own.x, own.before))
                 label, targets, ended = (
                     joined(own.split(values[part], 1)) for values in (self._labels, self._privileged, self._ended[..., None])
                 )
-                made = own.stack(x, memory if own.stack.memory else x[..., :0])
-                error = losses.behaviour(made.action, label, before, self._std, spec.clip) / len(parts)
-                told = told + error.detach()
+                outputs = own.stack(x, memory if own.stack.memory else x[..., :0])
+                error = losses.behaviour(outputs.action, label, target, self._std, spec.clip) / len(parts)
+                detached = detached + error.detach()
                 total = total + error
                 if self._targets:
-                    total = total + losses.decoded(made.told, targets, self._scales, self._weights) / len(parts)
-                memory = forgotten(made.memory, ended[..., 0]) if own.stack.memory else memory
+                    total = total + losses.decoded(outputs.told, targets, self._scales, self._weights) / len(parts)
+                memory = forgotten(outputs.memory, ended[..., 0]) if own.stack.memory else memory
             own.stack.descend(total)
-        return told, memory.detach()
+        return detached, memory.detach()
 
     def _look(self) -> None:
         """Take what was seen into account in the students' normalisation."""
-        self._beside([partial(self._look_by, own) for own in self.rollouts])
+        self._beside([partial(self._look_by, rollout) for rollout in self.rollouts])
 
     def _look_by(self, own: Rollout) -> None:
         for x in own.x:
@@ -262,7 +262,7 @@ class Distiller:
         num, actions, steps = env.num_envs, env.num_actions, spec.steps
         seen = dict.fromkeys((*self._teacher.groups, *(name for names in self.groups.values() for name in names)))
         self._seen = {name: torch.zeros((num, env.groups[name]), device=device) for name in seen}
-        self._inputs = [torch.zeros_like(own.x[0]) for own in self.rollouts]
+        self._inputs = [torch.zeros_like(rollout.x[0]) for rollout in self.rollouts]
         self._action, self._asked, self._label = (torch.zeros((num, actions), device=device) for _ in range(3))
         self._labels = torch.zeros((steps, num, actions), device=device)
         self._ended = torch.zeros((steps, num), dtype=torch.bool, device=device)
@@ -294,8 +294,8 @@ class Distiller:
 
     def _of_rollout(self) -> list[Tensor]:
         """Return what a pass reads of a rollout: live tensors."""
-        own = [value for each in self.rollouts for value in (each.x, each.before, each.begun)]
-        return [*own, self._labels, self._privileged, self._ended]
+        buffers = [value for each in self.rollouts for value in (each.x, each.before, each.begun)]
+        return [*buffers, self._labels, self._privileged, self._ended]
 
     def _see(self, obs: Mapping[str, Tensor]) -> None:
         copy_each(list(self._seen.values()), [obs[name] for name in self._seen])
@@ -303,16 +303,16 @@ class Distiller:
     def _keep(self, t: int) -> None:
         """Keep what was seen, asked for and said."""
         self._labels[t].copy_(self._label)
-        for own, x in zip(self.rollouts, self._inputs, strict=True):
-            own.x[t].copy_(x)
-            own.before[t].copy_(own.split(self._asked))
+        for rollout, x in zip(self.rollouts, self._inputs, strict=True):
+            rollout.x[t].copy_(x)
+            rollout.before[t].copy_(rollout.split(self._asked))
         if self._targets:
             privileged = self.env.task.decoded(self.env.now)
             self._privileged[t].copy_(torch.stack([privileged[name] for name in self._targets], dim=1))
 
     def _forget(self, ended: Bool[Tensor, " env"]) -> None:
-        for own in self.rollouts:
-            own.memory.copy_(forgotten(own.memory, own.split(ended)))
+        for rollout in self.rollouts:
+            rollout.memory.copy_(forgotten(rollout.memory, rollout.split(ended)))
         self._teacher.begin(ended)
 
     def _told(self) -> Iteration:
@@ -320,15 +320,15 @@ class Distiller:
         sums, count = self._tally.taken(), len(self.keys)
         scores = self._scores.view(2, count, -1).sum(dim=2).flatten()
         updates = self._spec.epochs * self._spec.steps // self._spec.gradient_length
-        told = torch.cat([sums, scores, (self._losses / updates).double().to(sums.device)]).tolist()
+        numbers = torch.cat([sums, scores, (self._losses / updates).double().to(sums.device)]).tolist()
         self._scores.zero_()
         rollout, update = self._clock.stop()
-        made = self._tally.means(told[: len(sums)]) | {"Loss/learning_rate": self._rate}
-        ended, score, loss = (told[len(sums) + i * count :][:count] for i in range(3))
+        means = self._tally.means(numbers[: len(sums)]) | {"Loss/learning_rate": self._rate}
+        ended, score, loss = (numbers[len(sums) + i * count :][:count] for i in range(3))
         for key, number, total, error in zip(self.keys, ended, score, loss, strict=True):
-            made |= {f"Score/{key.name}": total / number} if number else {}
-            made[f"Loss/{key.name}"] = error
-        return Iteration(round(told[0]), made, rollout, update)
+            means |= {f"Score/{key.name}": total / number} if number else {}
+            means[f"Loss/{key.name}"] = error
+        return Iteration(round(numbers[0]), means, rollout, update)
 
     def _checked_targets(self, loaded: LoadedTask) -> list[str]:
         """Return the privileged numbers that decoders tell.
@@ -337,11 +337,11 @@ class Distiller:
             SpecError: If the task has no such number.
         """
         named = list(self._spec.decoders)
-        known = list(self.env.task.decoded(self.env.now)) if named else []
+        numbers = list(self.env.task.decoded(self.env.now)) if named else []
         for name in named:
-            if name not in known:
+            if name not in numbers:
                 problem = f'the task has no privileged number "{name}"'
-                raise loaded.error(("distill", "decoders", name), problem, did_you_mean(name, known, "numbers"))
+                raise loaded.error(("distill", "decoders", name), problem, did_you_mean(name, numbers, "numbers"))
         return named
 
 
@@ -351,18 +351,20 @@ class ActingStudents(Actor):
     def __init__(self, distiller: Distiller):
         """Begin episodes."""
         self._rollouts = distiller.rollouts
-        self._memory = [torch.zeros_like(own.memory) for own in self._rollouts]
+        self._memory = [torch.zeros_like(rollout.memory) for rollout in self._rollouts]
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
         """Return the actions of each student for what its own environments let it see."""
         actions = []
         with torch.no_grad():
-            for i, own in enumerate(self._rollouts):
-                made = own.stack(own.inputs(obs), self._memory[i])
-                self._memory[i] = made.memory
-                actions.append(made.action.flatten(0, 1))
+            for i, rollout in enumerate(self._rollouts):
+                outputs = rollout.stack(rollout.inputs(obs), self._memory[i])
+                self._memory[i] = outputs.memory
+                actions.append(outputs.action.flatten(0, 1))
         return torch.cat(actions)
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
         """Forget episodes that have ended."""
-        self._memory = [forgotten(memory, own.split(ended)) for memory, own in zip(self._memory, self._rollouts, strict=True)]
+        self._memory = [
+            forgotten(memory, stack.split(ended)) for memory, stack in zip(self._memory, self._rollouts, strict=True)
+        ]

@@ -75,14 +75,16 @@ def rows_of(
         minutes: How long all have learned together [min].
     """
     kinds: dict[tuple[str, str, str], list[Evaluation]] = {}
-    for key, own in zip(keys, found, strict=True):
-        kinds.setdefault(key.kind, []).append(own)
+    for key, evaluation in zip(keys, found, strict=True):
+        kinds.setdefault(key.kind, []).append(evaluation)
     rows = []
-    for (type_, placement, noise), own in kinds.items():
-        low, high = interval(own)
-        score, held = fmean(each.score for each in own), fmean(each.held for each in own)
-        episodes = sum(each.episodes for each in own)
-        rows.append(Row(type_, placement, resolution, noise, len(own), score, low, high, held, episodes, samples, minutes))
+    for (type_, placement, noise), evaluation in kinds.items():
+        low, high = interval(evaluation)
+        score, held = fmean(each.score for each in evaluation), fmean(each.held for each in evaluation)
+        episodes = sum(each.episodes for each in evaluation)
+        rows.append(
+            Row(type_, placement, resolution, noise, len(evaluation), score, low, high, held, episodes, samples, minutes)
+        )
     return rows
 
 
@@ -90,7 +92,7 @@ def interval(found: Sequence[Evaluation]) -> tuple[float, float]:
     """Return the 95 % interval of the mean score over seeds and episodes."""
     scores, num = [each.score for each in found], len(found)
     halves = [0.5 * (each.score_interval[1] - each.score_interval[0]) for each in found]
-    half = math.sqrt(sum(own**2 for own in halves)) / num
+    half = math.sqrt(sum(half_width**2 for half_width in halves)) / num
     if num > 1:
         with np.errstate(invalid="ignore"):  # of a score that is not finite there is no interval
             half = max(half, float(student_t.ppf(0.975, num - 1) * np.std(scores, ddof=1)) / math.sqrt(num))
@@ -153,9 +155,9 @@ def write_students(
             alone[key.felt] = compile_sensed(own_task(loaded, key.felt), "cpu").touch
         touch, names = alone[key.felt], distiller.groups[key.name]
         sizes = {GROUP if key.felt and name == key.felt.group else name: distiller.env.groups[name] for name in names}
-        own = own_task(loaded, key.felt).spec
-        chosen = {"touch": own.touch, "placement": own.placement, "noise": own.noise}
-        run = dict(origin) | {"spec": own.model_dump(mode="json"), "taxels": touch.taxels_id, "seed": key.seed}
+        task_spec = own_task(loaded, key.felt).spec
+        chosen = {"touch": task_spec.touch, "placement": task_spec.placement, "noise": task_spec.noise}
+        run = dict(origin) | {"spec": task_spec.model_dump(mode="json"), "taxels": touch.taxels_id, "seed": key.seed}
         run["overrides"] = dict(origin["overrides"]) | chosen
         card = made_card(distiller, sizes, run, seconds, command)
         card["samples"] = distiller.samples // len(distiller.keys)

@@ -59,8 +59,8 @@ class Rollout:
         shape = (len(keys), rows)
         memory, begun = (torch.zeros((*shape, stack.memory), device=device) for _ in range(2))
         x = torch.zeros((spec.steps, *shape, networks.num_features), device=device)
-        before = torch.zeros((spec.steps, *shape, networks.actions), device=device)
-        return Rollout(stack, keys, seen, first, rows, memory, begun, x, before)
+        actions = torch.zeros((spec.steps, *shape, networks.actions), device=device)
+        return Rollout(stack, keys, seen, first, rows, memory, begun, x, actions)
 
     @property
     def envs(self) -> slice:

@@ -110,10 +110,10 @@ class Stack:
 
     def student(self, index: int) -> Student:
         """Return a copy of one student, on the CPU."""
-        own = Student(self.architecture)
+        student = Student(self.architecture)
         state = {name: value[index].detach().cpu() for name, value in (self.parameters | self.buffers).items()}
-        own.load_state_dict({name: state[name] for name in own.state_dict()})
-        return own
+        student.load_state_dict({name: state[name] for name in student.state_dict()})
+        return student
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that teaching goes on from: live tensors."""

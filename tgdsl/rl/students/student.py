@@ -81,8 +81,8 @@ class Student(nn.Module):
     def forward(self, x: Tensor, memory: Tensor) -> Made:
         """Return actions and what else is made of observations."""
         latent, memory = self.embed(x, memory)
-        told = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
-        return Made(self.trunk(latent), told, memory)
+        decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
+        return Made(self.trunk(latent), decoded, memory)
 
     def act(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions and what is remembered, and nothing that is dropped at deployment."""
@@ -91,13 +91,13 @@ class Student(nn.Module):
 
     def embed(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the embeddings of all groups, side by side, and what is remembered."""
-        own = self.architecture
+        architecture = self.architecture
         mean, var = self.mean, self.var
-        normal = ((x - mean) / (var.sqrt() + own.eps)).clamp(-own.clip, own.clip)  # pyright: ignore
-        parts = normal.split([size for size, _ in own.groups], dim=1)
+        normal = ((x - mean) / (var.sqrt() + architecture.eps)).clamp(-architecture.clip, architecture.clip)  # pyright: ignore
+        parts = normal.split([size for size, _ in architecture.groups], dim=1)
         held = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
-        made = [encoder(*each) for encoder, *each in zip(self.encoders, parts, held, strict=True)]
-        return torch.cat([each for each, _ in made], dim=1), torch.cat([each for _, each in made], dim=1)
+        embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, held, strict=True)]
+        return torch.cat([each for each, _ in embeddings], dim=1), torch.cat([each for _, each in embeddings], dim=1)
 
 
 class Deployed(nn.Module):
@@ -152,16 +152,18 @@ class Remembering(nn.Module):
 
 def deployed(student: Student) -> torch.jit.ScriptModule:
     """Return a student as TorchScript, on the CPU."""
-    own = copy.deepcopy(student).cpu().eval().requires_grad_(False)  # what remembers would keep a graph of all its steps
-    own.decoders = nn.ModuleList()
-    x, memory = torch.zeros((2, own.architecture.num_features)), torch.zeros((2, own.memory))
+    student_copy = (
+        copy.deepcopy(student).cpu().eval().requires_grad_(False)
+    )  # what remembers would keep a graph of all its steps
+    student_copy.decoders = nn.ModuleList()
+    x, memory = torch.zeros((2, student_copy.architecture.num_features)), torch.zeros((2, student_copy.memory))
     with torch.no_grad():
-        if own.memory == 0:
-            return torch.jit.trace(Deployed(own), (x,))  # pyright: ignore[reportReturnType]
-        acting: torch.jit.ScriptModule = torch.jit.trace(Acting(own), (x, memory))  # pyright: ignore[reportAssignmentType]
-        made: Any = torch.jit.script(Remembering(acting, own.memory))
-        made.define(RECURRENT)
-        return made
+        if student_copy.memory == 0:
+            return torch.jit.trace(Deployed(student_copy), (x,))  # pyright: ignore[reportReturnType]
+        acting: torch.jit.ScriptModule = torch.jit.trace(Acting(student_copy), (x, memory))  # pyright: ignore[reportAssignmentType]
+        script: Any = torch.jit.script(Remembering(acting, student_copy.memory))
+        script.define(RECURRENT)
+        return script
 
 
 def forgotten(memory: Tensor, ended: Tensor) -> Tensor:

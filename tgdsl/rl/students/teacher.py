@@ -49,8 +49,10 @@ class Teacher:
             raise PolicyError(f"{file}: its card has no spec.{missing[0]}: this is not what tgdsl train writes")
         self.felt = Felt(theirs["touch"], theirs["placement"], theirs["noise"]) if GROUP in card["groups"] else None
         if self.felt and theirs["resolution"] != ours["resolution"]:
-            found, wanted = theirs["resolution"], ours["resolution"]
-            raise PolicyError(f"{file}: this teacher feels with other taxels: resolution {found}, here {wanted}")
+            their_resolution, our_resolution = theirs["resolution"], ours["resolution"]
+            raise PolicyError(
+                f"{file}: this teacher feels with other taxels: resolution {their_resolution}, here {our_resolution}"
+            )
         if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
             problem = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
             raise PolicyError(f"{file}: {problem}; learn it again, or take distill.loss=mse")
@@ -119,6 +121,6 @@ class BoundTeacher:
 
 def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:
     """Return the task of a policy that feels one thing, in environments of its own."""
-    chosen = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
-    spec = loaded.spec.model_copy(update=chosen)
+    touch = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
+    spec = loaded.spec.model_copy(update=touch)
     return dataclasses.replace(loaded, spec=spec)

@@ -188,9 +188,9 @@ class GripForce(Task[GripForceSpec]):
         """
         super().__init__(spec, setup)
         self.qpos, self.ctrl = (_keyframes(spec, setup, name)[setup.variant] for name in ("qpos", "ctrl"))
-        self.item, own = object_qpos(setup), setup.actuators
-        self.moved = torch.from_numpy(own.actuator).to(setup.device, torch.int64)
-        held = self.qpos[:, torch.from_numpy(own.qpos).to(setup.device, torch.int64)]
+        self.item, actuators = object_qpos(setup), setup.actuators
+        self.moved = torch.from_numpy(actuators.actuator).to(setup.device, torch.int64)
+        held = self.qpos[:, torch.from_numpy(actuators.qpos).to(setup.device, torch.int64)]
         self.held, self.lag = held, self.ctrl[:, self.moved] - held
         self.weight = float(np.linalg.norm(setup.model.opt.gravity))
         self.first, self.last = (round(end / setup.control_step) for end in spec.change)
@@ -254,8 +254,8 @@ class GripForce(Task[GripForceSpec]):
         spec, draws = self.spec, self.setup.draws
         low, high = spec.force
         least = (spec.hold_margin * self.weight * mass / friction).clamp(min=low, max=high)
-        found = draws.shares({"command": 1, "command interval": 1}, self.count, chosen)
-        share, left = found["command"][:, 0].to(least.dtype), whole(found["command interval"], self.first, self.last)
+        shares = draws.shares({"command": 1, "command interval": 1}, self.count, chosen)
+        share, left = shares["command"][:, 0].to(least.dtype), whole(shares["command interval"], self.first, self.last)
         self.begin(chosen, command=least + share * (high - least), left=left[:, 0], since=0.0)
 
 

@@ -52,9 +52,9 @@ class HotBallRandomSpec(RandomSpec):
 
     @model_validator(mode="after")
     def _check(self) -> HotBallRandomSpec:
-        told = [name for name in ("friction", "mass", "push") if getattr(self, name) != getattr(RandomSpec(), name)]
-        if told:
-            raise ValueError(f"`{told[0]}` would be the hot ball's alone and tell it from others: expected it to be left out")
+        given = [name for name in ("friction", "mass", "push") if getattr(self, name) != getattr(RandomSpec(), name)]
+        if given:
+            raise ValueError(f"`{given[0]}` would be the hot ball's alone and tell it from others: expected it to be left out")
         return self
 
 
@@ -224,5 +224,5 @@ def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:
 def _cells(links: np.ndarray) -> Int[Tensor, "link cell"]:
     """Return the rows of each link's cells; a link with fewer than others has its first one again."""
     rows = [np.flatnonzero(links == name) for name in dict.fromkeys(links.tolist())]
-    most = max(len(own) for own in rows)
-    return torch.from_numpy(np.array([np.concatenate([own, np.repeat(own[:1], most - len(own))]) for own in rows]))
+    most = max(len(links) for links in rows)
+    return torch.from_numpy(np.array([np.concatenate([links, np.repeat(links[:1], most - len(links))]) for links in rows]))

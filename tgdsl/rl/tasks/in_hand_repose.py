@@ -125,13 +125,13 @@ def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: floa
     """
     pos = record["pos"]
     rot = [_matrix(quat) for quat in record["quat"]]
-    reached, near_since, given = 0, 0, 0
+    reached, near_since, goal_time = 0, 0, 0
     goal = _turn(record["goal_axis"][0], spec.goal_step) @ rot[0]
     for t in range(1, len(pos)):
         error = _angle_between(goal, rot[t])
         near_since = near_since + 1 if error < spec.goal_tolerance else 0
         is_reached = near_since >= spec.goal_hold
-        is_late = not is_reached and t - given >= round(spec.goal_timeout / dt)
+        is_late = not is_reached and t - goal_time >= round(spec.goal_timeout / dt)
         is_dropped = np.linalg.norm(pos[t] - pos[0]) > spec.drop_distance
         row = {
             "success": is_reached,
@@ -142,7 +142,7 @@ def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: floa
             "goal_timeout": is_late,
         }
         if is_reached:
-            reached, near_since, given = reached + 1, 0, t
+            reached, near_since, goal_time = reached + 1, 0, t
             goal = _turn(record["goal_axis"][reached], spec.goal_step) @ goal
         yield row | {"is_over": is_dropped or is_late, "score": reached}
 
@@ -221,8 +221,8 @@ class InHandRepose(Task[InHandReposeSpec]):
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random, and give each a first goal."""
         qpos, pos, quat = placed(self.setup, self.spec.randomise, chosen, episode)
-        for own in (self.reached, self.held, self.waited, self.is_reached, self.is_late):
-            own.masked_fill_(chosen, 0)
+        for buffer in (self.reached, self.held, self.waited, self.is_reached, self.is_late):
+            buffer.masked_fill_(chosen, 0)
         self.begin(chosen, start_pos=pos, episode=episode)
         goal = self._goal_after(quat)
         left = rotations.between(goal, quat)

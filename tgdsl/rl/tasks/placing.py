@@ -51,8 +51,8 @@ def placed(
     """
     own, draws, dtype = object_qpos(setup), setup.draws, setup.dtype
     qpos = setup.qpos.repeat(setup.num_envs, 1)
-    found = draws.shares({"placement": 2, "yaw": 1}, episode, chosen)
-    xy, yaw = (within(found[name], *own).to(dtype) for name, own in (("placement", spec.xy), ("yaw", spec.yaw)))
+    shares = draws.shares({"placement": 2, "yaw": 1}, episode, chosen)
+    xy, yaw = (within(shares[name], *bounds).to(dtype) for name, bounds in (("placement", spec.xy), ("yaw", spec.yaw)))
     up = torch.eye(3, dtype=dtype, device=setup.device)[2].expand(setup.num_envs, 3)
     rise = setup.half_height - setup.first_half_height
     pos = qpos[:, own.start : own.start + 3] + torch.cat([xy, rise[:, None]], dim=1)

@@ -215,7 +215,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
         self.axis = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.holding = Holding(spec.hold, setup)
         self.joints = torch.from_numpy(setup.actuators.qpos).to(setup.device, torch.int64)
-        self.upright_pos, self.upright_tip = (own.to(setup.device, setup.dtype) for own in _upright(setup, spec.tip))
+        self.upright_pos, self.upright_tip = (place.to(setup.device, setup.dtype) for place in _upright(setup, spec.tip))
         self.quat, self.start_joints = self.keep("quat", 4), self.keep("start_joints", len(setup.actuators.names))
         self.rate, self.tilt, self.turned = self.keep("rate"), self.keep("tilt"), self.keep("turned")
 
@@ -281,4 +281,4 @@ def _upright(setup: Setup, tip: str) -> tuple[Float[Tensor, " 3"], Float[Tensor,
     state = mujoco.MjData(setup.model)
     state.qpos[:] = setup.qpos.cpu().numpy()
     mujoco.mj_kinematics(setup.model, state)
-    return tuple(torch.from_numpy(own.copy()) for own in (state.body(setup.object).xpos, state.site(tip).xpos))  # type: ignore[return-value]
+    return tuple(torch.from_numpy(place.copy()) for place in (state.body(setup.object).xpos, state.site(tip).xpos))  # type: ignore[return-value]

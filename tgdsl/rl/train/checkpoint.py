@@ -41,7 +41,7 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
         seconds: How long it has learned [s].
     """
     env = learner.env
-    own = {
+    state = {
         "resets": env.resets.cpu().clone(),
         "steps": env.steps.cpu().clone(),
         "touch": {name: getattr(env.touch.memory.clock, name).cpu().clone() for name in _counted(env)},
@@ -55,7 +55,7 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
         "seconds": seconds,
         "groups": learner.groups,
         **learner.state_dict(),
-        "processes": learner.ranks.gathered(own),
+        "processes": learner.ranks.gathered(state),
     }
 
 
@@ -137,17 +137,17 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
     except (RuntimeError, ValueError, KeyError) as error:
         raise CheckpointError(f"{file}: its networks are of other sizes: {str(error).splitlines()[-1].strip()}") from error
     learner.iteration, learner.samples = state["iteration"], state["samples"]
-    own = state["processes"][rank] if rank < len(state["processes"]) else None
-    if own is not None and own["resets"].shape == learner.env.resets.shape:
-        _count_on(learner.env, [own])
-        learner.go_on(own["steps"].to(learner.env.device))
+    process_state = state["processes"][rank] if rank < len(state["processes"]) else None
+    if process_state is not None and process_state["resets"].shape == learner.env.resets.shape:
+        _count_on(learner.env, [process_state])
+        learner.go_on(process_state["steps"].to(learner.env.device))
     else:
         _count_on(learner.env, state["processes"])
-    if own is None:
+    if process_state is None:
         return
-    torch.set_rng_state(own["cpu"])
-    if own["cuda"] is not None and learner.env.device.type == "cuda":
-        torch.cuda.set_rng_state(own["cuda"], learner.env.device)
+    torch.set_rng_state(process_state["cpu"])
+    if process_state["cuda"] is not None and learner.env.device.type == "cuda":
+        torch.cuda.set_rng_state(process_state["cuda"], learner.env.device)
 
 
 def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping[str, int], path: str = "") -> str:
@@ -171,8 +171,8 @@ def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping
     if "normalizer" not in path and ".seen." not in path:
         return path
     wrong = (~state.isfinite()).reshape(-1, state.shape[-1] if state.ndim else 1).any(dim=0).tolist()
-    own = [name for name in networks if f"{name}_state_dict" in path] or list(networks)  # one of rsl_rl's, or students
-    columns = [[group for group in networks[name] for _ in range(sizes.get(group, 0))] for name in own]
+    named = [name for name in networks if f"{name}_state_dict" in path] or list(networks)  # one of rsl_rl's, or students
+    columns = [[group for group in networks[name] for _ in range(sizes.get(group, 0))] for name in named]
     result = (group for each in columns if len(each) == len(wrong) for group, is_it in zip(each, wrong, strict=True) if is_it)
     return f"{path}, which observes {listed([*dict.fromkeys(result)])},"
 
@@ -180,13 +180,13 @@ def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping
 def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
     """Have environments go on to draw what was not drawn: each from its own counts, or all from the largest of any."""
     counts = {"resets": env.resets} | {name: getattr(env.touch.memory.clock, name) for name in _counted(env)}
-    for name, own in counts.items():
-        kept = [each["resets"] if name == "resets" else each.get("touch", {}).get(name) for each in processes]
-        found = [value for value in kept if value is not None]  # an earlier checkpoint has none of touch
-        if len(found) == 1 and found[0].shape == own.shape:
-            own.copy_(found[0])
-        elif found:
-            own.fill_(max(int(value.max()) for value in found))
+    for name, count in counts.items():
+        counters = [each["resets"] if name == "resets" else each.get("touch", {}).get(name) for each in processes]
+        present = [value for value in counters if value is not None]  # an earlier checkpoint has none of touch
+        if len(present) == 1 and present[0].shape == count.shape:
+            count.copy_(present[0])
+        elif present:
+            count.fill_(max(int(value.max()) for value in present))
 
 
 def _counted(env: TouchEnv) -> tuple[str, ...]:
@@ -210,7 +210,7 @@ def _slim(state: Mapping[str, Any]) -> dict[str, Any]:
 def _rounded(optimiser: Mapping[str, Any]) -> dict[str, Any]:
     """Return an optimiser's state with its moments in bfloat16."""
     moments = {
-        i: {key: value.bfloat16() if key.startswith("exp_avg") else value for key, value in own.items()}
-        for i, own in optimiser["state"].items()
+        i: {key: value.bfloat16() if key.startswith("exp_avg") else value for key, value in moments.items()}
+        for i, moments in optimiser["state"].items()
     }
     return dict(optimiser) | {"state": moments}

@@ -27,9 +27,9 @@ def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[st
         SpecError: If a group that is named is not there, or is empty.
     """
     train = loaded.spec.train
-    known = [name for name in groups if name not in (PROPRIO, GROUP)]
-    actor = _given(loaded, groups, ("actor",)) or [name for name in known if name != PROPS]
-    result = {"actor": actor, "critic": _given(loaded, groups, ("critic",)) or known}
+    privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
+    actor = _given(loaded, groups, ("actor",)) or [name for name in privileged if name != PROPS]
+    result = {"actor": actor, "critic": _given(loaded, groups, ("critic",)) or privileged}
     if train.rnd != "off":
         result["rnd_state"] = _given(loaded, groups, ("rnd", "groups")) or ([STATE] if STATE in groups else actor)
     return result
@@ -48,11 +48,11 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
     """
     train = loaded.spec.train
     model = _model(train)
-    own = train.networks
+    networks = train.networks
     gaussian = {
         "class_name": "tgdsl.rl.train.model:Gaussian",
-        "init_std": own.initial_std,
-        "std_range": (own.min_std, MOST_STD),
+        "init_std": networks.initial_std,
+        "std_range": (networks.min_std, MOST_STD),
     }
     return {
         "num_steps_per_env": train.steps,
@@ -66,15 +66,15 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
 
 
 def _model(train: TrainSpec) -> dict[str, Any]:
-    own = train.networks
+    networks = train.networks
     return {
         "class_name": "tgdsl.rl.train.model:EncodedModel",
-        "hidden_dims": list(own.hidden),
+        "hidden_dims": list(networks.hidden),
         "activation": "elu",
         "obs_normalization": True,
-        "encoders": {GROUP: _encoder(own.touch_encoder), "*": _encoder(own.encoder)},
-        "eps": own.eps,
-        "clip": own.clip,
+        "encoders": {GROUP: _encoder(networks.touch_encoder), "*": _encoder(networks.encoder)},
+        "eps": networks.eps,
+        "clip": networks.clip,
     }
 
 

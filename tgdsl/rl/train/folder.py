@@ -186,12 +186,12 @@ class RunFolder:
             TgdslError: If it is no curve.
             FileError: If it cannot be written.
         """
-        kept = [row for row in self.rows() if int(row["iteration"]) <= iterations]
+        rows = [row for row in self.rows() if int(row["iteration"]) <= iterations]
         text = io.StringIO()
-        if kept:
-            writer = csv.DictWriter(text, list(kept[0]), lineterminator="\n")
+        if rows:
+            writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
             writer.writeheader()
-            writer.writerows(kept)
+            writer.writerows(rows)
         content = text.getvalue().encode()
         if self.curve.is_file() and self.curve.read_bytes() != content:
             atomic_write(self.curve, content)
@@ -229,7 +229,7 @@ class RunFolder:
         except (OSError, ValueError) as error:
             raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
         starts = result.get("starts") if isinstance(result, dict) else None
-        if not isinstance(starts, list) or not all(isinstance(own, dict) and own.keys() >= ASKED for own in starts):
+        if not isinstance(starts, list) or not all(isinstance(start, dict) and start.keys() >= ASKED for start in starts):
             raise TgdslError(
                 f"{self.run}: expected what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ASKED))}"
             )
@@ -247,13 +247,13 @@ def documents(loaded: LoadedTask) -> dict[str, Path]:
 
     Of documents that are files. Two files of one name have that of their folder before it, as in `sub_palm.yaml`.
     """
-    own = [file for file in (Path(loaded.source.file), loaded.folder / loaded.spec.document) if file.is_file()]
+    documents = [file for file in (Path(loaded.source.file), loaded.folder / loaded.spec.document) if file.is_file()]
     module = sys.modules.get(loaded.task.__module__)
     if not loaded.task.__module__.startswith("tgdsl.") and module is not None and module.__file__:
-        own.append(Path(module.__file__))
-    if len({file.name for file in own}) == len(own):
-        return {file.name: file for file in own}
-    return {f"{file.resolve().parent.name}_{file.name}": file for file in own}
+        documents.append(Path(module.__file__))
+    if len({file.name for file in documents}) == len(documents):
+        return {file.name: file for file in documents}
+    return {f"{file.resolve().parent.name}_{file.name}": file for file in documents}
 
 
 def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[str, Any], processes: int) -> dict[str, Any]:
@@ -286,8 +286,8 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskS
     """
     lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
-    told = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
-    return lines + [problem for name, problem in told.items() if before[name] != now[name]]
+    descriptions = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
+    return lines + [problem for name, problem in descriptions.items() if before[name] != now[name]]
 
 
 def versions() -> dict[str, str]:

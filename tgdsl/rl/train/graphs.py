@@ -57,9 +57,9 @@ class Captured(Generic[T]):
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
         with torch.cuda.stream(stream), _matmul(self._has_tf32), torch.inference_mode(False):
-            made = self._body()
+            outputs = self._body()
         current.wait_stream(stream)
-        return made
+        return outputs
 
     def _capture(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, T]:
         """Capture the work without doing it; nothing may be collected meanwhile: what Warp frees breaks it."""
@@ -73,11 +73,11 @@ class Captured(Generic[T]):
                 torch.inference_mode(False),
                 torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
             ):
-                made = self._body()
+                outputs = self._body()
         finally:
             if was_enabled:
                 gc.enable()
-        return graph, made
+        return graph, outputs
 
 
 class SideBySide:
@@ -95,22 +95,22 @@ class SideBySide:
         """Do them; return what each returns. What is enqueued after them waits for all."""
         if self._streams is None:
             return [work() for work in works]
-        made, current = [], torch.cuda.current_stream(self._streams[0].device)
+        outputs, current = [], torch.cuda.current_stream(self._streams[0].device)
         for stream, work in zip(self._streams[: len(works)], works, strict=True):
             stream.wait_stream(current)
             with torch.cuda.stream(stream):
-                made.append(work())
+                outputs.append(work())
         for stream in self._streams[: len(works)]:
             current.wait_stream(stream)
-        return made
+        return outputs
 
 
 @contextlib.contextmanager
 def _matmul(has_tf32: bool) -> Iterator[None]:
     """Multiply matrices in TF32 or in float32, and as before afterwards."""
-    before = torch.get_float32_matmul_precision()
+    precision = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if has_tf32 else "highest")
     try:
         yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        torch.set_float32_matmul_precision(precision)

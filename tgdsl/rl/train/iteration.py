@@ -35,21 +35,28 @@ class EpisodeTally:
     def add(self, step: Step) -> None:
         """Add a control step; the host does not wait."""
         info = step.info
-        told = [info.episode_return, info.episode_steps, info.score, step.terminated, info.faults, *info.episode_terms.values()]
-        values = torch.stack([info.ended.double(), *(each.double() for each in told)])
-        kept = torch.where(info.ended, values, 0.0).sum(dim=1)
+        numbers = [
+            info.episode_return,
+            info.episode_steps,
+            info.score,
+            step.terminated,
+            info.faults,
+            *info.episode_terms.values(),
+        ]
+        values = torch.stack([info.ended.double(), *(each.double() for each in numbers)])
+        sums = torch.where(info.ended, values, 0.0).sum(dim=1)
         if self._sums is None:
             self.names = [*OWN, *(f"Reward/{name}" for name in info.episode_terms)]
-            self._sums = torch.zeros_like(kept)
-        self._sums += kept
+            self._sums = torch.zeros_like(sums)
+        self._sums += sums
 
     def taken(self) -> Tensor:
         """Return the sums over all processes, the number of episodes first, and begin again; the host does not wait."""
         assert self._sums is not None
-        made = self._sums.clone()
-        summed(made)
+        sums = self._sums.clone()
+        summed(sums)
         self._sums.zero_()
-        return made
+        return sums
 
     def means(self, sums: list[float]) -> dict[str, float]:
         """Return means over episodes by name, of sums that were taken; none if no episode has ended."""

@@ -55,11 +55,11 @@ class Learner:
         self.iteration = self.samples = 0
         self._score: float | None = None  # of the episodes that have ended last
         self._train, self._tally, self._is_begun = loaded.spec.train, EpisodeTally(), False
-        wanted = config(loaded, env.groups, self.ranks.rsl_rl)
-        self.groups: dict[str, list[str]] = wanted["obs_groups"]
+        settings = config(loaded, env.groups, self.ranks.rsl_rl)
+        self.groups: dict[str, list[str]] = settings["obs_groups"]
         self._names = list(dict.fromkeys(name for names in self.groups.values() for name in names))
         torch.manual_seed(seed)
-        self.algorithm = self._algorithm(wanted)
+        self.algorithm = self._algorithm(settings)
         if self.ranks.size > 1:
             self.algorithm.broadcast_parameters()
         torch.manual_seed(seed * self.ranks.size + self.ranks.rank)
@@ -70,9 +70,9 @@ class Learner:
         self.env.curricula.advance(self.iteration, self._score)
         self.roll()
         self.learn()
-        made = self._told()
-        self._score = made.told.get("Episode/score", self._score)
-        return made
+        numbers = self._told()
+        self._score = numbers.told.get("Episode/score", self._score)
+        return numbers
 
     @property
     def episode_names(self) -> list[str]:
@@ -105,12 +105,12 @@ class Learner:
         """Return what the last iteration was: the host waits for the device here, and only here."""
         algorithm, sums = self.algorithm, self._tally.taken()
         std, reward = algorithm.actor.output_std.mean(), algorithm.storage.rewards.mean()
-        own = torch.stack([*algorithm.losses, algorithm.rate, std, reward]).double()
-        told = torch.cat([sums, own.to(sums.device)]).tolist()
+        statistics = torch.stack([*algorithm.losses, algorithm.rate, std, reward]).double()
+        numbers = torch.cat([sums, statistics.to(sums.device)]).tolist()
         rollout, update = self._clock.stop()
         names = [*(f"Loss/{name}" for name in LOSSES), "Loss/learning_rate", "Policy/mean_std", "Train/reward_per_step"]
-        also = dict(zip(names, told[len(sums) :], strict=True))
-        return Iteration(round(told[0]), self._tally.means(told[: len(sums)]) | also, rollout, update)
+        also = dict(zip(names, numbers[len(sums) :], strict=True))
+        return Iteration(round(numbers[0]), self._tally.means(numbers[: len(sums)]) | also, rollout, update)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is learned, and what learning goes on from, as plain values and tensors."""
@@ -136,12 +136,12 @@ class Learner:
         Args:
             before: The document's `train` with which the state was saved, as plain values.
         """
-        own = self._train
-        if not own.adaptive or before.get("learning_rate", own.learning_rate) != own.learning_rate:
-            self.algorithm.learning_rate = own.learning_rate
-        if self.algorithm.rnd and own.rnd != "off":
+        train_spec = self._train
+        if not train_spec.adaptive or before.get("learning_rate", train_spec.learning_rate) != train_spec.learning_rate:
+            self.algorithm.learning_rate = train_spec.learning_rate
+        if self.algorithm.rnd and train_spec.rnd != "off":
             for group in self.algorithm.rnd.optimizer.param_groups:
-                group["lr"] = own.rnd.learning_rate
+                group["lr"] = train_spec.rnd.learning_rate
 
     def go_on(self, steps: torch.Tensor) -> None:
         """Begin episodes that count as having lasted so many control steps, in place of any at random."""
@@ -167,5 +167,5 @@ class Learner:
         env = TouchVecEnv(self.env)
         kind: Any = resolve_callable(wanted["algorithm"]["class_name"])
         with contextlib.redirect_stdout(io.StringIO()):  # the networks, printed
-            made = kind.construct_algorithm(self._seen(dict(env.get_observations())), env, wanted, str(self.env.device))
-        return made
+            algorithm = kind.construct_algorithm(self._seen(dict(env.get_observations())), env, wanted, str(self.env.device))
+        return algorithm

@@ -69,16 +69,18 @@ class EncodedModel(MLPModel):
             clip: As `Normalisation` has it.
         """
         self._sizes = [obs[name].shape[-1] for name in obs_groups[obs_set]]
-        chosen = [(encoders or {}).get(name, (encoders or {}).get("*")) for name in obs_groups[obs_set]]
-        self._latent = sum(own["size"] if own else size for own, size in zip(chosen, self._sizes, strict=True))
+        encoder_specs = [(encoders or {}).get(name, (encoders or {}).get("*")) for name in obs_groups[obs_set]]
+        self._latent = sum(
+            encoder["size"] if encoder else size for encoder, size in zip(encoder_specs, self._sizes, strict=True)
+        )
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, activation, obs_normalization, distribution_cfg)
         if obs_normalization:
             self.obs_normalizer = Normalisation(self.obs_dim, eps, clip=clip)
-        made = [
-            MLP(size, own["size"], list(own["hidden"]), activation) if own else nn.Identity()
-            for own, size in zip(chosen, self._sizes, strict=True)
+        encoders_made = [
+            MLP(size, encoder["size"], list(encoder["hidden"]), activation) if encoder else nn.Identity()
+            for encoder, size in zip(encoder_specs, self._sizes, strict=True)
         ]
-        self.encoders = nn.ModuleList(made)
+        self.encoders = nn.ModuleList(encoders_made)
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
         """Return the embeddings of all groups, side by side."""
@@ -112,14 +114,14 @@ class Exported(nn.Module):
     def __init__(self, model: EncodedModel):
         """Copy a model."""
         super().__init__()
-        own = model.distribution
-        if own is not None:
+        distribution = model.distribution
+        if distribution is not None:
             model.distribution = None  # what it was updated with last belongs to a graph of gradients, and cannot be copied
         try:
             self.model = copy.deepcopy(model).eval()
         finally:
-            model.distribution = own
-        self.output = own.as_deterministic_output_module() if own is not None else nn.Identity()
+            model.distribution = distribution
+        self.output = distribution.as_deterministic_output_module() if distribution is not None else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
         """Return actions, (env, joint)."""

@@ -108,11 +108,11 @@ class CapturedPPO(PPO):
     def act(self, obs: TensorDict) -> Tensor:
         """Draw actions, (env, joint), and remember what led to them; they hold until the next call."""
         self._see(obs)
-        made = self.transition
-        made.actions, made.values, made.actions_log_prob, made.distribution_params = self._chosen()
-        self._value, made.hidden_states = made.values, (None, None)
-        made.observations = self._obs
-        return made.actions
+        transition = self.transition
+        transition.actions, transition.values, transition.actions_log_prob, transition.distribution_params = self._chosen()
+        self._value, transition.hidden_states = transition.values, (None, None)
+        transition.observations = self._obs
+        return transition.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Keep what a control step has brought: see rsl_rl.
@@ -123,11 +123,11 @@ class CapturedPPO(PPO):
             dones: Where an episode has ended.
             extras: `time_outs`, where an episode was cut off; `final_obs`, observations at the ends of episodes.
         """
-        own = self.transition
+        transition = self.transition
         paid = rewards.clone()
-        own.dones = dones
+        transition.dones = dones
         if self.rnd is not None or "final_obs" in extras:
-            own.observations = self._obs.clone()
+            transition.observations = self._obs.clone()
         if "final_obs" in extras:
             self._see(extras["final_obs"])
             self._value = self._valued()
@@ -137,9 +137,9 @@ class CapturedPPO(PPO):
             self._see(obs)
             self.intrinsic_rewards = self._rnd_graph() * self.rnd.next_weight()
             paid += self.intrinsic_rewards
-        own.rewards = paid
-        self.storage.add_transition(own)
-        own.clear()
+        transition.rewards = paid
+        self.storage.add_transition(transition)
+        transition.clear()
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages of the rollout; advantages are normalised over all processes."""
@@ -179,8 +179,8 @@ class CapturedPPO(PPO):
     def load(self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool) -> bool:
         """Take over what was saved: see rsl_rl; what was captured is captured again."""
         is_loaded = super().load(loaded_dict, load_cfg, strict)
-        own = [self.optimizer, *([self.rnd.optimizer] if self.rnd else [])]
-        for group in (group for optimizer in own for group in optimizer.param_groups):
+        optimisers = [self.optimizer, *([self.rnd.optimizer] if self.rnd else [])]
+        for group in (group for optimizer in optimisers for group in optimizer.param_groups):
             group |= {"fused": True, "capturable": self._flat.is_cuda}  # it may have been saved on another device
         for group in self.optimizer.param_groups:
             self.rate.fill_(float(group["lr"]))
@@ -233,8 +233,8 @@ class CapturedPPO(PPO):
         actor = self.actor
         assert actor.distribution is not None
         with torch.autocast(**self._autocast):
-            made = actor.mlp(actor.get_latent(obs))
-        actor.distribution.update(made.to(self._flat.dtype))
+            mean = actor.mlp(actor.get_latent(obs))
+        actor.distribution.update(mean.to(self._flat.dtype))
         return actor.distribution
 
     def _judge(self, obs: TensorDict) -> Tensor:
@@ -259,15 +259,15 @@ class CapturedPPO(PPO):
 
     def _returns(self) -> None:
         with torch.no_grad():
-            own, value = self.storage, self._judge(self._obs)
+            storage, value = self.storage, self._judge(self._obs)
             advantage = torch.zeros_like(value)
-            for step in reversed(range(own.num_transitions_per_env)):
-                goes_on = 1.0 - own.dones[step].float()
-                delta = own.rewards[step] + goes_on * self.gamma * value - own.values[step]
+            for step in reversed(range(storage.num_transitions_per_env)):
+                goes_on = 1.0 - storage.dones[step].float()
+                delta = storage.rewards[step] + goes_on * self.gamma * value - storage.values[step]
                 advantage = delta + goes_on * self.gamma * self.lam * advantage
-                value = own.values[step]
-                own.returns[step] = advantage + value
-            own.advantages.copy_(own.returns - own.values)
+                value = storage.values[step]
+                storage.returns[step] = advantage + value
+            storage.advantages.copy_(storage.returns - storage.values)
 
     def _epoch(self) -> None:
         for i in range(self.num_mini_batches):
@@ -276,14 +276,14 @@ class CapturedPPO(PPO):
 
     def _differentiate(self, i: int) -> None:
         """Compute the gradients of mini-batch i, and how far the policy has moved."""
-        own, rows = self.storage, self._order[i * self._rows : (i + 1) * self._rows]
+        storage, rows = self.storage, self._order[i * self._rows : (i + 1) * self._rows]
         with torch.no_grad():
-            obs = TensorDict({name: each.flatten(0, 1)[rows] for name, each in own.observations.items()}, [len(rows)])
+            obs = TensorDict({name: each.flatten(0, 1)[rows] for name, each in storage.observations.items()}, [len(rows)])
             actions, values, chance, returns, advantages = (
                 each.flatten(0, 1)[rows]
-                for each in (own.actions, own.values, own.actions_log_prob, own.returns, own.advantages)
+                for each in (storage.actions, storage.values, storage.actions_log_prob, storage.returns, storage.advantages)
             )
-            before = tuple(each.flatten(0, 1)[rows] for each in own.distribution_params or ())
+            old_params = tuple(each.flatten(0, 1)[rows] for each in storage.distribution_params or ())
         with torch.enable_grad():
             distribution = self._policy(obs)
             ratio = (distribution.log_prob(actions) - chance[:, 0]).exp()
@@ -293,12 +293,12 @@ class CapturedPPO(PPO):
             entropy = distribution.entropy.mean()
             loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
             error = self.rnd.compute_loss(obs) if self.rnd is not None else torch.zeros_like(loss)
-            found = [*torch.autograd.grad(loss, self._weights)]
-            found += torch.autograd.grad(error, self._predictor) if self._predictor else []
+            gradients = [*torch.autograd.grad(loss, self._weights)]
+            gradients += torch.autograd.grad(error, self._predictor) if self._predictor else []
         with torch.no_grad():
-            copy_each(self._gradients, found)
+            copy_each(self._gradients, gradients)
             params = tuple(each.detach() for each in distribution.params)
-            self._kl.copy_(distribution.kl_divergence(before, params).mean())
+            self._kl.copy_(distribution.kl_divergence(old_params, params).mean())
             self.losses += torch.stack([value, surrogate, entropy, error]).detach()
 
     def _value_loss(self, found: Tensor, before: Tensor, wanted: Tensor) -> Tensor:
@@ -315,8 +315,8 @@ class CapturedPPO(PPO):
                 kl, rate = self._kl[0], self.rate
                 slower = (rate / RATE_FACTOR).clamp(min=LEAST_RATE)
                 faster = torch.where(kl > 0.0, (rate * RATE_FACTOR).clamp(max=MOST_RATE), rate)
-                kept = torch.where(kl < self.desired_kl / 2.0, faster, rate)
-                rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, kept))
+                new_rate = torch.where(kl < self.desired_kl / 2.0, faster, rate)
+                rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, new_rate))
             nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
             nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
             self.optimizer.step()
@@ -332,8 +332,10 @@ def _refuse(actor: MLPModel, critic: MLPModel, options: dict[str, Any]) -> None:
     Raises:
         TgdslError: If it is asked for.
     """
-    asked = {name: options.get(name) for name in ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")}
-    asked["recurrent networks"] = actor.is_recurrent or critic.is_recurrent
-    asked[f"optimizer {options.get('optimizer')}"] = options.get("optimizer", "adam") not in ("adam", "adamw")
-    if wrong := [name for name, value in asked.items() if value]:
+    options_used = {
+        name: options.get(name) for name in ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")
+    }
+    options_used["recurrent networks"] = actor.is_recurrent or critic.is_recurrent
+    options_used[f"optimizer {options.get('optimizer')}"] = options.get("optimizer", "adam") not in ("adam", "adamw")
+    if wrong := [name for name, value in options_used.items() if value]:
         raise TgdslError(f"CapturedPPO does without {', '.join(wrong)}: take rsl_rl's own PPO")

@@ -91,9 +91,9 @@ class Ranks:
         """Return the first process's choices."""
         if self.size == 1:
             return choices
-        told = torch.tensor(choices, dtype=torch.int32, device=device)
-        distributed.broadcast(told, src=0)
-        return tuple(bool(each) for each in told.tolist())
+        numbers = torch.tensor(choices, dtype=torch.int32, device=device)
+        distributed.broadcast(numbers, src=0)
+        return tuple(bool(each) for each in numbers.tolist())
 
     def gathered(self, own: Any) -> list[Any]:
         """Return what each process has, in all of them."""

@@ -40,12 +40,12 @@ class StopRequest:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():  # Python lets no other thread handle signals
-            self._before = {own: signal.signal(own, self._note) for own in (signal.SIGINT, signal.SIGTERM)}
+            self._before = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_: object) -> None:
-        for own, before in self._before.items():
-            signal.signal(own, before)
+        for signal_number, handler in self._before.items():
+            signal.signal(signal_number, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.signal = signal.Signals(number)
@@ -132,24 +132,28 @@ class Run:
                 self._iterate(iterations, seconds, shown, request)
             self.stopped_by = request.signal
         except FileError as error:
-            kept = f"{self._folder.checkpoint} is whole, of iteration {self._saved}"
-            raise FileError(error.file, f"{error.reason}; {kept}; --resume {self._folder.path} goes on from it") from error
+            checkpoint = f"{self._folder.checkpoint} is whole, of iteration {self._saved}"
+            raise FileError(
+                error.file, f"{error.reason}; {checkpoint}; --resume {self._folder.path} goes on from it"
+            ) from error
         finally:
             if self._board is not None:
                 self._board.close()
 
     def _iterate(self, iterations: int, seconds: float, shown: Shown | None, request: StopRequest) -> None:
         """Make iterations until enough were made, time is over or someone asks to stop."""
-        learner, before = self._learner, self.seconds
+        learner, seconds_before = self._learner, self.seconds
         begun = saved = time.monotonic()
         is_over = learner.iteration >= iterations or seconds <= 0.0
         while not is_over:
             start = time.monotonic()
-            made = learner.iterate(max(learner.iteration / iterations, (before + start - begun) / (before + seconds)))
+            iteration = learner.iterate(
+                max(learner.iteration / iterations, (seconds_before + start - begun) / (seconds_before + seconds))
+            )
             now = time.monotonic()
-            self.seconds = before + now - begun
-            self._refuse_diverged(made)
-            self._tell(made, now - start, iterations, seconds - (now - begun), shown)
+            self.seconds = seconds_before + now - begun
+            self._refuse_diverged(iteration)
+            self._tell(iteration, now - start, iterations, seconds - (now - begun), shown)
             is_over = learner.iteration >= iterations or now - begun >= seconds or request.signal is not None
             is_due = is_over or now - saved + (now - start) > self._every
             is_over, is_due = learner.ranks.agreed((is_over, is_due), learner.env.device)

@@ -33,13 +33,10 @@ class Knobs(
     GainKnobs,
     RadiusKnobs,
 ):
-    """All knobs; the defaults are neutral.
-
-    Attributes:
-        plain: The model with these knobs and nothing else.
-    """
+    """All knobs; the defaults are neutral."""
 
     plain: ClassVar[type[Knobs]]
+    """The model with these knobs and nothing else."""
 
     def over(self, base: Knobs) -> Knobs:
         """Return the knobs of another with those of this one that were written."""
