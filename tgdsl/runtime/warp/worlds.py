@@ -169,8 +169,8 @@ class Worlds:
             self._leave_out_sensors(wp, model, inputs)
             joints = JointColumns.of(inputs, model)
             names = (*INTEGRATED, *_DERIVED, *_WATCHED)
-            self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), stream) for name in names}
-            self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), stream) for name in per_env}
+            self.arrays: dict[str, Tensor] = {name: view(wp, getattr(self.data, name), stream.device) for name in names}
+            self.parameters: dict[str, Tensor] = {name: view(wp, getattr(self.model, name), stream.device) for name in per_env}
             self.kept = {array: self.arrays[array].clone() for array in (*joints.moved.values(), "time")}
             self.contacts = PairContacts(inputs, model, num_envs, stream.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
@@ -369,6 +369,6 @@ def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return copies
 
 
-def _view(wp: Any, array: Any, stream: WarpStream) -> Tensor:
+def view(wp: Any, array: Any, device: torch.device) -> Tensor:
     """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
-    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=stream.device)
+    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=device)
