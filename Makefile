@@ -9,7 +9,9 @@ TORCH_INDEX ?=
 PIP = $(BIN)/pip install $$([ -t 2 ] || echo --quiet)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo learn test test-full mutate lint bench docs soak clean
+ADAPTERS := .venv-adapters
+
+.PHONY: demo learn test test-full test-adapters mutate lint bench docs soak clean
 
 demo: $(READY)
 	@echo "compiling examples/xhand1_palm.yaml"
@@ -33,6 +35,15 @@ test: $(READY)
 test-full: $(READY)
 	@$(PYTEST) -m slow
 	@$(PYTEST) -m "not slow" --check-types tests/geometry tests/observations tests/oracles tests/quantities tests/surfaces tests/tensors tests/sensors --ignore=tests/sensors/test_compiled.py
+
+# Adapters against the simulators as they are installed, with the MuJoCo that these pin; torch and the rest are those of $(VENV).
+test-adapters: $(READY)
+	@$(PYTHON) -m venv $(ADAPTERS)
+	@$(ADAPTERS)/bin/pip install --quiet --no-deps -r tests/adapters/constraints-mjlab.txt \
+		|| { echo "mjlab cannot be installed here: its adapter is not tested"; exit 1; }
+	@$(BIN)/python -c "import sysconfig; print(sysconfig.get_path('purelib'))" \
+		> $$($(ADAPTERS)/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))")/tgdsl.pth
+	@OMP_NUM_THREADS=1 $(ADAPTERS)/bin/python -m pytest -W default tests/adapters
 
 # Change one thing at a time in a room and list what no test notices: make mutate ROOM=sensors MUTATE="--count 60".
 ROOM ?= fields
@@ -58,7 +69,7 @@ soak: $(READY)
 	@$(BIN)/python benchmarks/hand_soak.py --seconds $(SOAK_SECONDS)
 
 clean:
-	rm -rf $(VENV) out build docs/generated
+	rm -rf $(VENV) $(ADAPTERS) out build docs/generated
 
 # On a terminal pip shows what it downloads: torch alone may take minutes.
 $(READY): pyproject.toml constraints.txt

@@ -18,7 +18,7 @@ FLOORS = (
     ("placement",),
     ("compiler", "runtime"),
     ("tuning", "view"),
-    ("calibrate", "rl"),
+    ("adapters", "calibrate", "rl"),
     ("report",),
     ("commands",),
 )

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from tgdsl.rl.env import TouchEnv
     from tgdsl.runtime.batch.simulation import BatchSimulation
     from tgdsl.runtime.connect import connect as connect
+    from tgdsl.runtime.read import read_mujoco as read_mujoco
+    from tgdsl.runtime.read import read_warp as read_warp
     from tgdsl.runtime.simulate import simulate as simulate
     from tgdsl.runtime.warp import WarpSimulation
     from tgdsl.tuning.compile import compile as compile
@@ -60,6 +62,8 @@ _PLACES = {
     "connect": "runtime.connect",
     "instrument": "compiler.scene",
     "load": "module.artifact",
+    "read_mujoco": "runtime.read",
+    "read_warp": "runtime.read",
     "save": "module.artifact",
     "simulate": "runtime.simulate",
 }
@@ -85,6 +89,8 @@ __all__ = [
     "connect",
     "instrument",
     "load",
+    "read_mujoco",
+    "read_warp",
     "save",
     "simulate",
     "testing",

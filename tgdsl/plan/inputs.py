@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 from tgdsl.console.tables import listing, spelled
+from tgdsl.errors import StateError, did_you_mean
 from tgdsl.quantities.pairs import Pair
 
 
@@ -101,6 +102,41 @@ class Inputs:
     def touching(self, pair: Pair) -> tuple[Touching, ...]:
         """Return the parts between which contacts are a pair's."""
         return tuple(Touching(*parts) for parts in itertools.product(self.parts_of(pair.object), self.parts_of_link(pair.link)))
+
+    def renamed(self, names: Mapping[str, str] | None = None, *, prefix: str = "") -> Inputs:
+        """Return the same inputs by the names that another scene has for bodies, geoms, joints and actuators.
+
+        Args:
+            names: Names in the other scene by the names here.
+            prefix: Stands before all other names there, such as "robot/"; the body "world" has none.
+
+        Raises:
+            StateError: If `names` has a name that is not among these.
+        """
+        names = names or {}
+        parts = [part for own in (*self.contacts_of.values(), *self.link_parts.values()) for part in own]
+        bodies = {*self.bodies, *self.bodies_of.values(), *(pair.link for pair in self.pairs)}
+        known = {*bodies, *self.joints, *self.actuators, *(part.name for part in parts)}
+        if unknown := [name for name in names if name not in known]:
+            hint = did_you_mean(unknown[0], known)
+            raise StateError(f'this module reads no body, geom, joint or actuator "{unknown[0]}"; {hint}')
+
+        def there(name: str) -> str:
+            return names.get(name, name if name == "world" else prefix + name)
+
+        def parts_there(own: tuple[ContactPart, ...]) -> tuple[ContactPart, ...]:
+            return tuple(ContactPart(part.kind, there(part.name)) for part in own)
+
+        return dataclasses.replace(
+            self,
+            bodies=tuple(there(name) for name in self.bodies),
+            pairs=tuple(Pair(there(pair.link), pair.object) for pair in self.pairs),
+            bodies_of={name: there(body) for name, body in self.bodies_of.items()},
+            joints=tuple(there(name) for name in self.joints),
+            actuators=tuple(there(name) for name in self.actuators),
+            contacts_of={name: parts_there(own) for name, own in self.contacts_of.items()},
+            link_parts={there(link): parts_there(own) for link, own in self.link_parts.items()},
+        )
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
@@ -28,7 +28,7 @@ from tgdsl.runtime.simulators.devices import checked_device
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
 from tgdsl.runtime.simulators.fields import STATE_ARRAYS, BodyFields, JointColumns
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
-from tgdsl.runtime.simulators.model_ids import geoms_of
+from tgdsl.runtime.simulators.model_ids import element_id, geoms_of
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
 from tgdsl.runtime.simulators.objects.properties import PER_ENV
 from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
@@ -39,6 +39,8 @@ from tgdsl.tensors.env_ids import EnvIds, env_mask
 if TYPE_CHECKING:
     import mujoco.batch
 
+
+Array = np.ndarray
 
 CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")
 """Fields of a state that are read of contact sensors."""
@@ -97,7 +99,7 @@ class _PointSensor:
 
     def __init__(self, model: mujoco.MjModel, name: str, num_slots: int):
         self._place = _place(model, name)
-        sensor = int(model.sensor(name).id)
+        sensor = element_id(model, "sensor", name)
         bits, _, self._num = model.sensor_intprm[sensor, :3].tolist()
         columns: dict[str, list[int]] = {}
         end = itertools.count()
@@ -151,10 +153,10 @@ def _in_world(slots: Float[np.ndarray, "env pair slot 15"]) -> dict[str, Float[n
 
 def _place(model: mujoco.MjModel, name: str) -> range:
     try:
-        sensor = model.sensor(name)
-    except KeyError as error:
+        sensor = element_id(model, "sensor", name)
+    except SimulationError as error:
         raise SimulationError(f'the scene has no contact sensor "{name}", which the module wants; {_ADVICE}') from error
-    return range(int(sensor.adr[0]), int(sensor.adr[0] + sensor.dim[0]))
+    return range(int(model.sensor_adr[sensor]), int(model.sensor_adr[sensor] + model.sensor_dim[sensor]))
 
 
 def _least_margin(model: mujoco.MjModel, sensor: int) -> float | None:
@@ -191,8 +193,29 @@ def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
 
 
+class ArrayReader:
+    """Gathers the fields of a state that are poses, velocities, contacts or joints from MuJoCo's arrays (env, …), by name."""
+
+    def __init__(self, inputs: Inputs, model: mujoco.MjModel):
+        self._bodies = BodyFields(inputs, model, index=np.asarray, take=_rows, cross=_cross)
+        self._contacts = ContactSensors(model, inputs)
+        self.joints = JointColumns.of(inputs, model)
+        self.names = tuple(dict.fromkeys((*STATE_ARRAYS, *self.joints.fields.values())))
+
+    def read(self, arrays: Mapping[str, Array], kept: Mapping[str, Array] | None = None) -> dict[str, torch.Tensor]:
+        """Return the fields, each an array of its own; those that are `kept`, by field, are taken as they are."""
+        values = self._bodies.read(arrays) | self._contacts.read(arrays["sensordata"]) | dict(kept or {})
+        now = {name: array for name, array in self.joints.fields.items() if name not in values}
+        values |= {name: self.joint_values(name, arrays[array]) for name, array in now.items()}
+        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in values.items()}
+
+    def joint_values(self, name: str, array: Array) -> Array:
+        """Return a field of joints or actuators from the array that it is read from."""
+        return np.array(array[:, self.joints.by_array[self.joints.fields[name]]], dtype=np.float64)
+
+
 class BatchReader:
-    """Gathers the fields of a state that are poses, velocities, contacts or joints.
+    """Reads a batch.
 
     A physics step moves joints on, but leaves poses, velocities and contacts as they were at its start, which is a state's
     instant: so joints are kept from just before it.
@@ -200,12 +223,10 @@ class BatchReader:
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, batch: mujoco.batch.Batch):
         self._batch = batch
-        self._bodies = BodyFields(inputs, model, index=np.asarray, take=_rows, cross=_cross)
-        self._contacts = ContactSensors(model, inputs)
-        self._joints = JointColumns.of(inputs, model)
-        for name in (*STATE_ARRAYS, *self._joints.fields.values()):
+        self._reader = ArrayReader(inputs, model)
+        for name in self._reader.names:
             batch.bind(name)  # an array is filled only by calls that come after its first use
-        self._kept = {name: self._joints_now(name) for name in self._joints.moved}
+        self._kept = {name: self._joints_now(name) for name in self._reader.joints.moved}
 
     @property
     def keeps_joints(self) -> bool:
@@ -220,20 +241,14 @@ class BatchReader:
     def read(self, rows: SomeRows = None) -> dict[str, torch.Tensor]:
         """Return the fields of some environments (default: all), (env, …), each an array of its own."""
         chosen = slice(None) if rows is None else rows
-        live = {name: getattr(self._batch, name)[chosen] for name in STATE_ARRAYS}
-        arrays = self._bodies.read(live) | self._contacts.read(live["sensordata"])
-        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        for name in self._joints.fields:
-            arrays[name] = self._kept[name][chosen].copy() if name in self._kept else self._joints_now(name, rows)
-        return {name: torch.from_numpy(array) for name, array in arrays.items()}
+        live = {name: getattr(self._batch, name)[chosen] for name in self._reader.names}
+        return self._reader.read(live, {name: kept[chosen].copy() for name, kept in self._kept.items()})
 
     def _joints_now(self, name: str, rows: SomeRows = None) -> Array:
-        array = self._joints.fields[name]
-        values = getattr(self._batch, array)[slice(None) if rows is None else rows]
-        return np.array(values[:, self._joints.by_array[array]], dtype=np.float64)
+        array = getattr(self._batch, self._reader.joints.fields[name])
+        return self._reader.joint_values(name, array[slice(None) if rows is None else rows])
 
 
-Array = np.ndarray
 _FORWARD, _VELOCITIES = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_VEL)
 """How far `forward` goes: all that `mj_forward` does; poses and velocities."""
 _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]

@@ -1,4 +1,4 @@
-"""Where the named elements of a model stand: bodies, sites, geoms, joints, actuators, keyframes."""
+"""Where the named elements of a model stand: bodies, sites, geoms, joints, actuators, keyframes, sensors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Int
 
-from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.plan.inputs import ContactPart
 
 _ELEMENTS = {
@@ -18,20 +18,21 @@ _ELEMENTS = {
     "joint": ("njnt", "joint", "joints"),
     "actuator": ("nu", "actuator", "actuators"),
     "key": ("nkey", "keyframe", "keyframes"),
+    "sensor": ("nsensor", "sensor", "sensors"),
 }
 """By MuJoCo's accessor: where the model counts them, and what one and several are called."""
 
 
 def element_id(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """Return the index of an element by name.
+    """Return the index of an element by name, or by the end of its name after a slash if just one ends so.
 
     Args:
         model: The model.
-        kind: MuJoCo's accessor: "body", "site", "geom", "joint", "actuator" or "key".
+        kind: MuJoCo's accessor: "body", "site", "geom", "joint", "actuator", "key" or "sensor".
         name: The element's name.
 
     Raises:
-        SimulationError: If there is none of that name.
+        SimulationError: If there is none of that name, or several names end in it.
     """
     element = getattr(model, kind)
     try:
@@ -39,6 +40,12 @@ def element_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     except KeyError as error:
         count, one, several = _ELEMENTS[kind]
         known = [element(i).name for i in range(getattr(model, count))]
+        nested = [i for i, path in enumerate(known) if path.endswith(f"/{name}")]
+        if len(nested) == 1:
+            return nested[0]
+        if nested:
+            what = f'"{name}" may be any of the {several} {listed([known[i] for i in nested])}'
+            raise SimulationError(f"{what}; say which: touch.inputs.renamed({{{name!r}: {known[nested[0]]!r}}})") from error
         raise SimulationError(f'the scene has no {one} "{name}"; {did_you_mean(name, known, several)}') from error
 
 

@@ -28,7 +28,7 @@ from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.runtime.simulators.model_ids import part_geoms
 from tgdsl.runtime.warp.stream import libraries
 
-TRIED = ("3.17.0",)
+TRIED = ("3.11.0", "3.17.0")
 """Versions of MuJoCo Warp that have these parts as they are used here."""
 
 
@@ -116,7 +116,8 @@ class PairContacts:
         self._memory.zero_()
         pool = warp_data.contact
         inputs = [warp_model.opt.cone, warp_data.nacon, pool.worldid, pool.geom, pool.type, pool.pos]
-        inputs += [pool.dist, pool.includemargin, pool.frame, pool.friction, pool.dim, pool.efc_address, pool.adhesion]
+        inputs += [pool.dist, pool.includemargin, pool.frame, pool.friction, pool.dim, pool.efc_address]
+        inputs += [getattr(pool, "adhesion", None)]  # MuJoCo Warp 3.11 has none
         inputs += [warp_data.efc.force, warp_data.njmax]
         self._launch(self._kernel, dim=warp_data.naconmax, inputs=inputs, outputs=self._outputs)
 
@@ -166,6 +167,7 @@ def _kernel(wp: Any, mjw: Any) -> Any:
     the part along that: in the world both are turned, as the normal is.
     """
     wrench_of = contact_force_function(mjw)
+    has_adhesion = "contact_adhesion_in" in wrench_of.input_types
     constraint = wp.constant(constraint_contact_bit(mjw))
 
     # fmt: off
@@ -198,9 +200,14 @@ def _kernel(wp: Any, mjw: Any) -> Any:
                         slot = int(wp.atomic_add(found, env, row, 1.0))
                     is_kept = slot < num_slots
                     if netforce or (is_kept and (force or torque)):
-                        wrench = wrench_of(
-                            cone, frame, friction, dim, efc_address, adhesion, efc_force, njmax, nacon, env, contact, True
-                        )
+                        if wp.static(has_adhesion):
+                            wrench = wrench_of(
+                                cone, frame, friction, dim, efc_address, adhesion, efc_force, njmax, nacon, env, contact, True
+                            )
+                        else:
+                            wrench = wrench_of(
+                                cone, frame, friction, dim, efc_address, efc_force, njmax, nacon, env, contact, True
+                            )
                         if netforce:
                             wp.atomic_add(netforce, env, row, sign * wp.spatial_top(wrench))
                         if force and is_kept:

@@ -259,8 +259,8 @@ class WarpSimulation(Simulation):
             self._leave_out_sensors(wp, model, inputs)
             joints = JointColumns.of(inputs, model)
             names = (*INTEGRATED, *_DERIVED, *_WATCHED)
-            self._arrays = {name: _view(wp, getattr(self.warp_data, name), stream) for name in names}
-            self.parameters = {name: _view(wp, getattr(self.warp_model, name), stream) for name in per_env}
+            self._arrays = {name: view(wp, getattr(self.warp_data, name), stream.device) for name in names}
+            self.parameters = {name: view(wp, getattr(self.warp_model, name), stream.device) for name in per_env}
             self._kept = {array: self._arrays[array].clone() for array in (*joints.moved.values(), "time")}
             self._instant = self._kept["time"]
             self._contacts = PairContacts(inputs, model, num_envs, stream.device)
@@ -455,6 +455,6 @@ def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return copies
 
 
-def _view(wp: Any, array: Any, stream: WarpStream) -> Tensor:
+def view(wp: Any, array: Any, device: torch.device) -> Tensor:
     """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
-    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=stream.device)
+    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=device)

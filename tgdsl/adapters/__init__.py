@@ -1,0 +1,1 @@
+"""Touch in other people's simulators: a file each, which imports the simulator that it is for."""

@@ -1,0 +1,150 @@
+"""Touch as a sensor of mjlab's scenes: `SceneCfg(sensors=(TouchSensorCfg(name="touch", document="hand.yaml"),))`.
+
+Shapes: `env` environments, `row` and `channel` as the module's `outputs` list them.
+"""
+
+# pyright: reportMissingImports=false, reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from mjlab.sensor import Sensor, SensorCfg
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, TgdslError, did_you_mean
+from tgdsl.module.artifact import load
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.runtime.read import read_warp
+from tgdsl.tuning.compile import compile
+
+
+@dataclass
+class TouchSensorCfg(SensorCfg):
+    """A module's readings as a sensor of a scene.
+
+    Attributes:
+        name: Name of the sensor: `env.scene[name]`.
+        document: The document, or an artefact (`.safetensors`).
+        prefix: Stands before all names in mjlab's scene, such as "robot/"; needed only where several names end alike.
+        names: Names in mjlab's scene by those in the document, where they differ otherwise.
+    """
+
+    document: str | PathLike[str] | Mapping[str, Any] = field(kw_only=True)
+    prefix: str = ""
+    names: Mapping[str, str] = field(default_factory=dict)
+
+    def build(self) -> TouchSensor:
+        """Compile the document, or load the artefact."""
+        is_artifact = not isinstance(self.document, Mapping) and str(self.document).endswith(".safetensors")
+        touch = load(self.document) if is_artifact else compile(self.document)  # pyright: ignore[reportArgumentType]
+        return TouchSensor(self, touch)
+
+
+class TouchSensor(Sensor):
+    """The readings of all environments by name, `data`.
+
+    They advance once a control step, whatever asks first, and are of the instant that mjlab's derived arrays then have: for
+    observations of now, for rewards a physics step earlier. An environment that is reset is read again.
+
+    Attributes:
+        touch: The module.
+    """
+
+    data: Mapping[str, Float[Tensor, "env *step row channel"]]
+
+    def __init__(self, cfg: TouchSensorCfg, touch: TactileModule):
+        super().__init__()
+        self.touch, self._cfg, self._elapsed = touch, cfg, 0.0
+        self._due: Bool[Tensor, " env"] | None = None  # what is to be read; None: all
+
+    def edit_spec(self, scene_spec: mujoco.MjSpec, entities: Mapping[str, Any]) -> None:
+        """Leave the scene as it is: contacts are read without sensors."""
+
+    def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
+        """Look up the document's names in the compiled scene.
+
+        Raises:
+            SimulationError: If the scene lacks one, or several names match it; if the module is advanced at each physics step.
+        """
+        if self.touch.inputs.substeps > 1:
+            what = f"this module is advanced at {self.touch.inputs.substeps} physics steps a call"
+            raise SimulationError(f"{what}, and mjlab reads it once a control step")
+        self.touch.to(device)
+        inputs = self.touch.inputs.renamed(self._cfg.names, prefix=self._cfg.prefix)
+        self._scene = (mj_model, model.struct, data.struct, inputs)
+        self._state()
+
+    def reset(self, env_ids: Tensor | slice | None = None) -> None:
+        """Begin a new episode in some environments (default: all)."""
+        super().reset(env_ids)
+        mask = torch.zeros(self._scene[2].nworld, dtype=torch.bool, device=self.touch.device)
+        mask[slice(None) if env_ids is None else env_ids] = True
+        self.touch.reset(mask)
+        if self._due is not None:
+            self._due |= mask
+
+    def update(self, dt: float) -> None:
+        """Take note of a physics step of some duration [s]."""
+        super().update(dt)
+        self._elapsed = dt if self._due is not None else self._elapsed + dt
+        self._due = None
+
+    def debug_vis(self, visualizer: Any) -> None:
+        """Draw the taxels of all sensors: red where a reading is not zero, else grey."""
+        state, readings, bodies, arm = self._state(), self.data, self.touch.inputs.bodies, np.zeros(3)
+        pos, quat = (values.double().cpu().numpy() for values in (state.body_pos, state.body_quat))
+        for env in visualizer.get_env_indices(len(pos)):
+            for output in self.touch.outputs:
+                if output.rows != "taxel" or len(output.shape) != 2:  # not stacked calls
+                    continue
+                active = (readings[output.name][env] != 0).any(dim=-1).tolist()
+                for taxel, is_active in zip(self.touch.taxels[output.sensor], active, strict=True):
+                    body = bodies.index(str(taxel["body"]))
+                    mujoco.mju_rotVecQuat(arm, taxel["pos"].astype(float), quat[env, body])
+                    color = (0.9, 0.1, 0.1, 1.0) if is_active else (0.5, 0.5, 0.5, 0.5)
+                    visualizer.add_sphere(pos[env, body] + arm, float(taxel["radius"]) / 2, color)
+
+    def _compute_data(self) -> dict[str, Tensor]:
+        state = self._state()
+        state.dt = self._elapsed or self.touch.inputs.dt or float(self._scene[0].opt.timestep)
+        with torch.no_grad():
+            readings = self.touch(state, mask=self._due)
+        self._due = torch.zeros(self._scene[2].nworld, dtype=torch.bool, device=self.touch.device)
+        return readings
+
+    def _state(self) -> SceneState:
+        mj_model, model, data, inputs = self._scene
+        return read_warp(self.touch, mj_model, model, data, inputs=inputs)
+
+
+def reading(env: Any, sensor: str, name: str) -> Float[Tensor, "env feature"]:
+    """Return a reading, flattened: `ObservationTermCfg(func=reading, params={"sensor": "touch", "name": "tips"})`.
+
+    Raises:
+        TgdslError: If the document declares no such reading.
+    """
+    data = env.scene[sensor].data
+    if name not in data:
+        raise TgdslError(f'the sensor "{sensor}" has no reading "{name}"; {did_you_mean(name, data, "readings")}')
+    return data[name].flatten(1)
+
+
+def observation(env: Any, sensor: str, group: str = "policy") -> Float[Tensor, "env feature"]:
+    """Return an observation group of the document: `ObservationTermCfg(func=observation, params={"sensor": "touch"})`.
+
+    Raises:
+        TgdslError: If the document declares no such group.
+    """
+    touch = env.scene[sensor].touch
+    if group not in touch.observations:
+        raise TgdslError(f'the sensor "{sensor}" has no group "{group}"; {did_you_mean(group, touch.observations, "groups")}')
+    return touch.observe(env.scene[sensor].data)[group]

@@ -1,0 +1,124 @@
+"""States of scenes that others step with MuJoCo or MuJoCo Warp, gathered by the readers of tgdsl's own simulations."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+
+from tgdsl.errors import SimulationError
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.plan.inputs import Inputs
+from tgdsl.runtime.batch.simulation import ArrayReader
+from tgdsl.runtime.simulators.fields import FORCES, MOVED, STATE_ARRAYS
+from tgdsl.runtime.warp.contacts import PairContacts
+from tgdsl.runtime.warp.simulation import StateReader, view
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
+
+_WARP_ARRAYS = ("time", *(name for name in STATE_ARRAYS if name != "sensordata"), *MOVED.values(), *FORCES.values())
+
+
+def read_mujoco(
+    touch: TactileModule,
+    model: mujoco.MjModel,
+    data: mujoco.MjData | Sequence[mujoco.MjData],
+    *,
+    inputs: Inputs | None = None,
+) -> SceneState:
+    """Return the state of a scene that is stepped by `mujoco.mj_step`.
+
+    Poses, velocities and contacts are those of MuJoCo's last evaluation, joints and controls are of now: call `mj_forward`
+    first, as `mj_step` leaves the former a step behind. What MuJoCo does not know, such as `dt` or `variant`, is left None.
+
+    Args:
+        touch: The module that will read the state.
+        model: The scene. Contacts are read of its sensors: `tgdsl.instrument` adds them before it is compiled.
+        data: Its data, or the data of several environments.
+        inputs: `touch.inputs.renamed(…)` where names differ; by default a name may also be the end of one name in the scene
+            after a slash, as "palm" is of "robot/palm".
+
+    Returns:
+        The state, (env, …), float64, on the module's device.
+
+    Raises:
+        SimulationError: If the scene lacks a body, a joint, an actuator or a contact sensor, or several names match one.
+    """
+    own = inputs or touch.inputs
+    reader = _reader(touch, own, (model,), lambda: ArrayReader(own, model))
+    envs: list[mujoco.MjData] = list(data) if isinstance(data, Sequence) else [data]
+    fields: dict[str, Any] = reader.read({name: np.stack([getattr(env, name) for env in envs]) for name in reader.names})
+    time = torch.tensor([env.time for env in envs], dtype=torch.float64)
+    return SceneState(**fields, time=time).to(touch.device)
+
+
+def read_warp(
+    touch: TactileModule, mj_model: mujoco.MjModel, model: Any, data: Any, *, inputs: Inputs | None = None
+) -> SceneState:
+    """Return the state of a scene that is stepped by MuJoCo Warp.
+
+    It is gathered from MuJoCo Warp's arrays, where they lie, in the order of torch's and Warp's current streams; from the
+    second call on it can be captured in a `torch.cuda.graph`. No contact sensors are needed. Poses, velocities and contacts are
+    those of the last evaluation, joints and controls are of now: call `mujoco_warp.forward` first, as `mujoco_warp.step` leaves
+    the former a step behind. What MuJoCo does not know, such as `dt` or `variant`, is left None.
+
+    Args:
+        touch: The module that will read the state, on the device of `data`.
+        mj_model: The scene.
+        model: MuJoCo Warp's model of it.
+        data: MuJoCo Warp's data; its arrays must stay the same ones.
+        inputs: As for `read_mujoco`.
+
+    Returns:
+        The state, (env, …), float32, on the device of `data`.
+
+    Raises:
+        SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if the module is on
+            another device; if MuJoCo Warp is of a version that contacts cannot be read of.
+    """
+    own = inputs or touch.inputs
+    return _reader(touch, own, (mj_model, model, data), lambda: _warp_reader(touch, own, mj_model, model, data))()
+
+
+def _warp_reader(
+    touch: TactileModule, inputs: Inputs, mj_model: mujoco.MjModel, model: Any, data: Any
+) -> Callable[[], SceneState]:
+    wp, _ = libraries()
+    device = torch.device(wp.device_to_torch(data.qpos.device))
+    if touch.device != device:
+        raise SimulationError(f"the module is on {touch.device}, physics on {device}; touch.to({str(device)!r}) moves it there")
+    stream = WarpStream(str(device), graph=False)
+    with stream.scope():
+        arrays = {name: view(wp, getattr(data, name), device) for name in _WARP_ARRAYS}
+        contacts = PairContacts(inputs, mj_model, data.nworld, device)
+        reader = StateReader(inputs, mj_model, arrays, {}, contacts)
+
+    def state() -> SceneState:
+        contacts.update(model, data)
+        fields: dict[str, Any] = reader.read()
+        return SceneState(**fields, time=arrays["time"].clone())
+
+    return GraphedCall(stream, state)
+
+
+class _Held(NamedTuple):
+    """A reader, and what it was made of."""
+
+    inputs: Inputs
+    scene: tuple[Any, ...]
+    reader: Any
+
+
+_HELD: weakref.WeakKeyDictionary[TactileModule, _Held] = weakref.WeakKeyDictionary()
+"""The last reader of each module: names are looked up when it is first used with a scene."""
+
+
+def _reader(touch: TactileModule, inputs: Inputs, scene: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    held = _HELD.get(touch)
+    if held is None or held.inputs != inputs or [*map(id, held.scene)] != [*map(id, scene)]:
+        held = _HELD[touch] = _Held(inputs, scene, make())
+    return held.reader
