@@ -95,7 +95,7 @@ def _shapes(found: Spectrum, size: float, middle: np.ndarray) -> ModeShapes:
 def _known(name: str, material: Material) -> tuple[float, float, float, float]:
     """Return stiffness, Poisson's ratio and damping of a material."""
     values = [getattr(material, field) for field in WANTED]
-    if missing := [problem for problem, value in zip(WANTED.values(), values, strict=True) if value is None]:
+    if missing := [quantity for quantity, value in zip(WANTED.values(), values, strict=True) if value is None]:
         shown = " and no ".join(dict.fromkeys(missing))
         hint = (
             f"give {', '.join(field for field, value in zip(WANTED, values, strict=True) if value is None)}, or list its modes"

@@ -130,7 +130,7 @@ def explain(touch: Explained) -> str:
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
     lines += [line for each in touch.quantities for line in _account(touch, each)]
     lines += [""] + _observations(touch) + _inputs(touch)
-    lines += ["left out"] + [f"  {problem}: {why}" for problem, why in plan.dropped] if plan.dropped else []
+    lines += ["left out"] + [f"  {name}: {why}" for name, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
     if plan.unfelt:
         lines += [f"{len(unfelt_ids(plan.unfelt))} taxels cannot feel", *(f"  {taxels}" for taxels in plan.unfelt), ""]
@@ -167,10 +167,8 @@ def _links(touch: Explained) -> list[str]:
 
 
 def _sensor(touch: Explained, sensor: PlannedSensor) -> list[str]:
-    problem, rows = len(sensor.taxels) or len(sensor.links), sensor.readings[0].rows
-    where = (
-        f"{problem} {'taxels' if len(sensor.taxels) else 'joints' if rows == 'joint' else 'links'}" if problem else "on no link"
-    )
+    count, rows = len(sensor.taxels) or len(sensor.links), sensor.readings[0].rows
+    where = f"{count} {'taxels' if len(sensor.taxels) else 'joints' if rows == 'joint' else 'links'}" if count else "on no link"
     lines = [f"{sensor.name}: {sensor.kind}, {where}, {_remembers(touch, sensor)}"]
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))

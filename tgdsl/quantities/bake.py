@@ -264,7 +264,7 @@ def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, na
 def geom_table(cases: Sequence[Sequence[GeomDistance]]) -> GeomTable[np.ndarray]:
     """Return the table of an object's variants, or of links: geoms of one shape share a column, in their order."""
     shapes, places = aligned([[part.shape for part in case] for case in cases])
-    rows = [[None if i is None else rows_of[i] for i in table] for rows_of, table in zip(cases, places, strict=True)]
+    rows = [[None if i is None else case[i] for i in place] for case, place in zip(cases, places, strict=True)]
     columns = list(zip(*rows, strict=True))
     of_geom = {}
     for key, absent in (("size", np.ones(3)), ("pos", np.zeros(3)), ("rotation", np.eye(3))):

@@ -83,7 +83,7 @@ class Draws:
         self.seed = _checked(seed)
         self._ahead.clear()
         for sizes, streams in self._known.items():
-            streams.begun.copy_(self._begun([problem for problem, _ in sizes]))
+            streams.begun.copy_(self._begun([purpose for purpose, _ in sizes]))
 
     def shares(
         self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None = None
@@ -162,7 +162,7 @@ class Draws:
         return self._known[requests]
 
     def _begun(self, names: list[str]) -> Int[Tensor, "env purpose half"]:
-        keys = torch.tensor([sensor_key(self.seed, problem) for problem in names], dtype=torch.int32, device=self._device)
+        keys = torch.tensor([sensor_key(self.seed, purpose) for purpose in names], dtype=torch.int32, device=self._device)
         return mix(self._envs.to(torch.int32)[:, None, None] ^ keys)
 
     def _share(

@@ -74,6 +74,6 @@ class Events:
     def _wait(self, name: str, term: EventTerm, chosen: Bool[Tensor, " env"]) -> None:
         """Draw how many control steps there are before the next one."""
         first, last = (round(end / self._setup.control_step) for end in term.interval)
-        problem = f"event {name} interval"
-        share = self._setup.draws.shares({problem: 1}, self.memory[f"{name}/count"], chosen)[problem]
+        purpose = f"event {name} interval"
+        share = self._setup.draws.shares({purpose: 1}, self.memory[f"{name}/count"], chosen)[purpose]
         put_rows(self.memory[f"{name}/left"], chosen, whole(share, first, last)[:, 0])

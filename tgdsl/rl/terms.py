@@ -146,8 +146,8 @@ class Event:
 
     def uniform(self, num: int, low: float = 0.0, high: float = 1.0) -> Float[Tensor, "env num"]:
         """Return random numbers between two bounds, of physics' dtype: others each time that it happens."""
-        problem = f"event {self.name}"
-        return within(self.setup.draws.shares({problem: num}, self.count, self.chosen)[problem].to(self.setup.dtype), low, high)
+        purpose = f"event {self.name}"
+        return within(self.setup.draws.shares({purpose: num}, self.count, self.chosen)[purpose].to(self.setup.dtype), low, high)
 
 
 class EventTerm(Term):

@@ -82,8 +82,8 @@ class TouchTrace:
         names, unit = short_names(links), self._output.units[0]
         stem = self._output.channels[0].removesuffix("_x")
         full = float(each.max(initial=0.0))
-        problem = f"Σ |{stem}|" if reduce is np.sum else f"largest {stem}"
-        title = f"{problem}, full: {full:.3g} {'' if unit == '1' else unit}; spheres: up to {self.values.max(initial=0.0):.2g}"
+        quantity = f"Σ |{stem}|" if reduce is np.sum else f"largest {stem}"
+        title = f"{quantity}, full: {full:.3g} {'' if unit == '1' else unit}; spheres: up to {self.values.max(initial=0.0):.2g}"
         return LinkBars(tuple(names[links[i]] for i in shown), each[:, shown] / (full or 1.0), title.strip())
 
 

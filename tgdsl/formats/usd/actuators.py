@@ -192,8 +192,8 @@ def write_actuators(writer: StageWriter, actuators: list[int]) -> None:
         ends = _ends(writer, actuator, kind)
         if ends is None or model.actuator_plugin[actuator] >= 0:
             shown = f'actuator "{name}"' if name else f"unnamed actuator {actuator}"
-            problem = "a plugin" if ends else "on what USD has no prim for (a free joint)"
-            writer.unsupported.append(f"{writer.file}: {shown} is {problem}: left out")
+            reason = "a plugin" if ends else "on what USD has no prim for (a free joint)"
+            writer.unsupported.append(f"{writer.file}: {shown} is {reason}: left out")
             continue
         prim = writer.define("MjcActuator", name or "actuator", name)
         set_custom(prim, "order", actuator)

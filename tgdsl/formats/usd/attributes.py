@@ -221,8 +221,8 @@ TENDON: Table = {
         for name in ("armature", "damping", "frictionloss", "stiffness", "margin", "group", "limited")
     },
     "springlength": mjc("springlength", array="tendon_lengthspring"),
-    **{f"sol{problem}limit": mjc(f"sol{problem}limit", array=f"tendon_sol{problem}_lim") for problem in ("ref", "imp")},
-    **{f"sol{problem}friction": mjc(f"sol{problem}friction", array=f"tendon_sol{problem}_fri") for problem in ("ref", "imp")},
+    **{f"sol{part}limit": mjc(f"sol{part}limit", array=f"tendon_sol{part}_lim") for part in ("ref", "imp")},
+    **{f"sol{part}friction": mjc(f"sol{part}friction", array=f"tendon_sol{part}_fri") for part in ("ref", "imp")},
     "range": mjc("range", array="tendon_range", is_range=True),
     "actuatorfrclimited": mjc("actuatorfrclimited", array="tendon_actfrclimited"),
     "actuatorfrcrange": mjc("actuatorfrcrange", array="tendon_actfrcrange", is_range=True),

@@ -199,8 +199,8 @@ def write_equalities(writer: StageWriter) -> None:
             joints = {index: str(joint.GetPath()) for index, joint in writer.joints.items()}
             prim = _write_polynomial(writer, equality, writer.tendons if kind == TENDON_EQ else joints)
         else:
-            problem = f'equality constraint "{name}"' if name else f"unnamed equality constraint {equality}"
-            writer.unsupported.append(f"{writer.file}: {problem} is of a flex, which USD does not have: left out")
+            constraint = f'equality constraint "{name}"' if name else f"unnamed equality constraint {equality}"
+            writer.unsupported.append(f"{writer.file}: {constraint} is of a flex, which USD does not have: left out")
             continue
         set_custom(prim, "equality", equality)
         set_custom(prim, "equality_name", name)

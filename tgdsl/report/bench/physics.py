@@ -146,9 +146,9 @@ def _subject(
         points.append(Measured(setting.label, "float64", setting.is_own, chosen, verified, time_of_step, cost))
     units = {"angle": "rad", "position": "m"}
     scales = {name: f"{scale:.4g} {units[name]}" for name, scale in zip(quantities, magnitude.scale, strict=True)}
-    problem = f"time step 1/{FINE}, up to {ITERATIONS} iterations to {TOLERANCE:g}"
+    baseline = f"time step 1/{FINE}, up to {ITERATIONS} iterations to {TOLERANCE:g}"
     left_out = tuple((tried[k].label, why) for k, why in faults.items())
-    return Subject("physics", "physics", problem, "", scales, with_front(points), left_out)
+    return Subject("physics", "physics", baseline, "", scales, with_front(points), left_out)
 
 
 def coordinates(model: mujoco.MjModel) -> tuple[list[int], list[str]]:

@@ -133,8 +133,8 @@ def prepare(
     changes: Sequence[str] = ()
     if card is not None:
         check_learned(card, policy, loaded.spec)
-        overrides_of_card = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
-        loaded = _with(loaded, overrides_of_card)
+        from_card = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
+        loaded = _with(loaded, from_card)
         changes = changes_since(card, loaded.spec)
     names = tuple(groups) or tuple(card["groups"] if card else _default_groups(loaded))
     _refuse_unknowable(policy, loaded, names)

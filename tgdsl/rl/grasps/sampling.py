@@ -144,7 +144,7 @@ class _Trials:
     @property
     def failures(self) -> str:
         """Why trials were not kept, in words."""
-        return ", ".join(f"{num} {problem}" for problem, num in self._failed.items())
+        return ", ".join(f"{num} {reason}" for reason, num in self._failed.items())
 
     def made(self, round_: int) -> list[_Kept]:
         """Make a round of trials, and return the grasps that hold."""
@@ -163,8 +163,8 @@ class _Trials:
         tilted, moved = (near[0][i] | near[1][i] for i in (0, 1))
         reasons = (sim.faults, tilted, moved, ~presses)
         holds = torch.ones_like(presses)
-        for problem, failed in zip(self._failed, reasons, strict=True):
-            self._failed[problem] += int((holds & failed).sum())
+        for reason, failed in zip(self._failed, reasons, strict=True):
+            self._failed[reason] += int((holds & failed).sum())
             holds &= ~failed
         return [_Kept(int(self.variant[i]), grasp[i].numpy(), ctrl[i].numpy()) for i in torch.nonzero(holds).flatten().tolist()]
 

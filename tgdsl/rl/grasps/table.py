@@ -74,8 +74,8 @@ class GraspTable:
             SimulationError: If the grasps are of other joints or actuators, or a variant that some environment has is lacking.
         """
         shape = (sim.model.nq, sim.model.nu)
-        if (grasps.qpos.shape[1], grasps.ctrl.shape[1]) != shape:
-            sizes = (grasps.qpos.shape[1], grasps.ctrl.shape[1])
+        sizes = (grasps.qpos.shape[1], grasps.ctrl.shape[1])
+        if sizes != shape:
             raise SimulationError(f"grasps of {sizes[0]} positions and {sizes[1]} controls, expected {shape[0]} and {shape[1]}")
         variants = variant.cpu().numpy()
         lacking = sorted({int(v) for v in variants} - {int(v) for v in grasps.variant})
@@ -90,9 +90,9 @@ class GraspTable:
         self.first = torch.from_numpy(np.searchsorted(variants_in_order, variants)).to(device)
         self.count = torch.from_numpy(np.searchsorted(variants_in_order, variants, side="right")).to(device) - self.first
         self._draws = draws
-        sizes = self._evaluated(sim, body, variants)
-        self.pos, self.quat = sizes.pop("pos"), sizes.pop("quat")
-        self.contacts = sizes
+        contacts = self._evaluated(sim, body, variants)
+        self.pos, self.quat = contacts.pop("pos"), contacts.pop("quat")
+        self.contacts = contacts
 
     def draw(self, episode: Int[Tensor, " env"]) -> Drawn:
         """Return a grasp of each environment, drawn by its count of episodes."""

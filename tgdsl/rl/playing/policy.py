@@ -259,7 +259,7 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
         theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
     if _without_folder(theirs["task"]) != _without_folder(ours["task"]):
         raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
-    steps = [round(physics_of["physics"]["timestep"] * physics_of["physics"]["substeps"], 9) for physics_of in (theirs, ours)]
+    steps = [round(each["physics"]["timestep"] * each["physics"]["substeps"], 9) for each in (theirs, ours)]
     for name, learned, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
         if not is_close(learned, now):
             texts = (json.dumps(value, ensure_ascii=False) for value in (learned, now))

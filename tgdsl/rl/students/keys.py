@@ -69,11 +69,11 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
     for name in selected:
         if name not in all_types:
             raise StudentError(f'there is no type "{name}"; {did_you_mean(name, all_types, "types")}')
-    for problem, names in (("types", selected), ("placements", placements), ("noise", noises)):
+    for option, names in (("types", selected), ("placements", placements), ("noise", noises)):
         if len(set(names)) < len(names):
-            raise StudentError(f"{problem} {', '.join(names)}: one is named twice")
+            raise StudentError(f"{option} {', '.join(names)}: one is named twice")
         if not names:
-            raise StudentError(f"{problem}: expected one at least")
+            raise StudentError(f"{option}: expected one at least")
     if seeds < 1:
         raise StudentError(f"{seeds} seeds, expected 1 at least")
     felts = [

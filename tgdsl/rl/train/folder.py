@@ -287,7 +287,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskS
     lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
     descriptions = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
-    return lines + [problem for name, problem in descriptions.items() if before[name] != now[name]]
+    return lines + [description for name, description in descriptions.items() if before[name] != now[name]]
 
 
 def versions() -> dict[str, str]:

@@ -76,11 +76,11 @@ class EncodedModel(MLPModel):
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, activation, obs_normalization, distribution_cfg)
         if obs_normalization:
             self.obs_normalizer = Normalisation(self.obs_dim, eps, clip=clip)
-        encoders_made = [
+        encoders_of_groups = [
             MLP(size, encoder["size"], list(encoder["hidden"]), activation) if encoder else nn.Identity()
             for encoder, size in zip(encoder_specs, self._sizes, strict=True)
         ]
-        self.encoders = nn.ModuleList(encoders_made)
+        self.encoders = nn.ModuleList(encoders_of_groups)
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
         """Return the embeddings of all groups, side by side."""

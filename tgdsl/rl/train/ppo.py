@@ -332,10 +332,10 @@ def _refuse(actor: MLPModel, critic: MLPModel, options: dict[str, Any]) -> None:
     Raises:
         TgdslError: If it is asked for.
     """
-    options_used = {
+    unsupported = {
         name: options.get(name) for name in ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")
     }
-    options_used["recurrent networks"] = actor.is_recurrent or critic.is_recurrent
-    options_used[f"optimizer {options.get('optimizer')}"] = options.get("optimizer", "adam") not in ("adam", "adamw")
-    if wrong := [name for name, value in options_used.items() if value]:
+    unsupported["recurrent networks"] = actor.is_recurrent or critic.is_recurrent
+    unsupported[f"optimizer {options.get('optimizer')}"] = options.get("optimizer", "adam") not in ("adam", "adamw")
+    if wrong := [name for name, value in unsupported.items() if value]:
         raise TgdslError(f"CapturedPPO does without {', '.join(wrong)}: take rsl_rl's own PPO")

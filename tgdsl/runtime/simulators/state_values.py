@@ -118,9 +118,9 @@ class StateTable:
         shape = tuple(self._arrays[name].shape[1:])
         num_rows = self._num_envs if ids is None else len(ids)
         if tuple(result.shape) not in ((num_rows, *shape), shape):
-            problem = "a row per environment" if ids is None else "a row for each index"
+            rows = "a row per environment" if ids is None else "a row for each index"
             raise SimulationError(
-                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *shape)}, {problem}, or {shape} for all"
+                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *shape)}, {rows}, or {shape} for all"
             )
         if ids is not None and result.ndim > len(shape) and len(np.unique(ids)) < len(ids):
             twice = sorted({str(env) for env in ids.tolist() if (ids == env).sum() > 1})

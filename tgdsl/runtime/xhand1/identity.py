@@ -50,9 +50,7 @@ class HandIdentity:
 
     def __str__(self) -> str:
         values = {"version": self.version, "side": self.side, "serial number": self.serial_number, "name": self.name}
-        return f"{self.device}: hand {self.hand_id}, " + ", ".join(
-            f"{problem} {shown(value)}" for problem, value in values.items()
-        )
+        return f"{self.device}: hand {self.hand_id}, " + ", ".join(f"{label} {shown(value)}" for label, value in values.items())
 
 
 def identify(

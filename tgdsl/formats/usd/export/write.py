@@ -209,9 +209,9 @@ def _unsupported_elements(writer: StageWriter) -> list[str]:
         "no ellipsoids, and leaves out or rounds": (model.geom_type == ELLIPSOID) & colliding,
         "no planes on bodies, and leaves out": (model.geom_type == PLANE) & colliding & (model.geom_bodyid > 0),
     }
-    for problem, geoms in unfit.items():
+    for lack, geoms in unfit.items():
         names = [model.geom(geom).name or f"unnamed geom {geom}" for geom in np.flatnonzero(geoms).tolist()]
-        messages += [f"{writer.file}: USD's physics has {problem}: {listed(names)}"] if names else []
+        messages += [f"{writer.file}: USD's physics has {lack}: {listed(names)}"] if names else []
     light = [body for body in range(1, model.nbody) if not model.body_mass[body] and model.body_weldid[body]]
     if light:
         names = listed([writer.body_name(body) for body in light])

@@ -312,17 +312,17 @@ class SerialClient:
         self.counters.num_unexpected += waiting.num_unexpected
 
     def _failure(self, waiting: _Waiting) -> HandError:
-        problem = f"command {waiting.command:#04x} ({waiting.command.name.lower()})"
+        request = f"command {waiting.command:#04x} ({waiting.command.name.lower()})"
         within = f"{1e3 * self.timing.reply_timeout_s:.0f} ms"
         if waiting.refusal is not None:
             return HandRefusedError(
-                f"the hand refused {problem}; its error reply holds {waiting.refusal.hex(' ') or 'nothing'}"
+                f"the hand refused {request}; its error reply holds {waiting.refusal.hex(' ') or 'nothing'}"
             )
         if waiting.is_babble:
             return HandTimeoutError(_BABBLE)
         if waiting.num_damaged > waiting.num_incomplete:
             self.counters.num_damaged += 1
-            return HandTimeoutError(f"the reply to {problem} came damaged: {waiting.num_damaged} bytes are in no sound frame")
+            return HandTimeoutError(f"the reply to {request} came damaged: {waiting.num_damaged} bytes are in no sound frame")
         self.counters.num_timeouts += 1
         if waiting.foreign is not None and self._addresses is not None:
             expected = "from {:#04x} to {:#04x}".format(*self._addresses.reply)
@@ -330,11 +330,11 @@ class SerialClient:
             message = f"a reply came {ends}, expected {expected}; if it is this hand's, set its reply addresses"
         elif waiting.is_early:
             took = f"sooner than {self.timing.baud} baud allow"
-            message = f"a reply to {problem} came {took}: an earlier one's, or set checks_wire_time=False"
+            message = f"a reply to {request} came {took}: an earlier one's, or set checks_wire_time=False"
         elif waiting.wrong_size is not None:
-            message = f"the reply to {problem} has {waiting.wrong_size} bytes, expected {waiting.reply_size}"
+            message = f"the reply to {request} has {waiting.wrong_size} bytes, expected {waiting.reply_size}"
         elif waiting.num_incomplete:
-            message = f"the reply to {problem} was not complete within {within}: {waiting.num_incomplete} bytes had come"
+            message = f"the reply to {request} was not complete within {within}: {waiting.num_incomplete} bytes had come"
         else:
-            message = f"no reply to {problem} within {within}"
+            message = f"no reply to {request} within {within}"
         return HandTimeoutError(message)
