@@ -249,6 +249,10 @@ class TouchEnv:
         self._obs, self._is_loaded = step.obs, False
         return step._replace(obs=dict(step.obs))
 
+    def observe(self) -> Observations:
+        """Return the last observations, by group."""
+        return dict(self._obs)
+
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from tgdsl.errors import TgdslError, did_you_mean, raised_at
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.playing.rollout import Actor
 
 KINDS = ("zero", "random", "script")
 """Actions by one word; else they are a function of a file, `FILE.py:FUNCTION`."""

@@ -32,9 +32,9 @@ from tgdsl.errors import TaxelError, TgdslError, did_you_mean
 from tgdsl.layout.identity import Columns
 from tgdsl.module.taxels.identity import HasPlan, check_taxels
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actor import Actor
 from tgdsl.rl.playing.differences import is_close, spec_differences
 from tgdsl.rl.playing.provenance import changes_around
+from tgdsl.rl.playing.rollout import Actor
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.spec import TaskSpec
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from tgdsl.errors import did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.playing.rollout import Actor
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
 from tgdsl.rl.students.rollout import Rollout, joined
