@@ -126,6 +126,7 @@ class GripForce(Task[GripForceSpec]):
     wants_normal_force = True
     score_unit = "RMS of force error over command"
     is_less_better = True
+    constants = ("settling",)
     hand_groups = ("goal",)
     goal_units = ("N",)
 

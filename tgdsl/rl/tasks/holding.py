@@ -35,11 +35,15 @@ class HoldSpec(SpecModel):
 
 
 class Holding:
-    """Says where the object is held, and what its progress pays."""
+    """Says where the object is held, and what its progress pays.
+
+    Attributes:
+        pays_in_full: Whether progress always pays the same.
+    """
 
     def __init__(self, spec: HoldSpec, setup: Setup):
         """Note which links are fingers."""
-        self.spec = spec
+        self.spec, self.pays_in_full = spec, isinstance(spec.coasting_pay, float) and spec.coasting_pay == 1.0
         self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(setup.device)
 
     def is_held(self, now: Now) -> Bool[Tensor, " env"]:

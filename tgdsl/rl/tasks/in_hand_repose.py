@@ -166,6 +166,7 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     Spec = InHandReposeSpec
     senses = ("link_contact", "surface_distance")
+    constants = ("goal_step", "goal_timeout")
     score_unit = "goals in a row"
 
     @reward_term(500.0, "1/s")

@@ -204,7 +204,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.is_reached.copy_((self._goal() - self.angle < self.spec.goal_tolerance) & (self.tilt < self.spec.max_tilt))
         self.reached += self.is_reached
         self.quat.copy_(quat)
-        if self.spec.hold.coasting_pay < 1.0:
+        if not self.holding.pays_in_full:
             self._note_pay(now, step)
 
     def _note_pay(self, now: Now, step: Float[Tensor, " env"]) -> None:

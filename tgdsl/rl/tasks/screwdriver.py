@@ -167,6 +167,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
 
     Spec = ScrewdriverSpec
     senses = ("link_contact", "surface_distance")
+    constants = ("grasps",)
     score_unit = "rad/s"
 
     @reward_term(10.0, "1/rad")
@@ -267,7 +268,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
 
     def _pay(self, now: Now) -> Float[Tensor, " env"]:
         """Return what turning pays: c; turning back costs the same whether the object is held or not."""
-        if self.spec.hold.coasting_pay == 1.0:
+        if self.holding.pays_in_full:
             return torch.ones_like(self.rate)
         return torch.where(self.rate > 0, self.holding.pay(now), 1.0)
 
