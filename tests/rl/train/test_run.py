@@ -18,7 +18,7 @@ from small_runs import small_learner
 
 from tgdsl.errors import FileError, TgdslError
 from tgdsl.rl.load import load_task
-from tgdsl.rl.playing.differences import differences
+from tgdsl.rl.playing.provenance import differences
 from tgdsl.rl.train import folder as folders
 from tgdsl.rl.train.checkpoint import CheckpointError, read_checkpoint, restore, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder, documents, made_from

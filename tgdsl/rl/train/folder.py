@@ -37,8 +37,7 @@ from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writ
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.differences import differences, spec_differences
-from tgdsl.rl.playing.provenance import provenance
+from tgdsl.rl.playing.provenance import differences, provenance, spec_differences
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
