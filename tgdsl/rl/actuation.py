@@ -378,7 +378,6 @@ class Actuation:
         return ends
 
     def _arrived(self) -> Float[Tensor, "env joint"]:
-        """Return the targets that have arrived at the drives."""
         if len(self._past) == 1:
             return self._past[0]
         return self._past.gather(0, self.drawn["delay"].to(torch.int64)[None])[0]

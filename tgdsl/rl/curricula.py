@@ -26,7 +26,6 @@ class Curricula:
     """
 
     def __init__(self, loaded: LoadedTask, like: Tensor):
-        """Begin with the numbers before the first iteration, of the dtype and on the device of `like`."""
         self._terms = {name: term for name, term in loaded.terms.items() if isinstance(term, CurriculumTerm)}
         self.values = {term.of: torch.zeros((), dtype=like.dtype, device=like.device) for term in self._terms.values()}
         self.spec: TaskSpec = _with(loaded.spec, {path: v for path, v in self.values.items() if not path.startswith("terms.")})

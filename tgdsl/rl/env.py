@@ -330,7 +330,6 @@ class TouchEnv:
         self.reset(seed)
 
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Begin episodes of some environments."""
         self._episodes.begin(chosen)
         for held in (self._used, self._before):
             held.masked_fill_(chosen[:, None], 0.0)

@@ -134,7 +134,6 @@ class Episodes:
         return memory | {"friction": setup.friction, "mass": setup.mass} | {f"sums/{name}": total for name, total in sums}
 
     def _restart(self, chosen: Bool[Tensor, " env"], at_controls: bool) -> None:
-        """Have drives begin again, and begin to add up."""
         self._actuation.reset(chosen, self.number, at_controls)
         for counted in (self.steps, self.total, self.sums):
             counted.masked_fill_(chosen, 0)

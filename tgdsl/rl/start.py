@@ -142,7 +142,6 @@ def make_setup(
 
 
 def _num_variants(sensed: Sensed, name: str) -> int:
-    """Return how many variants an object has; environment i of all processes has variant i modulo their number."""
     inputs = sensed.touch.inputs
     return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 
@@ -157,7 +156,6 @@ def _half_heights(sim: Simulation, sensed: Sensed, name: str) -> Float[Tensor, "
 
 
 def _first_half_height(sim: Simulation, sensed: Sensed) -> float:
-    """Return how far the object's first variant reaches below its body's origin [m], whatever the environments here have."""
     first = SceneModels(sensed.touch.plan.scene).model({})
     return half_height(first, sensed.object, sim.qpos[0].double().cpu().numpy())
 

@@ -288,7 +288,6 @@ class Task(ABC, Generic[S]):
             )
 
     def __init__(self, spec: S, setup: Setup):
-        """Begin with nothing remembered; what a task remembers it takes from `keep`."""
         self.spec, self.setup, self.memory = spec, setup, {}
         weights = getattr(spec, "rewards", None)
         self._rates = {name: term.rate_of(self) for name, term in self.terms.items() if getattr(weights, name) is not None}

@@ -340,5 +340,4 @@ def emulated_limits(prepared: Prepared) -> MotionLimits:
 
 
 def _needs_goal(prepared: Prepared) -> bool:
-    """Return whether the policy sees a group that is made of what is asked for."""
     return any(name in prepared.loaded.task.hand_groups for name in prepared.groups)

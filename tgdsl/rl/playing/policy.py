@@ -264,7 +264,7 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
 
 
 def _without_folder(task: str) -> str:
-    """Return a task's name; of one in a file, whose folder is relative to the document, without that: `task.py:Class`."""
+    """Return a task's name; of one in a file without the folder, which is relative to the document: `task.py:Class`."""
     file, colon, class_ = task.rpartition(":")
     return f"{Path(file).name}{colon}{class_}"
 

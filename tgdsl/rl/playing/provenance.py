@@ -71,7 +71,7 @@ def changes_around(card: Mapping[str, Any], loaded: LoadedTask, model: mujoco.Mj
 
 
 def _known(before: Any, now: Any) -> Any:
-    """Return what there was before: neither sensors that are new, nor fields that its version of tgdsl did not know."""
+    """Return what there was before: neither new sensors nor fields that its version of tgdsl did not know."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return now
     return {name: _known(before[name], value) for name, value in now.items() if name in before}

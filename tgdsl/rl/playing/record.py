@@ -29,7 +29,6 @@ class Record:
     """
 
     def __init__(self, joints: Sequence[str]):
-        """Begin without rows."""
         self.joints = tuple(joints)
         self._columns: dict[str, list[Column]] = {}
 

@@ -149,7 +149,7 @@ class Distiller(Learning):
         self._asked[own.envs].copy_(action.action.flatten(0, 1))
 
     def _answer(self) -> None:
-        """Have the students say what they would ask for now in the rollout: an earlier one's a_0 bounds nothing any more."""
+        """Have the students say what they would ask for now: an earlier rollout's a_0 bounds nothing any more."""
         with torch.no_grad():
             self._beside([partial(self._answer_by, rollout) for rollout in self.rollouts])
 
@@ -161,7 +161,6 @@ class Distiller(Learning):
             memory = forgotten(action.memory, own.split(ended))
 
     def _epoch(self) -> None:
-        """Go through the rollout once."""
         each = self._losses.split([len(rollout.keys) for rollout in self.rollouts])
         self._beside([partial(self._pass, rollout, errors) for rollout, errors in zip(self.rollouts, each, strict=True)])
 
@@ -194,7 +193,6 @@ class Distiller(Learning):
         return detached, memory.detach()
 
     def _look(self) -> None:
-        """Take what was seen into account in the students' normalisation."""
         self._beside([partial(self._look_by, rollout) for rollout in self.rollouts])
 
     def _look_by(self, own: Rollout) -> None:
@@ -267,7 +265,6 @@ class Distiller(Learning):
         self._rate = spec.learning_rate
 
     def _of_rollout(self) -> list[Tensor]:
-        """Return what a pass reads of a rollout: live tensors."""
         buffers = [value for each in self.rollouts for value in (each.x, each.before, each.begun)]
         return [*buffers, self._labels, self._privileged, self._ended]
 
@@ -290,7 +287,6 @@ class ActingStudents(Actor):
     """All students, each in its block."""
 
     def __init__(self, distiller: Distiller):
-        """Begin episodes."""
         self._rollouts = distiller.rollouts
         self._memory = [torch.zeros_like(rollout.memory) for rollout in self._rollouts]
 

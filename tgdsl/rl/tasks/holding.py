@@ -42,7 +42,6 @@ class Holding:
     """
 
     def __init__(self, spec: HoldSpec, setup: Setup):
-        """Note which links are fingers."""
         self.spec, self.pays_in_full = spec, isinstance(spec.coasting_pay, float) and spec.coasting_pay == 1.0
         self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(setup.device)
 

@@ -207,7 +207,6 @@ class InHandRepose(Task[InHandReposeSpec]):
     work = terms.Work.of_task(-1e-3)
 
     def __init__(self, spec: InHandReposeSpec, setup: Setup):
-        """Begin with all objects where the keyframe has them."""
         super().__init__(spec, setup)
         self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.step = torch.full((setup.num_envs,), spec.goal_step, dtype=setup.dtype, device=setup.device)

@@ -123,7 +123,6 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
 
 
 def _way(spec: InPalmRotateSpec) -> float:
-    """Return the axis' component along the vertical."""
     return 1.0 if spec.direction == "counterclockwise" else -1.0
 
 
@@ -175,7 +174,6 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     object_speed = terms.ObjectSpeed.of_task(0.0, free_speed="free_speed", free_spin="free_spin")
 
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
-        """Begin with all objects where the keyframe has them."""
         super().__init__(spec, setup)
         self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.holding = Holding(spec.hold, setup)
@@ -244,9 +242,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         return self.reached
 
     def _distance(self, now: Now) -> Float[Tensor, " env"]:
-        """Return how far the object is from where it started [m]."""
         return vector_norm(now.object.pos - self.start_pos, dim=1)
 
     def _goal(self) -> Float[Tensor, " env"]:
-        """Return the angle of the next goal [rad]."""
         return (self.reached + 1.0) * QUARTER

@@ -267,13 +267,11 @@ class Screwdriver(Task[ScrewdriverSpec]):
         return self.turned / self.spec.episode
 
     def _pay(self, now: Now) -> Float[Tensor, " env"]:
-        """Return what turning pays: c; turning back costs the same whether the object is held or not."""
         if self.holding.pays_in_full:
             return torch.ones_like(self.rate)
         return torch.where(self.rate > 0, self.holding.pay(now), 1.0)
 
     def _tip_distance(self, now: Now) -> Float[Tensor, " env"]:
-        """Return how far the tip is from where it was [m]."""
         return (now.watched.site_pos[:, 0] - self.upright_tip).norm(dim=1)
 
 

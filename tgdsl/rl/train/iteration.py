@@ -32,7 +32,6 @@ class EpisodeTally:
     """
 
     def __init__(self):
-        """Begin."""
         self.names: list[str] = []
         self._sums: Tensor | None = None
 
@@ -89,7 +88,6 @@ class Clock:
     """Measures rollout and update; on a GPU by events, which nobody waits for."""
 
     def __init__(self, device: torch.device):
-        """Begin."""
         self._is_gpu, self._marks = device.type == "cuda", []
 
     def start(self) -> None:
