@@ -1,8 +1,8 @@
 """A task: how an episode begins and ends, what is observed and rewarded, and how well it went.
 
-A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done and its groups; the spec; `reference`, its own
-terms of the reward and the end of an episode in float64 NumPy; then the class: its terms, `reset`, `advance`, `is_over`,
-`observe`, `score`.
+A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done and its groups; the spec; then the class: its
+terms, `reset`, `advance`, `is_over`, `observe`, `score`. Numbers of the document are read in each step, as a curriculum may
+change them, but for those that the class lists as its `constants`.
 
 A term of the reward is a method marked by `reward_term`, or a shared one of `tgdsl.rl.terms` such as `near = Near.of_task(0.1,
 width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order.

@@ -25,7 +25,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import create_model, model_validator
@@ -46,8 +45,6 @@ FREE_SHARE = 0.95
 Force = Annotated[float, Quantity("force", gt=0.0)]
 Speed = Annotated[float, Quantity("speed", gt=0.0)]
 Spin = Annotated[float, Quantity("number", gt=0.0)]
-Row = Mapping[str, np.ndarray]
-"""One instant of one environment: fields of `Now`, and `low`, `high` and `max_torque` of `Setup`."""
 
 
 class Term(SpecModel, ABC):
@@ -76,10 +73,6 @@ class RewardTerm(Term):
     @abstractmethod
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         """Return its rate without the weight; the reward is the sum of all rates times Δt."""
-
-    def reference(self, row: Row) -> float | np.floating:
-        """Return the rate of one environment in float64, for tests: of `Now`'s fields and the limits of `Setup`."""
-        raise NotImplementedError
 
     @classmethod
     def of_task(cls, weight: float, **parameters: str) -> TaskReward:
@@ -227,9 +220,6 @@ class ActionRate(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.action - now.last_action).square().sum(dim=1)
 
-    def reference(self, row: Row) -> float | np.floating:
-        return np.sum((row["action"] - row["last_action"]) ** 2)
-
 
 class JointLimit(RewardTerm):
     """How far joints are beyond the middle 95 % of their ranges, Σ_j max(0, |q_j − m_j| − 0.95 h_j)."""
@@ -240,10 +230,6 @@ class JointLimit(RewardTerm):
         middle, half = 0.5 * (setup.low + setup.high), 0.5 * (setup.high - setup.low)
         return ((now.joint_pos - middle).abs() - FREE_SHARE * half).clamp(min=0.0).sum(dim=1)
 
-    def reference(self, row: Row) -> float | np.floating:
-        middle, half = 0.5 * (row["low"] + row["high"]), 0.5 * (row["high"] - row["low"])
-        return np.sum(np.maximum(abs(row["joint_pos"] - middle) - 0.95 * half, 0.0))
-
 
 class Work(RewardTerm):
     """Power of the drives, braking included, Σ_j |τ_j q̇_j|."""
@@ -253,18 +239,12 @@ class Work(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.torque * now.joint_vel).abs().sum(dim=1)
 
-    def reference(self, row: Row) -> float | np.floating:
-        return np.sum(np.abs(row["torque"] * row["joint_vel"]))
-
 
 class Effort(RewardTerm):
     """Squares of the torques as shares of the largest ones, Σ_j (τ_j/τ_max,j)²; a drive without a limit makes none."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.torque / setup.max_torque).square().sum(dim=1)
-
-    def reference(self, row: Row) -> float | np.floating:
-        return np.sum((row["torque"] / row["max_torque"]) ** 2)
 
 
 class ContactForce(RewardTerm):
@@ -277,9 +257,6 @@ class ContactForce(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return ((vector_norm(now.link_force, dim=2) - self.max_force).clamp(min=0.0) / self.max_force).sum(dim=1)
 
-    def reference(self, row: Row) -> float | np.floating:
-        return sum(max(0.0, np.linalg.norm(f) - self.max_force) / self.max_force for f in row["link_force"])
-
 
 class Near(RewardTerm):
     """How near the probes of `surface_distance` are to the object, mean_p exp(−max(0, d_p)/λ): from 0 to 1, which is touch."""
@@ -290,9 +267,6 @@ class Near(RewardTerm):
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return torch.exp(-now.distance.clamp(min=0.0) / self.width).mean(dim=1)
-
-    def reference(self, row: Row) -> float | np.floating:
-        return np.mean(np.exp(-np.maximum(row["distance"], 0.0) / self.width))
 
 
 class ObjectSpeed(RewardTerm):
@@ -309,10 +283,6 @@ class ObjectSpeed(RewardTerm):
             (vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(velocities, free, strict=True)
         )
         return speed + spin
-
-    def reference(self, row: Row) -> float | np.floating:
-        speed, spin = np.linalg.norm(row["linvel"]), np.linalg.norm(row["angvel"])
-        return max(0.0, speed / self.free_speed - 1.0) + max(0.0, spin / self.free_spin - 1.0)
 
 
 class ForceLimit(TerminationTerm):
