@@ -26,8 +26,7 @@ def pay(spec, link_force: np.ndarray, fingers: np.ndarray) -> float:
 
 
 def in_palm_rotate(spec, record, dt):
-    """The record has `pos` [m], `quat`, `link_force` (step, link, 3) [N]; and
-    `fingers`, which links are fingers."""
+    # The record has `pos` [m], `quat`, `link_force` (step, link, 3) [N]; and `fingers`, which links are fingers
     way, pos, quat = (1.0 if spec.direction == "counterclockwise" else -1.0), record["pos"], record["quat"]
     angle, reached, forth, paid = 0.0, 0, 0.0, 0.0
     for t in range(1, len(pos)):
@@ -61,8 +60,7 @@ def _quat_product(left: np.ndarray, right: np.ndarray):
 
 
 def in_hand_repose(spec, record, dt):
-    """The record has `pos` [m] and `quat`; and `goal_axis` (goal, 3), axes of goals
-    in turn."""
+    # The record has `pos` [m] and `quat`; and `goal_axis` (goal, 3), axes of goals in turn
     pos = record["pos"]
     rot = [_matrix(quat) for quat in record["quat"]]
     reached, near_since, goal_time = 0, 0, 0
@@ -102,9 +100,8 @@ def _angle_between(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def screwdriver(spec, record, dt):
-    """The record has `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `link_force`
-    (step, link, 3) [N]; `upright_pos`, `upright_tip` [m], where body and tip are in the keyframe; and `fingers`, which
-    links are fingers."""
+    # The record has `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `link_force` (step, link, 3) [N]; `upright_pos`,
+    # `upright_tip` [m], where body and tip are in the keyframe; and `fingers`, which links are fingers
     quat, turned = record["quat"], 0.0
     for t in range(1, len(quat)):
         step = -_turned_about_z(quat[t - 1], quat[t])
@@ -135,8 +132,8 @@ def _turned_about_z(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def grip_force(spec, record, dt):
-    """The record has `pos` [m], `quat`, `normal_force` (step, link) [N], `command`,
-    as observed then [N], and `is_new`, whether that was drawn then."""
+    # The record has `pos` [m], `quat`, `normal_force` (step, link) [N], `command`, as observed then [N], and `is_new`,
+    # whether that was drawn then
     since, squares = 0, []
     for t in range(1, len(record["pos"])):
         since += 1
@@ -161,8 +158,8 @@ def grip_force(spec, record, dt):
 
 
 def hot_ball(spec, record, dt):
-    """The record has `pos`, of the hot ball [m], `link_force`, of it on fingertips
-    (step, link, 3) [N], `distance` [m], and `heat`, what grids read (step, cell) [°C]."""
+    # The record has `pos`, of the hot ball [m], `link_force`, of it on fingertips (step, link, 3) [N], `distance` [m],
+    # and `heat`, what grids read (step, cell) [°C]
     is_latched, score = False, 0.0
     for t in range(1, len(record["pos"])):
         # The largest of clamped progresses is that of the hottest cell.
