@@ -64,8 +64,18 @@ class TouchEnv:
         curricula: Numbers of terms that change while a policy is learned: whoever learns calls `advance`.
         groups: Size of each group of observations.
         felt: Sources of the groups of touch.
-        steps: Control steps of each environment's present episode; may be written.
+        num_envs: Number of environments.
+        num_actions: Number of joints that the policy moves.
+        joint_names: These joints, in the order of actions.
+        device: Where observations and rewards are.
+        control_step: Duration of a control step [s].
+        max_steps: Control steps of an episode that nothing ends before.
+        steps: Control steps of each environment's present episode: a live tensor, which may be written.
+        resets: How often each environment was reset, from which its random numbers follow: the same.
     """
+
+    steps: Int[Tensor, " env"]
+    resets: Int[Tensor, " env"]
 
     @torch.inference_mode(False)  # what is remembered is written outside of inference mode too
     def __init__(
@@ -114,10 +124,11 @@ class TouchEnv:
         self.touch.memory.keeps_last = True  # of environments that do not begin again while others do
         if is_compiled:
             self.touch.compile(dynamic=not is_cuda)  # a GPU reads all environments each time, a CPU any number of them
-        self._joints = moved_joints(loaded, sensed)
-        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, simulator, threads, first_env)
+        self.joint_names = moved_joints(loaded, sensed)
+        self.sim = make_simulation(loaded, sensed, self.joint_names, num_envs, device, simulator, threads, first_env)
+        self.num_envs, self.num_actions, self.device = num_envs, len(self.joint_names), self.touch.device
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
-        setup = make_setup(loaded, sensed, self.sim, self._joints, draws, first_env)
+        setup = make_setup(loaded, sensed, self.sim, self.joint_names, draws, first_env)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
         self.curricula = Curricula(loaded, self.sim.qpos)
         try:
@@ -129,9 +140,10 @@ class TouchEnv:
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
         self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
         self._events = Events(event_terms(random, self.curricula.terms), self.sim, setup, self.actuation)
-        self._control_step = setup.control_step  # MuJoCo takes a while to tell
+        self.control_step = setup.control_step
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
         self._episodes = Episodes(self.sim, self.task, self.actuation, self._events, is_compiled)
+        self.steps, self.resets = self._episodes.steps, self._episodes.number
         self._action = torch.zeros((num_envs, self.num_actions), dtype=torch.float32, device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
         is_measured = self.spec.joint_vel == "measured"
@@ -154,41 +166,6 @@ class TouchEnv:
         self.groups = {name: value.shape[1] for name, value in obs.items()}
         if is_cuda or is_compiled:
             self._prepare(seed)
-
-    @property
-    def num_envs(self) -> int:
-        """Number of environments."""
-        return self.sim.num_envs
-
-    @property
-    def num_actions(self) -> int:
-        """Number of joints that the policy moves."""
-        return len(self._joints)
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """The joints that the policy moves, in the order of actions."""
-        return self._joints
-
-    @property
-    def device(self) -> torch.device:
-        """Where observations and rewards are."""
-        return self.touch.device
-
-    @property
-    def control_step(self) -> float:
-        """Duration of a control step [s]."""
-        return self.sim.control_step
-
-    @property
-    def steps(self) -> Int[Tensor, " env"]:
-        """Control steps of each environment's present episode: a live tensor."""
-        return self._episodes.steps
-
-    @property
-    def resets(self) -> Int[Tensor, " env"]:
-        """How often each environment was reset, from which its random numbers follow: a live tensor; may be written."""
-        return self._episodes.number
 
     @property
     def now(self) -> Now:
@@ -287,9 +264,8 @@ class TouchEnv:
 
         Another `TouchEnv` of the same document and number of environments goes on from it: on a CPU bit for bit.
         """
-        state = {part: saving.saved(memory) for part, memory in self._memory().items()}
-        state |= {"sim": self.sim.state_dict(), "touch": saving.saved(self.touch.state_dict()), "obs": saving.saved(self._obs)}
-        return state | {"seed": {"seed": torch.tensor(self._draws.seed)}}
+        memory = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs}
+        return saving.copied(memory) | {"sim": self.sim.state_dict(), "seed": {"seed": torch.tensor(self._draws.seed)}}
 
     def load_state_dict(self, state: Mapping[str, Mapping[str, Tensor]]) -> Observations:
         """Go on where environments of the same document and number were saved; return the observations there.
@@ -298,13 +274,13 @@ class TouchEnv:
             SimulationError: If they were others; nothing has changed.
         """
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
-        saving.refuse_other_parts(own, {part: saved_part for part, saved_part in state.items() if part != "sim"})
+        saving.refuse_other(own, {part: saved_part for part, saved_part in state.items() if part != "sim"})
         self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
         for part, memory in self._memory().items():
             saving.restore(memory, state[part])
         self.touch.load_state_dict(dict(state["touch"]))
         self._draws.reseed(int(state["seed"]["seed"]))
-        self._obs = {name: value.to(self.device) for name, value in saving.saved(state["obs"]).items()}
+        self._obs = {name: value.to(self.device) for name, value in saving.copied(state["obs"]).items()}
         self._is_loaded = True
         return dict(self._obs)
 
@@ -384,7 +360,7 @@ class TouchEnv:
         for name, term in self.curricula.terms.items():
             if isinstance(term, TerminationTerm):
                 terminated = terminated | checked(f'the term "{name}"', term.is_over(now, self.task.setup), self.num_envs)
-        earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self._control_step).float()
+        earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self.control_step).float()
         reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
         self._episodes.add(earned, reward)
         truncated = (self.steps >= self.max_steps) & ~terminated

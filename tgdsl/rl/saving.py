@@ -11,26 +11,8 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, listed
 
 
-def saved(memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return copies."""
-    return {name: value.clone() for name, value in memory.items()}
-
-
-def refuse_other(own: Mapping[str, Tensor], given: Mapping[str, Tensor], what: str) -> None:
-    """Refuse what was saved of something else.
-
-    Raises:
-        SimulationError: If names or shapes differ.
-    """
-    wrong = [name for name in {**own, **given} if name not in own or name not in given or own[name].shape != given[name].shape]
-    if wrong:
-        raise SimulationError(
-            f"the {what} that was saved is of other environments: {listed(wrong)} missing or of another shape"
-        )
-
-
-def refuse_other_parts(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, Mapping[str, Tensor]]) -> None:
-    """Refuse what was saved of something else, part by part.
+def refuse_other(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Refuse tensors, by part and name, that were saved of something else.
 
     Raises:
         SimulationError: If parts, or names or shapes in one, differ.
@@ -38,7 +20,10 @@ def refuse_other_parts(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[s
     if wrong := sorted(own.keys() ^ given.keys()):
         raise SimulationError(f"the state that was saved is of other environments: {listed(wrong)} missing or not known")
     for part, tensors in own.items():
-        refuse_other(tensors, given[part], part)
+        shapes, saved = ({name: value.shape for name, value in each.items()} for each in (tensors, given[part]))
+        if wrong := [name for name in {**shapes, **saved} if shapes.get(name) != saved.get(name)]:
+            problem = f"{listed(wrong)} missing or of another shape"
+            raise SimulationError(f"the {part} that was saved is of other environments: {problem}")
 
 
 def restore(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
@@ -52,6 +37,6 @@ def copied(made: Any) -> Any:
     """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
     if isinstance(made, Tensor):
         return made.clone()
-    if isinstance(made, dict):
+    if isinstance(made, Mapping):
         return {name: copied(value) for name, value in made.items()}
     return type(made)(*(copied(value) for value in made))

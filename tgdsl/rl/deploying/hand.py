@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -15,10 +16,11 @@ from torch import Tensor
 
 from tgdsl.rl import groups
 from tgdsl.rl.actuation import Actuation, DriveSpec
-from tgdsl.rl.deploying.prepared import JOINT_POS, JOINT_VEL, Prepared, refuse_policy
+from tgdsl.rl.deploying.prepared import JOINT_POS, JOINT_VEL, Prepared
 from tgdsl.rl.deploying.scene import TaskScene, first_step
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Observations, Step
+from tgdsl.rl.playing.policy import PolicyError
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.task import HandNow
 from tgdsl.runtime.connection import Connection
@@ -125,7 +127,7 @@ class Hand:
         action = action.to(self.action)
         if not bool(action.isfinite().all()):
             problem = f"at control step {self.steps} this policy returns {action[0].tolist()}, expected finite actions"
-            raise refuse_policy(self._prepared.saved.file, problem)
+            raise PolicyError(f"{self._prepared.saved.file}: {problem}")
         self._actuation.command(action)
         self.action = action.clamp(-1.0, 1.0)
         self.steps += 1
@@ -136,10 +138,11 @@ class Hand:
 
     def _holding(self, joint_pos: Float[Tensor, "env joint"]) -> Float[Tensor, " actuator"]:
         """Return set-points that hold all joints where they are, within their ranges [rad]."""
-        model, ids = self._prepared.model, self._prepared.actuator_id
-        held = np.zeros(model.nu)
-        held[ids] = joint_pos[0].double().numpy()
+        model = self._prepared.model
         joints = [model.joint(name).id for name in self._prepared.joints]
+        is_of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        ids = [np.flatnonzero(is_of_joint & (model.actuator_trnid[:, 0] == joint))[0] for joint in joints]
+        held = np.zeros(model.nu)
         low, high = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf]).T
-        held[ids] = held[ids].clip(low, high)
+        held[ids] = joint_pos[0].double().numpy().clip(low, high)
         return torch.from_numpy(held)

@@ -1,7 +1,4 @@
-"""A policy and its task's document, seen to fit each other and a hand, before anything is connected.
-
-Shapes: `actuator` actuators of the scene.
-"""
+"""A policy and its task's document, seen to fit each other and a hand, before anything is connected."""
 
 from __future__ import annotations
 
@@ -13,18 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
-from jaxtyping import Int
 
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, SimulationError, TgdslError, listed
-from tgdsl.module.module import TactileModule
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.playing.policy import (
     ACTOR_GROUPS,
     Policy,
-    PolicyError,
     PolicyFile,
     changes_since,
     check_card,
@@ -62,8 +55,6 @@ class Prepared:
         groups: Groups of observations that it takes, in its order, with their sizes.
         goal: What a user asks for; None: what the scene's task does.
         model: The scene.
-        joints: The actuated joints, in the order of the module's groups `joint_pos` and `joint_vel`.
-        actuator_id: Actuator of each.
         moved: The joints that the policy moves.
         changes: What of the task was otherwise when the policy was learned, a line each.
     """
@@ -75,10 +66,13 @@ class Prepared:
     groups: Mapping[str, int]
     goal: tuple[float, ...] | None
     model: mujoco.MjModel
-    joints: tuple[str, ...]
-    actuator_id: Int[np.ndarray, " joint"]
     moved: Actuators
     changes: Sequence[str]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The actuated joints, in the order of the module's groups `joint_pos` and `joint_vel`."""
+        return self.sensed.touch.inputs.joints
 
     @property
     def control_step(self) -> float:
@@ -127,18 +121,20 @@ def prepare(
         PolicyError: If the policy cannot be read, or was learned in another task, with other actions, joints or taxels.
         DeployError: If it sees what no hand can know, or is asked for what it cannot be.
     """
-    loaded = load_task(task, overrides)
-    saved = read_policy(policy)
-    card = saved.card
-    changes: Sequence[str] = ()
+    loaded, saved = load_task(task, overrides), read_policy(policy)
+    card, changes = saved.card, list[str]()
     if card is not None:
         check_learned(card, policy, loaded.spec)
         from_card = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
-        loaded = _with(loaded, from_card)
-        changes = changes_since(card, loaded.spec)
-    names = tuple(groups) or tuple(card["groups"] if card else _default_groups(loaded))
-    _refuse_unknowable(policy, loaded, names)
-    loaded, goal_numbers = _asked(loaded, goal)
+        loaded = dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=from_card))
+        changes += changes_since(card, loaded.spec)
+    known = ("proprio", *([GROUP] if loaded.spec.touch != "none" else []), *loaded.task.hand_groups)
+    names = tuple(groups) or tuple(card["groups"] if card else [name for name in ACTOR_GROUPS if name in known])
+    if unknown := [name for name in names if name not in (*known, GROUP)]:
+        problem = f'this policy sees {listed(unknown)} of the task "{loaded.spec.task}", which only a scene knows'
+        hint = f"on a hand there are {listed(['proprio', GROUP, *loaded.task.hand_groups])}"
+        raise DeployError(f"{policy}: {problem}; {hint}; teach a student that sees no more: tgdsl distill")
+    loaded, asked = _asked(loaded, goal)
     spec = loaded.spec
     felt = Felt(spec.touch, spec.placement, spec.noise) if GROUP in names and spec.touch != "none" else None
     feels = [] if felt is None else [felt]
@@ -148,41 +144,21 @@ def prepare(
     sensed = compile_sensed(loaded, device, progress, feels=feels, also=also)
     moved, model = moved_joints(loaded, sensed), SceneModels(sensed.touch.plan.scene).model({})
     if card is not None:
-        check_card(saved, moved, _alone(loaded, sensed, feels))
-        changes = [*changes, *changes_around(card, loaded, model)]
-    joints = sensed.touch.inputs.joints
+        alone = sensed.touch if len(feels) < 2 else compile_sensed(loaded, "cpu", feels=feels[:1]).touch
+        check_card(saved, moved, alone)
+        changes += changes_around(card, loaded, model)
     try:
         actuators = Actuators.of(model, moved)
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
-    sizes = {name: _size(name, card, sensed, felt, len(moved), goal_numbers) for name in names}
-    actuator_id = _actuators(model, joints)
-    result = Prepared(saved, loaded, sensed, felt, sizes, goal_numbers, model, joints, actuator_id, actuators, changes)
+    sizes = {name: int(card["groups"][name]) if card and name in card["groups"] else len(asked or ()) for name in names}
+    sizes |= {"proprio": 3 * len(moved)} if "proprio" in sizes else {}
+    if felt is not None:
+        observation = sensed.groups[felt.group].observation
+        sizes[GROUP] = sum(term.num_features for term in sensed.touch.plan.observations if term.group == observation)
+    result = Prepared(saved, loaded, sensed, felt, sizes, asked, model, actuators, changes)
     result.policy()
     return result
-
-
-def _with(loaded: LoadedTask, values: Mapping[str, Any]) -> LoadedTask:
-    return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=dict(values)))
-
-
-def _default_groups(loaded: LoadedTask) -> list[str]:
-    there = {"proprio", *loaded.task.hand_groups, *([GROUP] if loaded.spec.touch != "none" else [])}
-    return [name for name in ACTOR_GROUPS if name in there]
-
-
-def _refuse_unknowable(policy: Path, loaded: LoadedTask, names: Sequence[str]) -> None:
-    """Refuse groups that no hand can know.
-
-    Raises:
-        DeployError: If there are some; all are named.
-    """
-    group_names = ("proprio", GROUP, *loaded.task.hand_groups)
-    unknown = [name for name in names if name not in group_names]
-    if unknown:
-        problem = f'this policy sees {listed(unknown)} of the task "{loaded.spec.task}", which only a scene knows'
-        hint = f"on a hand there are {listed(group_names)}; teach a student that sees no more: tgdsl distill"
-        raise DeployError(f"{policy}: {problem}; {hint}")
 
 
 def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple[float, ...] | None]:
@@ -202,34 +178,3 @@ def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple
     except LowerError as error:
         raise DeployError(f"goal: {error} (`{error.field}` of the task's document)") from error
     return dataclasses.replace(loaded, spec=spec), tuple(goal)
-
-
-def _alone(loaded: LoadedTask, sensed: Sensed, feels: Sequence[Felt]) -> TactileModule:
-    return sensed.touch if len(feels) < 2 else compile_sensed(loaded, "cpu", feels=feels[:1]).touch
-
-
-def _size(
-    name: str, card: Mapping[str, Any] | None, sensed: Sensed, felt: Felt | None, num: int, asked: tuple[float, ...] | None
-) -> int:
-    """Return how many numbers a group has: as the card says, else by what it is of."""
-    if name == GROUP and felt is not None:
-        source = sensed.groups[felt.group]
-        terms = sensed.touch.plan.observations
-        return sum(term.num_features for term in terms if term.group == source.observation)
-    if name == "proprio":
-        return 3 * num
-    return int(card["groups"][name]) if card else len(asked or ())
-
-
-def _actuators(model: mujoco.MjModel, joints: Sequence[str]) -> Int[np.ndarray, " joint"]:
-    """Return the actuator of each joint."""
-    targets = [
-        model.joint(int(joint)).name if kind == mujoco.mjtTrn.mjTRN_JOINT else ""
-        for kind, joint in zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True)
-    ]
-    return np.array([targets.index(name) for name in joints], dtype=np.int64)
-
-
-def refuse_policy(file: Path, what: str) -> PolicyError:
-    """Return the error of a policy that does something that no drive can follow."""
-    return PolicyError(f"{file}: {what}")

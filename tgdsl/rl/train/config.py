@@ -8,12 +8,27 @@ from typing import Any
 from tgdsl.errors import did_you_mean
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import GROUP
-from tgdsl.rl.train.spec import EncoderSpec, RndSpec, TrainSpec
 
 PROPRIO, PRIVILEGED, STATE, PROPS = "proprio", "priv_proprio", "priv_obj_state", "priv_obj_props"
 """What is known of the hand; that and its forces; the object's motion; what it is like."""
 MOST_STD = 1e6
 """Bound above of the actions' standard deviation: rsl_rl's."""
+
+PPO_OPTIONS = {
+    "num_learning_epochs": "epochs",
+    "num_mini_batches": "mini_batches",
+    "clip_param": "clip",
+    "gamma": "discount",
+    "lam": "gae",
+    "value_loss_coef": "value",
+    "entropy_coef": "entropy",
+    "learning_rate": "learning_rate",
+    "max_grad_norm": "max_grad_norm",
+    "use_clipped_value_loss": "clip_values",
+    "desired_kl": "desired_kl",
+    "precision": "precision",
+}
+"""Numbers of `train` by rsl_rl's names."""
 
 
 def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[str]]:
@@ -46,73 +61,41 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
     Raises:
         SpecError: If a group that is named is not there.
     """
-    train = loaded.spec.train
-    model = _model(train)
-    networks = train.networks
-    gaussian = {
-        "class_name": "tgdsl.rl.train.model:Gaussian",
-        "init_std": networks.initial_std,
-        "std_range": (networks.min_std, MOST_STD),
-    }
-    return {
-        "num_steps_per_env": train.steps,
-        "save_interval": 1000,
-        "obs_groups": observed(loaded, groups),
-        "actor": model | {"distribution_cfg": gaussian},
-        "critic": dict(model),
-        "algorithm": _algorithm(train),
-        "multi_gpu": None if multi_gpu is None else dict(multi_gpu),
-    }
-
-
-def _model(train: TrainSpec) -> dict[str, Any]:
-    networks = train.networks
-    return {
+    train, networks = loaded.spec.train, loaded.spec.train.networks
+    encoders = {GROUP: networks.touch_encoder, "*": networks.encoder}
+    normalisation = {"eps": networks.eps, "clip": networks.clip}
+    model = normalisation | {
         "class_name": "tgdsl.rl.train.model:EncodedModel",
         "hidden_dims": list(networks.hidden),
         "activation": "elu",
         "obs_normalization": True,
-        "encoders": {GROUP: _encoder(networks.touch_encoder), "*": _encoder(networks.encoder)},
-        "eps": networks.eps,
-        "clip": networks.clip,
+        "encoders": {name: {"hidden": list(spec.hidden), "size": spec.size} for name, spec in encoders.items()},
     }
-
-
-def _encoder(spec: EncoderSpec) -> dict[str, Any]:
-    return {"hidden": list(spec.hidden), "size": spec.size}
-
-
-def _algorithm(train: TrainSpec) -> dict[str, Any]:
+    gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian", "init_std": networks.initial_std}
+    algorithm = {name: getattr(train, own) for name, own in PPO_OPTIONS.items()}
+    algorithm |= {"class_name": "tgdsl.rl.train.ppo:CapturedPPO", "schedule": "adaptive" if train.adaptive else "fixed"}
+    rnd = (
+        None
+        if train.rnd == "off"
+        else normalisation
+        | {
+            "weight": train.rnd.weight,
+            "num_outputs": train.rnd.outputs,
+            "predictor_hidden_dims": list(train.rnd.predictor),
+            "target_hidden_dims": list(train.rnd.target),
+            "state_normalization": True,
+            "reward_normalization": True,
+            "learning_rate": train.rnd.learning_rate,
+        }
+    )
     return {
-        "class_name": "tgdsl.rl.train.ppo:CapturedPPO",
-        "num_learning_epochs": train.epochs,
-        "num_mini_batches": train.mini_batches,
-        "clip_param": train.clip,
-        "gamma": train.discount,
-        "lam": train.gae,
-        "value_loss_coef": train.value,
-        "entropy_coef": train.entropy,
-        "learning_rate": train.learning_rate,
-        "max_grad_norm": train.max_grad_norm,
-        "use_clipped_value_loss": train.clip_values,
-        "schedule": "adaptive" if train.adaptive else "fixed",
-        "desired_kl": train.desired_kl,
-        "precision": train.precision,
-        "rnd_cfg": None if train.rnd == "off" else _distillation(train.rnd, train),
-    }
-
-
-def _distillation(rnd: RndSpec, train: TrainSpec) -> dict[str, Any]:
-    return {
-        "weight": rnd.weight,
-        "num_outputs": rnd.outputs,
-        "predictor_hidden_dims": list(rnd.predictor),
-        "target_hidden_dims": list(rnd.target),
-        "state_normalization": True,
-        "reward_normalization": True,
-        "learning_rate": rnd.learning_rate,
-        "eps": train.networks.eps,
-        "clip": train.networks.clip,
+        "num_steps_per_env": train.steps,
+        "save_interval": 1000,
+        "obs_groups": observed(loaded, groups),
+        "actor": model | {"distribution_cfg": gaussian | {"std_range": (networks.min_std, MOST_STD)}},
+        "critic": dict(model),
+        "algorithm": algorithm | {"rnd_cfg": rnd},
+        "multi_gpu": None if multi_gpu is None else dict(multi_gpu),
     }
 
 
