@@ -9,7 +9,6 @@ from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.task import Now
-from tgdsl.rl.terms import SharedReward
 
 Record = dict[str, np.ndarray]
 NAMES = ("joint_pos", "joint_vel", "torque", "action", "link_force", "distance", "linvel", "angvel")
@@ -92,9 +91,7 @@ def reference_rates(task, reference, spec, record: Record, dt: float) -> Record:
     """Return all terms of a task's reward [1/s], `is_over` and `score` at each step of one environment, in float64."""
     weights, limits = spec.rewards, {name: record[name] for name in ("low", "high", "max_torque") if name in record}
     instants = {name: record[name] for name in NAMES if name in record}
-    shared = {
-        name: term.term.for_spec(spec, term.parameters) for name, term in task.terms.items() if isinstance(term, SharedReward)
-    }
+    shared = {name: term.term.for_spec(spec, term.parameters) for name, term in task.terms.items() if term.term is not None}
     rows = []
     for t, own in enumerate(reference(spec, record, dt), start=1):
         row = {name: value[t] for name, value in instants.items()} | {"last_action": record["action"][t - 1]} | limits

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+from copy import copy
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -16,11 +17,14 @@ from pydantic import (
     Field,
     Tag,
     WithJsonSchema,
+    create_model,
     model_validator,
 )
 from pydantic_core import CoreSchema, core_schema
 
 from tgdsl.fields import units
+
+M = TypeVar("M", bound="SpecModel")
 
 
 class SpecModel(BaseModel):
@@ -35,6 +39,16 @@ class SpecModel(BaseModel):
         if isinstance(info.context, dict):
             info.context[id(value)] = cls
         return value
+
+
+def with_defaults(base: type[M], **defaults: Any) -> type[M]:
+    """Return a subclass of a model in which fields have other defaults; all else of them stays."""
+    fields: dict[str, Any] = {}
+    for name, default in defaults.items():
+        field = copy(base.model_fields[name])
+        field.default = default
+        fields[name] = (field.annotation, field)
+    return create_model(base.__name__, __base__=base, __module__=base.__module__, __doc__=base.__doc__, **fields)
 
 
 PATTERN = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*(%s)?\s*$"

@@ -52,12 +52,6 @@ class Events:
     def __init__(self, terms: Mapping[str, EventTerm], sim: Simulation, setup: Setup, actuation: Actuation):
         """Begin; an episode's begin draws when the first ones come.
 
-        Args:
-            terms: What `event_terms` returned.
-            sim: The simulation.
-            setup: The setup of the environments.
-            actuation: The drives.
-
         Raises:
             SimulationError: If an event would come more often than control steps.
         """

@@ -15,12 +15,7 @@ from tgdsl.runtime.simulators.model_ids import element_id
 
 
 def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray, " link"]:
-    """Return which links are fingers: a hinge moves them, or a slide that does not move all links, as one of a whole hand does.
-
-    Args:
-        model: The scene.
-        links: Bodies.
-    """
+    """Return which links are fingers: a hinge moves them, or a slide that does not move all links, as that of a whole hand."""
     joints = [_joints_above(model, element_id(model, "body", link)) for link in links]
     of_all = set.intersection(*joints) if joints else set()
     slides = {joint for joint in of_all if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)}

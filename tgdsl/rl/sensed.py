@@ -101,12 +101,7 @@ class Sensed:
     def forces(
         self, readings: Mapping[str, Tensor], like: Float[Tensor, "env joint"]
     ) -> tuple[Float[Tensor, "env link 3"], Float[Tensor, "env loaded"]]:
-        """Return the object's force on each link, and the sum of its normal forces on each, as `Now` has them [N].
-
-        Args:
-            readings: Of the module.
-            like: A tensor of physics' dtype.
-        """
+        """Return the object's force on each link, and the sum of its normal forces on each, as `Now` has them [N]."""
         none = like[:, :0]
         if self.contact is None:
             return none[:, :, None].expand(-1, -1, 3), none

@@ -161,13 +161,7 @@ def _first_half_height(sim: Simulation, sensed: Sensed) -> float:
 
 
 def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:
-    """Return how far a body's colliding geoms reach below its origin in the world [m]; meshes by their bounding boxes.
-
-    Args:
-        model: The scene.
-        body: The body.
-        qpos: Positions of all joints.
-    """
+    """Return how far a body's colliding geoms reach below its origin in the world [m]; meshes by their bounding boxes."""
     state = mujoco.MjData(model)
     state.qpos[:] = qpos
     mujoco.mj_kinematics(model, state)

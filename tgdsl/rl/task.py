@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -205,6 +205,8 @@ class TaskReward:
         summary: What it is, in a line.
         rate_of: Makes the term of a task.
         name: Its name if it is not that of the attribute.
+        term: The shared term that it is, a `RewardTerm`; None: one of the task alone.
+        parameters: The shared term's parameters, each by the key of the task's document that has it.
     """
 
     weight: float
@@ -212,6 +214,8 @@ class TaskReward:
     summary: str
     rate_of: Callable[[Any], Rate]
     name: str | None = None
+    term: type[Any] | None = None
+    parameters: Mapping[str, str] = field(default_factory=dict)
 
     def __get__(self, task: Task | None, owner: type[Task]) -> Any:
         return self if task is None else self.rate_of(task)

@@ -21,7 +21,7 @@ import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -87,25 +87,12 @@ class RewardTerm(Term):
             return partial(cls.for_spec(task.spec, parameters).rate, setup=task.setup)
 
         summary = (cls.__doc__ or "").partition("\n")[0].rstrip(".")
-        return SharedReward(weight, cls.unit, summary, rate_of, None, cls, parameters)
+        return TaskReward(weight, cls.unit, summary, rate_of, None, cls, parameters)
 
     @classmethod
     def for_spec(cls, spec: TaskSpec, parameters: Mapping[str, str]) -> Self:
         """Return the term with the parameters that a task's document has, its weight aside."""
         return cls.model_construct(weight=1.0, **{name: getattr(spec, key) for name, key in parameters.items()})
-
-
-@dataclass(frozen=True)
-class SharedReward(TaskReward):
-    """A shared term as one of a task's reward.
-
-    Attributes:
-        term: The term.
-        parameters: Its parameters, each by the key of the task's document that has it.
-    """
-
-    term: type[RewardTerm] = RewardTerm
-    parameters: Mapping[str, str] = field(default_factory=dict)
 
 
 class TerminationTerm(Term):

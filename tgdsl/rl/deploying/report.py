@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -92,13 +92,9 @@ class Report:
     late_steps: int
     moves: bool
 
-    def plain(self) -> dict[str, Any]:
-        """Return plain values, named tuples as mappings."""
-        named = {name: getattr(self, name) for name in ("scores", "age", "inference", "latency")}
-        return asdict(self) | {name: None if value is None else value._asdict() for name, value in named.items()}
-
     def __str__(self) -> str:
-        return "\n".join([self._scored(), self._timed(), *self._moved()])
+        moved = [] if self.moves else [f"{self.source} was not moved: actions were computed, and went nowhere"]
+        return "\n".join([self._scored(), self._timed(), *moved])
 
     def _scored(self) -> str:
         count = f"{self.episodes:,} episode{'' if self.episodes == 1 else 's'}, {self.steps:,} control steps"
@@ -115,6 +111,3 @@ class Report:
             return f"inference {self.inference}; {rate}, not in real time"
         parts = f"latency {self.latency}: sample age {self.age}, inference {self.inference}"
         return f"{parts}; {rate}, {self.late_steps} late"
-
-    def _moved(self) -> list[str]:
-        return [] if self.moves else [f"{self.source} was not moved: actions were computed, and went nowhere"]

@@ -58,14 +58,7 @@ class ScriptActor(Actor):
     """A function of the environment and its observations."""
 
     def __init__(self, env: TouchEnv, function: ScriptFunction, name: str, file: str = ""):
-        """Begin.
-
-        Args:
-            env: The environment.
-            function: Returns the actions.
-            name: What errors call it.
-            file: The file that it is in, if errors shall name the line in it.
-        """
+        """Take a function, what errors call it, and the file that it is in, if errors shall name the line in it."""
         self._env, self._function, self._name, self._file = env, function, name, file
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
@@ -104,10 +97,13 @@ def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
         return ZeroActor(env)
     if actions == "random":
         return RandomActor(env, seed)
-    if actions == "script":
-        return ScriptActor(env, _own_script(env), f"the script of {env.spec.task}")
-    function, file, name = _script_of(actions)
-    return ScriptActor(env, function, name, file)
+    if actions != "script":
+        function, file, name = _script_of(actions)
+        return ScriptActor(env, function, name, file)
+    script = getattr(env.task, "script", None)
+    if script is None:
+        raise ScriptError(f'the task "{env.spec.task}" brings no script of its own; name one as FILE.py:FUNCTION')
+    return ScriptActor(env, lambda _, obs: script(obs), f"the script of {env.spec.task}")
 
 
 def check_actions(actions: str) -> None:
@@ -118,13 +114,6 @@ def check_actions(actions: str) -> None:
     """
     if actions not in KINDS:
         _script_of(actions)
-
-
-def _own_script(env: TouchEnv) -> ScriptFunction:
-    script = getattr(env.task, "script", None)
-    if script is None:
-        raise ScriptError(f'the task "{env.spec.task}" brings no script of its own; name one as FILE.py:FUNCTION')
-    return lambda _, obs: script(obs)
 
 
 def _script_of(actions: str) -> tuple[ScriptFunction, str, str]:

@@ -242,12 +242,6 @@ def changes_since(card: Mapping[str, Any], spec: TaskSpec, leave_out: tuple[str,
 def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str = "policy") -> None:
     """See that a policy was learned in a task, with its actions and control steps.
 
-    Args:
-        card: The policy's card.
-        file: Its file, for errors.
-        spec: The task's document.
-        who: What errors call it.
-
     Raises:
         PolicyError: If not.
     """

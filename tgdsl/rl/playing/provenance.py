@@ -41,12 +41,7 @@ LEAST = 1e-12
 
 
 def provenance(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:
-    """Return what a card says of sensors and scene, as plain values.
-
-    Args:
-        loaded: The task's document.
-        model: MuJoCo's model of its scene.
-    """
+    """Return what a card says of sensors and scene, as plain values."""
     spec = sensors_document(loaded).spec
     return {
         "sensors": spec.model_dump(mode="json", exclude=ELSEWHERE),
@@ -55,13 +50,7 @@ def provenance(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def changes_around(card: Mapping[str, Any], loaded: LoadedTask, model: mujoco.MjModel) -> list[str]:
-    """Return what of sensors and scene is otherwise than where a policy was learned, a line each; nothing of older cards.
-
-    Args:
-        card: The policy's card.
-        loaded: The task's document.
-        model: MuJoCo's model of its scene.
-    """
+    """Return what of sensors and scene is otherwise than where a policy was learned, a line each; nothing of older cards."""
     if "sensors" not in card:
         return []
     now, scene = provenance(loaded, model), card["scene"]

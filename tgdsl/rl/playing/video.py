@@ -140,13 +140,6 @@ def _encoder() -> str:
 def _encode(encoder: str, frames: Iterable[Frame], rate: float, file: Path, target: Path) -> None:
     """Write frames as H.264.
 
-    Args:
-        encoder: Path of ffmpeg's program.
-        frames: The frames.
-        rate: Frames per second.
-        file: The file to write.
-        target: What errors call it.
-
     Raises:
         FileError: If it cannot be written.
     """

@@ -136,12 +136,6 @@ def seen_by(key: StudentKey, names: Sequence[str]) -> list[str]:
 def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequence[str]) -> Architecture:
     """Return a student's networks: students whose networks are equal are stacked.
 
-    Args:
-        loaded: The task's document.
-        env: The environments.
-        key: The student.
-        names: What `groups_of` returned.
-
     Raises:
         StudentError: If images are wanted of a type whose links are not all on grids.
     """

@@ -67,8 +67,8 @@ class Distiller(Learning):
         self.rollouts: list[Rollout] = []
         for networks, members in stacked.items():
             first, rows = self.rollouts[-1].envs.stop if self.rollouts else 0, env.num_envs // len(keys)
-            seen = tuple(tuple(seen_by(key, names)) for key in members)
-            self.rollouts.append(Rollout.made(networks, tuple(members), seen, first, rows, self._spec, env.device))
+            seen = [seen_by(key, names) for key in members]
+            self.rollouts.append(Rollout(networks, members, seen, first, rows, self._spec, env.device))
         self.keys = [key for each in self.rollouts for key in each.keys]
         seen_groups = [groups for each in self.rollouts for groups in each.seen]
         self.groups = {key.name: list(groups) for key, groups in zip(self.keys, seen_groups, strict=True)}

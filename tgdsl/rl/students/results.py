@@ -27,7 +27,7 @@ from tgdsl.rl.students.keys import StudentKey
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import deployed
 from tgdsl.rl.students.teacher import own_task
-from tgdsl.rl.train.policies import made_card, write_module
+from tgdsl.rl.train.policies import card_of, write_module
 
 
 class Row(NamedTuple):
@@ -159,7 +159,7 @@ def write_students(
         chosen = {"touch": task_spec.touch, "placement": task_spec.placement, "noise": task_spec.noise}
         run = dict(origin) | {"spec": task_spec.model_dump(mode="json"), "taxels": touch.taxels_id, "seed": key.seed}
         run["overrides"] = dict(origin["overrides"]) | chosen
-        card = made_card(distiller, sizes, run, seconds, command)
+        card = card_of(distiller, run, seconds, command, sizes)
         card["samples"] = distiller.samples // len(distiller.keys)
-        card |= {"std": None, "teacher": origin["teacher"], "score": found[i].plain() if found else None}
+        card |= {"teacher": origin["teacher"], "score": found[i].plain() if found else None}
         write_module(lambda i=i: deployed(distiller.student(i)), touch, card, folder / f"{key.name}.pt")

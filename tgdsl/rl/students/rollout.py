@@ -5,8 +5,7 @@ Shapes: `env` environments, `step` control steps, `student` students of the stac
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Shaped
@@ -18,7 +17,6 @@ from tgdsl.rl.students.stack import Stack
 from tgdsl.rl.students.student import Architecture
 
 
-@dataclass(frozen=True, eq=False)
 class Rollout:
     """Students of one stack, and where they are.
 
@@ -34,33 +32,22 @@ class Rollout:
         before: What they asked for in it, (step, student, row, joint).
     """
 
-    stack: Stack
-    keys: tuple[StudentKey, ...]
-    seen: tuple[tuple[str, ...], ...]
-    first: int
-    rows: int
-    memory: Tensor
-    begun: Tensor
-    x: Tensor
-    before: Tensor
-
-    @staticmethod
-    def made(
+    def __init__(
+        self,
         networks: Architecture,
-        keys: tuple[StudentKey, ...],
-        seen: tuple[tuple[str, ...], ...],
+        keys: Sequence[StudentKey],
+        seen: Sequence[Sequence[str]],
         first: int,
         rows: int,
         spec: DistillSpec,
         device: torch.device,
-    ) -> Rollout:
-        """Make a stack, and room for its rollout: see the attributes."""
-        stack = Stack(networks, [key.seed for key in keys], spec.learning_rate, spec.max_grad_norm, device)
+    ):
+        self.keys, self.seen, self.first, self.rows = keys, seen, first, rows
+        self.stack = Stack(networks, [key.seed for key in keys], spec.learning_rate, spec.max_grad_norm, device)
         shape = (len(keys), rows)
-        memory, begun = (torch.zeros((*shape, stack.memory), device=device) for _ in range(2))
-        x = torch.zeros((spec.steps, *shape, networks.num_features), device=device)
-        actions = torch.zeros((spec.steps, *shape, networks.actions), device=device)
-        return Rollout(stack, keys, seen, first, rows, memory, begun, x, actions)
+        self.memory, self.begun = (torch.zeros((*shape, self.stack.memory), device=device) for _ in range(2))
+        self.x = torch.zeros((spec.steps, *shape, networks.num_features), device=device)
+        self.before = torch.zeros((spec.steps, *shape, networks.actions), device=device)
 
     @property
     def envs(self) -> slice:

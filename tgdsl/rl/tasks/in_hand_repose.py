@@ -43,7 +43,7 @@ from pydantic import model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Angle, Positive, PositiveLength, Quantity
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, with_defaults
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Time, Whole
 from tgdsl.rl.students.spec import DistillSpec
@@ -53,18 +53,12 @@ from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.tensors.env_ids import may_be_nonempty
 
 
-class Train(TrainSpec):
+class Train(with_defaults(TrainSpec, iterations=20000)):
     """How a policy is learned; the paper's numbers for this task."""
 
-    iterations: Whole = 20000
-    """Iterations of the whole run: rollout and update."""
 
-
-class Distill(DistillSpec):
+class Distill(with_defaults(DistillSpec, max_grad_norm=None)):
     """How students are taught; the paper's numbers for this task."""
-
-    max_grad_norm: Positive | None = None
-    """Norm to which the gradient of each student is scaled down; null: it is not."""
 
 
 class InHandReposeSpec(TaskSpec):

@@ -40,50 +40,38 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.fields.models import Angle, NonNegative, Positive, PositiveLength, Quantity
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, with_defaults
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.grasps.spec import GraspSpec
 from tgdsl.rl.spec import TaskSpec
-from tgdsl.rl.students.spec import DecoderSpec, DistillSpec, Loss
+from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.train.spec import Share, TrainSpec, Whole
+from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
 
 UPRIGHT = math.radians(20.0)
 """Tilt below which a turn counts for the score [rad]; the paper's."""
 
 
-class Train(TrainSpec):
+class Train(with_defaults(TrainSpec, iterations=5000, steps=12, discount=0.99, entropy=0.0)):
     """How a policy is learned; the paper's numbers for this task."""
 
-    iterations: Whole = 5000
-    """Iterations of the whole run: rollout and update."""
-    steps: Whole = 12
-    """Control steps of each environment per iteration."""
-    discount: Share = 0.99
-    """γ."""
-    entropy: NonNegative = 0.0
-    """Weight of the entropy."""
 
-
-class Distill(DistillSpec):
+class Distill(
+    with_defaults(
+        DistillSpec,
+        iterations=2000,
+        steps=12,
+        gradient_length=4,
+        learning_rate=1e-5,
+        max_grad_norm=0.5,
+        loss="inverse_variance",
+        clip=0.1,
+    )
+):
     """How students are taught; the paper's numbers for this task."""
 
-    iterations: Whole = 2000
-    """Iterations of the whole run: rollout and update."""
-    steps: Whole = 12
-    """Control steps of each environment per iteration: a multiple of `gradient_length`."""
-    gradient_length: Whole = 4
-    """Control steps of a gradient step, through which recurrent networks are differentiated."""
-    learning_rate: Positive = 1e-5
-    """Learning rate."""
-    max_grad_norm: Positive | None = 0.5
-    """Norm to which the gradient of each student is scaled down; null: it is not."""
-    loss: Loss = "inverse_variance"
-    """Mean of (a_s − a_t)², or of (a_s − a_t)²/σ_t², σ_t the standard deviation of the teacher's actions."""
-    clip: Positive | None = 0.1
-    """Bound of a student's change of an action within an update, as PPO bounds values; null: there is none."""
     decoders: dict[str, DecoderSpec] = {
         name: DecoderSpec(weight=0.5, hidden=(512, 128)) for name in ("object_tilt", "rotation_progress")
     }

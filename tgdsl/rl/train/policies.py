@@ -24,34 +24,26 @@ KEPT = ("task", "overrides", "seed", "processes", "device", "module", "taxels", 
 """What a card says of what a run was made from."""
 
 
-def card_of(learner: Learner, run: Mapping[str, Any], seconds: float, command: str) -> dict[str, Any]:
+def card_of(
+    learner: Learning,
+    run: Mapping[str, Any],
+    seconds: float,
+    command: str,
+    groups: Mapping[str, int] | None = None,
+) -> dict[str, Any]:
     """Return what is to be known of a policy, as plain values.
 
     Args:
-        learner: The learner.
+        learner: Who has learned.
         run: What its run was made from.
         seconds: How long it has learned [s].
         command: How to learn it again.
+        groups: Groups of observations that it takes, with their sizes; default: those of the actor.
     """
-    groups = {name: learner.env.groups[name] for name in learner.groups["actor"]}
-    std = dict(learner.algorithm.actor.named_parameters()).get("distribution.std_param")
-    return made_card(learner, groups, run, seconds, command) | {"std": None if std is None else std.tolist()}
-
-
-def made_card(
-    learner: Learning, groups: Mapping[str, int], run: Mapping[str, Any], seconds: float, command: str
-) -> dict[str, Any]:
-    """Return what all cards have: see `card_of`.
-
-    Args:
-        learner: Who has learned.
-        groups: Groups of observations that the policy takes, with their sizes.
-        run: What the run was made from.
-        seconds: How long it has learned [s].
-        command: How to learn it again.
-    """
+    algorithm = getattr(learner, "algorithm", None)
+    std = dict(algorithm.actor.named_parameters()).get("distribution.std_param") if algorithm else None
     return {
-        "groups": dict(groups),
+        "groups": dict(groups or {name: learner.env.groups[name] for name in learner.groups["actor"]}),
         "joints": list(learner.env.joint_names),
         "iterations": learner.iteration,
         "samples": learner.samples,
@@ -59,6 +51,7 @@ def made_card(
         "command": command,
         "score": None,
         **{name: run[name] for name in KEPT},
+        "std": None if std is None else std.tolist(),
     }
 
 

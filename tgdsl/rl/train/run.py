@@ -195,10 +195,6 @@ class Run:
 def end_if_stopped(run: Run, command: str) -> None:
     """End the process if a signal has stopped a run, and say how to go on.
 
-    Args:
-        run: The run.
-        command: What goes on with it.
-
     Raises:
         SystemExit: With the exit code of a process that such a signal ends.
     """
