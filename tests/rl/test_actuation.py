@@ -47,8 +47,14 @@ def hinge(tmp_path, simulator, num_envs=1, kv=0.0, passive=0.0, substeps=1, driv
     actuation = Actuation(actuators, sim._arrays, spec, drive or DriveSpec(), Draws(0, num_envs))
     sim.drive = None if actuation.is_ideal else actuation.drive
     everywhere = torch.ones(num_envs, dtype=torch.bool)
-    actuation.reset(everywhere, torch.ones(num_envs, dtype=torch.int64))
+    begin(actuation, everywhere, torch.ones(num_envs, dtype=torch.int64))
     return sim, actuation
+
+
+def begin(actuation, chosen, episode, at_controls=False):
+    """Begin episodes, as environments whose drives are random do."""
+    actuation.draw(chosen, episode)
+    actuation.reset(chosen, episode, at_controls)
 
 
 def targets(sim, radians) -> torch.Tensor:
@@ -214,18 +220,18 @@ def test_offsets_are_from_the_target_that_an_episode_began_with(tmp_path, simula
     """Two environments start at 0.3 and −1.8 rad: a ⟼ start + 0.5 a, within ±2; the second begins again where its joint is then."""
     sim, actuation = hinge(tmp_path, simulator, num_envs=2, action=ActionSpec(mode="offset", scale=0.5))
     sim.qpos[:, 0] = torch.tensor([0.3, -1.8])
-    actuation.reset(torch.tensor([True, True]), torch.tensor([1, 1]))
+    begin(actuation, torch.tensor([True, True]), torch.tensor([1, 1]))
     for action in (1.0, -1.0, 0.2):
         actuation.command(torch.full((2, 1), action))
         expected = [0.3 + 0.5 * action, max(-2.0, -1.8 + 0.5 * action)]
         assert actuation.target[:, 0].tolist() == pytest.approx(expected, abs=1e-6)
     sim.qpos[:, 0] = 0.7
-    actuation.reset(torch.tensor([False, True]), torch.tensor([1, 2]))
+    begin(actuation, torch.tensor([False, True]), torch.tensor([1, 2]))
     actuation.command(torch.full((2, 1), -1.0))
     assert actuation.target[:, 0].tolist() == pytest.approx([-0.2, 0.2], abs=1e-6)
     saved = {name: value.clone() for name, value in actuation.memory().items()}
     sim.qpos[:, 0] = -0.4
-    actuation.reset(torch.tensor([True, True]), torch.tensor([3, 3]))
+    begin(actuation, torch.tensor([True, True]), torch.tensor([3, 3]))
     for name, value in actuation.memory().items():
         value.copy_(saved[name])
     actuation.command(torch.zeros(2, 1))
@@ -250,7 +256,7 @@ def test_slides_have_a_scale_of_their_own_and_none_of_what_is_an_angle():
     arrays = {name: torch.zeros(3, 2, dtype=torch.float64) for name in ("qpos", "qvel", "ctrl", "qfrc_applied")}
     drive = DriveSpec(bias=(0.05, 0.05), deadband=(0.02, 0.02), backlash=(0.04, 0.04), top_speed=1.0)
     actuation = Actuation(own, arrays, ActionSpec(scale=0.1, slide_scale=0.01), drive, Draws(0, 3))
-    actuation.reset(torch.ones(3, dtype=torch.bool), torch.ones(3, dtype=torch.int64))
+    begin(actuation, torch.ones(3, dtype=torch.bool), torch.ones(3, dtype=torch.int64))
     actuation.command(torch.ones(3, 2))
     torch.testing.assert_close(actuation.target, torch.tensor([[0.01, 0.1]]).double().expand(3, 2))
     actuation.drive()
@@ -266,7 +272,7 @@ def drawn(seed=0, num_envs=64, first_env=0, episode=1, spec=PAPER):
     actuation = Actuation(
         Actuators.of(model, ["a", "b", "c"]), arrays, ActionSpec(), spec, Draws(seed, num_envs, first_env=first_env)
     )
-    actuation.reset(torch.ones(num_envs, dtype=torch.bool), torch.full((num_envs,), episode))
+    begin(actuation, torch.ones(num_envs, dtype=torch.bool), torch.full((num_envs,), episode))
     return actuation
 
 
@@ -332,7 +338,7 @@ def test_only_chosen_environments_are_drawn_anew_and_placed():
     before = {name: value.clone() for name, value in actuation.drawn.items()}
     actuation.command(torch.ones(4, 3, dtype=torch.float64))
     target = actuation.target.clone()
-    actuation.reset(torch.tensor([False, True, False, True]), torch.tensor([1, 2, 1, 2]))
+    begin(actuation, torch.tensor([False, True, False, True]), torch.tensor([1, 2, 1, 2]))
     for name, value in actuation.drawn.items():
         assert torch.equal(value[[0, 2]], before[name][[0, 2]])
         assert name == "delay" or not torch.equal(value[[1, 3]], before[name][[1, 3]])
@@ -357,7 +363,7 @@ def test_drives_that_begin_at_controls_press(tmp_path, simulator):
         sim, actuation = hinge(tmp_path, simulator, num_envs=2, action=ActionSpec(), drive=drive)
         sim.reset(ctrl=[0.1])
         chosen = torch.tensor([True, False])
-        actuation.reset(chosen, torch.ones(2, dtype=torch.int64), at_controls=True)
+        begin(actuation, chosen, torch.ones(2, dtype=torch.int64), at_controls=True)
         torch.testing.assert_close(actuation.target[:, 0], torch.tensor([0.1, 0.0]).to(actuation.target))
         actuation.command(torch.zeros(2, 1))
         sim.step()
