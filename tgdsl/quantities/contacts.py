@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Plane, Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
@@ -89,8 +88,8 @@ class ContactsUse(Generic[Array]):
         pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
     """
 
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
+    bodies: Array
+    pairs: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ geoms, columns of a table; `node` nodes of all grids of a column.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.bvh import TriangleMesh, nearest
 from tgdsl.geometry.grid import METHODS, Grid
@@ -146,10 +145,8 @@ class GridTable(Generic[Array]):
     """
 
     values: Array
-    first: Array = field(
-        metadata=indices(lambda grids, part, plan: len(grids.values) + 1 - np.prod(grids.num, axis=1, dtype=float))
-    )
-    num: Array = field(metadata=indices(None, least=2))
+    first: Array
+    num: Array
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -167,7 +164,7 @@ class TriangleTable:
 
     stays_on_host: ClassVar[bool] = True
     vertices: tuple[np.ndarray, ...]
-    faces: tuple[np.ndarray, ...] = field(metadata=indices(lambda table, part, plan: tuple(map(len, table.vertices))))
+    faces: tuple[np.ndarray, ...]
     max_distance: float
 
     @cached_property
@@ -205,7 +202,7 @@ class GeomTable(Generic[Array]):
     size: Array
     pos: Array
     rotation: Array
-    is_absent: Array | None = field(metadata=indices(lambda table, part, plan: 2))
+    is_absent: Array | None
     surfaces: tuple[GridTable[Array] | TriangleTable | None, ...]
     accuracy: tuple[tuple[Mapping[str, float], ...], ...]
 

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Rot, Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
@@ -102,7 +101,7 @@ class Places(Request[Vec]):
 class PlacesUse(Generic[Array]):
     """One request: the bodies in the state (point,), and the points in their frames (point, 3) [m]."""
 
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
+    bodies: Array
     offset: Array
 
 
@@ -178,8 +177,8 @@ class Joints(Request[JointDrive]):
 class JointsUse(Generic[Array]):
     """One request: joints and their bodies in the state (joint,), and the joints' anchors in these bodies' frames [m]."""
 
-    joints: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.joints)))
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
+    joints: Array
+    bodies: Array
     anchor: Array
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
@@ -92,9 +91,9 @@ class LoadsUse(Generic[Array]):
         center: The frame of the centre of contacts; empty: no centre is computed.
     """
 
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    objects: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
+    bodies: Array
+    objects: Array
+    pairs: Array
     center: Literal["", "link", "object"]
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -16,7 +16,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import BakeError, LowerError
-from tgdsl.fields.indices import indices
 from tgdsl.geometry.grid import Count
 from tgdsl.geometry.planes import rot, split, vec
 from tgdsl.quantities.base import Planning, Quantity, Scene, Use, pairs_for, variant_of
@@ -52,10 +51,8 @@ class FieldTable(Generic[Array]):
     """
 
     values: Array
-    first: Array = field(
-        metadata=indices(lambda fields, part, plan: len(fields.values) + 1 - np.prod(fields.num, axis=1, dtype=float))
-    )
-    num: Array = field(metadata=indices(None, least=2))
+    first: Array
+    num: Array
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -79,11 +76,9 @@ class CloudTable(Generic[Array]):
 
     points: Array
     weight: Array
-    lists: Array = field(metadata=indices(lambda clouds, part, plan: clouds.points.shape[1]))
-    first: Array = field(
-        metadata=indices(lambda clouds, part, plan: len(clouds.lists) + 1 - np.prod(clouds.num, axis=1, dtype=float))
-    )
-    num: Array = field(metadata=indices(None, least=1))
+    lists: Array
+    first: Array
+    num: Array
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -103,7 +98,7 @@ class MomentTable(Generic[Array]):
         accuracy: Measured errors of each field, variant after variant, radius by radius: see `FieldErrors`.
     """
 
-    object: int = field(metadata=indices(lambda table, part, plan: len(plan.objects)))
+    object: int
     radii: tuple[float, ...]
     area: Array
     plane_pos: Array
@@ -126,13 +121,11 @@ class MomentUse(Generic[Array]):
         motion: Whether the objects' motions are asked for.
     """
 
-    tables: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(part.tables)))
+    tables: tuple[int, ...]
     pos: Array
-    pair: Array = field(
-        metadata=indices(lambda use, part, plan: [[plan.objects[part.tables[i].object].num_pairs] for i in use.tables])
-    )
+    pair: Array
     reach: Array
-    radius_id: Array = field(metadata=indices(lambda use, part, plan: [[len(part.tables[i].radii)] for i in use.tables]))
+    radius_id: Array
     radius_noise: str
     motion: bool
 

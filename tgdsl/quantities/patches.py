@@ -7,7 +7,7 @@ request, `choice` materials that one may have, `variant` its variants.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
@@ -247,17 +246,17 @@ class PatchesUse(Generic[Array]):
 
     topology: Topology
     is_star: bool
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
-    relations: Array = field(metadata=indices(lambda use, part, plan: len(plan.pairs.link) + 1))
+    bodies: Array
+    pairs: Array
+    relations: Array
     boxes: Array
     start: Array
     has_start: Array
     materials: Array
     shapes: Array
     grids: Array
-    variants: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(plan.inputs.objects), least=-1))
-    heated: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(plan.inputs.heated), least=-1))
+    variants: tuple[int, ...]
+    heated: tuple[int, ...]
     has_own_start: tuple[bool, ...]
     num_materials: tuple[int, ...]
     sides: Mapping[str, Array]

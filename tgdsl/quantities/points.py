@@ -7,7 +7,7 @@ differs between environments, `tile` groups of taxels that a GPU's kernel takes 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,7 +16,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import BakeError, LowerError
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec, vec
@@ -170,7 +169,7 @@ class CloudPart(Generic[Array]):
         area: Surface that each stands for [m²], (variant,).
     """
 
-    object: int = field(metadata=indices(lambda cloud, part, plan: len(plan.objects)))
+    object: int
     points: Array
     area: Array
 
@@ -188,14 +187,12 @@ class MetObject(Generic[Array]):
         tiles: What `points.point_tiles` returns of the taxels, (tile, 3).
     """
 
-    cloud: int = field(metadata=indices(lambda met, part, plan: len(part.clouds)))
-    links: tuple[int, ...] = field(metadata=indices(lambda met, part, plan: len(part.links)))
-    taxels: tuple[tuple[int, int], ...] = field(metadata=indices(lambda met, part, plan: plan.layout.num_taxels + 1))
-    pair: Array = field(metadata=indices(lambda met, part, plan: len(plan.pairs.link)))
-    link: Array = field(metadata=indices(lambda met, part, plan: len(part.links)))
-    tiles: Array = field(
-        metadata=indices(lambda met, part, plan: [len(met.links), *[plan.layout.num_taxels + 1] * 2], least=-1)
-    )
+    cloud: int
+    links: tuple[int, ...]
+    taxels: tuple[tuple[int, int], ...]
+    pair: Array
+    link: Array
+    tiles: Array
 
 
 @dataclass(frozen=True, eq=False)
