@@ -52,7 +52,7 @@ def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) 
         problem, hint = f'no joint of the robot matches "{pattern}"', did_you_mean(pattern, joint_names, "joints")
         if matching(pattern, own.others):
             problem, hint = f'"{pattern}" is a ball or free joint', "it has no single position; expected hinges and slides"
-        loaded.problems.append(loaded.problem(path, problem, hint))
+        loaded.note(path, problem, hint)
     return hits
 
 
@@ -82,10 +82,10 @@ def sensor_joints(loaded: Loaded, own: RobotJoints) -> Iterator[tuple[str, tuple
         selected = joints_chosen(loaded, ("sensors", name, "joints"), spec.joints, own)
         if len(loaded.problems) == num_problems and not selected:
             problem, hint = "the robot has no actuated joints", 'name them: joints: ["*"]' if own.joints else ""
-            loaded.problems.append(loaded.problem(("sensors", name), problem, hint))
+            loaded.note(("sensors", name), problem, hint)
         if "" in selected:
             problem = "an actuated joint of the robot has no name"
-            loaded.problems.append(loaded.problem(("sensors", name), problem, "name it in the robot's file, or list `joints`"))
+            loaded.note(("sensors", name), problem, "name it in the robot's file, or list `joints`")
         yield name, selected
 
 
@@ -95,5 +95,4 @@ def check_named_bodies(loaded: Loaded, scene: Model) -> None:
         for field, body in spec.named_bodies.items():
             if body not in scene.bodies:
                 problem = f'the scene has no body "{body}"'
-                hint = did_you_mean(body, scene.bodies, "bodies")
-                loaded.problems.append(loaded.problem(("sensors", name, field), problem, hint))
+                loaded.note(("sensors", name, field), problem, did_you_mean(body, scene.bodies, "bodies"))

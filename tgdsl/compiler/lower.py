@@ -6,6 +6,7 @@ import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -164,7 +165,7 @@ def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
             problem = f'"{target}" can never be in contact with a link of this sensor: {problem}'
         else:
             problem, hint = f'"{target}" and the links of this sensor are one rigid body', "put a joint between them"
-        loaded.problems.append(loaded.problem(path, problem, hint))
+        loaded.note(path, problem, hint)
 
 
 class ContactParts(NamedTuple):
@@ -178,11 +179,8 @@ def _contact_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[Lowered
     """Return which geoms' contacts are an object's and a link's; what cannot be told apart is a mistake."""
     objects = {}
     for name in sorted({pair.object for pair in pruned.contact_pairs}):
-
-        def report(what: str, hint: str, at: Path = ("objects", name, "surface")) -> None:
-            loaded.problems.append(loaded.problem(at, what, hint))
-
         felt = resolved.objects[name]
+        report = partial(loaded.note, ("objects", name, "surface"))
         parts = contact_parts(resolved.scene, felt.bodies, felt.touched, report)
         objects |= {name: parts} if parts != (ContactPart("body", felt.body),) else {}
     for sensor in sensors:
@@ -200,7 +198,7 @@ def _link_parts(
         at: Path = ("sensors", next(sensor.sensor for sensor in sensors if link in sensor.layout.bodies), "links")
 
         def report(what: str, hint: str, at: Path = at, link: str = link) -> None:
-            loaded.problems.append(loaded.problem(at, f'body "{link}" and what is welded to it: {what}', hint))
+            loaded.note(at, f'body "{link}" and what is welded to it: {what}', hint)
 
         own = link_parts(resolved.scene, resolved.link_bodies[link], report)
         parts |= {link: own} if own else {}
@@ -214,7 +212,7 @@ def _check_shared(loaded: Loaded, resolved: Resolved, sensor: LoweredSensor, req
         if one & two and not (one <= two or two <= one):
             problem = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
             path: Path = ("sensors", sensor.sensor, "feels", i)
-            loaded.problems.append(loaded.problem(path, problem, "give each a sensor of its own, or surfaces apart"))
+            loaded.note(path, problem, "give each a sensor of its own, or surfaces apart")
 
 
 def _quantities(
@@ -228,10 +226,6 @@ def _quantities(
     progress: Progress,
 ) -> Parts:
     """Return the part of the Plan of each quantity; mistakes are noted."""
-
-    def report(path: Sequence[str | int], what: str, hint: str) -> None:
-        loaded.problems.append(loaded.problem(tuple(path), what, hint))
-
     planning = Planning(
         layout=resolved.layout,
         sensed=resolved.objects,
@@ -240,7 +234,7 @@ def _quantities(
         objects=numbered.objects,
         bodies=numbered.bodies,
         geoms_of=resolved.geoms_of,
-        report=report,
+        report=loaded.note,
         progress=progress,
         joints=read.joints,
         anchors={name: resolved.anchor_of(name) for name in read.joints if name},
@@ -250,10 +244,9 @@ def _quantities(
         try:
             parts[quantity.name] = quantity.plan(planning, shared.uses[quantity.name])
         except LowerError as error:
-            sensor = shared.uses[quantity.name][0].sensors[0]
-            report(("sensors", sensor, *([error.field] if error.field else [])), error.what, error.hint)
+            loaded.note(("sensors", shared.uses[quantity.name][0].sensors[0]), error)
         except BakeError as error:
-            report(("sensors", shared.uses[quantity.name][0].sensors[0]), str(error), "")
+            loaded.note(("sensors", shared.uses[quantity.name][0].sensors[0]), str(error))
     if not loaded.problems:
         _check_parts(parts, asked)
     return parts

@@ -9,7 +9,7 @@ import numpy as np
 
 from tgdsl.compiler.links import joints_matching
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.errors import Problem, did_you_mean
+from tgdsl.errors import did_you_mean
 from tgdsl.formats.joints import RobotJoints
 from tgdsl.layout.layout import Layout
 from tgdsl.observations import observations
@@ -42,18 +42,16 @@ class Wanted:
         rows: Those of each observation term of joints, by group and number, in its order.
         joints: Names of all joints that are read, by observations and sensors, in the robot's order.
         actuators: Names of all actuators that are read.
-        problems: What is wrong with the observations' own lists.
     """
 
     rows: Mapping[tuple[str, int], tuple[str, ...]]
     joints: tuple[str, ...]
     actuators: tuple[str, ...]
-    problems: tuple[Problem, ...]
 
 
 def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
     """Return the joints and actuators that a document reads."""
-    all_joints, selected, num_problems = resolved.joints, {}, len(loaded.problems)
+    all_joints, selected = resolved.joints, {}
     requested: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
     for group, i, spec in _terms(loaded):
         if isinstance(spec, JointObservation):
@@ -61,9 +59,7 @@ def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
             requested[PROPRIOCEPTION[spec.type].rows].update(selected[group, i])
     joints = tuple(name for name in all_joints.joints if name in requested["joint"])
     actuators = tuple(actuator.name for actuator in all_joints.actuators if actuator.name in requested["actuator"])
-    problems = tuple(loaded.problems[num_problems:])
-    del loaded.problems[num_problems:]
-    return Wanted(selected, joints, actuators, problems)
+    return Wanted(selected, joints, actuators)
 
 
 def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
@@ -87,7 +83,6 @@ def observed(
         layouts: The taxels of each, by its name.
         read: The joints and actuators that are read.
     """
-    loaded.problems += read.problems
     specs, all_joints, joints, actuators = _terms(loaded), resolved.joints, read.joints, read.actuators
     reading_of = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
     terms: list[PlannedObservation] = []
@@ -100,8 +95,7 @@ def observed(
         else:
             count = observations.HAND_ONLY.get(spec.type, 0)
             terms.append(PlannedObservation(group, i, spec.type, None, (), count, {}))
-    types = {spec.type for _, _, spec in specs}
-    return Observed(tuple(terms), _proprioception(types, joints, actuators, all_joints))
+    return Observed(tuple(terms), _proprioception({spec.type for _, _, spec in specs}, joints, actuators, all_joints))
 
 
 def _of_reading(
@@ -114,8 +108,7 @@ def _of_reading(
     """Return the observation of a sensor's reading, or nothing if it is wrong."""
     path: Path = ("observations", group, i)
     if spec.of not in found:
-        hint = did_you_mean(spec.of, found, "readings")
-        loaded.problems.append(loaded.problem((*path, "of"), f'there is no reading "{spec.of}"', hint))
+        loaded.note((*path, "of"), f'there is no reading "{spec.of}"', did_you_mean(spec.of, found, "readings"))
         return []
     reading, layout = found[spec.of]
     if isinstance(spec, ReadingObservation):
@@ -124,8 +117,7 @@ def _of_reading(
         wanted, rows = observations.WANTED[spec.type]
         if reading.rows != rows or not set(wanted) <= set(reading.channels):
             problem = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
-            has = f"it reads {', '.join(reading.channels)} of each {reading.rows}"
-            loaded.problems.append(loaded.problem(path, problem, has))
+            loaded.note(path, problem, f"it reads {', '.join(reading.channels)} of each {reading.rows}")
             return []
     constants = observations.lower(spec, layout)
     channels = tuple(reading.channels.index(channel) for channel in wanted)
@@ -142,8 +134,7 @@ def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: Pla
         hits = matching(pattern, reading.channels)
         if not hits:
             problem = f'no channel of "{reading.name}" matches "{pattern}"'
-            hint = did_you_mean(pattern, reading.channels, "channels")
-            loaded.problems.append(loaded.problem((*path, "channels", k), problem, hint))
+            loaded.note((*path, "channels", k), problem, did_you_mean(pattern, reading.channels, "channels"))
         selected |= dict.fromkeys(hits)
     return tuple(selected)
 
@@ -157,19 +148,18 @@ def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tupl
         selected = dict.fromkeys(names)
         if not names:
             hint = 'name them: joints: ["*"]' if is_of_joints and own.joints else ""
-            problem = f"the robot has no actuated joints, so there is no {spec.type} of them"
-            loaded.problems.append(loaded.problem(path, problem, hint))
+            loaded.note(path, f"the robot has no actuated joints, so there is no {spec.type} of them", hint)
     for k, pattern in enumerate(spec.joints or ()):
         hits = joints_matching(loaded, (*path, "joints", k), pattern, own)
         if not is_of_joints and hits:
             joints, hits = hits, [actuator.name for actuator in own.actuators if set(actuator.joints) & set(hits)]
             if not hits:
                 problem = f"no actuator acts on {', '.join(joints)}"
-                loaded.problems.append(loaded.problem((*path, "joints", k), problem, "so there is no last action of it"))
+                loaded.note((*path, "joints", k), problem, "so there is no last action of it")
         selected |= dict.fromkeys(hits)
     if "" in selected:
         problem = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
-        loaded.problems.append(loaded.problem(path, problem, "name it in the robot's file"))
+        loaded.note(path, problem, "name it in the robot's file")
     return tuple(selected)
 
 

@@ -107,13 +107,13 @@ def patches_of(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: d
         if not hits:
             all_names = [name for names in names_of(robot) for name in names]
             problem = f'no body, geom or mesh matches "{pattern}"'
-            loaded.problems.append(layout.problem(path, problem, did_you_mean(pattern, all_names, "links"), on_key=True))
+            layout.note(path, problem, did_you_mean(pattern, all_names, "links"), on_key=True)
         for link, geoms in hits:
             if link.name in result:
                 problem = f'link "{link.name}" already has a layout, by "{result[link.name].path[-1]}"'
-                loaded.problems.append(layout.problem(path, problem, "give each link one", on_key=True))
+                layout.note(path, problem, "give each link one", on_key=True)
             elif not geoms:
-                loaded.problems.append(layout.problem(path, f'link "{link.name}" has no geoms', on_key=True))
+                layout.note(path, f'link "{link.name}" has no geoms', on_key=True)
             else:
                 result[link.name] = Patch(link, geoms, placement, path)
     order = {body: i for i, body in enumerate(robot.bodies)}
@@ -172,8 +172,7 @@ def sampled(
             drawn = pools.setdefault((patch.as_collided, *(geom.id for geom in patch.geoms)), {})
             parts.append(sample(surface, patch.placement, layout.folder, name, covered, drawn))
         except SampleError as error:
-            problem = f'link "{patch.link.name}": {error.what}'
-            loaded.problems.append(layout.problem(patch.path, problem, error.hint))
+            layout.note(patch.path, f'link "{patch.link.name}": {error.what}', error.hint)
     loaded.raise_problems()
     if not parts:  # all sensors are on links, whatever their taxels
         return Layout.of_links((), {})

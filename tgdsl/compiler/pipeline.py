@@ -18,7 +18,7 @@ from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import models_of, resolve
 from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import TgdslError, did_you_mean, listed
+from tgdsl.errors import SpecError, TgdslError, did_you_mean, listed
 from tgdsl.formats.mjcf import xml_files
 from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import Unfelt
@@ -27,6 +27,7 @@ from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable
 from tgdsl.schema.load import load
 from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 
@@ -126,17 +127,6 @@ class Placed(NamedTuple):
     unfelt: dict[str, tuple[Unfelt, ...]]
 
 
-def layouts(
-    document: Document,
-    overrides: Mapping[str, Any] | None = None,
-    resolutions: Sequence[str] = (),
-    kinds: Sequence[Kind] = (),
-) -> tuple[mujoco.MjModel, dict[str, Layout]]:
-    """Return the model and the layouts of `placed`."""
-    result = placed(document, overrides, resolutions, kinds)
-    return result.model, result.layouts
-
-
 def placed(
     document: Document,
     overrides: Mapping[str, Any] | None = None,
@@ -176,6 +166,28 @@ def placed(
     each = {name: resolve(parsed[name], progress, models) for name in shown_names}
     result = {name: unfelt(placement.colliders, placement.layout, placement.reach) for name, placement in each.items()}
     return Placed(each[shown_names[0]].scene.compiled, {name: placement.layout for name, placement in each.items()}, result)
+
+
+def all_layouts(
+    document: Document, overrides: Mapping[str, Any], resolutions: Sequence[str] = ()
+) -> tuple[LayoutSpec, dict[str, Layout]]:
+    """Return a document's layout as written, and the taxels of all its links at some resolutions (default: all).
+
+    Raises:
+        SpecError: All mistakes in the document and its layout, with file, line and column.
+        RobotError: If the robot cannot be read, or holds what is not supported.
+        TgdslError: If the layout has no such resolution.
+    """
+    loaded = load(document, overrides, known_kinds(()), needs_sensors=False)
+    if loaded.layout is None:
+        if loaded.is_without_layout:
+            loaded.note(("robot",), 'missing key "layout"', "only a layout has taxels to write down", on_key=True)
+        raise SpecError(loaded.problems)
+    spec = loaded.layout.spec
+    of_sensors = {**overrides, "resolution": next(iter(spec.resolutions))}
+    load(document, of_sensors, known_kinds(()), needs_sensors=False).raise_problems()
+    bare = {**overrides, "sensors": {}, "observations": {}}
+    return spec, placed(document, bare, resolutions or tuple(spec.resolutions)).layouts
 
 
 def _origin(loaded: Loaded) -> Origin:

@@ -28,7 +28,7 @@ from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.sensed import SensedObject
 
 Value = TypeVar("Value")
-Report = Callable[[Sequence[str | int], str, str], None]
+Report = Callable[[tuple[str | int, ...], str, str], None]
 """Notes a mistake: its place in the document, the problem, and a hint."""
 
 
