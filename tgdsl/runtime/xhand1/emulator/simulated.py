@@ -14,7 +14,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -30,16 +30,14 @@ from tgdsl.plan.sensors import PlannedObservation
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces, is_driven
+from tgdsl.runtime.xhand1.driver import Reading, XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, Emulator, TipForces, is_driven
 from tgdsl.runtime.xhand1.fingertips import HandTerm
 from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
-from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import WatchdogError
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, NUM_TAXELS, PASSIVE, JointCommand
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, PASSIVE, JointCommand
 
 PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 """For an emulator on a busy machine, where bytes are late but not lost: pseudo-terminals then take up to half a second."""
@@ -146,7 +144,7 @@ class SimulatedBody:
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
         """Return angles and counts after the last step."""
         with self._lock:
-            return self._position.copy(), TipForces(self._counts, np.zeros((len(FINGERS), NUM_TAXELS, 3)))
+            return self._position.copy(), replace(TipForces.zero(), total=self._counts)
 
     def goes_to(self, target: Float[np.ndarray, " joint"]) -> bool:
         """Return whether the last command sends all joints just there, as far as the wire's floats can say it."""
