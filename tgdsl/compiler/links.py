@@ -21,22 +21,16 @@ LinkBodies = Mapping[str, tuple[int, ...]]
 def link_bodies(scene: Model, links: Collection[str], objects: Collection[str]) -> dict[str, tuple[int, ...]]:
     """Return the bodies that each link's body is one rigid body with: see `Inputs.parts_of_link`.
 
-    Args:
-        scene: The scene.
-        links: Bodies that carry taxels of the layout, or are links of a sensor.
-        objects: Bodies of objects.
+    `links` carry taxels of the layout or are links of a sensor, `objects` are bodies of objects.
     """
     apart = {*links, *objects}
     return {link: scene.rigid_bodies(link, apart) for link in sorted(links)}
 
 
 def link_parts(scene: Model, bodies: tuple[int, ...], report: Report) -> tuple[ContactPart, ...]:
-    """Return the geoms that contacts with a link act on; nothing where no body but its own has geoms that collide.
+    """Return the geoms that contacts with a link act on, nothing where no body but its own has geoms that collide.
 
-    Args:
-        scene: The scene.
-        bodies: Its bodies, by `link_bodies`.
-        report: Called where a geom has no name that would tell it apart.
+    `report` is called where a geom has no name that would tell it apart.
     """
     colliding = [geom for geom in scene.rigid_geoms(bodies) if geom.is_colliding]
     if not any(scene.compiled.geom_bodyid[geom.id] != bodies[0] for geom in colliding):
@@ -57,14 +51,7 @@ def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) 
 
 
 def joints_chosen(loaded: Loaded, path: Path, patterns: Sequence[str] | None, own: RobotJoints) -> tuple[str, ...]:
-    """Return the joints of some patterns, each once, in the order of these; default: the actuated ones.
-
-    Args:
-        loaded: The document, which mistakes are noted in.
-        path: Where its list `joints` is.
-        patterns: Names and wildcards; None: there is no such list.
-        own: The robot's joints.
-    """
+    """Return the joints of some patterns, of the list at `path`, each once and in their order; default: the actuated ones."""
     selected: dict[str, None] = {}
     if patterns is None:
         selected = dict.fromkeys(own.joints[: own.num_actuated])

@@ -50,11 +50,6 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
 
     A sensor that reads contacts cannot on a body that is never in contact with its objects. Where no object collides with a
     body, nothing keeps the objects out of it, so that no taxel is too deep in it. Readings of bodies are not of taxels.
-
-    Args:
-        resolved: The document on its robot.
-        sensors: Its sensors, lowered.
-        pruned: The pairs that can meet.
     """
     layout, within = resolved.layout, resolved.reach
     names = np.array([link.body for link in layout.links], dtype=object)[layout.link_id]
@@ -82,13 +77,7 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
 
 
 def warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
-    """Warn once of all taxels that cannot feel, by link and reason.
-
-    Args:
-        file: Name of the document.
-        found: The taxels.
-        num_taxels: Number of all taxels.
-    """
+    """Warn once of all taxels that cannot feel, by link and reason."""
     if found:
         problem = f"{len(unfelt_ids(found))} of {num_taxels} taxels cannot feel: {'; '.join(map(str, found[:SHOWN]))}"
         problem += f"; and {len(found) - SHOWN} more, see `explain`" if len(found) > SHOWN else ""
@@ -110,13 +99,6 @@ FIELDS = (
 
 def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin, progress: Progress = silent) -> Plan:
     """Return the Plan of a document, its scene still empty.
-
-    Args:
-        loaded: The document.
-        resolved: What it means on its robot.
-        kinds: The kinds that it may use.
-        origin: What it was made of.
-        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
@@ -312,7 +294,6 @@ def _inputs(
 
 
 def _is_timed(sensor: LoweredSensor) -> bool:
-    """Return whether a sensor wants to know how much time has passed."""
     return sensor.kind.is_timed or sensor.spec.rate is not None or (sensor.noise is not None and sensor.noise.needs_dt)
 
 

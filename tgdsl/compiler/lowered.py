@@ -89,17 +89,7 @@ def imperfections(
     layout: Layout,
     named: Mapping[str, NoiseSpec],
 ) -> LoweredNoise | None:
-    """Return the lowered noise of a sensor; None if all its knobs are neutral.
-
-    Args:
-        name: The sensor's name.
-        spec: Its spec.
-        kind: Its kind.
-        knobs: The knobs of each of its links.
-        lowered: The sensor, lowered.
-        rows: What its reading has rows of.
-        layout: Its taxels.
-        named: The noise profiles of the document.
+    """Return the lowered noise of a sensor whose links have `knobs`; None if all of them are neutral.
 
     Raises:
         LowerError: If a knob names a quantity that the sensor does not read.
@@ -230,13 +220,7 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
 
 
 def fitted(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) -> list[LoweredSensor]:
-    """Return sensors, each fitted to the time step and to those that it reads; what these cannot be is noted.
-
-    Args:
-        loaded: The document.
-        sensors: All sensors.
-        timestep: Time of a physics step of the scene [s].
-    """
+    """Return sensors, each fitted to the scene's time step [s] and to those that it reads; mistakes are noted."""
     reading = {sensor.name: _upstream_of(loaded, sensor, sensors) for sensor in sensors}
     loaded.raise_problems()
     done: dict[str, LoweredSensor] = {}

@@ -63,7 +63,6 @@ def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
 
 
 def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
-    """Return the observation terms of all groups, with their group and number in it."""
     return [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
 
 
@@ -74,15 +73,7 @@ def observed(
     layouts: Mapping[str, Layout],
     read: Wanted,
 ) -> Observed:
-    """Return a document's observations; what is wrong with one is noted among the document's problems.
-
-    Args:
-        loaded: The document.
-        resolved: Its meaning on the robot.
-        sensors: The planned sensors.
-        layouts: The taxels of each, by its name.
-        read: The joints and actuators that are read.
-    """
+    """Return a document's observations; what is wrong with one is noted among the document's problems."""
     specs, all_joints, joints, actuators = _terms(loaded), resolved.joints, read.joints, read.actuators
     reading_of = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
     terms: list[PlannedObservation] = []
@@ -185,7 +176,6 @@ def _of_joints(
     chosen: Sequence[str],
     wanted: Sequence[str],
 ) -> PlannedObservation:
-    """Return the observation of a reading of joints or actuators."""
     is_all = list(chosen) == list(wanted)
     constants = {} if is_all else {"rows": np.array([wanted.index(name) for name in chosen], dtype=np.int64)}
     return PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants)

@@ -42,14 +42,7 @@ class Pruned(NamedTuple):
 
 
 def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], link_bodies: LinkBodies, scene: Model) -> Pruned:
-    """Return the pairs that some request is of and that can meet.
-
-    Args:
-        sensors: The sensors.
-        sensed: The objects.
-        link_bodies: The bodies of each link.
-        scene: The scene.
-    """
+    """Return the pairs that some request is of and that can meet."""
     geoms = {link: [geom.id for geom in scene.rigid_geoms(bodies) if geom.is_colliding] for link, bodies in link_bodies.items()}
     can_meet: set[Pair] = set()
     touching: set[Pair] = set()

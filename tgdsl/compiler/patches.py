@@ -151,14 +151,7 @@ def sampled(
 ) -> Layout:
     """Return the taxels of links.
 
-    Args:
-        loaded: The document.
-        layout: Its layout.
-        colliders: What the simulator collides of the robot.
-        patches: The links.
-        objects: Bodies of the robot's file that are no links, but objects.
-        pools: Points that were drawn on the links before; those that are drawn are added.
-        progress: Called with a line of text for each long job.
+    `objects` are bodies of the robot's file that are no links; points that are drawn on links are added to `pools`.
 
     Raises:
         SpecError: If a surface cannot satisfy a placement; all mistakes found so far.

@@ -107,7 +107,6 @@ def _check_chosen(loaded: Loaded, choice: Choice) -> None:
 def _written(
     document: Document, overrides: Mapping[str, Any] | None, kinds: tuple[Kind, ...], sensors: Collection[str] | None
 ) -> Loaded:
-    """Return a document as it is written, what was chosen left out."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
         return load(document, overrides, kinds, sensors=sensors)
@@ -135,13 +134,6 @@ def placed(
     progress: Progress = silent,
 ) -> Placed:
     """Return where a document puts taxels, at one resolution or more, without lowering sensors or baking objects.
-
-    Args:
-        document: A YAML file, or the same as a mapping; without sensors, all taxels of its layout count.
-        overrides: YAML text, or plain values, by dotted path.
-        resolutions: Default: the document's own, or all of the layout's if it names none.
-        kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
-        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.

@@ -39,12 +39,9 @@ from tgdsl.surfaces.surface import Surface
 
 
 def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, OwnObjects]:
-    """Return the scene with the bodies that the document adds, and the objects that have geoms or sizes of their own.
+    """Return the scene with the bodies that the document adds, and the objects with geoms or sizes of their own.
 
-    Args:
-        loaded: The document; mistakes are noted in it.
-        scene: The scene as its file has it.
-        links: Bodies that carry taxels.
+    `links` are bodies that carry taxels.
     """
     bodies, objects, meshes = _new_bodies(loaded, scene), [], Meshes()
     scene = with_bodies(scene, bodies)
@@ -72,7 +69,6 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
 
 
 def _others(loaded: Loaded, body: str) -> set[str]:
-    """Return the bodies of the objects that are not of a body."""
     return {target.body_of(name) for name, target in loaded.spec.objects.items()} - {body}
 
 
@@ -237,12 +233,7 @@ class Resolved:
 
 
 def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None = None) -> Resolved:
-    """Place a document's sensors on its robot.
-
-    Args:
-        loaded: The document.
-        progress: Called with a line of text for each long job.
-        models: Robot and scene of the same document, read before; default: they are read.
+    """Place a document's sensors on its robot; models of the same document that were read before may be given.
 
     Raises:
         SpecError: All mistakes found so far, those of reading included.
@@ -299,20 +290,12 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
 
 
 def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:
-    """Return the bodies of the robot's file that are a document's objects, or parts of them: they are no links."""
     named = {target.body_of(name) for name, target in loaded.spec.objects.items()} & set(robot.bodies)
     return tuple(sorted({i for body in named for i in robot.rigid_bodies(body, named - {body})}))
 
 
 def _unlisted(robot: Model, scene: Model, listed: Collection[str], rigid: Collection[int]) -> Iterator[tuple[str, str]]:
-    """Yield the bodies with geoms of the scene that are neither the robot's nor an object's, and why nothing feels them.
-
-    Args:
-        robot: The robot.
-        scene: The scene.
-        listed: Names of the objects' bodies.
-        rigid: Indices of bodies that are parts of objects or links.
-    """
+    """Yield the bodies with geoms of the scene that are neither the robot's nor an object's, and why nothing feels them."""
     model, listed_bodies = scene.compiled, {*robot.bodies[1:], *listed}
     robot_bodies = {robot.body_path(i) for i in range(1, robot.compiled.nbody)}
     for i in range(model.nbody):

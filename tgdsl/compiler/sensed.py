@@ -35,15 +35,6 @@ def sensed_object(
 
     Bodies that are welded to its body from below are part of it, and the solver's contacts with it are those on its geoms that
     collide. A surface that is only seen has none of its own: contacts with it are those of the whole object.
-
-    Args:
-        name: Its name.
-        body: Its body.
-        target: What the document says of it.
-        scene: The scene.
-        variants: If it has geoms of its own, the scene with each variant of them, and their names.
-        others: The other objects' bodies.
-        report: Called with mistakes.
     """
     bodies = scene.rigid_bodies(body, others)
     if target.compounds:
@@ -109,11 +100,7 @@ def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, 
 def contact_parts(scene: Model, bodies: Sequence[int], touched: Set[int], report: Report) -> tuple[ContactPart, ...]:
     """Return the geoms that contacts with an object or a link act on as MuJoCo's contact sensors can name them.
 
-    Args:
-        scene: The scene.
-        bodies: The bodies that are one rigid body, the first its own: see `Model.rigid_bodies`.
-        touched: Indices of the geoms.
-        report: Called where a geom has no name that would tell it apart.
+    `bodies` are one rigid body, the first its own; `report` is called where a geom has no name that would tell it apart.
     """
     model, first = scene.compiled, bodies[0]
     body_geoms = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in bodies}

@@ -138,7 +138,6 @@ def explain(touch: Explained) -> str:
 
 
 def _account(touch: Explained, asked: Quantity) -> list[str]:
-    """Return what was measured of what a quantity computes beforehand."""
     result = asked.account(touch.plan.quantities[asked.name], touch.plan.objects)
     return [line for headline, lines in result.items() for line in ["", headline, *(f"  {line}" for line in lines)]]
 

@@ -63,16 +63,7 @@ def _is_prepared(record: Any) -> bool:
 def scene_of(
     plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], drawn: Mapping[str, Drawn], dtype: torch.dtype
 ) -> Scene:
-    """Return what quantities are gathered from.
-
-    Args:
-        plan: The plan.
-        own: Its parts, bound.
-        tensors: The fields of `SceneState` that `inputs` names.
-        nows: When sensors are read, by their names.
-        drawn: Values of their noise, which may disturb the taxels' radii.
-        dtype: Dtype of what is gathered.
-    """
+    """Return what quantities are gathered from; drawn values of noise may disturb the taxels' radii."""
     shifts = {}
     for sensor in plan.sensors:
         if sensor.noise is not None and RADIUS.name in sensor.noise.terms:
@@ -103,7 +94,6 @@ def gathered_of(sensor: PlannedSensor, quantities: Sequence[Quantity], values: M
 
 
 def _pairs(table: PairTable[Tensor], tensors: Tensors, dtype: torch.dtype) -> Pairs:
-    """Return the relative poses and motions of all pairs, and which of them may be felt."""
     gate = gates(tensors["contact_found"], table.gate, dtype) if "contact_found" in tensors else None
     motion = tensors.get("body_linvel"), tensors.get("body_angvel")
     return relate(tensors["body_pos"], tensors["body_quat"], table.link, table.object, dtype, *motion, gate)

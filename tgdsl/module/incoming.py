@@ -110,13 +110,7 @@ class Incoming:
     """Takes states apart for a module, and warns once of what is odd about them."""
 
     def __init__(self, plan: Plan, kinds: Mapping[str, Kind], constants: Constants):
-        """Begin; nothing has come in.
-
-        Args:
-            plan: The plan.
-            kinds: The kind of each sensor, by the sensor's name.
-            constants: The module's constants, of which some may depend on the time between calls.
-        """
+        """Begin; nothing has come in."""
         self._plan, self._kinds, self._constants = plan, kinds, constants
         self._timesteps = {sensor.name: sensor.timestep for sensor in plan.sensors if sensor.timestep}
         self._dt: tuple[float, Tensor] | None = None
@@ -130,11 +124,6 @@ class Incoming:
 
     def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return the fields of a state that are wanted, by name; those of earlier substeps as `substep/<i>/<field>`.
-
-        Args:
-            state: The state.
-            dtype: Dtype of the module.
-            device: Where it is.
 
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.

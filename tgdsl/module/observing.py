@@ -54,11 +54,6 @@ def observation_terms(plan: Plan) -> dict[str, tuple[ObservationTerm, ...]]:
 def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
     """Return the observation groups of a plan, each the concatenation of its terms, every term flattened channel-major.
 
-    Args:
-        plan: The plan.
-        constants: Its arrays as tensors.
-        readings: The readings that it observes, (env, *step, row, channel); others are ignored.
-
     Raises:
         ObservationError: If a reading that is observed is missing or of another shape, if readings are of different numbers of
             environments, or an observation is one that only the real hand has.

@@ -37,14 +37,7 @@ Tensors = dict[str, Tensor]
 def joined_signal(
     kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Any]
 ) -> Float[Tensor, "env channel taxel"]:
-    """Return the signals of sensors that are computed as one, one sensor's taxels after the other's.
-
-    Args:
-        kind: Their kind.
-        sensors: The sensors.
-        gathered: What they asked for, of the taxels of all of them.
-        constants: What was folded for each of them: scalars.
-    """
+    """Return the signals of sensors that are computed as one, one sensor's taxels after the other's."""
     of_taxels: Tensors = {}
     if names := tuple(sensors[0].constants):
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
@@ -73,18 +66,6 @@ def read(
 
     Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
     fuses then has the equation write all channels side by side, and would else form them again for each number of the noise.
-
-    Args:
-        sensor: The sensor.
-        kind: Its kind.
-        gathered: What it asked for.
-        context: When its kind is called.
-        constants: What its kind folded.
-        stages: The stages of its noise.
-        drawn: Their values.
-        memory: The state of all sensors, by `sensor:name`.
-        now: When it is read.
-        joined: Its signal, if that was computed with others'.
     """
     if GAIN in stages and kind.gains_depth:
         felt, gains = gathered[ContactDepth], drawn[GAIN.name]
@@ -129,14 +110,6 @@ def block(
     """Return the reading of a sensor that is advanced at each substep, its new state, and what its kind returned at each.
 
     The reading is (env, sample, row, channel).
-
-    Args:
-        sensor: The sensor.
-        kind: Its kind.
-        gathered: What it asked for, at each substep.
-        contexts: When its kind is called.
-        constants: What its kind folded.
-        memory: The state of all sensors, by `sensor:name`.
     """
     samples, answers, state = [], [], _kind_state(sensor, memory)
     for part, context in zip(gathered, contexts, strict=True):
@@ -189,12 +162,10 @@ def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None
 
 
 def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env *sample channel row"]:
-    """Return what a kind found as one tensor: by its name, or of the planes of its channels."""
     return found[name] if name in found else torch.stack([found[channel] for channel in channels], dim=1)
 
 
 def _kind_state(sensor: PlannedSensor, memory: Mapping[str, Tensor]) -> Tensors:
-    """Return what the kind remembers."""
     return {name: memory[f"{sensor.name}:{name}"] for name in sensor.state if "/" not in name}
 
 
@@ -290,7 +261,6 @@ def sense(
 
 
 def _with_upstream(sensor: PlannedSensor, gathered: Gathered, answers: Mapping[str, list[Tensors]], substep: int) -> Gathered:
-    """Return what a sensor asked for, with the planes of the sensors that it reads."""
     if not sensor.upstream:
         return gathered
     return gathered.replaced(Upstream, {name: answers[name][substep] for name in sensor.upstream})
@@ -304,14 +274,12 @@ def _gathered(
     drawn: Mapping[str, Drawn],
     dtype: torch.dtype,
 ) -> dict[str, Gathered]:
-    """Return by sensor what it asked for, of one state."""
     scene = scene_of(sensing.plan, own, tensors, nows, drawn, dtype)
     values = gather(sensing.quantities, own, scene)
     return {sensor.name: gathered_of(sensor, sensing.quantities, values) for sensor in sensing.plan.sensors}
 
 
 def _substeps(plan: Plan, tensors: Mapping[str, Tensor]) -> list[Tensors]:
-    """Return the fields of each substep before the last one."""
     names = [name for name in plan.inputs.fields if name != "dt"]
     return [{name: tensors[f"substep/{i}/{name}"] for name in names} for i in range(plan.inputs.substeps - 1)]
 

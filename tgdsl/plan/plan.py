@@ -116,11 +116,6 @@ class Plan:
     def from_json(text: str, arrays: Mapping[str, np.ndarray], quantities: Sequence[Quantity] = QUANTITIES) -> Plan:
         """Return the plan that `to_json` wrote.
 
-        Args:
-            text: What it wrote.
-            arrays: The plan's arrays.
-            quantities: The quantities that it may ask for.
-
         Raises:
             ArtifactError: If the text is not a plan of this version, the arrays are not its own, or a quantity is not known.
         """

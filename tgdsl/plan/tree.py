@@ -44,12 +44,9 @@ def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
 
 
 def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[Any], bool] = lambda record: False) -> Any:
-    """Return a tree with other leaves; what has none stays as it is. An array that stands in several places is changed once.
+    """Return a tree with other leaves; a dataclass that `is_kept` keeps its arrays.
 
-    Args:
-        value: The tree.
-        change: Returns what stands for an array.
-        is_kept: Whether a dataclass keeps its arrays.
+    What has no array stays as it is. An array that stands in several places is changed once.
     """
     made: dict[int, Any] = {}
 

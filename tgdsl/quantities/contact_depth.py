@@ -381,6 +381,5 @@ def _search(
 
 
 def _geoms(table: GeomTable[np.ndarray]) -> Geoms:
-    """Return primitives that are the same in all environments as tensors."""
     size, pos, rotation = (torch.from_numpy(np.asarray(part)) for part in (table.size, table.pos, table.rotation))
     return Geoms(table.shapes, table.is_centred, size, pos, rotation, None, None, (None,) * len(table.shapes))

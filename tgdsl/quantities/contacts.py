@@ -132,15 +132,7 @@ def contacts_of(
     index: Int[Tensor, "body object"],
     dtype: torch.dtype,
 ) -> ContactPoints:
-    """Bring the contacts of a state into the frames of the bodies, in the state's dtype, and then cast them.
-
-    Args:
-        state: Fields of `SceneState`: body_pos, body_quat, contact_netforce and, unless the slots are not wanted, contact_pos,
-            contact_force, contact_torque and contact_normal.
-        bodies: Indices of the bodies in the state.
-        index: Pair of each body and object; their number where there is none.
-        dtype: Dtype of the result.
-    """
+    """Bring the contacts of a state into the frames of the bodies, in the state's dtype, and then cast them."""
     quat = state["body_quat"].index_select(1, bodies)
     whole = _of_pairs(state["contact_netforce"], index)
     *rotation, x, y, z = on_host(_in_frame, quat, whole.sum(dim=2))
@@ -163,7 +155,6 @@ def contacts_of(
 
 
 def _in_frame(quat: Plane, vector: Plane) -> list[Plane]:
-    """Return the planes of the rotations of bodies, (env, body), and of vectors of the world in their frames."""
     rotation = planes.rotation(quat)
     return [*rotation, *planes.rotate_back(rotation, planes.split(vector))]
 
@@ -185,12 +176,7 @@ class PairContacts(NamedTuple):
 
 
 def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]) -> PairContacts:
-    """Return the contacts of bodies and objects where they are, without torques.
-
-    Args:
-        state: Fields of `SceneState`: contact_netforce, contact_pos, contact_force and contact_normal.
-        index: Pair of each body and object; their number where there is none.
-    """
+    """Return the contacts of bodies and objects where they are, without torques."""
     names = ("contact_pos", "contact_force", "contact_normal")
     pos, force, normal = (planes.split(_of_pairs(state[name], index)) for name in names)
     is_used = _is_any((*force, *normal))
@@ -207,7 +193,6 @@ def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
 
 
 def _told(normal: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
-    """Return normals, not-a-number where a contact has none."""
     is_missing = is_used & (planes.dot(normal, normal) == 0)
     return planes.vec(torch.where(is_missing, torch.nan, part) for part in normal)
 
@@ -223,7 +208,6 @@ def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object sl
 
 
 def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
-    """Return a field (env, pair, *rest) as (env, body, object, *rest), zero where there is no pair."""
     padding = field.new_zeros((field.shape[0], 1, *field.shape[2:]))
     return torch.cat([field, padding], dim=1).index_select(1, index.flatten()).unflatten(1, index.shape)
 

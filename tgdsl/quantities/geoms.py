@@ -90,12 +90,7 @@ def union_distance(point: Vec, frames: Sequence[Frame | None], geoms: Geoms) -> 
 
 
 def united(geoms: Iterable[tuple[Tensor, Vec]], is_absent: Bool[Tensor, "case geom"] | None) -> tuple[Tensor, Vec]:
-    """Return the least of the distances to an object's geoms [m], the first among equals, and its gradient.
-
-    Args:
-        geoms: Signed distance to each geom [m] and its gradient, planes (case, …, point).
-        is_absent: Which geoms a case lacks; None if none does.
-    """
+    """Return the least of the distances to an object's geoms [m], the first among equals, and its gradient."""
     least, outward = None, None
     for g, (distance, gradient) in enumerate(geoms):
         if is_absent is not None:
@@ -208,12 +203,7 @@ class GeomTable(Generic[Array]):
 
 
 def account_of_geoms(table: GeomTable[np.ndarray], names: Sequence[str]) -> list[str]:
-    """Return the measured errors of a table's grids, for users.
-
-    Args:
-        table: The table.
-        names: What to call each case.
-    """
+    """Return the measured errors of a table's grids for users, who know each case by a name."""
     lines = []
     for case, (name, row) in enumerate(zip(names, table.accuracy, strict=True)):
         for i, accuracy in enumerate(row):
@@ -293,7 +283,6 @@ def _surface(
 
 
 def _chosen(array: Tensor, variant: Tensor | None) -> Tensor:
-    """Return an array with one row per environment, or a single one if it is the same in all."""
     return array if variant is None else array[variant]
 
 

@@ -223,7 +223,6 @@ class _Joints(Quantity):
 
 
 def _places(scene: Scene, bodies: Tensor, offset: Tensor) -> Vec:
-    """Return points of bodies in the world (env, point) [m], in the state's dtype."""
     pos, quat = (scene.tensors[name][:, bodies] for name in ("body_pos", "body_quat"))
     return planes.add(planes.split(pos), planes.rotate(planes.rotation(quat), planes.split(offset.to(pos.dtype))))
 

@@ -121,7 +121,6 @@ def _use(planning: Planning, use: Use) -> LoadsUse[np.ndarray]:
 
 
 def _places(planning: Planning, bodies: Sequence[str]) -> np.ndarray:
-    """Return where bodies stand in the state; one that touches nothing has no pose there, and no contacts."""
     return np.array([planning.bodies.index(body) if body in planning.bodies else 0 for body in bodies], dtype=np.int64)
 
 
@@ -144,12 +143,10 @@ def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtyp
 
 
 def _of_link(plane: Tensor) -> Tensor:
-    """Return a plane (env, body) as it broadcasts with (env, body, object, slot)."""
     return plane[:, :, None, None]
 
 
 def _of_object(plane: Tensor) -> Tensor:
-    """Return a plane (env, object) as it broadcasts with (env, body, object, slot)."""
     return plane[:, None, :, None]
 
 

@@ -223,7 +223,6 @@ def _too_large(radius: float, limits: Limits, needed: int) -> str:
 
 
 def _truth(surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: float, with_gradients: bool) -> Truth:
-    """Return what a field is measured against at points."""
     gradients = gradient_sums(surface, pos, radius) if with_gradients else None
     return Truth(pos, moment_sums(surface, pos, radius, 4, block=1), gradients)
 
@@ -393,9 +392,6 @@ def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.nd
     Args:
         geoms: The geoms of one variant of an object, none of them a plane.
         count: Number of points.
-
-    Raises:
-        BakeError: A mesh has no face with an area.
     """
 
     def make() -> tuple[np.ndarray, float]:
@@ -424,9 +420,6 @@ def sample_cloud(
         count: Number of points.
         budget: Largest size of the lists [bytes].
         radius_noise: By how much probes may reach farther [m]; the points are the same with and without.
-
-    Raises:
-        BakeError: Nothing to sample, or no lists within the budget.
     """
     return cache.cached(
         moments_key(geoms, b"cloud", radius, count, budget, radius_noise),

@@ -110,7 +110,6 @@ def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = 
 
 
 def _linear_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Pair, Pair, Pair]]:
-    """Return the index of the lowest of the nodes around points, and the weights of both along each axis."""
     base, (x, y, z) = _cell_of(point, field.origin, field.cell, field.num, last=2)
     return base, ((1 - x, x), (1 - y, y), (1 - z, z))
 
@@ -128,13 +127,11 @@ def _spline_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Vec, 
 
 
 def _quadratic(t: Tensor) -> Vec:
-    """Return the weights of the three nodes of a quadratic B-spline's piece, 0 ≤ t ≤ 1 through it."""
     rest = 1 - t
     return 0.5 * rest * rest, 0.5 + t * rest, 0.5 * t * t
 
 
 def _axes(point: Vec, field: MomentField) -> zip[tuple[Tensor, Tensor, Count]]:
-    """Return for each axis where points are, where the lattice begins, and how many nodes it has."""
     return zip(point, field.origin, field.num, strict=True)
 
 

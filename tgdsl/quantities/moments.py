@@ -374,13 +374,11 @@ def _way(use: Use) -> tuple[Any, ...]:
 
 
 def _radii(planning: Planning, uses: Sequence[Use], use: Use, name: str) -> list[float]:
-    """Return the radii of all probes whose tables are this use's [m], ascending."""
     alike = [other for other in uses if _way(other) == _way(use) and name in other.request.objects]
     return sorted({float(r) for other in alike for r in _radius(planning, other) if r > 0})
 
 
 def _radius(planning: Planning, use: Use) -> Float[np.ndarray, " taxel"]:
-    """Return the sensing radius of each probe [m]; at most 0 where it is inactive."""
     radius, of_all = planning.layout.radius[use.taxels], _request(use).radius
     return radius if of_all is None else np.where(radius > 0, of_all, radius)
 
@@ -411,14 +409,9 @@ def _use(planning: Planning, use: Use, tables: Sequence[MomentTable[np.ndarray]]
 def moment_table(
     sensed: SensedObject, request: MomentsRequest, radii: Sequence[float], radius_noise: float = 0.0, number: int | None = 0
 ) -> MomentTable[np.ndarray]:
-    """Compute the moments of an object beforehand.
+    """Compute the moments of an object, the Plan's `number`-th, beforehand.
 
-    Args:
-        sensed: The object.
-        request: The request, which gives the method.
-        radii: The sensing radii of its probes [m], ascending, each above 0.
-        radius_noise: By how much radii may differ from these [m].
-        number: The object's place in the Plan.
+    They are for sensing radii [m], ascending, which noise may change by `radius_noise` [m].
 
     Raises:
         LowerError: If its size is part of the state ("feels"), or the tolerance takes more than the budget.
@@ -485,7 +478,6 @@ def _fields(
 
 
 def _measured(errors: Any) -> dict[str, float]:
-    """Return the errors that were measured, by name."""
     return {name: value for name, value in dataclasses.asdict(errors).items() if value is not None}
 
 

@@ -169,12 +169,6 @@ def at_probes(part: Float[Tensor, "env pairs"], own: slice, pair: Int[Tensor, " 
 
 
 def gates(found: Tensor, place: Int[Tensor, " pair"], dtype: torch.dtype) -> Float[Tensor, "env pair"]:
-    """Return 0 where a pair is in contact, −∞ where it is not; not-a-number where the state does not know.
-
-    Args:
-        found: The state's `contact_found`.
-        place: Where each pair stands in it.
-        dtype: Dtype of the result.
-    """
+    """Return 0 where a pair is in contact by the state's `contact_found`, −∞ where it is not; not-a-number where that is."""
     column = found[:, place]
     return torch.where(column > 0, 0.0, torch.where(column.isnan(), torch.nan, -torch.inf)).to(dtype)

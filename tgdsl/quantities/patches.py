@@ -459,7 +459,6 @@ def _topology(planning: Planning, bodies: Sequence[str], names: Sequence[str], h
 
 
 def _place(planning: Planning, name: str, heat: ObjectHeat) -> int:
-    """Return where an object is in the state's fields of heat, if they say anything of it; else −1."""
     is_told = heat.is_per_env or len(heat.materials) > 1
     return planning.heated.index(name) if is_told and name in planning.heated else -1
 
@@ -524,7 +523,6 @@ def _as_objects_see(use: PatchesUse[Tensor], scene: Scene, centre: Vec, normal: 
 
 
 def _pairs_of(relations: Tensor, plane: Tensor) -> Tensor:
-    """Return a plane (env, pair) as (env, body, object); 0 where they never meet."""
     return pad(plane, (0, 1))[:, relations]
 
 

@@ -101,9 +101,7 @@ def link_points(own: ObjectPoints) -> LinkPoints:
 def point_tiles(taxels: Sequence[tuple[int, int]], num_taxels: int) -> list[tuple[int, int, int]]:
     """Return tiles that cover all taxels of a query: the number of a link, −1 for none, its first taxel, one beyond the last.
 
-    Args:
-        taxels: First of each link's taxels, and one beyond the last.
-        num_taxels: Number of the query's taxels.
+    `taxels` has the first of each link's taxels, and one beyond the last.
     """
     size, result, end = tile_size(taxels), [], 0
     owners = sorted((first, last, link) for link, (first, last) in enumerate(taxels))

@@ -266,7 +266,6 @@ def _set_control_step(sim: Simulation, control_step: float) -> None:
 
 
 def _stepping(scene: SteppedScene, control_step: float) -> SteppedScene:
-    """Return a scene, after a look at the duration of its control steps."""
     if abs(scene.control_step - control_step) > 1e-9:
         raise SimulationError(f"control steps of {control_step:g} s, and the scene's are {scene.control_step:g} s")
     return scene

@@ -56,11 +56,7 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
 
 
 def controls_between(targets: Sequence[Float[np.ndarray, " actuator"]], seconds: float, control_step: float) -> Controls:
-    """Return controls that hold each of some targets for some seconds and move evenly to the next in as long.
-
-    Raises:
-        SimulationError: If the duration is not positive, or takes more steps than there is memory for.
-    """
+    """Return controls that hold each of some targets for some seconds and move evenly to the next in as long."""
     if not 0 < seconds < np.inf:
         raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
     steps, times = max(round(seconds / control_step), 1), 2 * len(targets) - 1
@@ -107,11 +103,7 @@ def recorded_controls(path: Path) -> Controls:
 
 
 def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterator[Step]:
-    """Step a scene through controls and yield the readings after each control step.
-
-    Raises:
-        SimulationError: If the controls do not fit the scene, or a step fails: then it says which one, from 0.
-    """
+    """Step a scene through controls and yield the readings after each control step."""
     control_tensor(controls[0], sim.num_envs, sim.model.nu)
     for index, control in enumerate(controls):
         try:

@@ -36,11 +36,7 @@ class Script:
     note: str = ""
 
     def begin(self, touch: TactileModule, num_envs: int, substeps: int, seconds: float, options: Options | None = None) -> Run:
-        """Start the scene; each hold and each move takes some seconds.
-
-        Raises:
-            SimulationError: If the scene has no such keyframe, or cannot be simulated.
-        """
+        """Start the scene; each hold and each move takes some seconds."""
         if self.closing is not None:
             prepare = self.closing.prepare
             sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=START, options=options, prepare=prepare)

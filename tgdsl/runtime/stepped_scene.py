@@ -57,9 +57,6 @@ class SteppedScene:
 
         Args:
             control: Set-points of all actuators, (actuator,) or (1, actuator); default: as they were.
-
-        Raises:
-            SimulationError: If they do not fit, or the scene diverges.
         """
         if control is not None:
             values = control_tensor(control, *self.sim.ctrl.shape).reshape(-1)

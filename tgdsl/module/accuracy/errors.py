@@ -73,12 +73,7 @@ def halves(num_envs: int) -> tuple[slice, slice]:
 
 
 def magnitude_of(expected: Readings, quantities: Sequence[str]) -> Magnitude:
-    """Return what errors of a reading are relative to.
-
-    Args:
-        expected: The exact readings.
-        quantities: What each channel is a component of.
-    """
+    """Return what errors of a reading are relative to; `quantities` names what each channel is a component of."""
     rest = np.median(expected.reshape(-1, expected.shape[-1]), axis=0)
     away = np.abs(expected - rest)
     largest = away.max(axis=(0, 1, 2), initial=0.0)
@@ -91,13 +86,6 @@ def errors_of(found: Readings, expected: Readings, magnitude: Magnitude, is_rela
     """Return the errors of readings, each relative to its channel's magnitude.
 
     Intervals are a bootstrap's over environments, whose states depend on each other in time but not among themselves.
-
-    Args:
-        found: The readings.
-        expected: The exact ones.
-        magnitude: What they are relative to.
-        is_relative: Whether errors are divided by the magnitude.
-        seed: Of the bootstrap.
     """
     is_finite = bool(np.isfinite(found).all())
     error = np.abs(found - expected) / (magnitude.scale if is_relative else 1.0)
@@ -120,6 +108,5 @@ def _interval(value: float, samples: Float[np.ndarray, " sample"]) -> Interval:
 
 
 def _exceeded_by(error: Readings, count: int) -> float:
-    """Return the least of the errors that no more than so many exceed."""
     flat = error.reshape(-1)
     return float(np.partition(flat, len(flat) - 1 - count)[len(flat) - 1 - count]) if count < len(flat) else 0.0

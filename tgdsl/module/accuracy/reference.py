@@ -36,15 +36,7 @@ class ReferenceModule:
         others: Mapping[str, tuple[Kind, AnySensorSpec]] | None = None,
         sensor: str | None = None,
     ):
-        """Begin an episode.
-
-        Args:
-            plan: The plan.
-            kind: The kind of the sensor.
-            spec: Its spec.
-            others: Kind and spec of the sensors that it reads, by their names.
-            sensor: The name of the sensor; default: the plan's first one.
-        """
+        """Begin an episode of a sensor (default: the plan's first); `others`: kind and spec of sensors that it reads."""
         self.plan = plan
         self.kind = kind
         self.spec = spec

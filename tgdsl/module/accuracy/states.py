@@ -22,12 +22,7 @@ TOGETHER = 1e-6
 
 
 def narrowed(state: SceneState, have: Mapping[str, Sequence[str]], inputs: Inputs) -> SceneState:
-    """Return what a module wants of a state that has more.
-
-    Args:
-        state: The state.
-        have: What stands at its places: `Inputs.names` of the module that it was recorded for.
-        inputs: What is wanted.
+    """Return what a module wants of a state that has more; `have` is `Inputs.names` of the module that it was recorded for.
 
     Raises:
         StateError: If it has less.
@@ -118,7 +113,6 @@ def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
 
 
 def _repeated(there: Sequence[np.ndarray], samples: int, width: int) -> list[np.ndarray]:
-    """Return the rows of one sample for all samples of a block."""
     return [k * width + at for k in range(samples) for at in there]
 
 

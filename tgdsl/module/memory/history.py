@@ -41,6 +41,5 @@ def last_step(reading: Float[Tensor, "env *step row channel"]) -> Float[Tensor, 
 
 
 def _median(window: Window) -> Float[Tensor, "env channel row"]:
-    """Return the middle of each number's readings, the mean of both middle ones if their count is even."""
     ordered, count = window.sort(dim=1).values, window.shape[1]
     return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])

@@ -94,13 +94,7 @@ class Memory(HookedModule):
         readings: Mapping[str, PlannedReading],
         kinds: Mapping[str, Kind] | None = None,
     ):
-        """Note what sensors carry, and what all readings are.
-
-        Args:
-            sensors: The sensors.
-            readings: All readings, by name.
-            kinds: The kind of each sensor, by its name, where what kinds warn of is to be watched.
-        """
+        """Note what sensors carry, and what all readings are; `kinds` by sensor, where what they warn of is to be watched."""
         super().__init__()
         self._watch = StateWatch(sensors, kinds or {})
         self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
@@ -138,12 +132,6 @@ class Memory(HookedModule):
 
     def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
-
-        Args:
-            num_envs: Number of environments: of those whose state is held, if there are any.
-            dt: Time since the last call [s], if some sensor wants to know it.
-            dtype: Dtype of what is remembered.
-            device: Where.
 
         Raises:
             StateError: If dt is so short that a ring is too short.

@@ -22,14 +22,7 @@ Tensors = dict[str, Tensor]
 def chosen_rows(
     mask: Bool[Tensor, " env"], readings: Tensors, updated: Tensors, memory: Mapping[str, Tensor]
 ) -> tuple[Tensors, Tensors]:
-    """Return readings and new state of the environments of a mask; of the others what they had, as it was handed out before.
-
-    Args:
-        mask: The environments that are read.
-        readings: Readings of all environments.
-        updated: New state of all of them.
-        memory: State of all of them before, and what was handed out.
-    """
+    """Return readings and new state of the environments of a mask; of the others what they had, as it was handed out before."""
     updated, result = chosen_only(memory, updated, mask), dict(readings)
     for name, reading in readings.items():
         if f"{KEPT}{name}" in memory:
@@ -65,11 +58,7 @@ def read_rows(
 ) -> Tensors:
     """Read some environments, put their new state in the place of the old one, and return the readings of all.
 
-    Args:
-        core: Returns readings as `reading/<name>`, and new state as `state/<name>`.
-        rows: The environments.
-        tensors: The fields of their state.
-        memory: State of all environments, and what was handed out before, by name.
+    `core` returns readings as `reading/<name>`, and new state as `state/<name>`.
     """
     held = {name: value if name in SHARED else value[rows] for name, value in memory.items()}
     outputs = core(dict(tensors), held | {ENV: rows})

@@ -138,11 +138,9 @@ class BatchProperties(ObjectProperties):
 
 
 def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
-    """Return the fields in which two models of one layout differ."""
     names = [name for name in dir(one) if isinstance(getattr(one, name), Array)]
     return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
 
 
 def _shared(fields: Sequence[str]) -> list[str]:
-    """Return those fields that all environments of a batch share."""
     return [name for name in fields if name not in mujoco.batch.MODEL_FIELDS]

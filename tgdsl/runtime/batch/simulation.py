@@ -177,7 +177,6 @@ def _least_margin(model: mujoco.MjModel, sensor: int) -> float | None:
 
 
 def _geoms(model: mujoco.MjModel, kind: int, index: int) -> Int[np.ndarray, " geom"]:
-    """Return the geoms of what a contact sensor names: a geom, a body, or a body and all below it."""
     is_geom = kind == mujoco.mjtObj.mjOBJ_GEOM
     return np.array([index]) if is_geom else geoms_of(model, index, kind == mujoco.mjtObj.mjOBJ_XBODY)
 

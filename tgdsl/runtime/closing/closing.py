@@ -270,7 +270,6 @@ def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:
 
 
 def _slacken(joint: mujoco.MjsJoint) -> None:
-    """Free a joint of springs, friction and limits of its force."""
     joint.stiffness, joint.damping, joint.frictionloss = [0, 0, 0], [0, 0, 0], 0.0
     joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
 

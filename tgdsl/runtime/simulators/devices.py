@@ -11,11 +11,7 @@ from tgdsl.tensors.devices import why_there_is_none
 
 
 def checked_device(device: str, supported: Sequence[str]) -> torch.device:
-    """Return a device with its index, by torch's name for it: "cpu", "cuda" or "cuda:1".
-
-    Raises:
-        SimulationError: If there is no such device, or its type is not supported.
-    """
+    """Return a device with its index, by torch's name for it: "cpu", "cuda" or "cuda:1"."""
     try:
         result = torch.empty(0, device=device).device
     except (RuntimeError, AssertionError) as error:

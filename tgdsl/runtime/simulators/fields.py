@@ -52,15 +52,7 @@ class BodyFields:
         take: Callable[[Any, Any], Any],
         cross: Callable[[Any, Any], Any],
     ):
-        """Look the bodies up.
-
-        Args:
-            inputs: What the module wants.
-            model: The scene.
-            index: Makes indices of the arrays that are read: NumPy's, or tensors on their device.
-            take: Returns the rows of an array (env, row, …) that such indices name.
-            cross: Their cross product along the last axis.
-        """
+        """Look the bodies up; indices, rows of an array (env, row, …) and cross products are NumPy's or torch's."""
         ids = np.array([element_id(model, "body", name) for name in inputs.bodies], dtype=np.int64)
         self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
         self._fields = inputs.fields
@@ -111,11 +103,7 @@ class JointColumns:
 
     @classmethod
     def of(cls, inputs: Inputs, model: mujoco.MjModel) -> JointColumns:
-        """Look them up.
-
-        Raises:
-            SimulationError: If the model lacks a joint or an actuator, or a joint is no hinge or slide.
-        """
+        """Look them up."""
         joints = np.array([_joint_id(model, name) for name in inputs.joints], dtype=np.intp)
         actuators = np.array([element_id(model, "actuator", name) for name in inputs.actuators], dtype=np.intp)
         dofs = model.jnt_dofadr[joints].astype(np.intp)

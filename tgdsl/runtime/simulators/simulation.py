@@ -92,11 +92,7 @@ class SubstepStates:
         return self._wanted > 1
 
     def begin(self, substeps: int) -> None:
-        """Forget the last control step; the next one has so many physics steps.
-
-        Raises:
-            SimulationError: If the module wants another number.
-        """
+        """Forget the last control step; the next one has so many physics steps."""
         if substeps != self._wanted:
             steps = f"{self._wanted} physics step{'' if self._wanted == 1 else 's'}"
             problem = f"this module has sensors that are advanced at {steps} per call"
@@ -613,7 +609,6 @@ class Simulation(ABC):
         self._has_warned_of_range = self._has_warned_of_range or warn_of_range(control, self.model)
 
     def _saved_arrays(self) -> dict[str, Tensor]:
-        """Return the live tensors of a saved state, by their names there."""
         arrays = {f"state/{name}": self._arrays[name] for name in INTEGRATED}
         return arrays | self.heat.saved | {"faults/counts": self._faults.counts}
 

@@ -48,11 +48,7 @@ class StartContacts:
             self.is_placed = self.is_placed & ~chosen
 
     def place(self, chosen: Bool[Tensor, " env"], contacts: Contacts) -> None:
-        """Note environments that were placed, and their contacts: "none", or fields of a state by name, the others zero.
-
-        Raises:
-            SimulationError: If there is no such word or field, or a shape does not fit.
-        """
+        """Note environments that were placed, and their contacts: "none", or fields of a state by name, the others zero."""
         given = self._given(contacts, chosen)
         for name in {**self.values, **given}:
             old, new = self.values.get(name), given.get(name)

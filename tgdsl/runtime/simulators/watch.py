@@ -140,7 +140,6 @@ class WatchReader:
         )
 
     def _sites(self, pos: Float[Tensor, "env body 3"], quat: Float[Tensor, "env body 4"]) -> tuple[Tensor, Tensor]:
-        """Return position [m] and orientation of each site from the bodies'."""
         carried = quat[:, self._carriers]
         site_pos, site_quat = (local.to(pos.dtype).expand(len(pos), -1, -1) for local in (self._site_pos, self._site_quat))
         return pos[:, self._carriers] + rotated(carried, site_pos), product(carried, site_quat)

@@ -72,11 +72,7 @@ class WorldObjects:
         self.model = shared_model(chosen.scenes, inputs)
 
     def write_to(self, parameters: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
-        """Write the fields of environments whose objects were chosen again, in place; the others keep their masses.
-
-        Raises:
-            SimulationError: If a field that all environments share would differ.
-        """
+        """Write the fields of environments whose objects were chosen again, in place; the others keep their masses."""
         choices = [self._choices(env) for env in range(len(self._chosen.variant))]
         before, self._written = self._written or [None] * len(choices), choices
         device = arrays["qpos"].device

@@ -232,11 +232,7 @@ class WarpSimulation(Simulation):
         self._driven = self.drive
 
     def _put_model(self, model: mujoco.MjModel, per_env: list[str], num_envs: int, keyframe: int, options: SimOptions) -> None:
-        """Put model and data on the device, all environments at the start.
-
-        Raises:
-            SimulationError: If MuJoCo Warp does not support something of the model, or a field cannot differ.
-        """
+        """Put model and data on the device, all environments at the start."""
         refuse_two_instants(model, "bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
         nconmax, njmax = options.get("nconmax"), options.get("njmax")
         self._nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
@@ -449,7 +445,6 @@ class WarpSimulation(Simulation):
 
 
 def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return copies of float32 arrays, made by one kernel."""
     copies = {name: torch.empty_like(array) for name, array in arrays.items()}
     copy_each(list(copies.values()), list(arrays.values()))
     return copies

@@ -123,13 +123,10 @@ class HandConnection(Connection):
     """A connection to an XHand1, or to the log of one."""
 
     def __init__(self, source: HandSource, observer: HandObserver, actuators: JointControls | None, name: str = ""):
-        """Connect a hand.
+        """Connect a hand that its observer observes.
 
-        Args:
-            source: The hand.
-            observer: Observes it for the module.
-            actuators: The actuators whose controls are its joint angles; None: controls go nowhere.
-            name: Its name in a warning, given once, that controls go nowhere; empty: no warning.
+        `actuators` are those whose controls are its joint angles; without them controls go nowhere, and a warning says once
+        that `name` was connected for reading alone.
         """
         super().__init__(source)
         self._hand, self._observer, self._actuators, self._name = source, observer, actuators, name

@@ -304,7 +304,6 @@ class XHand1Source(HandSource):
         return -math.inf
 
     def _time_of(self, reading: Reading) -> float:
-        """Return when the joints were where a reading says that they were [s]."""
         return reading.requested_at
 
     def _read(self, requested_after: float) -> HandSample:

@@ -103,12 +103,7 @@ class EmulatedHand:
     """
 
     def __init__(self, hand_id: int = 0, body: Body | None = None):
-        """Switch it on.
-
-        Args:
-            hand_id: Its id.
-            body: Its joints and fingertips; default: a `StillBody`.
-        """
+        """Switch it on, with a `StillBody` by default."""
         self.commands: tuple[JointCommand, ...] = PASSIVE
         self.address = hand_address(hand_id)
         self.position: Float[np.ndarray, " joint"] = np.zeros(NUM_JOINTS)
@@ -182,13 +177,7 @@ class EmulatedLine:
     """
 
     def __init__(self, hand: EmulatedHand, *, baud: int = BAUD, turnaround_s: float = 0.0002):
-        """Connect a hand.
-
-        Args:
-            hand: The hand.
-            baud: Bits per second.
-            turnaround_s: Time from a request's last byte to the reply's first [s].
-        """
+        """Connect a hand that answers `turnaround_s` after a request's last byte [s], on a line of `baud` bits per second."""
         self.hand = hand
         self.requests: deque[tuple[float, Frame]] = deque(maxlen=_KEPT_REQUESTS)
         self._byte_s, self._turnaround_s = 10 / baud, turnaround_s
@@ -249,12 +238,7 @@ class Emulator:
     """
 
     def __init__(self, hand: EmulatedHand | None = None, *, line: EmulatedLine | None = None):
-        """Plug the hand in and switch it on.
-
-        Args:
-            hand: The hand; default: one with id 0 that feels nothing.
-            line: Its line, in place of a hand.
-        """
+        """Plug a hand in, by default one with id 0 that feels nothing, or a line with a hand, and switch it on."""
         self.line = line or EmulatedLine(hand or EmulatedHand())
         self.num_lost_bytes = 0
         self.failure: Exception | None = None

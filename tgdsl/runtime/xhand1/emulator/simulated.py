@@ -153,11 +153,7 @@ class SimulatedBody:
         return len(setpoints) == NUM_JOINTS and np.array_equal(np.array(setpoints, np.float32), target.astype(np.float32))
 
     def step(self) -> None:
-        """Make one control step.
-
-        Raises:
-            SimulationError: If it diverges.
-        """
+        """Make one control step."""
         with self._lock:
             self._scene.step()
             self.time += self._scene.control_step
@@ -221,19 +217,7 @@ class EmulatedSource(XHand1Source):
         timing: SerialTiming | None = None,
         lockstep: bool = False,
     ):
-        """Plug the hand in and open it.
-
-        Args:
-            body: The simulation, whose control step is the same.
-            control_step: Duration of one control step [s].
-            calibration: What its counts mean.
-            motion: Leave to move it; default: none.
-            timing: Times of the line; default: `PATIENT`.
-            lockstep: Whether the simulation waits for `step`, and makes one control step then; else it runs in real time.
-
-        Raises:
-            HandError: If the hand does not answer.
-        """
+        """Plug the hand in and open it; in lockstep the simulation makes a control step when stepped, else it runs in time."""
         self.body, self._is_lockstep, self._has_warned = body, lockstep, False
         with ExitStack() as opened:
             opened.callback(body.close)
