@@ -24,7 +24,7 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.simulators.memory import refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id
-from tgdsl.runtime.source import Simulator
+from tgdsl.runtime.simulators.simulation import Simulation
 
 PLACES = ("link", "body", "pos", "normal", "area")
 """Columns of `taxels.taxel_table` that a recording holds."""
@@ -102,7 +102,7 @@ def recorded_controls(path: Path) -> Controls:
     return controls.astype(np.float64)
 
 
-def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterator[Step]:
+def rollout(touch: TactileModule, sim: Simulation, controls: Controls) -> Iterator[Step]:
     """Step a scene through controls and yield the readings after each control step."""
     control_tensor(controls[0], sim.num_envs, sim.model.nu)
     for index, control in enumerate(controls):

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,6 +20,7 @@ from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
 from tgdsl.sensors.base import Kind
 from tgdsl.tensors.env_ids import broadcast_over
 from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.on_host import HostCopy
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 
 EVERY = 16
@@ -40,7 +40,7 @@ class StateWatch:
         ]
         self._said: set[str] = set()
         self._num_calls = 0
-        self._copies: dict[str, tuple[Tensor, torch.cuda.Event]] = {}
+        self._copies = {path: HostCopy() for path, *_ in self._watched}
 
     def look(self, memory: Mapping[str, Tensor]) -> None:
         """Look at what is remembered, and warn of what is new. What a GPU holds may be seen some calls later."""
@@ -48,31 +48,13 @@ class StateWatch:
             return
         self._num_calls += 1
         for path, sensor, rows, warn in self._watched:
-            shown = self._shown(path, memory[path])
-            for message in () if shown is None else warn(sensor.sensor, sensor.constants, rows, shown):
+            if memory[path].is_cuda and self._num_calls % EVERY != 1:
+                continue
+            largest = self._copies[path].poll(memory[path].detach().amax(dim=0))
+            for message in () if largest is None else warn(sensor.sensor, sensor.constants, rows, largest.numpy()):
                 if message not in self._said:
                     self._said.add(message)
                     warnings.warn(message, stacklevel=6)
-
-    def _shown(self, path: str, state: Tensor) -> np.ndarray | None:
-        """Return the largest numbers of all environments, on the host; None if they are not there yet."""
-        if state.device.type != "cuda":
-            return state.detach().amax(dim=0).numpy()
-        if torch.cuda.is_current_stream_capturing():
-            return None
-        last_copy = self._copies.get(path)
-        if last_copy is not None and last_copy[1].query():
-            del self._copies[path]
-            return last_copy[0].numpy()
-        if last_copy is None and self._num_calls % EVERY == 1:
-            with torch.inference_mode(False), torch.no_grad():
-                largest = state.amax(dim=0)
-                copy = torch.empty(largest.shape, dtype=largest.dtype, pin_memory=True)
-                copy.copy_(largest, non_blocking=True)
-            event = torch.cuda.Event()
-            event.record(torch.cuda.current_stream(state.device))
-            self._copies[path] = copy, event
-        return None
 
 
 WINDOW, KEPT = "history/", "kept/"

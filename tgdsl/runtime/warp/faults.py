@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tgdsl.errors import listed
 from tgdsl.runtime.simulators.faults import DIVERGED, NO_ROOM, EnvFaults
+from tgdsl.tensors.on_host import HostCopy
 
 POOLS = {
     0: "njmax={njmax} is too small in environments {envs}: constraints are left out, {nefc} were wanted last",
@@ -48,8 +49,7 @@ class Faults(EnvFaults):
         self._arrays = arrays
         self._peak = torch.zeros(len(arrays["qpos"]), dtype=torch.float32, device=device)
         self._counts: Int[Tensor, " count"] = torch.zeros(1 + len(self.totals), dtype=torch.int64, device=device)
-        self._seen = torch.zeros(self._counts.shape, dtype=torch.int64, pin_memory=device.type == "cuda")
-        self._copied: torch.cuda.Event | None = None
+        self._copy = HostCopy()
 
     def check_divergence(self) -> None:
         """Look for divergence after a physics step, on the device."""
@@ -74,15 +74,8 @@ class Faults(EnvFaults):
 
         A GPU is not waited for: there both are of an earlier call.
         """
-        if self._counts.device.type == "cpu":
-            first, *totals = self._counts.tolist()
-            return bool(first), totals
-        if self._copied is not None and not self._copied.query():
-            return False, []
-        first, *totals = self._seen.tolist() if self._copied is not None else [0]
-        self._copied = torch.cuda.Event()
-        self._seen.copy_(self._counts, non_blocking=True)
-        self._copied.record(torch.cuda.current_stream(self._counts.device))
+        counts = self._copy.poll(self._counts)
+        first, *totals = [0] if counts is None else counts.tolist()
         return bool(first), totals
 
     def message(self, sizes: Mapping[str, int]) -> str:
