@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -76,7 +76,7 @@ class _Motion(Quantity):
         return {"body_pos", "body_quat", "body_linvel", "body_angvel"}
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(link.body for link in use.links))
+        return use.bodies
 
     def explain(self, part: MotionPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
         return ["poses and velocities of its links"]
@@ -146,23 +146,17 @@ class _Places(Quantity):
 class JointDrive(NamedTuple):
     """How a sensor's joints move and are driven, in the order of its layout's links; planes (env, joint).
 
+    The reference's are arrays (joint,), its places (joint, 3).
+
     Attributes:
         velocity: Velocity ω [rad/s; slides: m/s].
         effort: What the actuators exert τ [N·m; slides: N].
         place: Where the joint's anchor is in the world [m], in the dtype of the state.
     """
 
-    velocity: Float[Tensor, "env joint"]
-    effort: Float[Tensor, "env joint"]
-    place: Vec
-
-
-class ReferenceDrive(NamedTuple):
-    """`JointDrive` of one environment."""
-
-    velocity: Float[np.ndarray, " joint"]
-    effort: Float[np.ndarray, " joint"]
-    place: Float[np.ndarray, "joint 3"]
+    velocity: Any
+    effort: Any
+    place: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,16 +201,16 @@ class _Joints(Quantity):
             values.append(JointDrive(velocity, effort, _places(scene, use.bodies, use.anchor)))
         return tuple(values)
 
-    def reference(self, part: JointsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceDrive:
+    def reference(self, part: JointsPart[np.ndarray], use: int, scene: ReferenceScene) -> JointDrive:
         use_part = part.uses[use]
         velocity, effort = (scene.fields[name][use_part.joints] for name in ("joint_vel", "joint_effort"))
-        return ReferenceDrive(velocity, effort, _reference_places(scene, use_part.bodies, use_part.anchor))
+        return JointDrive(velocity, effort, _reference_places(scene, use_part.bodies, use_part.anchor))
 
     def fields(self, part: JointsPart) -> set[str]:
         return {"body_pos", "body_quat", "joint_vel", "joint_effort"}
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(link.body for link in use.links))
+        return use.bodies
 
     def explain(self, part: JointsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
         return ["velocity, effort and place of its joints"]

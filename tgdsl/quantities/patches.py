@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
-from tgdsl.quantities.contacts import SLOT_FIELDS, completed, is_counted
+from tgdsl.quantities.contacts import SLOT_FIELDS, is_counted, reference_contacts
 from tgdsl.quantities.pairs import Pair, PairedObject
 from tgdsl.quantities.patch import CONTACT_PATCH, Contacts, Sides, cancelled
 from tgdsl.quantities.reference import ReferenceScene
@@ -404,7 +404,7 @@ def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
 def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
     assert isinstance(use.request, ContactPatches)
     names = use.request.objects
-    bodies = tuple(dict.fromkeys(link.body for link in use.links))
+    bodies = use.bodies
     heats = [heat for name in names if (heat := planning.sensed[name].heat) is not None]
     objects = [next((target for target in planning.objects if target.name == name), None) for name in names]
     gate = {pair: i for i, pair in enumerate(planning.contact_pairs)}
@@ -599,9 +599,8 @@ class ReferencePatches:
 def _reference_patch(scene: ReferenceScene, b: int, name: str, pair: int, is_star: bool) -> ReferencePatch | None:
     link = scene.body(scene.layout.bodies[b])
     target = scene.object_body(next(each for each in scene.objects if each.name == name))
-    slots = zip(*(scene.fields[field][pair] for field in SLOT_FIELDS), strict=True)
-    used = completed([list(row) for row in slots if np.any(row[1:])], scene.fields["contact_netforce"][pair])
-    pressing = [(pos, float(force @ normal), normal) for pos, force, _, normal in used if not force @ normal <= 0]
+    contacts = reference_contacts(scene, pair)
+    pressing = [(pos, float(force @ normal), normal) for pos, force, _, normal in contacts if not force @ normal <= 0]
     if not pressing:
         return None
     weights = np.array([force for _, force, _ in pressing])
@@ -682,7 +681,7 @@ class _Patches(Quantity):
         return fields
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(link.body for link in use.links)) if use.request.objects else ()
+        return use.bodies if use.request.objects else ()
 
     def num_rows(self, part: PatchesPart, use: int) -> int:
         cells = part.uses[use].topology.cells
