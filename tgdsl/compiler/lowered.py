@@ -12,7 +12,6 @@ import numpy as np
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, TgdslError, did_you_mean, listed
-from tgdsl.fields.accuracy import Bound
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout, Link
@@ -367,17 +366,15 @@ def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
         if key and key not in units:
             loaded.note(path, f'the reading has no quantity "{key}"', did_you_mean(key, units, "quantities"), on_key=True)
         wrong = [
-            quantity for quantity in ([key] if key in units else [] if key else units) if not _is_of(bound, units[quantity])
+            quantity
+            for quantity in ([key] if key in units else [] if key else units)
+            if bound.unit not in ("", units[quantity])
         ]
         if wrong:
             loaded.note(path, f'"{bound.text}" is in {bound.unit}, and the reading has {quantities}', _hint(units))
     missing = [quantity for quantity in units if accuracy.of(quantity) is None]
     if missing:
         loaded.note(at, f"nothing is said of {listed(missing)}, which the reading has too", "expected a bound of each quantity")
-
-
-def _is_of(bound: Bound, unit: str) -> bool:
-    return not bound.unit or bound.unit == unit
 
 
 def _hint(units: Mapping[str, str]) -> str:

@@ -136,7 +136,7 @@ def contacts_of(
         none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
         vectors = [(none, none, none)] * 4
     else:
-        contacts = pair_contacts(state, index)
+        contacts = pair_contacts(state, index, has_torque=True)
         assert contacts.torque is not None
         fields = (contacts.pos, contacts.force, contacts.torque, contacts.normal)
         pos, force, torque, normal = (planes.vec(part.flatten(2) for part in vector) for vector in fields)
@@ -159,7 +159,7 @@ class PairContacts(NamedTuple):
     Attributes:
         pos: Contact points [m].
         force: Force on the body at each [N], what the slots lack of each pair's whole force shared out.
-        torque: Torque on the body at each [N·m]; None if the state has none.
+        torque: Torque on the body at each [N·m]; None if it was not asked for.
         normal: Unit normal out of the object; NaN where the state has a force without one.
         is_used: Which slots are contacts.
     """
@@ -171,12 +171,11 @@ class PairContacts(NamedTuple):
     is_used: Bool[Tensor, "env body object slot"]
 
 
-def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]) -> PairContacts:
-    """Return the contacts of bodies and objects where they are."""
-    pos, force, torque, normal = (
-        planes.split(_of_pairs(state[name], index)) if name in state else None for name in SLOT_FIELDS
-    )
-    assert pos is not None and force is not None and normal is not None
+def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"], has_torque: bool = False) -> PairContacts:
+    """Return the contacts of bodies and objects where they are; without torques one that has nothing else is none."""
+    names = ("contact_pos", "contact_force", "contact_normal", *(["contact_torque"] if has_torque else []))
+    pos, force, normal, *rest = (planes.split(_of_pairs(state[name], index)) for name in names)
+    torque = rest[0] if rest else None
     is_used = _is_any((*force, *(torque or ()), *normal))
     whole = planes.split(_of_pairs(state["contact_netforce"], index))
     is_missing = is_used & (planes.dot(normal, normal) == 0)

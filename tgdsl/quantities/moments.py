@@ -474,11 +474,11 @@ def _fields(
         is_smooth=request.gradient_tolerance is not None,
     )
     pairs = zip(baked, [*radii] * len(variants), strict=True)
-    return table, [{**_measured(field.errors), "radius": radius, "cell": field.cell} for field, radius in pairs]
-
-
-def _measured(errors: Any) -> dict[str, float]:
-    return {name: value for name, value in dataclasses.asdict(errors).items() if value is not None}
+    accuracy: list[Mapping[str, float]] = []
+    for field, radius in pairs:
+        measured = {name: value for name, value in dataclasses.asdict(field.errors).items() if value is not None}
+        accuracy.append({**measured, "radius": radius, "cell": field.cell})
+    return table, accuracy
 
 
 def _clouds(variants: Solid, request: MomentsRequest, radius: float, radius_noise: float) -> CloudTable[np.ndarray]:

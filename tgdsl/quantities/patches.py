@@ -419,7 +419,8 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
         ]
         return np.array(rows, dtype=np.int64).reshape(len(bodies), len(names))
 
-    choices, variants = (max([len(options) for options in part] + [1]) for part in _parts(heats))
+    choices = max([len(heat.materials) for heat in heats] + [1])
+    variants = max([len(heat.volume) for heat in heats] + [1])
     return PatchesUse(
         topology=topology,
         is_star=use.request.is_star,
@@ -430,7 +431,9 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
         start=np.array([heat.temperature or 0.0 for heat in heats]),
         has_start=np.array([float(heat.temperature is not None) for heat in heats]),
         materials=np.array([_padded([_thermal(m) for m in heat.materials], choices) for heat in heats]).reshape(-1, choices, 4),
-        shapes=np.array([_padded(_shapes(heat), variants) for heat in heats]).reshape(-1, variants, 3),
+        shapes=np.array(
+            [_padded(np.stack([heat.volume, heat.area, heat.curvature], axis=1).tolist(), variants) for heat in heats]
+        ).reshape(-1, variants, 3),
         grids=np.array([_grid(heat) for heat in heats]).reshape(-1, 2, 3),
         variants=tuple(-1 if target is None or target.num_variants == 1 else target.varied for target in objects),
         heated=tuple(_place(planning, name, heat) for name, heat in zip(names, heats, strict=True)),
@@ -463,18 +466,10 @@ def _place(planning: Planning, name: str, heat: ObjectHeat) -> int:
     return planning.heated.index(name) if is_told and name in planning.heated else -1
 
 
-def _parts(heats: Sequence[ObjectHeat]) -> tuple[list, list]:
-    return [heat.materials for heat in heats], [heat.volume for heat in heats]
-
-
 def _thermal(material) -> list[float]:  # type: ignore[no-untyped-def]
     modulus, ratio = material.youngs_modulus, material.poissons_ratio
     compliance = 0.0 if modulus is None else (1.0 - (ratio or 0.0) ** 2) / modulus
     return [material.conductivity, material.density * material.specific_heat, material.emissivity, compliance]
-
-
-def _shapes(heat: ObjectHeat) -> list[list[float]]:
-    return [[float(v) for v in row] for row in zip(heat.volume, heat.area, heat.curvature, strict=True)]
 
 
 def _grid(heat: ObjectHeat) -> list[np.ndarray]:
@@ -509,21 +504,11 @@ def _patches(use: PatchesUse[Tensor], scene: Scene) -> ContactPatch:
     force, area, centre, normal = CONTACT_PATCH(Contacts(*(tensors[name] for name in FIELDS)), sides, scene.dtype)
     seen: tuple[Vec | None, Vec | None] = None, None
     if use.topology.interfaces:
-        seen = _as_objects_see(use, scene, centre, normal)
+        assert scene.pairs is not None
+        rotation = planes.rot(pad(part, (0, 1))[:, use.relations] for part in scene.pairs.rotation)
+        offset = planes.vec(pad(part, (0, 1))[:, use.relations] for part in scene.pairs.offset)
+        seen = planes.add(planes.rotate(rotation, centre), offset), planes.rotate(rotation, normal)
     return ContactPatch(force, area, centre, normal, *seen, objects, use.topology, use.sides, cells, boxes)
-
-
-def _as_objects_see(use: PatchesUse[Tensor], scene: Scene, centre: Vec, normal: Vec) -> tuple[Vec, Vec]:
-    """Return centres and normals in the frames of the objects."""
-    assert scene.pairs is not None
-
-    rotation = planes.rot(_pairs_of(use.relations, part) for part in scene.pairs.rotation)
-    offset = planes.vec(_pairs_of(use.relations, part) for part in scene.pairs.offset)
-    return planes.add(planes.rotate(rotation, centre), offset), planes.rotate(rotation, normal)
-
-
-def _pairs_of(relations: Tensor, plane: Tensor) -> Tensor:
-    return pad(plane, (0, 1))[:, relations]
 
 
 def _objects(use: PatchesUse[Tensor], scene: Scene) -> HeatOfObjects:

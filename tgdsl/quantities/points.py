@@ -19,7 +19,6 @@ from tgdsl.errors import BakeError, LowerError
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec, vec
-from tgdsl.layout.layout import Link
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use, pairs_for, variant_of
 from tgdsl.quantities.geoms import Geoms, GeomTable, account_of_geoms, body_distance, distance_to, geoms_of, link_geoms, united
 from tgdsl.quantities.pairs import Pair, PairedObject, Pairs
@@ -383,25 +382,16 @@ def _links(planning: Planning, uses: Sequence[Use]) -> dict[str, list[Any]]:
                 continue
             planning.progress(f"link {link.name}: distances")
             try:
-                margin = _margin(planning, link, uses)
+                users = [other for other in uses if link in other.links]
+                # Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
+                radii = [planning.layout.radius[other.taxels].max() for other in users]
+                margin = float(max([*radii, *(_request(other).range for other in users)]))
                 geoms = planning.geoms_of(link.name)
                 result[link.name] = [geom_distance(geom, LINKS, margin, f"link {link.name}") for geom in geoms]
             except BakeError as error:
                 place = ("sensors", use.sensors[0], "links")
                 planning.report(place, f'link "{link.name}": {error}', "or use `anchors: taxels`")
     return result
-
-
-def _margin(planning: Planning, link: Link, uses: Sequence[Use]) -> float:
-    """Return the largest distance from a link's own surface that any sensor on it asks for [m].
-
-    Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
-    """
-    results = []
-    for use in uses:
-        if link in use.links:
-            results += [_request(use).range, float(planning.layout.radius[use.taxels].max())]
-    return max(results)
 
 
 def _use(planning: Planning, use: Use, clouds: dict[tuple[int, str], int], links: Sequence[str]) -> PointsUse[np.ndarray]:

@@ -104,16 +104,14 @@ def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
         channels = np.array([channel_index.get(channel, -1) for channel in one.channels])
     samples, more = (output.shape[0] if len(output.shape) > 2 else 1 for output in (one, two))
     if samples == more:
-        return Common(None, there if there is None else _repeated(there, samples, two.shape[-2]), channels)
+        width = two.shape[-2]
+        rows_there = None if there is None else [k * width + at for k in range(samples) for at in there]
+        return Common(None, rows_there, channels)
     times = [(k, (k + 1) * more // samples - 1) for k in range(samples) if (k + 1) * more % samples == 0]
     rows, width = one.shape[-2], two.shape[-2]
     alone = [np.array([row]) for row in range(rows)] if there is None else there
     here = np.concatenate([k * rows + np.arange(rows) for k, _ in times])
     return Common(here, [j * width + at for _, j in times for at in alone], channels)
-
-
-def _repeated(there: Sequence[np.ndarray], samples: int, width: int) -> list[np.ndarray]:
-    return [k * width + at for k in range(samples) for at in there]
 
 
 def _rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np.ndarray, " row"]] | None:

@@ -44,7 +44,9 @@ class BatchProperties(ObjectProperties):
         self._batch = batch
         self._fields: dict[str, Array] = {}
         self._chosen = [model] * batch.nsim
-        self._models = list(self._chosen) if is_open or any(_shared(_differing(model, other)) for other in variants) else None
+        differ = {name for other in variants for name in _differing(model, other)}
+        is_apart = is_open or bool(differ - set(mujoco.batch.MODEL_FIELDS))  # in what cannot be expanded
+        self._models = list(self._chosen) if is_apart else None
         self._is_derived = False
 
     def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
@@ -140,7 +142,3 @@ class BatchProperties(ObjectProperties):
 def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
     names = [name for name in dir(one) if isinstance(getattr(one, name), Array)]
     return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
-
-
-def _shared(fields: Sequence[str]) -> list[str]:
-    return [name for name in fields if name not in mujoco.batch.MODEL_FIELDS]

@@ -52,7 +52,9 @@ class Sweep:
         self.movement, self.model, self.body = movement, movement.model, body
         self.data = mujoco.MjData(self.model)
         self.is_free = int(self.model.body_dofnum[body]) == 6 and int(self.model.body_jntnum[body]) == 1
-        self.object_geoms = [geom for b in self._rigid(body) for geom in self._touchable(b)]
+        weld = self.model.body_weldid
+        rigid = [b for b in range(self.model.nbody) if weld[b] == weld[body] and body in (*movement.path(b), 0)]
+        self.object_geoms = [geom for b in rigid for geom in self._touchable(b)]
         self.hand_geoms = [geom for b in sorted(movement.hand) for geom in self._touchable(b)]
         self._posed(0.0)
         offsets = [self.data.geom_xpos[geom] - self.data.xpos[body] for geom in self.object_geoms]
@@ -88,7 +90,8 @@ class Sweep:
             middle = self.data.xpos[self.body] + self.data.xmat[self.body].reshape(3, 3) @ self.middle
             for geom in self.hand_geoms:
                 link = int(self.model.geom_bodyid[geom])
-                if link in sides or (share > 0 and self._is_far(geom, middle)):
+                away = np.linalg.norm(self.data.geom_xpos[geom] - middle) - self.model.geom_rbound[geom]
+                if link in sides or (share > 0 and away > self.radius):
                     continue
                 gap, point = self._gap(geom)
                 overlap = max(overlap, -gap) if share == 0 else overlap
@@ -115,10 +118,6 @@ class Sweep:
         geoms = self._touchable(body)
         return np.mean(self.data.geom_xpos[geoms], axis=0) if geoms else self.data.xpos[body]
 
-    def _is_far(self, geom: int, middle: Float[np.ndarray, " 3"]) -> bool:
-        gap = np.linalg.norm(self.data.geom_xpos[geom] - middle) - self.model.geom_rbound[geom] - self.radius
-        return bool(gap > 0)
-
     def _gap(self, geom: int) -> tuple[float, Float[np.ndarray, " 3"]]:
         """Return the distance of a geom from the object [m], and the object's nearest point."""
         best, point, ends = 1.0, np.zeros(3), np.zeros(6)
@@ -134,13 +133,6 @@ class Sweep:
             address = int(self.model.jnt_qposadr[self.model.body_jntadr[self.body]])
             self.data.qpos[address : address + 3] = origin
         mujoco.mj_kinematics(self.model, self.data)
-
-    def _rigid(self, body: int) -> list[int]:
-        model = self.model
-        return [b for b in range(model.nbody) if model.body_weldid[b] == model.body_weldid[body] and body in self._above(b)]
-
-    def _above(self, body: int) -> list[int]:
-        return [*self.movement.path(body), 0]
 
     def _touchable(self, body: int) -> list[int]:
         first, num = int(self.model.body_geomadr[body]), int(self.model.body_geomnum[body])

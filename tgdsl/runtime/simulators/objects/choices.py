@@ -74,7 +74,9 @@ class EnvObjects:
         """Say what objects are like in some environments: see `Simulation.set_objects`."""
         chosen = [dict(self._choices[env]) for env in ids]
         for name, value in variants.items():
-            for choices, variant in zip(chosen, self._variants(name, value, len(ids)), strict=True):
+            self._check_known(name)
+            numbers = checked_numbers(f"variants of object {name}", value, len(ids), self._num_variants[name])
+            for choices, variant in zip(chosen, numbers, strict=True):
                 choices[name] = Choice(int(variant))
         for name, value in sizes.items():
             for choices, size in zip(chosen, self._sizes(name, value, len(ids)), strict=True):
@@ -105,17 +107,13 @@ class EnvObjects:
     def _size(self, name: str, choice: Choice) -> tuple[float, float, float]:
         return self.scenes.size(name, choice) if self.scenes.objects[name].is_sized else (0.0, 0.0, 0.0)
 
-    def _known(self, name: str) -> None:
+    def _check_known(self, name: str) -> None:
         if name not in self._num_variants:
             hint = did_you_mean(name, self._num_variants, "objects that do")
             raise SimulationError(f'no object "{name}" differs between environments; {hint}')
 
-    def _variants(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
-        self._known(name)
-        return checked_numbers(f"variants of object {name}", value, count, self._num_variants[name])
-
     def _sizes(self, name: str, value: Values, count: int) -> Float[np.ndarray, "n size"]:
-        self._known(name)
+        self._check_known(name)
         if not self.scenes.objects[name].is_sized:
             raise SimulationError(f"the size of object {name} is fixed; the document frees it with `size: per_env`")
         result = np.atleast_1d(np.asarray(value, dtype=np.float64))

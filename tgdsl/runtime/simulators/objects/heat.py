@@ -62,7 +62,11 @@ class EnvHeat:
     ) -> dict[tuple[str, int], np.ndarray]:
         """Return, checked, what `write` writes: see `Simulation.set_objects`."""
         result = {("temperature", self._column(name)): self._degrees(name, v, len(ids)) for name, v in temperatures.items()}
-        return result | {("material", self._column(name)): self._materials(name, v, len(ids)) for name, v in materials.items()}
+        for name, value in materials.items():
+            column = self._column(name)
+            numbers = checked_numbers(f"materials of object {name}", value, len(ids), self._num_materials[column])
+            result["material", column] = numbers
+        return result
 
     def write(self, ids: Int[np.ndarray, " n"], chosen: Mapping[tuple[str, int], np.ndarray]) -> None:
         """Write what was chosen for some environments, in place."""
@@ -88,6 +92,3 @@ class EnvHeat:
             expected = f"{count} numbers of at least {COLDEST} °C"
             raise SimulationError(f"temperatures of object {name}: expected {expected}, found {value}")
         return np.broadcast_to(degrees, count).copy()
-
-    def _materials(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
-        return checked_numbers(f"materials of object {name}", value, count, self._num_materials[self._column(name)])
