@@ -6,30 +6,116 @@ Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row, 
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, listed
-from tgdsl.module.gathering import Tree, gather, gathered_of, scene_of
 from tgdsl.module.memory.clock import Clock
 from tgdsl.module.memory.history import pushed, reduced
 from tgdsl.module.memory.memory import WINDOW
+from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
-from tgdsl.quantities.base import Gathered, Quantity
+from tgdsl.quantities.base import Gathered, Quantity, Scene
 from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
 from tgdsl.sensors.base import UNTIMED, Context, Kind
 from tgdsl.sensors.noise.gain import GAIN
+from tgdsl.sensors.noise.radius import RADIUS
 from tgdsl.sensors.noise.release import RELEASE
 from tgdsl.sensors.noise.stage import NO_CLOCK, Now
 from tgdsl.sensors.noise.stages import AnyStage, Drawn, disturb, draw
 from tgdsl.sensors.upstream import Upstream
 from tgdsl.tensors.fusion import materialised
+
+Tree = Mapping[str, Any]
+"""What `parts` returns, with tensors for arrays."""
+
+
+def parts(plan: Plan) -> dict[str, Any]:
+    """Return what of a plan is read at run time, its arrays being a module's constants."""
+    return {
+        "pairs": plan.pairs,
+        "quantities": plan.quantities,
+        "sensors": {sensor.name: sensor.constants for sensor in plan.sensors},
+        "noise": {sensor.name: sensor.noise.constants for sensor in plan.sensors if sensor.noise is not None},
+        "observations": {term.key: term.constants for term in plan.observations},
+    }
+
+
+def constant_arrays(plan: Plan) -> dict[str, np.ndarray]:
+    """Return the arrays of these parts, by the names that the plan gives them."""
+    names, result = {id(array): name for name, array in plan.arrays.items()}, {}
+    tree.mapped(parts(plan), lambda array: result.setdefault(names[id(array)], array), _stays_on_host)
+    return result
+
+
+def bind(plan: Plan, kinds: Mapping[str, Kind], tensor_of: Callable[[str], Tensor]) -> Tree:
+    """Return these parts with a tensor in the place of each array, and constants as the kind of each sensor has them."""
+    names = {id(array): name for name, array in plan.arrays.items()}
+    bound = tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]), _is_prepared)
+    return {**bound, "sensors": {name: kinds[name].typed(constants) for name, constants in bound["sensors"].items()}}
+
+
+def _stays_on_host(record: Any) -> bool:
+    """Return whether a part of the plan is no constant of a module, but the source of one."""
+    return getattr(record, "stays_on_host", False)
+
+
+def _is_prepared(record: Any) -> bool:
+    """Return the same, after making now what is made of it: no compiler traces that."""
+    return _stays_on_host(record) and record.prepared is not None
+
+
+def scene_of(
+    plan: Plan,
+    own: Tree,
+    tensors: Mapping[str, Tensor],
+    nows: Mapping[str, Now],
+    drawn: Mapping[str, Drawn],
+    dtype: torch.dtype,
+) -> Scene:
+    """Return what quantities are gathered from; drawn values of noise may disturb the taxels' radii."""
+    shifts = {}
+    for sensor in plan.sensors:
+        if sensor.noise is not None and RADIUS.name in sensor.noise.terms:
+            values = drawn[sensor.name][RADIUS.name]
+            probes = values.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
+            shifts[sensor.name] = RADIUS.shift(values, nows[sensor.name], probes)
+    return Scene(tensors, plan.objects, _pairs(own["pairs"], tensors, dtype) if plan.objects else None, shifts, dtype)
+
+
+def gather(quantities: Sequence[Quantity], own: Tree, scene: Scene) -> dict[str, tuple[Any, ...]]:
+    """Return the values of all uses of each quantity, by its name."""
+    values_of = {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
+    for name, values in values_of.items():
+        if not isinstance(values, (tuple, list)):
+            problem = f"expected a tuple with a value for each use, found {type(values).__name__}"
+            raise TgdslError(f'`gather` of the quantity "{name}": {problem}')
+    return values_of
+
+
+def gathered_of(sensor: PlannedSensor, quantities: Sequence[Quantity], values: Mapping[str, tuple[Any, ...]]) -> Gathered:
+    """Return what a sensor asked for."""
+    used = [quantity for quantity in quantities if quantity.name in sensor.uses]
+    for name in (quantity.name for quantity in used):
+        if sensor.uses[name] >= len(values[name]):
+            problem = f'{len(values[name])} values, and sensor "{sensor.name}" has use {sensor.uses[name]} (from 0)'
+            raise TgdslError(f'`gather` of the quantity "{name}" returns {problem}; expected one for each use')
+    return Gathered({quantity.request: values[quantity.name][sensor.uses[quantity.name]] for quantity in used})
+
+
+def _pairs(table: PairTable[Tensor], tensors: Mapping[str, Tensor], dtype: torch.dtype) -> Pairs:
+    gate = gates(tensors["contact_found"], table.gate, dtype) if "contact_found" in tensors else None
+    motion = tensors.get("body_linvel"), tensors.get("body_angvel")
+    return relate(tensors["body_pos"], tensors["body_quat"], table.link, table.object, dtype, *motion, gate)
+
 
 Tensors = dict[str, Tensor]
 

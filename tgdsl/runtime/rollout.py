@@ -22,7 +22,7 @@ from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.controls import control_tensor
-from tgdsl.runtime.simulators.memory import refuse_beyond_memory
+from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.simulation import Simulation
 

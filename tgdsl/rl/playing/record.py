@@ -15,7 +15,7 @@ from torch import Tensor
 from tgdsl.files.write import atomic_open
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.play import Played, poses_of
-from tgdsl.runtime.simulators.memory import refuse_beyond_memory
+from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 
 
 class Record:

@@ -27,8 +27,7 @@ from tgdsl.runtime.controls import warn_of_range, write_controls
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults, OnFault
 from tgdsl.runtime.simulators.fields import warn_of_mocap
 from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
-from tgdsl.runtime.simulators.objects.choices import EnvObjects, SharedMeshModels, Values
-from tgdsl.runtime.simulators.objects.heat import EnvHeat
+from tgdsl.runtime.simulators.objects.choices import EnvHeat, EnvObjects, SharedMeshModels, Values
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable, StateValues
