@@ -141,7 +141,6 @@ class SimulationConnection(Connection):
         self._touch, self._scene = touch, source
 
     def read(self) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the observation groups of the state."""
         scene = self._scene
         return self._touch.observe(scene.readings if isinstance(scene, SteppedScene) else self._touch(scene.state()))
 

@@ -40,12 +40,10 @@ class SteppedScene:
 
     @property
     def num_envs(self) -> int:
-        """One."""
         return 1
 
     @property
     def control_step(self) -> float:
-        """Duration of one control step [s]."""
         return self.sim.control_step
 
     def put(self, actuators: Int[np.ndarray, " n"], setpoints: Float[np.ndarray, " n"]) -> None:

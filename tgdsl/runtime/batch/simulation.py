@@ -88,12 +88,10 @@ class BatchProperties(ObjectProperties):
             self._batch.set_const(np.array(changed))
 
     def fields(self) -> dict[str, Tensor]:
-        """Return the fields that differ: see `ObjectProperties.fields`."""
         names = list(self._fields) if self._models is None else list(_DERIVED_FROM)
         return {name: self._values(name) for name in names}
 
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        """Set the fields that differ: see `ObjectProperties.set_fields`."""
         names = [name for name in fields if name in mujoco.batch.MODEL_FIELDS]
         refuse_other_fields(fields, {name: self._values(name) for name in names})
         changed = set()
@@ -386,11 +384,9 @@ class BatchSimulation(Simulation):
     _reader: BatchReader
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return where all bodies are in one environment: see `Simulation.body_poses`."""
         return self.batch.xpos[env], self.batch.xquat[env]
 
     def env_model(self, env: int) -> mujoco.MjModel:
-        """Return the model of one environment."""
         return self.batch.get_model(env)
 
     def read(self, env_ids: EnvIds | None = None) -> dict[str, torch.Tensor]:
@@ -438,8 +434,7 @@ class BatchSimulation(Simulation):
         self._readers.append(BatchReader(inputs, self.model, self.batch))
         return self._readers[-1]
 
-    def _refresh(self) -> None:
-        """Do nothing: environments are evaluated at once."""
+    def _refresh(self) -> None: ...
 
     def _use_objects(self, objects: EnvObjects) -> None:
         models = objects.models()

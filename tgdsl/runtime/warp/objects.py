@@ -165,11 +165,9 @@ class WorldProperties(ObjectProperties):
                 value.copy_(array[:, columns])
 
     def fields(self) -> dict[str, Tensor]:
-        """Return the fields that differ: see `ObjectProperties.fields`."""
         return dict(self._fields)
 
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        """Set the fields that differ: see `ObjectProperties.set_fields`."""
         refuse_other_fields(fields, self._fields)
         for name, value in fields.items():
             self._fields[name].copy_(value)

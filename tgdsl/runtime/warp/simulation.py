@@ -212,7 +212,6 @@ class WarpSimulation(Simulation):
         return readings
 
     def repeated(self, body: Callable[[], T]) -> Callable[[], T]:
-        """Return work that is done again and again, such as a whole step of an environment: see `Simulation.repeated`."""
         call = GraphedCall(self._stream, body)
         placed: tuple[Bool[Tensor, " env"] | None, dict[str, Tensor]] = (None, {})
 
@@ -231,7 +230,6 @@ class WarpSimulation(Simulation):
         return done
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
-        """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
         self._refresh()
         pos, quat = (self.arrays[name][env].double().cpu().numpy() for name in ("xpos", "xquat"))
         return pos, quat

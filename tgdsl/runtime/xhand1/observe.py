@@ -133,16 +133,13 @@ class HandConnection(Connection):
 
     @property
     def is_over(self) -> bool:
-        """Whether a log is at its end."""
         return self._hand.is_over
 
     @property
     def age_s(self) -> float | None:
-        """How old what the hand said is at most, now [s]."""
         return self._hand.age_s
 
     def read(self) -> dict[str, Float[Tensor, "env feature"]]:
-        """Observe what the hand said at the end of the last step."""
         return self._observer.observe(self._hand.sample())
 
     def send(self, control: Control) -> None:
@@ -163,16 +160,13 @@ class HandConnection(Connection):
         self._observer.note(control)
 
     def restart(self, env_ids: EnvIds | None) -> None:
-        """Reset the hand, and forget its past."""
         self._hand.reset(env_ids)
         self._observer.reset()
 
     def concerns(self, env_ids: EnvIds) -> bool:
-        """Return whether the one environment is among these."""
         return is_chosen(env_ids)
 
     def resume(self) -> None:
-        """Let a hand move again after an error made it passive."""
         self._hand.resume()
 
 

@@ -236,7 +236,6 @@ class XHand1Source(HandSource):
 
     @property
     def control_step(self) -> float:
-        """Duration of one control step [s]."""
         return self._control_step
 
     def step(self, control: Control = None) -> None:
@@ -268,19 +267,12 @@ class XHand1Source(HandSource):
 
     @property
     def age_s(self) -> float | None:
-        """How old the sample is at most, now [s]."""
         return self.sample().reading.age_s()
 
     def resume(self) -> None:
-        """Let a hand move again after an error made it passive."""
         self.hand.resume()
 
     def close(self) -> None:
-        """Close the hand.
-
-        Raises:
-            HandError: If it was moving and did not confirm that it is passive.
-        """
         self.hand.close()
 
     def _restart(self) -> None:

@@ -79,11 +79,9 @@ class Body(Protocol):
 class StillBody:
     """Joints that stay at zero, and fingertips that feel nothing."""
 
-    def command(self, time_s: float, joints: Sequence[JointCommand]) -> None:
-        """Move nothing."""
+    def command(self, time_s: float, joints: Sequence[JointCommand]) -> None: ...
 
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
-        """Return zeros."""
         return np.zeros(NUM_JOINTS), TipForces.zero()
 
 

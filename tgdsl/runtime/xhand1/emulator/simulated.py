@@ -142,7 +142,6 @@ class SimulatedBody:
             self._joints = tuple(joints)
 
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
-        """Return angles and counts after the last step."""
         with self._lock:
             return self._position.copy(), replace(TipForces.zero(), total=self._counts)
 
@@ -251,7 +250,6 @@ class EmulatedSource(XHand1Source):
             warnings.warn(f"{problem}; see the calibration's scale and rotation", stacklevel=2)
 
     def close(self) -> None:
-        """Close the hand, pull the plug and end the simulation."""
         self._opened.close()
 
     def _restart(self) -> None:

@@ -133,7 +133,6 @@ class ReplaySource(HandSource):
         self._take(0)
 
     def close(self) -> None:
-        """Release the file."""
         self._readings = iter(())
         self._now = self._end
         self._next_reading, self._next_fault = self.log.num_readings, len(self.log.faults)
