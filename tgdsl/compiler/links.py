@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 
 from tgdsl.compiler.sensed import Report, contact_parts
 from tgdsl.errors import did_you_mean
@@ -50,23 +50,18 @@ def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) 
     return hits
 
 
-def joints_chosen(loaded: Loaded, path: Path, patterns: Sequence[str] | None, own: RobotJoints) -> tuple[str, ...]:
-    """Return the joints of some patterns, of the list at `path`, each once and in their order; default: the actuated ones."""
-    selected: dict[str, None] = {}
-    if patterns is None:
-        selected = dict.fromkeys(own.joints[: own.num_actuated])
-    for k, pattern in enumerate(patterns or ()):
-        selected |= dict.fromkeys(joints_matching(loaded, (*path, k), pattern, own))
-    return tuple(selected)
-
-
 def sensor_joints(loaded: Loaded, own: RobotJoints) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield each sensor that is on joints, and these; that there are none, or nameless ones, is noted."""
     for name, spec in loaded.spec.sensors.items():
         if not isinstance(spec, OnJointsSpec):
             continue
         num_problems = len(loaded.problems)
-        selected = joints_chosen(loaded, ("sensors", name, "joints"), spec.joints, own)
+        path: Path = ("sensors", name, "joints")
+        if spec.joints is None:
+            selected = own.joints[: own.num_actuated]
+        else:
+            hits = [joints_matching(loaded, (*path, k), pattern, own) for k, pattern in enumerate(spec.joints)]
+            selected = tuple(dict.fromkeys(joint for joints in hits for joint in joints))
         if len(loaded.problems) == num_problems and not selected:
             problem, hint = "the robot has no actuated joints", 'name them: joints: ["*"]' if own.joints else ""
             loaded.note(("sensors", name), problem, hint)

@@ -50,13 +50,6 @@ def names_of(robot: Model) -> list[list[str]]:
     return [[body] for body in robot.bodies] + [[*geom.names, geom.body] for geom in robot.geoms if geom.names]
 
 
-def check_groups(layout: LoadedLayout, robot: Model, problems: list[Problem]) -> None:
-    """Note the patterns of groups that match nothing."""
-    for group, selection in layout.spec.groups.items():
-        path: Path = ("groups", group)
-        select(selection, names_of(robot), layout.spec.groups, reporter(layout, path, problems), group)
-
-
 def reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:
     """Return a function that notes what is wrong with a pattern, at the place where the pattern stands.
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.compiler.links import LinkBodies, check_named_bodies, link_bodies, sensor_joints
-from tgdsl.compiler.patches import Patch, Pools, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
+from tgdsl.compiler.patches import Patch, Pools, check_regions, matched, names_of, patches_of, reporter, sampled
 from tgdsl.compiler.sensed import sensed_object
 from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.console.progress import Progress, silent
@@ -191,11 +191,6 @@ class Resolved:
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 
-    def moved_by(self, joint: str) -> str:
-        """Return the body that a joint moves."""
-        model = self.scene.compiled
-        return model.body(model.jnt_bodyid[model.joint(joint).id]).name
-
     def anchor_of(self, joint: str) -> Float[np.ndarray, " 3"]:
         """Return where a joint's anchor is in the frame of the body that it moves [m]."""
         return self.scene.compiled.jnt_pos[self.scene.compiled.joint(joint).id].copy()
@@ -226,7 +221,9 @@ class Resolved:
         names = self.links[sensor]
         if sensor in self.on_links:
             joints = self.on_joints.get(sensor, ())
-            links = (*(Link(name, name) for name in names), *(Link(name, self.moved_by(name)) for name in joints))
+            model = self.scene.compiled
+            moved = [model.body(model.jnt_bodyid[model.joint(joint).id]).name for joint in joints]
+            links = (*(Link(name, name) for name in names), *map(Link, joints, moved))
             return np.zeros(0, dtype=np.int64), Layout.of_links(links, self.layout.groups)
         taxels = self.layout.taxels_of(names)
         return taxels, self.layout.take(taxels)
@@ -253,7 +250,9 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     if robot is not None and loaded.is_without_layout:
         links = _sensor_links(loaded, {}, robot, [], on_links)
     elif robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
-        check_groups(loaded.layout, robot, loaded.problems)
+        for group, selection in loaded.layout.spec.groups.items():  # patterns that match nothing
+            report = reporter(loaded.layout, ("groups", group), loaded.problems)
+            select(selection, names_of(robot), loaded.layout.spec.groups, report, group)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
         if placements is not None:
             patches = patches_of(loaded, loaded.layout, robot, placements)

@@ -68,12 +68,6 @@ def controls_between(targets: Sequence[Float[np.ndarray, " actuator"]], seconds:
     return np.concatenate(parts)
 
 
-def default_keyframes(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return `rest` and `squeeze`, if the scene has both; else nothing."""
-    known = {model.key(i).name for i in range(model.nkey)}
-    return ("rest", "squeeze") if {"rest", "squeeze"} <= known else ()
-
-
 def held_controls(model: mujoco.MjModel, seconds: float, control_step: float) -> Controls:
     """Return controls that stay zero, as in the initial state, for some time: see `controls_between`."""
     return controls_between([np.zeros(model.nu)], seconds, control_step)

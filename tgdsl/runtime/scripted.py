@@ -9,7 +9,7 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.closing.closing import START, Closing, closing_of
-from tgdsl.runtime.rollout import Controls, controls_between, default_keyframes, held_controls, scripted_controls
+from tgdsl.runtime.rollout import Controls, controls_between, held_controls, scripted_controls
 from tgdsl.scene.options import Options
 from tgdsl.scene.scene import scene_model
 
@@ -58,7 +58,11 @@ def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, pr
 
     Else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
     """
-    names = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
+    names = keyframes
+    if names is None:
+        model = scene_model(touch.plan.scene)
+        is_scripted = {"rest", "squeeze"} <= {model.key(i).name for i in range(model.nkey)}
+        names = ("rest", "squeeze") if is_scripted else ()
     if names or keyframes is not None:
         return Script(names)
     progress("finding out how the hand closes")

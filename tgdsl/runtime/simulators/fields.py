@@ -70,23 +70,11 @@ class BodyFields:
             if "body_linvel" in self._fields:
                 pos = values["body_pos"] if "body_pos" in values else self._take(arrays["xpos"], self._bodies)
                 arm = pos - self._take(arrays["subtree_com"], self._roots)
-                values["body_linvel"] = origin_velocity(spatial, arm, self._cross)
+                # MuJoCo gives velocities at the centre of mass of a body's kinematic tree.
+                values["body_linvel"] = spatial[..., 3:] + self._cross(spatial[..., :3], arm)
             if "body_angvel" in self._fields:
                 values["body_angvel"] = spatial[..., :3]
         return values
-
-
-def origin_velocity(spatial: T, arm: T, cross: Callable[[T, T], T]) -> T:
-    """Return the velocity of a body frame's origin from MuJoCo's spatial velocity `cvel`.
-
-    MuJoCo gives the latter at the centre of mass of the body's kinematic tree.
-
-    Args:
-        spatial: Angular and linear velocity, (…, 6), in the world [rad/s], [m/s].
-        arm: From that centre of mass to the origin, (…, 3), in the world [m].
-        cross: Cross product along the last axis.
-    """
-    return spatial[..., 3:] + cross(spatial[..., :3], arm)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import mujoco
@@ -22,7 +23,6 @@ from tgdsl.runtime.simulators.objects.choices import EnvObjects
 from tgdsl.runtime.simulators.objects.properties import PER_ENV
 from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
-from tgdsl.runtime.simulators.watch import merged_joints
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.objects import OBJECT_FIELDS, WorldObjects, WorldProperties
@@ -320,7 +320,9 @@ class WarpSimulation(Simulation):
         start = mujoco.MjData(model)
         if keyframe >= 0:
             mujoco.mj_resetDataKeyframe(model, start, keyframe)
-        inputs, stream = merged_joints(self._touch.inputs, self._watch), self._stream
+        inputs, stream = self._touch.inputs, self._stream
+        if self._watch is not None:  # its joints too are kept from before a physics step
+            inputs = replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *self._watch.inputs.fields))))
         with stream.scope():
             try:
                 self.warp_model = self._mjw.put_model(model, batch_sizes=dict.fromkeys(per_env, num_envs))
