@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tgdsl.compiler.links import LinkBodies
 from tgdsl.compiler.lowered import LoweredSensor
+from tgdsl.compiler.sensed import LinkBodies
 from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout

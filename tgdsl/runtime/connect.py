@@ -27,10 +27,9 @@ from tgdsl.runtime.warp.simulation import WarpSimulation
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource, SimulatedBody, SimulatedTips
-from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.log.replay import ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
-from tgdsl.runtime.xhand1.observe import HandConnection, HandObserver, moved_joints
+from tgdsl.runtime.xhand1.observe import HandConnection, HandObserver, moved_joints, warn_of_noise
 from tgdsl.runtime.xhand1.source import XHand1Source, refuse_beyond_watchdog
 from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
 from tgdsl.runtime.xhand1.wire.serial_port import list_ports

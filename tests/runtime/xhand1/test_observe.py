@@ -10,8 +10,7 @@ from tgdsl.errors import ObservationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading
-from tgdsl.runtime.xhand1.fingertips import finger_of, hand_terms, warn_of_noise
-from tgdsl.runtime.xhand1.observe import HandObserver
+from tgdsl.runtime.xhand1.observe import HandObserver, finger_of, hand_terms, warn_of_noise
 from tgdsl.runtime.xhand1.source import HandSample, VelocityFilter
 from tgdsl.runtime.xhand1.wire.payloads import HandState
 

@@ -12,13 +12,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import StateError, listed
-from tgdsl.module.memory.clock import Clock
+from tgdsl.module.memory.clock import ENV, SHARED, Clock
+from tgdsl.module.memory.history import reduced
 from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
 from tgdsl.sensors.base import Kind
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.tensors.env_ids import broadcast_over, few_ids
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.on_host import HostCopy
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
@@ -280,3 +282,68 @@ def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:
     if planned.past == 0 or dt is None:
         return ()
     return (max(math.ceil(planned.past / dt - 1e-6), 1),)
+
+
+Tensors = dict[str, Tensor]
+
+
+def chosen_rows(
+    mask: Bool[Tensor, " env"], readings: Tensors, updated: Tensors, memory: Mapping[str, Tensor]
+) -> tuple[Tensors, Tensors]:
+    """Return readings and new state of the environments of a mask; of the others what they had, as it was handed out before."""
+    updated, result = chosen_only(memory, updated, mask), dict(readings)
+    for name, reading in readings.items():
+        if f"{KEPT}{name}" in memory:
+            result[name] = torch.where(
+                broadcast_over(mask, reading), reading.transpose(-2, -1), memory[f"{KEPT}{name}"]
+            ).transpose(-2, -1)
+        elif f"{WINDOW}{name}" in memory:
+            result[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
+    return result, updated
+
+
+def few_rows(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
+    """Return the environments of a mask, if they are on a CPU and few enough to be read as a batch of their own.
+
+    One alone is read twice: compiled code that serves every batch from two on is then not made again for it.
+    """
+    rows = None if torch.is_grad_enabled() else few_ids(mask)
+    if rows is None or not len(rows):
+        return None
+    return rows if len(rows) > 1 else rows.repeat(2)
+
+
+def rows_of(tensors: Mapping[str, Tensor], rows: Int[Tensor, " n"]) -> Tensors:
+    """Return some environments' rows of a state's fields."""
+    return {name: value[rows] if value.ndim else value for name, value in tensors.items() if name != "mask"}
+
+
+def read_rows(
+    core: Callable[[Tensors, Tensors], Tensors],
+    rows: Int[Tensor, " n"],
+    tensors: Mapping[str, Tensor],
+    memory: Mapping[str, Tensor],
+) -> Tensors:
+    """Read some environments, put their new state in the place of the old one, and return the readings of all.
+
+    `core` returns readings as `reading/<name>`, and new state as `state/<name>`.
+    """
+    held = {name: value if name in SHARED else value[rows] for name, value in memory.items()}
+    outputs = core(dict(tensors), held | {ENV: rows})
+    for path, value in outputs.items():
+        part, _, name = path.partition("/")
+        if part == "state" and value.ndim < memory[name].ndim:
+            memory[name].index_put_((rows, held["clock/step"] % memory[name].shape[1]), value)
+        elif part == "state":
+            memory[name][rows] = value
+    readings: Tensors = {}
+    for path, value in outputs.items():
+        part, _, name = path.partition("/")
+        if part != "reading":
+            continue
+        if f"{KEPT}{name}" in memory:
+            memory[f"{KEPT}{name}"][rows] = value.transpose(-2, -1)
+            readings[name] = memory[f"{KEPT}{name}"].clone().transpose(-2, -1)
+        else:
+            readings[name] = reduced(memory[f"{WINDOW}{name}"].clone(), "stack")
+    return readings

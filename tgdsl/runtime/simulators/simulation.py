@@ -29,8 +29,7 @@ from tgdsl.runtime.simulators.fields import warn_of_mocap
 from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
 from tgdsl.runtime.simulators.objects.choices import EnvHeat, EnvObjects, SharedMeshModels, Values
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
-from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
-from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable, StateValues
+from tgdsl.runtime.simulators.state_values import INTEGRATED, Contacts, Rows, StartContacts, StateTable, StateValues
 from tgdsl.runtime.simulators.watch import Watch, Watched, WatchReader
 from tgdsl.runtime.source import Control
 from tgdsl.scene.options import Options

@@ -32,8 +32,8 @@ from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, Emulator, TipForces, is_driven
-from tgdsl.runtime.xhand1.fingertips import HandTerm
 from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
+from tgdsl.runtime.xhand1.observe import HandTerm
 from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import WatchdogError
