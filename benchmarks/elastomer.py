@@ -204,12 +204,14 @@ class Curved:
 
     def run(self) -> None:
         """Print one row per fingertip: how curved it is, and the largest and RMS error, of the dense operator and planar."""
-        from tgdsl.compiler.pipeline import layouts
+        from tgdsl.compiler.pipeline import placed
 
         print("| hand | fingertip | taxels | normals differ by | dense | planar, largest | planar, RMS |")
         print("|---|---|---|---|---|---|---|")
         for hand in ("xhand1", "sharpa"):
-            for resolution, layout in layouts({"tgdsl": 1, "robot": {"model": hand}}, resolutions=self.resolutions)[1].items():
+            for resolution, layout in placed(
+                {"tgdsl": 1, "robot": {"model": hand}}, resolutions=self.resolutions
+            ).layouts.items():
                 links = [i for i, link in enumerate(layout.links) if link.name in layout.groups["tips"]]
                 for i in links[:2]:
                     own = layout.link_id == i

@@ -16,10 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
-from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.driver import Reading, XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, Emulator, StillBody, TipForces
 from tgdsl.runtime.xhand1.wire.client import SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
 from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD
@@ -30,18 +28,18 @@ WIRE_S = 10 * (COMMAND_SIZE + STATE_SIZE + 2 * OVERHEAD) / BAUD
 PATIENT = SerialTiming(reply_timeout_s=20.0, silence_s=10.0)
 
 
-class NumberedStates:
-    """A force field that writes into the thumb's first taxels how many states the hand has sent."""
+class NumberedStates(StillBody):
+    """A body that writes into the thumb's first taxels how many states the hand has sent."""
 
     def __init__(self) -> None:
         self.num = 0
 
-    def __call__(self, time_s: float, position: Float[np.ndarray, " joint"]) -> TipForces:
+    def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
         """Number one more."""
         taxel = np.zeros((5, 120, 3))
         taxel[0, :4, 2] = list(self.num.to_bytes(4, "little"))
         self.num += 1
-        return TipForces(np.zeros((5, 3)), taxel)
+        return np.zeros(12), TipForces(np.zeros((5, 3)), taxel)
 
 
 def number_of(reading: Reading) -> int:
@@ -104,7 +102,7 @@ def soak(seconds: float) -> Soak:
     """
     numbers, received_at, ages = [], [], []
     with (
-        Emulator(EmulatedHand(forces=NumberedStates())) as emulator,
+        Emulator(EmulatedHand(body=NumberedStates())) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, max_age_s=30.0) as hand,
     ):
         deadline = time.monotonic() + seconds

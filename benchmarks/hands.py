@@ -40,7 +40,7 @@ from tgdsl.commands.layout.new import New
 from tgdsl.commands.links import Links
 from tgdsl.commands.render import Render
 from tgdsl.commands.run import Run
-from tgdsl.compiler.pipeline import layouts
+from tgdsl.compiler.pipeline import placed
 from tgdsl.errors import TgdslError
 from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import load
@@ -196,7 +196,7 @@ class Line:
     def layout_new(self) -> None:
         """`tgdsl layout new`, and what it proposed."""
         printed(New(str(self.file), density=DENSITY, out=self.layout, force=True).run)
-        _, by_resolution = layouts(self._robot())
+        by_resolution = placed(self._robot()).layouts
         self.row.taxels = {name: layout.num_taxels for name, layout in by_resolution.items()}
         self.med = by_resolution["med"]
         self.row.links = len(self.med.links)

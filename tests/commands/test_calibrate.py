@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from first_order_hands import first_order_hand
 from hand_logs import random_readings
 from resting_hands import TARE
 
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
-from tgdsl.runtime.xhand1.log import record
-from tgdsl.runtime.xhand1.log.log import open_log
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator, TipForces
+from tgdsl.runtime.xhand1.log.log import LogWriter, open_log
 
 SCALE, TURN = np.array([0.05, 0.05, 0.02]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, -1]])
 PRESSES = np.array([[0, 0, 0], [1, 0, 0], [0, 1.5, 0], [0, 0, -2], [1, 1, -3], [-1, 0, -1], [0, -1, -1]])
@@ -32,9 +31,9 @@ def pressed(tmp_path_factory):
 
     loads: list[str] = []
     with (
-        Emulator(EmulatedHand(forces=force)) as emulator,
+        Emulator(first_order_hand(forces=force)) as emulator,
         XHand1.open(emulator.device) as hand,
-        record.LogWriter(folder / "press.npz") as log,
+        LogWriter(folder / "press.npz") as log,
     ):
         first = hand.read(20.0)
         log.add(first)
@@ -105,9 +104,9 @@ def test_calibrate_with_forces_over_time(here, tmp_path):
         return TipForces(counts, np.zeros((5, 120, 3)))
 
     with (
-        Emulator(EmulatedHand(forces=force)) as emulator,
+        Emulator(first_order_hand(forces=force)) as emulator,
         XHand1.open(emulator.device) as hand,
-        record.LogWriter(tmp_path / "a.npz") as log,
+        LogWriter(tmp_path / "a.npz") as log,
     ):
         for _ in range(300):
             log.add(hand.read(20.0))
@@ -164,7 +163,7 @@ def test_calibrate_beside_a_simulation(here, tmp_path):
     skin[:, 0, :4] = taxel[:, None]
     np.savez(tmp_path / "readings.npz", time=steps, skin=skin.astype(np.float32))
     readings = random_readings(7.0 + 0.07 + steps)
-    with record.LogWriter(tmp_path / "a.npz") as log:
+    with LogWriter(tmp_path / "a.npz") as log:
         for i, reading in enumerate(readings):
             total = np.tile(TARE, (5, 1, 1))[0]
             total[3] += 4 * taxel[i] @ TURN / SCALE

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.compiler.pipeline import layouts
+from tgdsl.compiler.pipeline import placed
 from tgdsl.errors import SpecError
 from tgdsl.plan.inputs import ContactPart
 
@@ -86,7 +86,7 @@ def test_kinds_on_taxels_need_one(folder):
     assert problems(DOCUMENT.replace("link_contact", "contact")) == [MISSING]
     assert problems(DOCUMENT + "  touch: {kind: contact, links: finger, feels: [cube]}\n") == [MISSING]
     with pytest.raises(SpecError, match='robot: missing key "layout"'):
-        layouts({"tgdsl": 1, "robot": {"model": "hand.xml"}})
+        placed({"tgdsl": 1, "robot": {"model": "hand.xml"}})
     assert problems(DOCUMENT.replace("model: hand.xml", "model: hand.xml, layout: lay.yaml")) == [
         'd.yaml:2:34: robot.layout: there is no file "lay.yaml"; paths are relative to this document'
     ]

@@ -1,11 +1,13 @@
 """An emulated hand's line that damages, drops, delays and repeats the hand's replies, with a seed."""
 
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from first_order_hands import first_order_hand
 
-from tgdsl.runtime.xhand1.emulator.emulator import EmulatedLine, Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, EmulatedLine, Emulator
 from tgdsl.runtime.xhand1.wire.protocol import HAND_ADDRESS, Frame, encode_frame
 
 
@@ -51,7 +53,7 @@ class FaultyLine(EmulatedLine):
     """
 
     def __init__(self, hand: EmulatedHand | None = None, faults: Faults | None = None, seed: int = 0, **options):
-        super().__init__(hand or EmulatedHand(), **options)
+        super().__init__(hand or first_order_hand(), **options)
         self.faults = faults or Faults()
         self.counts: dict[str, int] = {}
         self._rng = np.random.default_rng(seed)
@@ -102,6 +104,21 @@ class FaultyEmulator(Emulator):
 
     def __init__(self, hand: EmulatedHand | None = None, faults: Faults | None = None, seed: int = 0):
         super().__init__(line=FaultyLine(hand, faults, seed))
+
+    def unplug(self) -> None:
+        """Pull the cable: the port goes away, and the bytes on their way are lost."""
+        self.call(self._unplug)
+
+    def replug(self) -> None:
+        """Plug it in again: the port is there under the same name. The hand was on all the time."""
+        self.call(self._plug)
+
+    def call(self, change: Callable[[], None]) -> None:
+        """Change the emulator or its line between two of the thread's turns."""
+        with self._lock:
+            self.check()
+            change()
+        os.write(self._wake_write, b"!")
 
     def set_faults(self, faults: Faults) -> None:
         """Let other faults strike from now on."""

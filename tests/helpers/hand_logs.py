@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tgdsl.runtime.xhand1.log.log import Fault
-from tgdsl.runtime.xhand1.log.record import LogWriter
-from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.driver import Reading
+from tgdsl.runtime.xhand1.log.log import Fault, LogWriter
 from tgdsl.runtime.xhand1.wire.payloads import FORCE_MAX, FORCE_MIN, HandState
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.quantities import Gathered, Quantity, References, Request
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel, Lowered, ProbeSpec, body_axis
@@ -33,7 +32,7 @@ class ObjectHeatOf(Request[Heat]):
 class HeatUse(Generic[Array]):
     """What the Plan holds of a request: the object's place in the fields, its temperature if fixed, and (material,) conductivities."""
 
-    place: int = field(metadata=indices(lambda use, part, plan: len(plan.inputs.heated) or None))
+    place: int
     temperature: float | None
     conductivity: Array
 

@@ -12,11 +12,10 @@ from typing import Any
 
 from faulty_lines import Faults, FaultyLine
 
-from tgdsl.runtime.xhand1 import driver, reader, source
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1 import driver, source
+from tgdsl.runtime.xhand1.driver import HandReader, XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
-from tgdsl.runtime.xhand1.reader import HandReader
 from tgdsl.runtime.xhand1.wire.client import Addresses, SerialClient, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError
 from tgdsl.runtime.xhand1.wire.serial_port import POLL_S
@@ -181,7 +180,7 @@ def virtual_hand(
 ) -> Iterator[tuple[XHand1, VirtualPort, VirtualTime]]:
     """Open a hand as `XHand1.open` does, its line and its clock virtual."""
     time, timing = VirtualTime(), timing or SerialTiming()
-    for module in (driver, reader, source):
+    for module in (driver, source):
         monkeypatch.setattr(module, "time", time)
     port = VirtualPort(FaultyLine(hand, seed=seed, turnaround_s=turnaround_s), time)
 

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import TipForces
-from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.driver import Reading, XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import TipForces
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandError
 from tgdsl.runtime.xhand1.wire.serial_port import open_serial_port

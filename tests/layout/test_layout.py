@@ -1,13 +1,8 @@
 """Layouts: rows and links that are chosen from one, by hand."""
 
-import dataclasses
-
 import numpy as np
-import pytest
 
-from tgdsl.errors import ArtifactError
 from tgdsl.layout.layout import Layout, Link
-from tgdsl.plan.ranges import check
 
 LINKS = (Link("palm", "base"), Link("pad", "base"), Link("tip", "finger"))
 LAYOUT = Layout(
@@ -44,15 +39,3 @@ def test_rows_of_links_and_rows_that_are_taken():
     assert (found.pos.tolist(), found.radius.tolist(), found.area.tolist()) == ([[3, 4, 5], [9, 10, 11]], [0.2, 0.4], [2, 4])
     assert found.cell.tolist() == [[0, 1], [-1, -1]]
     assert LAYOUT.take(np.array([0])).groups == {"hand": ("palm",)}
-
-
-def test_a_cell_is_at_least_minus_one():
-    """Where a taxel has none; an artefact that says less is refused."""
-
-    @dataclasses.dataclass(frozen=True, eq=False)
-    class Whole:
-        layout: Layout
-
-    check(Whole(LAYOUT))
-    with pytest.raises(ArtifactError, match=r'"layout/cell" holds -2, expected at least -1'):
-        check(Whole(dataclasses.replace(LAYOUT, cell=LAYOUT.cell - 1)))

@@ -162,7 +162,7 @@ def test_other_versions_and_other_contents(artifact, tmp_path):
     rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "format"}))
     assert refused(path) == f"plan format None is not {FORMAT}, which this version of tgdsl reads; compile again"
     rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "layout"}))
-    assert refused(path).startswith("a plan has the parts ")
+    assert refused(path).startswith("not a plan: ")
     rewritten(artifact, path, json.dumps(plain | {"layout": 3}))
     assert refused(path).startswith("not a plan: ")
     for text in ("", "{", "3", "null"):
@@ -209,14 +209,12 @@ def test_arrays_that_were_tampered_with(artifact, tmp_path):
     changed = {**arrays, REACH: arrays[REACH] * 2}
     lacking = {name: value for name, value in arrays.items() if name != REACH}
     half = {**arrays, REACH: arrays[REACH].astype(np.float16)}
-    for bad, message in (
-        (changed, "the arrays are not those that the plan was written with"),
-        (lacking, f'the array "{REACH}" of the plan is missing'),
-        ({**lacking, "quantities/reach": arrays[REACH]}, f'the array "{REACH}" of the plan is missing'),
-        ({**arrays, "quantities/reach": arrays[REACH]}, 'the plan has no array "quantities/reach"'),
-        (half, f'the array "{REACH}" is float16, expected float64, float32, int64, int32'),
+    for bad in (
+        changed,
+        lacking,
+        {**lacking, "quantities/reach": arrays[REACH]},
+        {**arrays, "quantities/reach": arrays[REACH]},
+        half,
     ):
         (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
-        with pytest.raises(ArtifactError) as error:
-            load_plan(tmp_path / "bad.safetensors")
-        assert str(error.value) == f"{tmp_path / 'bad.safetensors'}: {message}"
+        assert refused(tmp_path / "bad.safetensors") == "the arrays are not those that the plan was written with"

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.module.gathering import scene_of
+from tgdsl.module.sensing import scene_of
 from tgdsl.quantities.points import POINTS
 
 SCENE = """<mujoco><worldbody>

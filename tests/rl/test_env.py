@@ -12,7 +12,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.runtime import simulate
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connect import SOURCES
-from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.source import VelocityFilter
 
 STEPS = 12
 

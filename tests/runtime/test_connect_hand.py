@@ -9,6 +9,7 @@ import pytest
 import torch
 from connections import SQUEEZE, TERMS, instant, stepped, steps
 from faulty_lines import Faults, FaultyEmulator
+from first_order_hands import first_order_hand
 from xhand1_hands import PATIENT, WrittenBytes, read_again, wait_until
 from xhand1_models import JOINTS, document, hand_xml
 
@@ -17,7 +18,6 @@ from tgdsl.errors import HandError, ObservationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime import connect as connecting
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
@@ -81,7 +81,10 @@ def test_reading_alone_moves_nothing_and_says_once_that_controls_go_nowhere(touc
     written = WrittenBytes()
     plain_open = XHand1.open
     monkeypatch.setattr(XHand1, "open", lambda *args, **options: plain_open(*args, **options, open_port=written.open))
-    with FaultyEmulator(EmulatedHand()) as emulator, tgdsl.connect(touch, f"xhand1:{emulator.device}", timing=PATIENT) as env:
+    with (
+        FaultyEmulator(first_order_hand()) as emulator,
+        tgdsl.connect(touch, f"xhand1:{emulator.device}", timing=PATIENT) as env,
+    ):
         with pytest.warns(UserWarning, match="the hand was connected for reading alone: its controls go nowhere"):
             env.step(SQUEEZE)
         with warnings.catch_warnings():
@@ -120,7 +123,7 @@ def test_a_hand_goes_where_the_actuators_say(tmp_path):
     order = JOINTS[::-1]
     touch = tgdsl.compile(document(tmp_path, {"policy": TERMS}, hand_xml(actuators=order)))
     with (
-        FaultyEmulator(EmulatedHand(time_constant_s=0.001)) as emulator,
+        FaultyEmulator(first_order_hand(time_constant_s=0.001)) as emulator,
         tgdsl.connect(touch, f"xhand1:{emulator.device}", motion=instant(touch), timing=PATIENT) as env,
     ):
         assert wait_until(lambda: stepped(env, SQUEEZE) and abs(emulator.hand.position - SQUEEZE[::-1]).max() < 1e-3)

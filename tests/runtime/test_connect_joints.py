@@ -11,8 +11,7 @@ from tgdsl.errors import ObservationError
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.source import HandSample
-from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.source import HandSample, VelocityFilter
 from tgdsl.runtime.xhand1.wire.errors import MotionError
 
 PLAIN = Calibration.none()

@@ -12,7 +12,7 @@ import tgdsl
 from tgdsl.errors import HandError, ObservationError, TgdslError
 from tgdsl.runtime.xhand1.calibration import load_calibration
 from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource
-from tgdsl.runtime.xhand1.log.record import LogWriter
+from tgdsl.runtime.xhand1.log.log import LogWriter
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.scene.scene import scene_model
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from tgdsl.compiler.pipeline import layouts
+from tgdsl.compiler.pipeline import placed
 from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt
 from tgdsl.view.render import drawing, render
@@ -26,7 +26,7 @@ def hand(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     file = tmp_path_factory.mktemp("hand") / "hand.xml"
     file.write_text(ROBOT)
     resolutions = {"few": {"palm": GRID}, "many": {"palm": MANY, "finger": GRID}}
-    return layouts({"tgdsl": 1, "robot": {"model": str(file), "layout": {"resolutions": resolutions}}})
+    return placed({"tgdsl": 1, "robot": {"model": str(file), "layout": {"resolutions": resolutions}}})[:2]
 
 
 def marks(axes: Axes, which: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 import tgdsl
-from tgdsl.compiler.pipeline import layouts
+from tgdsl.compiler.pipeline import placed
 from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
@@ -271,7 +271,7 @@ def test_a_link_on_a_visual_mesh_is_drawn_as_that(tmp_path: Path) -> None:
     )
     grid = {"method": "grid", "rows": 6, "columns": 2, "direction": [-1, 0, 0], "radius": 0.004}
     with pytest.warns(UserWarning, match="read whole"):
-        model, found = layouts(
+        model, found, _ = placed(
             {"tgdsl": 1, "robot": {"model": str(tmp_path / "hand.xml"), "layout": {"resolutions": {"o": {"skin": grid}}}}}
         )
     body, pose = {model.body("tip").id}, pose_of(model, None)

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.axes import Axes
 
 import tgdsl
-from tgdsl.compiler.pipeline import layouts, placed
+from tgdsl.compiler.pipeline import placed
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.view.cameras import VIEWS, camera_of, pose_of
@@ -65,7 +65,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def hand(folder: Path) -> Drawn:
-    return layouts(folder / "bare.yaml")
+    return placed(folder / "bare.yaml")[:2]
 
 
 def marks(axes: Axes, which: str) -> np.ndarray:
@@ -140,7 +140,7 @@ def test_what_is_in_view_is_what_a_ray_to_the_camera_leaves(hand: Drawn, view: s
 @pytest.mark.parametrize("name", ["xhand1_right", "xhand1_left", "sharpa_right"])
 def test_real_hands_show_their_taxels(name: str) -> None:
     """From the front hardly any taxel is hidden (some look away, round a tip or on the thumb); from the back most are."""
-    model, found = layouts({"tgdsl": 1, "robot": {"model": name}})
+    model, found, _ = placed({"tgdsl": 1, "robot": {"model": name}})
     front, back = (drawing(model, found, view=view, size=(1500, 500)) for view in ("front", "back"))
     for axes, behind, layout in zip(front.axes, back.axes, found.values(), strict=True):
         assert len(marks(axes, "shown")) + len(marks(axes, "hidden")) == layout.num_taxels
@@ -296,11 +296,11 @@ def test_a_document_without_sensors_has_all_taxels_at_all_resolutions(hand: Draw
 
 
 def test_a_document_has_the_taxels_of_its_sensors_at_its_resolution(folder: Path) -> None:
-    _, found = layouts(folder / "hand.yaml")
+    found = placed(folder / "hand.yaml").layouts
     assert {name: layout.num_taxels for name, layout in found.items()} == {"many": 3}
-    _, found = layouts(folder / "hand.yaml", resolutions=("many", "few"))
+    found = placed(folder / "hand.yaml", resolutions=("many", "few")).layouts
     assert {name: layout.num_taxels for name, layout in found.items()} == {"many": 3, "few": 6}
-    _, found = layouts(folder / "hand.yaml", {"sensors.touch.links": "all", "resolution": "few"})
+    found = placed(folder / "hand.yaml", {"sensors.touch.links": "all", "resolution": "few"}).layouts
     assert {name: layout.num_taxels for name, layout in found.items()} == {"few": 10}
 
 
@@ -312,7 +312,7 @@ def test_progress_names_the_links(folder: Path) -> None:
 
 def test_the_layout_drawn_is_the_layout_compiled(folder: Path) -> None:
     plan = tgdsl.compile(folder / "hand.yaml").plan
-    drawn = layouts(folder / "hand.yaml")[1]["many"]
+    drawn = placed(folder / "hand.yaml").layouts["many"]
     assert drawn.links == plan.layout.links
     for name in ("link_id", "pos", "normal", "tangent", "radius", "area", "cell"):
         np.testing.assert_array_equal(getattr(drawn, name), getattr(plan.layout, name))
@@ -320,12 +320,12 @@ def test_the_layout_drawn_is_the_layout_compiled(folder: Path) -> None:
 
 def test_mistakes_of_documents(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(TgdslError, match=r'^the layout has no resolution "man"; did you mean "many"\?$'):
-        layouts(folder / "bare.yaml", resolutions=("man",))
+        placed(folder / "bare.yaml", resolutions=("man",))
     with pytest.raises(SpecError, match=r'--set resolution=fw: resolution: unknown resolution "fw"; did you mean "few"\?$'):
-        layouts(folder / "bare.yaml", {"resolution": "fw"})
+        placed(folder / "bare.yaml", {"resolution": "fw"})
     (tmp_path / "x.yaml").write_text("tgdsl: 1\nrobot: {model: none.xml, layout: none.yaml}\nobjekts: {}\n")
     with pytest.raises(SpecError) as caught:
-        layouts(tmp_path / "x.yaml")
+        placed(tmp_path / "x.yaml")
     assert len(caught.value.problems) == 3  # the robot, the layout and the key: all in one run
     with pytest.raises(SpecError, match='missing key "sensors"'):
         tgdsl.compile(folder / "bare.yaml")

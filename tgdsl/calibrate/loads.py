@@ -26,8 +26,8 @@ from tgdsl.calibrate.fit import FitError, Forces, forces_at
 from tgdsl.errors import TgdslError
 from tgdsl.fields.models import Quantity, SpecModel
 from tgdsl.module.module import TactileModule
-from tgdsl.runtime.xhand1.fingertips import TIP_BODIES
 from tgdsl.runtime.xhand1.log.log import HandLog
+from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, NUM_TAXELS
 from tgdsl.schema.load import read_spec
 

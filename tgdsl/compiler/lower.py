@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tgdsl.compiler import passes
-from tgdsl.compiler.links import link_parts
 from tgdsl.compiler.lowered import LoweredSensor, lowered_sensors
-from tgdsl.compiler.observed import Observed, Wanted, observed, wanted
 from tgdsl.compiler.passes import Joined, Numbered, Pruned, Shared
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.compiler.sensed import contact_parts
+from tgdsl.compiler.sensed import contact_parts, joints_matching, link_parts
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import BakeError, LowerError, TgdslError, UnfeltWarning, did_you_mean
+from tgdsl.formats.joints import RobotJoints
+from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt, unfelt_ids
+from tgdsl.observations import observations
+from tgdsl.observations.observations import ObservationSpec, OfReading, ReadingObservation, ReadingSpec
+from tgdsl.observations.proprioception import PROPRIOCEPTION, JointObservation, JointSpec
 from tgdsl.placement.reach import unfelt
 from tgdsl.plan import tree
 from tgdsl.plan.inputs import ContactPart, Inputs
@@ -30,15 +34,178 @@ from tgdsl.plan.sensors import (
     PlannedHistory,
     PlannedMemory,
     PlannedNoise,
+    PlannedObservation,
     PlannedReading,
     PlannedSensor,
 )
 from tgdsl.quantities.base import Planning, Quantity, Request, heated_objects
 from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Axis, Channel, body_axis
 from tgdsl.sensors.known import quantities_of
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a document observes.
+
+    Attributes:
+        terms: The observation terms, in the document's order.
+        proprioception: Readings of joints and actuators that some of them want.
+    """
+
+    terms: tuple[PlannedObservation, ...]
+    proprioception: tuple[PlannedReading, ...]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The joints and actuators that a document reads.
+
+    Attributes:
+        rows: Those of each observation term of joints, by group and number, in its order.
+        joints: Names of all joints that are read, by observations and sensors, in the robot's order.
+        actuators: Names of all actuators that are read.
+    """
+
+    rows: Mapping[tuple[str, int], tuple[str, ...]]
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+
+
+def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
+    """Return the joints and actuators that a document reads."""
+    all_joints, selected = resolved.joints, {}
+    requested: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
+    for group, i, spec in _terms(loaded):
+        if isinstance(spec, JointObservation):
+            selected[group, i] = _rows(loaded, ("observations", group, i), spec, all_joints)
+            requested[PROPRIOCEPTION[spec.type].rows].update(selected[group, i])
+    joints = tuple(name for name in all_joints.joints if name in requested["joint"])
+    actuators = tuple(actuator.name for actuator in all_joints.actuators if actuator.name in requested["actuator"])
+    return Wanted(selected, joints, actuators)
+
+
+def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
+    return [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
+
+
+def observed(
+    loaded: Loaded,
+    resolved: Resolved,
+    sensors: Sequence[PlannedSensor],
+    layouts: Mapping[str, Layout],
+    read: Wanted,
+) -> Observed:
+    """Return a document's observations; what is wrong with one is noted among the document's problems."""
+    specs, all_joints, joints, actuators = _terms(loaded), resolved.joints, read.joints, read.actuators
+    reading_of = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
+    terms: list[PlannedObservation] = []
+    for group, i, spec in specs:
+        if isinstance(spec, OfReading):
+            terms += _of_reading(loaded, group, i, spec, reading_of)
+        elif isinstance(spec, JointObservation):
+            rows = joints if PROPRIOCEPTION[spec.type].rows == "joint" else actuators
+            terms.append(_of_joints(group, i, spec, read.rows[group, i], rows))
+        else:
+            count = observations.HAND_ONLY.get(spec.type, 0)
+            terms.append(PlannedObservation(group, i, spec.type, None, (), count, {}))
+    return Observed(tuple(terms), _proprioception({spec.type for _, _, spec in specs}, joints, actuators, all_joints))
+
+
+def _of_reading(
+    loaded: Loaded,
+    group: str,
+    i: int,
+    spec: ReadingSpec,
+    found: Mapping[str, tuple[PlannedReading, Layout]],
+) -> list[PlannedObservation]:
+    """Return the observation of a sensor's reading, or nothing if it is wrong."""
+    path: Path = ("observations", group, i)
+    if spec.of not in found:
+        loaded.note((*path, "of"), f'there is no reading "{spec.of}"', did_you_mean(spec.of, found, "readings"))
+        return []
+    reading, layout = found[spec.of]
+    if isinstance(spec, ReadingObservation):
+        wanted = _channels(loaded, path, spec, reading)
+    else:
+        wanted, rows = observations.WANTED[spec.type]
+        if reading.rows != rows or not set(wanted) <= set(reading.channels):
+            problem = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
+            loaded.note(path, problem, f"it reads {', '.join(reading.channels)} of each {reading.rows}")
+            return []
+    constants = observations.lower(spec, layout)
+    channels = tuple(reading.channels.index(channel) for channel in wanted)
+    per_call = observations.num_features(spec.type, len(channels), reading.num_rows, len(layout.links))
+    axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
+    count = max(reading.steps, 1) * per_call
+    return [PlannedObservation(group, i, spec.type, spec.of, channels, count, dict(sorted(constants.items())), axes)]
+
+
+def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: PlannedReading) -> tuple[str, ...]:
+    """Return the channels that a `reading` takes, each once, in the order in which they are first named."""
+    selected: dict[str, None] = {}
+    for k, pattern in enumerate(spec.channels or ("*",)):
+        hits = matching(pattern, reading.channels)
+        if not hits:
+            problem = f'no channel of "{reading.name}" matches "{pattern}"'
+            loaded.note((*path, "channels", k), problem, did_you_mean(pattern, reading.channels, "channels"))
+        selected |= dict.fromkeys(hits)
+    return tuple(selected)
+
+
+def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tuple[str, ...]:
+    """Return the joints, or for a `last_action` the actuators, that an observation is of, in its order."""
+    is_of_joints = PROPRIOCEPTION[spec.type].rows == "joint"
+    selected: dict[str, None] = {}
+    if spec.joints is None:
+        names = own.joints[: own.num_actuated] if is_of_joints else tuple(actuator.name for actuator in own.actuators)
+        selected = dict.fromkeys(names)
+        if not names:
+            hint = 'name them: joints: ["*"]' if is_of_joints and own.joints else ""
+            loaded.note(path, f"the robot has no actuated joints, so there is no {spec.type} of them", hint)
+    for k, pattern in enumerate(spec.joints or ()):
+        hits = joints_matching(loaded, (*path, "joints", k), pattern, own)
+        if not is_of_joints and hits:
+            joints, hits = hits, [actuator.name for actuator in own.actuators if set(actuator.joints) & set(hits)]
+            if not hits:
+                problem = f"no actuator acts on {', '.join(joints)}"
+                loaded.note((*path, "joints", k), problem, "so there is no last action of it")
+        selected |= dict.fromkeys(hits)
+    if "" in selected:
+        problem = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
+        loaded.note(path, problem, "name it in the robot's file")
+    return tuple(selected)
+
+
+def _proprioception(
+    types: Collection[str], joints: Sequence[str], actuators: Sequence[str], own: RobotJoints
+) -> tuple[PlannedReading, ...]:
+    """Return the readings of joints and actuators that are observed, in the order of `PROPRIOCEPTION`."""
+    num_rows = {"joint": len(joints), "actuator": len(actuators)}
+    is_slide = [name in own.slides for name in joints]
+    readings = []
+    for name, quantity in PROPRIOCEPTION.items():
+        if name in types:
+            hinge, slide = quantity.units
+            unit = hinge if hinge == slide or not any(is_slide) else slide if all(is_slide) else f"{hinge} or {slide}"
+            readings.append(PlannedReading(name, quantity.rows, num_rows[quantity.rows], (quantity.channel,), (unit,)))
+    return tuple(readings)
+
+
+def _of_joints(
+    group: str,
+    i: int,
+    spec: JointSpec,
+    chosen: Sequence[str],
+    wanted: Sequence[str],
+) -> PlannedObservation:
+    is_all = list(chosen) == list(wanted)
+    constants = {} if is_all else {"rows": np.array([wanted.index(name) for name in chosen], dtype=np.int64)}
+    return PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants)
+
 
 SHOWN = 8
 """Links and reasons that the warning names; the account of the module names all."""
@@ -49,11 +216,6 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
 
     A sensor that reads contacts cannot on a body that is never in contact with its objects. Where no object collides with a
     body, nothing keeps the objects out of it, so that no taxel is too deep in it. Readings of bodies are not of taxels.
-
-    Args:
-        resolved: The document on its robot.
-        sensors: Its sensors, lowered.
-        pruned: The pairs that can meet.
     """
     layout, within = resolved.layout, resolved.reach
     names = np.array([link.body for link in layout.links], dtype=object)[layout.link_id]
@@ -81,13 +243,7 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
 
 
 def warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
-    """Warn once of all taxels that cannot feel, by link and reason.
-
-    Args:
-        file: Name of the document.
-        found: The taxels.
-        num_taxels: Number of all taxels.
-    """
+    """Warn once of all taxels that cannot feel, by link and reason."""
     if found:
         problem = f"{len(unfelt_ids(found))} of {num_taxels} taxels cannot feel: {'; '.join(map(str, found[:SHOWN]))}"
         problem += f"; and {len(found) - SHOWN} more, see `explain`" if len(found) > SHOWN else ""
@@ -109,13 +265,6 @@ FIELDS = (
 
 def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin, progress: Progress = silent) -> Plan:
     """Return the Plan of a document, its scene still empty.
-
-    Args:
-        loaded: The document.
-        resolved: What it means on its robot.
-        kinds: The kinds that it may use.
-        origin: What it was made of.
-        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
@@ -164,7 +313,7 @@ def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
             problem = f'"{target}" can never be in contact with a link of this sensor: {problem}'
         else:
             problem, hint = f'"{target}" and the links of this sensor are one rigid body', "put a joint between them"
-        loaded.problems.append(loaded.problem(path, problem, hint))
+        loaded.note(path, problem, hint)
 
 
 class ContactParts(NamedTuple):
@@ -178,11 +327,8 @@ def _contact_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[Lowered
     """Return which geoms' contacts are an object's and a link's; what cannot be told apart is a mistake."""
     objects = {}
     for name in sorted({pair.object for pair in pruned.contact_pairs}):
-
-        def report(what: str, hint: str, at: Path = ("objects", name, "surface")) -> None:
-            loaded.problems.append(loaded.problem(at, what, hint))
-
         felt = resolved.objects[name]
+        report = partial(loaded.note, ("objects", name, "surface"))
         parts = contact_parts(resolved.scene, felt.bodies, felt.touched, report)
         objects |= {name: parts} if parts != (ContactPart("body", felt.body),) else {}
     for sensor in sensors:
@@ -200,7 +346,7 @@ def _link_parts(
         at: Path = ("sensors", next(sensor.sensor for sensor in sensors if link in sensor.layout.bodies), "links")
 
         def report(what: str, hint: str, at: Path = at, link: str = link) -> None:
-            loaded.problems.append(loaded.problem(at, f'body "{link}" and what is welded to it: {what}', hint))
+            loaded.note(at, f'body "{link}" and what is welded to it: {what}', hint)
 
         own = link_parts(resolved.scene, resolved.link_bodies[link], report)
         parts |= {link: own} if own else {}
@@ -214,7 +360,7 @@ def _check_shared(loaded: Loaded, resolved: Resolved, sensor: LoweredSensor, req
         if one & two and not (one <= two or two <= one):
             problem = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
             path: Path = ("sensors", sensor.sensor, "feels", i)
-            loaded.problems.append(loaded.problem(path, problem, "give each a sensor of its own, or surfaces apart"))
+            loaded.note(path, problem, "give each a sensor of its own, or surfaces apart")
 
 
 def _quantities(
@@ -228,10 +374,6 @@ def _quantities(
     progress: Progress,
 ) -> Parts:
     """Return the part of the Plan of each quantity; mistakes are noted."""
-
-    def report(path: Sequence[str | int], what: str, hint: str) -> None:
-        loaded.problems.append(loaded.problem(tuple(path), what, hint))
-
     planning = Planning(
         layout=resolved.layout,
         sensed=resolved.objects,
@@ -240,7 +382,7 @@ def _quantities(
         objects=numbered.objects,
         bodies=numbered.bodies,
         geoms_of=resolved.geoms_of,
-        report=report,
+        report=loaded.note,
         progress=progress,
         joints=read.joints,
         anchors={name: resolved.anchor_of(name) for name in read.joints if name},
@@ -250,10 +392,9 @@ def _quantities(
         try:
             parts[quantity.name] = quantity.plan(planning, shared.uses[quantity.name])
         except LowerError as error:
-            sensor = shared.uses[quantity.name][0].sensors[0]
-            report(("sensors", sensor, *([error.field] if error.field else [])), error.what, error.hint)
+            loaded.note(("sensors", shared.uses[quantity.name][0].sensors[0]), error)
         except BakeError as error:
-            report(("sensors", shared.uses[quantity.name][0].sensors[0]), str(error), "")
+            loaded.note(("sensors", shared.uses[quantity.name][0].sensors[0]), str(error))
     if not loaded.problems:
         _check_parts(parts, asked)
     return parts
@@ -319,7 +460,6 @@ def _inputs(
 
 
 def _is_timed(sensor: LoweredSensor) -> bool:
-    """Return whether a sensor wants to know how much time has passed."""
     return sensor.kind.is_timed or sensor.spec.rate is not None or (sensor.noise is not None and sensor.noise.needs_dt)
 
 

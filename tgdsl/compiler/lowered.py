@@ -12,7 +12,6 @@ import numpy as np
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, TgdslError, did_you_mean, listed
-from tgdsl.fields.accuracy import Bound
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout, Link
@@ -75,7 +74,7 @@ def _matching(loaded: Loaded, resolved: Resolved, name: str, links: Sequence[Lin
     chosen(among, missing)
     for problem, hint in missing:
         path = ("sensors", name, "noise", "links", pattern) if in_line else ("sensors", name, "noise")
-        loaded.problems.append(loaded.problem(path, problem if in_line else f'in the profile "{spec.noise}": {problem}', hint))
+        loaded.note(path, problem if in_line else f'in the profile "{spec.noise}": {problem}', hint)
     return chosen(links, [])
 
 
@@ -89,17 +88,7 @@ def imperfections(
     layout: Layout,
     named: Mapping[str, NoiseSpec],
 ) -> LoweredNoise | None:
-    """Return the lowered noise of a sensor; None if all its knobs are neutral.
-
-    Args:
-        name: The sensor's name.
-        spec: Its spec.
-        kind: Its kind.
-        knobs: The knobs of each of its links.
-        lowered: The sensor, lowered.
-        rows: What its reading has rows of.
-        layout: Its taxels.
-        named: The noise profiles of the document.
+    """Return the lowered noise of a sensor whose links have `knobs`; None if all of them are neutral.
 
     Raises:
         LowerError: If a knob names a quantity that the sensor does not read.
@@ -221,8 +210,7 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
         try:
             sensors += _ways(loaded, resolved, name, by_name[spec.kind], progress)  # type: ignore[attr-defined]
         except LowerError as error:
-            path: Path = ("sensors", name, *([error.field] if error.field else []))
-            loaded.problems.append(loaded.problem(path, error.what, error.hint))
+            loaded.note(("sensors", name), error)
     loaded.raise_problems()
     sensors = fitted(loaded, sensors, resolved.scene.compiled.opt.timestep)
     _check_blocks(loaded, sensors)
@@ -231,13 +219,7 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
 
 
 def fitted(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) -> list[LoweredSensor]:
-    """Return sensors, each fitted to the time step and to those that it reads; what these cannot be is noted.
-
-    Args:
-        loaded: The document.
-        sensors: All sensors.
-        timestep: Time of a physics step of the scene [s].
-    """
+    """Return sensors, each fitted to the scene's time step [s] and to those that it reads; mistakes are noted."""
     reading = {sensor.name: _upstream_of(loaded, sensor, sensors) for sensor in sensors}
     loaded.raise_problems()
     done: dict[str, LoweredSensor] = {}
@@ -248,13 +230,11 @@ def fitted(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) ->
             try:
                 done[sensor.name] = _fitted(sensor, fitting)
             except LowerError as error:
-                path: Path = ("sensors", sensor.sensor, *([error.field] if error.field else []))
-                loaded.problems.append(loaded.problem(path, error.what, error.hint))
+                loaded.note(("sensors", sensor.sensor), error)
                 done[sensor.name] = sensor
     if circle := [sensor for sensor in sensors if sensor.name not in done]:
         names = " → ".join([*(sensor.sensor for sensor in circle), circle[0].sensor])
-        path = ("sensors", circle[0].sensor, circle[0].kind.reads)
-        loaded.problems.append(loaded.problem(path, "sensors read one another in a circle", names))
+        loaded.note(("sensors", circle[0].sensor, circle[0].kind.reads), "sensors read one another in a circle", names)
     return [done.get(sensor.name, sensor) for sensor in sensors]
 
 
@@ -287,18 +267,18 @@ def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[Lowere
     if not upstream.sensors:
         if not able:
             problem = f"no sensor of the document makes {upstream.what}, so there is none to read"
-            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), problem))
+            loaded.note(("sensors", sensor.sensor), problem)
         return tuple(candidate.name for candidate in able.values())
     for i, name in enumerate(upstream.sensors):
         path: Path = ("sensors", sensor.sensor, sensor.kind.reads, i)
         kinds = {candidate.sensor: candidate.kind.name for candidate in sensors}
         if name not in kinds:
-            loaded.problems.append(loaded.problem(path, f'unknown sensor "{name}"', did_you_mean(name, kinds, "sensors")))
+            loaded.note(path, f'unknown sensor "{name}"', did_you_mean(name, kinds, "sensors"))
         elif name not in able:
             problem = f'"{name}" ({kinds[name]}) makes no {upstream.what}, as it is written'
-            loaded.problems.append(loaded.problem(path, problem, f"those that do: {', '.join(able) or 'none'}"))
+            loaded.note(path, problem, f"those that do: {', '.join(able) or 'none'}")
         elif name in upstream.sensors[:i]:
-            loaded.problems.append(loaded.problem(path, f'sensor "{name}" is listed twice', "name it once"))
+            loaded.note(path, f'sensor "{name}" is listed twice', "name it once")
     return tuple(able[name].name for name in upstream.sensors if name in able)
 
 
@@ -334,7 +314,7 @@ def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
         first, substeps = blocks[0], sensor.lowered.substeps
         if substeps != first.lowered.substeps:
             problem = f'it is advanced at {substeps} physics steps of a call, "{first.sensor}" at {first.lowered.substeps}'
-            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), problem, "expected as many of all"))
+            loaded.note(("sensors", sensor.sensor), problem, "expected as many of all")
 
 
 def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
@@ -384,22 +364,17 @@ def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
     for key, bound in accuracy.bounds:
         path = (*at, key) if key else at
         if key and key not in units:
-            problem = f'the reading has no quantity "{key}"'
-            loaded.problems.append(loaded.problem(path, problem, did_you_mean(key, units, "quantities"), on_key=True))
+            loaded.note(path, f'the reading has no quantity "{key}"', did_you_mean(key, units, "quantities"), on_key=True)
         wrong = [
-            quantity for quantity in ([key] if key in units else [] if key else units) if not _is_of(bound, units[quantity])
+            quantity
+            for quantity in ([key] if key in units else [] if key else units)
+            if bound.unit not in ("", units[quantity])
         ]
         if wrong:
-            problem = f'"{bound.text}" is in {bound.unit}, and the reading has {quantities}'
-            loaded.problems.append(loaded.problem(path, problem, _hint(units)))
+            loaded.note(path, f'"{bound.text}" is in {bound.unit}, and the reading has {quantities}', _hint(units))
     missing = [quantity for quantity in units if accuracy.of(quantity) is None]
     if missing:
-        problem = f"nothing is said of {listed(missing)}, which the reading has too"
-        loaded.problems.append(loaded.problem(at, problem, "expected a bound of each quantity"))
-
-
-def _is_of(bound: Bound, unit: str) -> bool:
-    return not bound.unit or bound.unit == unit
+        loaded.note(at, f"nothing is said of {listed(missing)}, which the reading has too", "expected a bound of each quantity")
 
 
 def _hint(units: Mapping[str, str]) -> str:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tgdsl.compiler.links import LinkBodies
 from tgdsl.compiler.lowered import LoweredSensor
+from tgdsl.compiler.sensed import LinkBodies
 from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout
@@ -42,14 +42,7 @@ class Pruned(NamedTuple):
 
 
 def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], link_bodies: LinkBodies, scene: Model) -> Pruned:
-    """Return the pairs that some request is of and that can meet.
-
-    Args:
-        sensors: The sensors.
-        sensed: The objects.
-        link_bodies: The bodies of each link.
-        scene: The scene.
-    """
+    """Return the pairs that some request is of and that can meet."""
     geoms = {link: [geom.id for geom in scene.rigid_geoms(bodies) if geom.is_colliding] for link, bodies in link_bodies.items()}
     can_meet: set[Pair] = set()
     touching: set[Pair] = set()
@@ -138,7 +131,8 @@ def share(sensors: Sensors, joined: Joined, layout: Layout, quantities: Sequence
         use_layout = layout.take(taxels) if len(taxels) else sensor.layout
         pos = places.setdefault(taxels.tobytes(), np.ascontiguousarray(layout.pos[taxels].T))
         for i, request in enumerate(sensor.requests):
-            request = _of_group([other.requests[i] for other in group]) if len(group) > 1 else request
+            if len(group) > 1:
+                request = group[0].requests[i].joined([other.requests[i] for other in group[1:]])
             noise = sensor.name if request.is_within_radii and sensor.radius_noise > 0 else ""
             name = _quantity_of(request, quantities).name
             key = taxels.tobytes(), tuple(use_layout.links), noise, request.key()
@@ -152,10 +146,6 @@ def share(sensors: Sensors, joined: Joined, layout: Layout, quantities: Sequence
                 order.append(key)
             of_sensor.setdefault(sensor.name, {})[name] = order.index(key)
     return Shared({name: [result[key] for key in use_keys] for name, use_keys in keys.items()}, of_sensor)
-
-
-def _of_group(requests: Sequence[Request]) -> Request:
-    return requests[0].joined(requests[1:])
 
 
 def _quantity_of(request: Request, quantities: Sequence[Quantity]) -> Quantity:

@@ -50,13 +50,6 @@ def names_of(robot: Model) -> list[list[str]]:
     return [[body] for body in robot.bodies] + [[*geom.names, geom.body] for geom in robot.geoms if geom.names]
 
 
-def check_groups(layout: LoadedLayout, robot: Model, problems: list[Problem]) -> None:
-    """Note the patterns of groups that match nothing."""
-    for group, selection in layout.spec.groups.items():
-        path: Path = ("groups", group)
-        select(selection, names_of(robot), layout.spec.groups, reporter(layout, path, problems), group)
-
-
 def reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:
     """Return a function that notes what is wrong with a pattern, at the place where the pattern stands.
 
@@ -107,13 +100,13 @@ def patches_of(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: d
         if not hits:
             all_names = [name for names in names_of(robot) for name in names]
             problem = f'no body, geom or mesh matches "{pattern}"'
-            loaded.problems.append(layout.problem(path, problem, did_you_mean(pattern, all_names, "links"), on_key=True))
+            layout.note(path, problem, did_you_mean(pattern, all_names, "links"), on_key=True)
         for link, geoms in hits:
             if link.name in result:
                 problem = f'link "{link.name}" already has a layout, by "{result[link.name].path[-1]}"'
-                loaded.problems.append(layout.problem(path, problem, "give each link one", on_key=True))
+                layout.note(path, problem, "give each link one", on_key=True)
             elif not geoms:
-                loaded.problems.append(layout.problem(path, f'link "{link.name}" has no geoms', on_key=True))
+                layout.note(path, f'link "{link.name}" has no geoms', on_key=True)
             else:
                 result[link.name] = Patch(link, geoms, placement, path)
     order = {body: i for i, body in enumerate(robot.bodies)}
@@ -151,14 +144,7 @@ def sampled(
 ) -> Layout:
     """Return the taxels of links.
 
-    Args:
-        loaded: The document.
-        layout: Its layout.
-        colliders: What the simulator collides of the robot.
-        patches: The links.
-        objects: Bodies of the robot's file that are no links, but objects.
-        pools: Points that were drawn on the links before; those that are drawn are added.
-        progress: Called with a line of text for each long job.
+    `objects` are bodies of the robot's file that are no links; points that are drawn on links are added to `pools`.
 
     Raises:
         SpecError: If a surface cannot satisfy a placement; all mistakes found so far.
@@ -172,8 +158,7 @@ def sampled(
             drawn = pools.setdefault((patch.as_collided, *(geom.id for geom in patch.geoms)), {})
             parts.append(sample(surface, patch.placement, layout.folder, name, covered, drawn))
         except SampleError as error:
-            problem = f'link "{patch.link.name}": {error.what}'
-            loaded.problems.append(layout.problem(patch.path, problem, error.hint))
+            layout.note(patch.path, f'link "{patch.link.name}": {error.what}', error.hint)
     loaded.raise_problems()
     if not parts:  # all sensors are on links, whatever their taxels
         return Layout.of_links((), {})

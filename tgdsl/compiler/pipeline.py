@@ -18,7 +18,7 @@ from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import models_of, resolve
 from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import TgdslError, did_you_mean, listed
+from tgdsl.errors import SpecError, TgdslError, did_you_mean, listed
 from tgdsl.formats.mjcf import xml_files
 from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import Unfelt
@@ -27,6 +27,7 @@ from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable
 from tgdsl.schema.load import load
 from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 
@@ -106,7 +107,6 @@ def _check_chosen(loaded: Loaded, choice: Choice) -> None:
 def _written(
     document: Document, overrides: Mapping[str, Any] | None, kinds: tuple[Kind, ...], sensors: Collection[str] | None
 ) -> Loaded:
-    """Return a document as it is written, what was chosen left out."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
         return load(document, overrides, kinds, sensors=sensors)
@@ -126,17 +126,6 @@ class Placed(NamedTuple):
     unfelt: dict[str, tuple[Unfelt, ...]]
 
 
-def layouts(
-    document: Document,
-    overrides: Mapping[str, Any] | None = None,
-    resolutions: Sequence[str] = (),
-    kinds: Sequence[Kind] = (),
-) -> tuple[mujoco.MjModel, dict[str, Layout]]:
-    """Return the model and the layouts of `placed`."""
-    result = placed(document, overrides, resolutions, kinds)
-    return result.model, result.layouts
-
-
 def placed(
     document: Document,
     overrides: Mapping[str, Any] | None = None,
@@ -145,13 +134,6 @@ def placed(
     progress: Progress = silent,
 ) -> Placed:
     """Return where a document puts taxels, at one resolution or more, without lowering sensors or baking objects.
-
-    Args:
-        document: A YAML file, or the same as a mapping; without sensors, all taxels of its layout count.
-        overrides: YAML text, or plain values, by dotted path.
-        resolutions: Default: the document's own, or all of the layout's if it names none.
-        kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
-        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
@@ -176,6 +158,28 @@ def placed(
     each = {name: resolve(parsed[name], progress, models) for name in shown_names}
     result = {name: unfelt(placement.colliders, placement.layout, placement.reach) for name, placement in each.items()}
     return Placed(each[shown_names[0]].scene.compiled, {name: placement.layout for name, placement in each.items()}, result)
+
+
+def all_layouts(
+    document: Document, overrides: Mapping[str, Any], resolutions: Sequence[str] = ()
+) -> tuple[LayoutSpec, dict[str, Layout]]:
+    """Return a document's layout as written, and the taxels of all its links at some resolutions (default: all).
+
+    Raises:
+        SpecError: All mistakes in the document and its layout, with file, line and column.
+        RobotError: If the robot cannot be read, or holds what is not supported.
+        TgdslError: If the layout has no such resolution.
+    """
+    loaded = load(document, overrides, known_kinds(()), needs_sensors=False)
+    if loaded.layout is None:
+        if loaded.is_without_layout:
+            loaded.note(("robot",), 'missing key "layout"', "only a layout has taxels to write down", on_key=True)
+        raise SpecError(loaded.problems)
+    spec = loaded.layout.spec
+    of_sensors = {**overrides, "resolution": next(iter(spec.resolutions))}
+    load(document, of_sensors, known_kinds(()), needs_sensors=False).raise_problems()
+    bare = {**overrides, "sensors": {}, "observations": {}}
+    return spec, placed(document, bare, resolutions or tuple(spec.resolutions)).layouts
 
 
 def _origin(loaded: Loaded) -> Origin:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.compiler.links import LinkBodies, check_named_bodies, link_bodies, sensor_joints
-from tgdsl.compiler.patches import Patch, Pools, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
-from tgdsl.compiler.sensed import sensed_object
+from tgdsl.compiler.patches import Patch, Pools, check_regions, matched, names_of, patches_of, reporter, sampled
+from tgdsl.compiler.sensed import LinkBodies, check_named_bodies, link_bodies, sensed_object, sensor_joints
 from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, RobotError, SampleError, SpecError, did_you_mean, listed
@@ -39,12 +38,9 @@ from tgdsl.surfaces.surface import Surface
 
 
 def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, OwnObjects]:
-    """Return the scene with the bodies that the document adds, and the objects that have geoms or sizes of their own.
+    """Return the scene with the bodies that the document adds, and the objects with geoms or sizes of their own.
 
-    Args:
-        loaded: The document; mistakes are noted in it.
-        scene: The scene as its file has it.
-        links: Bodies that carry taxels.
+    `links` are bodies that carry taxels.
     """
     bodies, objects, meshes = _new_bodies(loaded, scene), [], Meshes()
     scene = with_bodies(scene, bodies)
@@ -55,7 +51,7 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
             continue
 
         def report(place: Path, what: str, hint: str = "", name: str = name) -> None:
-            loaded.problems.append(loaded.problem(("objects", name, *place), what, hint))
+            loaded.note(("objects", name, *place), what, hint)
 
         same_body = [other for other, part in body_of.items() if part == body and other != name]
         rigid = [scene.compiled.body(i).name for i in scene.rigid_bodies(body, _others(loaded, body))]
@@ -72,7 +68,6 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
 
 
 def _others(loaded: Loaded, body: str) -> set[str]:
-    """Return the bodies of the objects that are not of a body."""
     return {target.body_of(name) for name, target in loaded.spec.objects.items()} - {body}
 
 
@@ -85,7 +80,7 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
     for name, target in loaded.spec.objects.items():
         if target.body is None and name in scene.bodies:
             problem = f'the scene has a body "{name}" already'
-            loaded.problems.append(loaded.problem(("objects", name), problem, f"`body: {name}` gives that one these geoms"))
+            loaded.note(("objects", name), problem, f"`body: {name}` gives that one these geoms")
         elif target.body is None:
             pos, quat = target.pos or (0.0, 0.0, 0.0), target.quat or (1.0, 0.0, 0.0, 0.0)
             bits = [
@@ -106,17 +101,12 @@ def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, S
         path: Path = ("objects", name, "body" if target.body is not None else "geom")
         body = target.body_of(name)
         if body not in scene.bodies:
-            hint = did_you_mean(body, scene.bodies, "bodies")
-            loaded.problems.append(loaded.problem(path, f'no body is named "{body}"', hint))
+            loaded.note(path, f'no body is named "{body}"', did_you_mean(body, scene.bodies, "bodies"))
             continue
         if (target.compounds or target.size == "per_env") and is_faulty:
             continue  # what is wrong with its geoms is known already
-
-        def report(what: str, hint: str, at: Path = path) -> None:
-            loaded.problems.append(loaded.problem(at, what, hint))
-
         variants = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else []
-        sensed = sensed_object(name, body, target, scene, variants, _others(loaded, body), report)
+        sensed = sensed_object(name, body, target, scene, variants, _others(loaded, body), partial(loaded.note, path))
         if name in felt:
             objects[name] = sensed
     return objects
@@ -200,11 +190,6 @@ class Resolved:
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 
-    def moved_by(self, joint: str) -> str:
-        """Return the body that a joint moves."""
-        model = self.scene.compiled
-        return model.body(model.jnt_bodyid[model.joint(joint).id]).name
-
     def anchor_of(self, joint: str) -> Float[np.ndarray, " 3"]:
         """Return where a joint's anchor is in the frame of the body that it moves [m]."""
         return self.scene.compiled.jnt_pos[self.scene.compiled.joint(joint).id].copy()
@@ -228,27 +213,23 @@ class Resolved:
     def geoms_of(self, link: str) -> tuple[SurfaceGeom, ...]:
         """Return the geoms that a link's taxels sit on: meshes as they are, or their convex hulls if the layout says so."""
         triangles = self.robot.hull if self.patches[link].as_collided else self.robot.mesh
-        geoms = self.patches[link].geoms
-        return tuple(SurfaceGeom(geom, triangles(geom) if geom.shape == "mesh" else None) for geom in geoms)
+        return tuple(SurfaceGeom(geom, triangles(geom) if geom.shape == "mesh" else None) for geom in self.patches[link].geoms)
 
     def layout_on(self, sensor: str) -> tuple[np.ndarray, Layout]:
         """Return the taxels of a sensor, and its layout; of one that is on links, no taxels and the links."""
         names = self.links[sensor]
         if sensor in self.on_links:
             joints = self.on_joints.get(sensor, ())
-            links = (*(Link(name, name) for name in names), *(Link(name, self.moved_by(name)) for name in joints))
+            model = self.scene.compiled
+            moved = [model.body(model.jnt_bodyid[model.joint(joint).id]).name for joint in joints]
+            links = (*(Link(name, name) for name in names), *map(Link, joints, moved))
             return np.zeros(0, dtype=np.int64), Layout.of_links(links, self.layout.groups)
         taxels = self.layout.taxels_of(names)
         return taxels, self.layout.take(taxels)
 
 
 def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None = None) -> Resolved:
-    """Place a document's sensors on its robot.
-
-    Args:
-        loaded: The document.
-        progress: Called with a line of text for each long job.
-        models: Robot and scene of the same document, read before; default: they are read.
+    """Place a document's sensors on its robot; models of the same document that were read before may be given.
 
     Raises:
         SpecError: All mistakes found so far, those of reading included.
@@ -268,7 +249,9 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     if robot is not None and loaded.is_without_layout:
         links = _sensor_links(loaded, {}, robot, [], on_links)
     elif robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
-        check_groups(loaded.layout, robot, loaded.problems)
+        for group, selection in loaded.layout.spec.groups.items():  # patterns that match nothing
+            report = reporter(loaded.layout, ("groups", group), loaded.problems)
+            select(selection, names_of(robot), loaded.layout.spec.groups, report, group)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
         if placements is not None:
             patches = patches_of(loaded, loaded.layout, robot, placements)
@@ -304,40 +287,13 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     return Resolved(layout, links, objects, new_objects, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
 
 
-def taxels_of_all_links(loaded: Loaded) -> Layout:
-    """Return where a document's layout puts taxels, on links that no sensor has too.
-
-    Raises:
-        SpecError: All mistakes found so far, those of reading included.
-        RobotError: If a model file cannot be read.
-    """
-    models = models_of(loaded)
-    robot = models.robot
-    patches: list[Patch] = []
-    if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
-        check_groups(loaded.layout, robot, loaded.problems)
-        patches = patches_of(loaded, loaded.layout, robot, loaded.layout.spec.resolutions.get(loaded.resolution or "", {}))
-    loaded.raise_problems()
-    assert robot is not None and loaded.layout is not None
-    objects = _object_bodies(loaded, robot)
-    return sampled(loaded, loaded.layout, models.colliders, patches, objects, models.pools, silent)
-
-
 def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:
-    """Return the bodies of the robot's file that are a document's objects, or parts of them: they are no links."""
     named = {target.body_of(name) for name, target in loaded.spec.objects.items()} & set(robot.bodies)
     return tuple(sorted({i for body in named for i in robot.rigid_bodies(body, named - {body})}))
 
 
 def _unlisted(robot: Model, scene: Model, listed: Collection[str], rigid: Collection[int]) -> Iterator[tuple[str, str]]:
-    """Yield the bodies with geoms of the scene that are neither the robot's nor an object's, and why nothing feels them.
-
-    Args:
-        robot: The robot.
-        scene: The scene.
-        listed: Names of the objects' bodies.
-        rigid: Indices of bodies that are parts of objects or links.
-    """
+    """Yield the bodies with geoms of the scene that are neither the robot's nor an object's, and why nothing feels them."""
     model, listed_bodies = scene.compiled, {*robot.bodies[1:], *listed}
     robot_bodies = {robot.body_path(i) for i in range(1, robot.compiled.nbody)}
     for i in range(model.nbody):
@@ -357,7 +313,7 @@ def models_of(loaded: Loaded) -> Models:
             if "/" not in model_name
             else "paths are relative to this document"
         )
-        loaded.problems.append(loaded.problem(("robot", "model"), f'there is no file or robot "{model_name}"', hint))
+        loaded.note(("robot", "model"), f'there is no file or robot "{model_name}"', hint)
     else:
         robot = load_model(loaded.robot_file)
     if loaded.spec.scene is None:
@@ -367,8 +323,7 @@ def models_of(loaded: Loaded) -> Models:
     if is_file(scene_file):
         scene = load_model(scene_file)
     else:
-        problem = f'there is no file "{loaded.spec.scene.model}"'
-        loaded.problems.append(loaded.problem(("scene", "model"), problem, "paths are relative to this document"))
+        loaded.note(("scene", "model"), f'there is no file "{loaded.spec.scene.model}"', "paths are relative to this document")
     return Models(robot, scene)
 
 
@@ -380,7 +335,7 @@ def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
     if file is None:
         beside = loaded.robot_file.with_name("colliders.yaml")
         problem = f'"{loaded.spec.robot.model}" has no primitive colliders: there is no file {beside}'
-        loaded.problems.append(loaded.problem(place, problem, "expected `collision: mesh`, or such a file"))
+        loaded.note(place, problem, "expected `collision: mesh`, or such a file")
         return ()
     try:
         result = load_colliders(file)
@@ -390,7 +345,7 @@ def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
     unknown = [collider.body for collider in result if collider.body not in scene.bodies]
     if unknown:
         problem = f'{file.name} has colliders of "{unknown[0]}", which is no body of the scene'
-        loaded.problems.append(loaded.problem(place, problem, did_you_mean(unknown[0], scene.bodies, "bodies")))
+        loaded.note(place, problem, did_you_mean(unknown[0], scene.bodies, "bodies"))
         return ()
     return result
 
@@ -402,7 +357,7 @@ def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
         return False
     problem = f"this layout is for another robot: {robot.file.name} has none of its {len(keys)} links"
     hint = f"the layout has {listed(keys, 4)}; the robot has {listed([b for b in robot.bodies if b != 'world'], 4)}"
-    loaded.problems.append(loaded.problem(("robot", "layout"), problem, hint))
+    loaded.note(("robot", "layout"), problem, hint)
     return True
 
 
@@ -433,7 +388,7 @@ def _sensor_links(
             hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
             loaded.problems += unknown or [loaded.problem(path, problem, hint)]
         elif not selected:
-            loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
+            loaded.note(path, "`exclude` leaves no link")
         links[name] = tuple(patches[i].link.name for i in selected)
     return links
 
@@ -446,7 +401,7 @@ def _links_chosen(loaded: Loaded, groups: Mapping[str, Selection], robot: Model,
     num_problems = len(loaded.problems)
     selected = select(loaded.spec.sensors[name].links, body_names, groups, reporter(loaded, path, loaded.problems))
     if not selected and len(loaded.problems) == num_problems:
-        loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
+        loaded.note(path, "`exclude` leaves no link")
     return tuple(bodies[i] for i in selected)
 
 
@@ -455,4 +410,4 @@ def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patc
     if missing:
         problem = f'the scene has no body "{missing[0]}", which the robot has'
         hint = did_you_mean(missing[0], scene.bodies, "bodies")
-        loaded.problems.append(loaded.problem(("scene", "model"), problem, f"a scene keeps the robot's names; {hint}"))
+        loaded.note(("scene", "model"), problem, f"a scene keeps the robot's names; {hint}")

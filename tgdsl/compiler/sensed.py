@@ -1,17 +1,22 @@
-"""What is felt of an object: which of its geoms, and which geoms the solver's contacts with it act on."""
+"""What is felt of an object, which bodies and joints a document's links are, and the geoms that contacts act on."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 
 import numpy as np
 
+from tgdsl.errors import did_you_mean
+from tgdsl.formats.joints import RobotJoints
 from tgdsl.formats.model import Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.inputs import ContactPart
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec, TemperaturePerEnv
 from tgdsl.schema.select import matching
+from tgdsl.schema.yaml import Path
+from tgdsl.sensors.base import OnJointsSpec
 from tgdsl.surfaces.bulk import PRIMITIVES, bulk
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.sensed import DistanceOptions, ObjectHeat, SensedObject
@@ -35,15 +40,6 @@ def sensed_object(
 
     Bodies that are welded to its body from below are part of it, and the solver's contacts with it are those on its geoms that
     collide. A surface that is only seen has none of its own: contacts with it are those of the whole object.
-
-    Args:
-        name: Its name.
-        body: Its body.
-        target: What the document says of it.
-        scene: The scene.
-        variants: If it has geoms of its own, the scene with each variant of them, and their names.
-        others: The other objects' bodies.
-        report: Called with mistakes.
     """
     bodies = scene.rigid_bodies(body, others)
     if target.compounds:
@@ -109,11 +105,7 @@ def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, 
 def contact_parts(scene: Model, bodies: Sequence[int], touched: Set[int], report: Report) -> tuple[ContactPart, ...]:
     """Return the geoms that contacts with an object or a link act on as MuJoCo's contact sensors can name them.
 
-    Args:
-        scene: The scene.
-        bodies: The bodies that are one rigid body, the first its own: see `Model.rigid_bodies`.
-        touched: Indices of the geoms.
-        report: Called where a geom has no name that would tell it apart.
+    `bodies` are one rigid body, the first its own; `report` is called where a geom has no name that would tell it apart.
     """
     model, first = scene.compiled, bodies[0]
     body_geoms = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in bodies}
@@ -161,3 +153,69 @@ def _chosen(own: tuple[Geom, ...], body: str, target: ObjectSpec, report: Report
         names = sorted({name for geom in own for name in geom.names})
         report(f'no geom or mesh of body "{body}" matches "{target.surface}"', f"it has {', '.join(names)}")
     return named
+
+
+LinkBodies = Mapping[str, tuple[int, ...]]
+"""Indices of the bodies that each link's body is one rigid body with, its own first, by its name."""
+
+
+def link_bodies(scene: Model, links: Collection[str], objects: Collection[str]) -> dict[str, tuple[int, ...]]:
+    """Return the bodies that each link's body is one rigid body with: see `Inputs.parts_of_link`.
+
+    `links` carry taxels of the layout or are links of a sensor, `objects` are bodies of objects.
+    """
+    apart = {*links, *objects}
+    return {link: scene.rigid_bodies(link, apart) for link in sorted(links)}
+
+
+def link_parts(scene: Model, bodies: tuple[int, ...], report: Report) -> tuple[ContactPart, ...]:
+    """Return the geoms that contacts with a link act on, nothing where no body but its own has geoms that collide.
+
+    `report` is called where a geom has no name that would tell it apart.
+    """
+    colliding = [geom for geom in scene.rigid_geoms(bodies) if geom.is_colliding]
+    if not any(scene.compiled.geom_bodyid[geom.id] != bodies[0] for geom in colliding):
+        return ()
+    return contact_parts(scene, bodies, {geom.id for geom in colliding}, report)
+
+
+def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) -> list[str]:
+    """Return the joints that a pattern matches, in their order; that there are none is noted."""
+    hits = matching(pattern, [name for name in own.joints if name])
+    if not hits:
+        joint_names = [name for name in (*own.joints, *own.others) if name]
+        problem, hint = f'no joint of the robot matches "{pattern}"', did_you_mean(pattern, joint_names, "joints")
+        if matching(pattern, own.others):
+            problem, hint = f'"{pattern}" is a ball or free joint', "it has no single position; expected hinges and slides"
+        loaded.note(path, problem, hint)
+    return hits
+
+
+def sensor_joints(loaded: Loaded, own: RobotJoints) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield each sensor that is on joints, and these; that there are none, or nameless ones, is noted."""
+    for name, spec in loaded.spec.sensors.items():
+        if not isinstance(spec, OnJointsSpec):
+            continue
+        num_problems = len(loaded.problems)
+        path: Path = ("sensors", name, "joints")
+        if spec.joints is None:
+            selected = own.joints[: own.num_actuated]
+        else:
+            hits = [joints_matching(loaded, (*path, k), pattern, own) for k, pattern in enumerate(spec.joints)]
+            selected = tuple(dict.fromkeys(joint for joints in hits for joint in joints))
+        if len(loaded.problems) == num_problems and not selected:
+            problem, hint = "the robot has no actuated joints", 'name them: joints: ["*"]' if own.joints else ""
+            loaded.note(("sensors", name), problem, hint)
+        if "" in selected:
+            problem = "an actuated joint of the robot has no name"
+            loaded.note(("sensors", name), problem, "name it in the robot's file, or list `joints`")
+        yield name, selected
+
+
+def check_named_bodies(loaded: Loaded, scene: Model) -> None:
+    """Note bodies that a sensor's spec names and the scene does not have."""
+    for name, spec in loaded.spec.sensors.items():
+        for field, body in spec.named_bodies.items():
+            if body not in scene.bodies:
+                problem = f'the scene has no body "{body}"'
+                loaded.note(("sensors", name, field), problem, did_you_mean(body, scene.bodies, "bodies"))

@@ -109,12 +109,7 @@ def unit_of(value: str) -> str:
 
 
 def dimension_of(value: str, dimensions: Sequence[str]) -> str | None:
-    """Return which of some dimensions a text's unit is of; None: of none of them.
-
-    Args:
-        value: Such as `"4 mm"`.
-        dimensions: Keys of `UNITS`.
-    """
+    """Return which of some dimensions the unit of a text such as "4 mm" is of; None: of none of them."""
     unit = unit_of(value.translate(_SPELLINGS))
     return next((dimension for dimension in dimensions if unit in UNITS[dimension]), None)
 
@@ -128,19 +123,11 @@ def _without_unit(number: float, unit: str) -> str:
 
 
 def _example(known: Mapping[str, float]) -> str:
-    """Return the last of some units whose scale begins at 0."""
     return [unit for unit in known if unit not in ZEROS][-1]
 
 
 def doubt(value: float, dimension: str | Dimension, low: float, high: float) -> tuple[str, str] | None:
-    """Return why a quantity was most likely meant in another unit, and in which; None if there is no doubt.
-
-    Args:
-        value: The quantity, in SI units.
-        dimension: A key of `UNITS`, or one's own.
-        low: Least usual magnitude; 0 is usual too.
-        high: Largest usual magnitude.
-    """
+    """Return why a quantity [SI] was most likely meant in another unit, and in which; None of usual magnitudes, and of 0."""
     if value == 0 or low <= abs(value) <= high:
         return None
     known = units_of(dimension)

@@ -118,23 +118,13 @@ def cached(
     try:
         with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
             value = unpack(archive)
-        _touch(file)
+        with contextlib.suppress(OSError):  # it is somebody else's, or was just removed
+            os.utime(file)  # many file systems do not note when one was read
         return value
     except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         pass  # there is none, or it is damaged
     value = make()
-    _write(file, pack(value))
+    with contextlib.suppress(FileError), atomic_open(with_folder(file)) as out:  # a folder that cannot be written is left alone
+        np.savez(out, allow_pickle=False, **pack(value))
     evict(limit)
     return value
-
-
-def _touch(file: Path) -> None:
-    """Note that a file was used: many file systems do not note when one was read."""
-    with contextlib.suppress(OSError):  # it is somebody else's, or was just removed
-        os.utime(file)
-
-
-def _write(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a cache file; a folder that cannot be written is left alone."""
-    with contextlib.suppress(FileError), atomic_open(with_folder(file)) as out:
-        np.savez(out, allow_pickle=False, **arrays)

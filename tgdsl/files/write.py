@@ -1,6 +1,7 @@
 """Atomic writes: a file appears whole, or not at all, with the permissions of any new file; its folder; and what goes wrong.
 
-What is written goes to a temporary file beside the target, which then takes the target's place.
+What is written goes to a temporary file beside the target, which then takes the target's place. What fails is a `FileError`
+that names the target.
 """
 
 from __future__ import annotations
@@ -40,11 +41,7 @@ def check_writable(target: Path) -> Path:
 
 
 def with_folder(target: Path) -> Path:
-    """Make the folder of a file that is written next; return the file.
-
-    Raises:
-        FileError: If it cannot be made.
-    """
+    """Make the folder of a file that is written next; return the file."""
     with as_file_error(target):
         target.parent.mkdir(parents=True, exist_ok=True)
     return target
@@ -55,9 +52,6 @@ def atomic_path(target: Path) -> Iterator[Path]:
     """Yield an empty temporary file of the target's suffix, for a library that writes to a path; then it replaces the target.
 
     If anything is raised meanwhile it is removed, and the target stays as it was.
-
-    Raises:
-        FileError: If it cannot be written; the error names the target.
     """
     temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
     with as_file_error(target):
@@ -73,31 +67,19 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_open(target: Path) -> Iterator[IO[bytes]]:
-    """Open a file for writing bytes; when it is closed it replaces the target.
-
-    Raises:
-        FileError: If it cannot be written; the error names the target.
-    """
+    """Open a file for writing bytes; when it is closed it replaces the target."""
     with atomic_path(target) as temporary, temporary.open("wb") as file:
         yield file
 
 
 def atomic_write(target: Path, content: bytes) -> None:
-    """Write a file; one that is there is replaced.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
+    """Write a file; one that is there is replaced."""
     with atomic_open(target) as file:
         file.write(content)
 
 
 def atomic_write_all(contents: Mapping[Path, bytes]) -> None:
-    """Write files that belong together, and their folders: none takes its place before all are written, the last one last.
-
-    Raises:
-        FileError: If one cannot be written; then no folder is left that was not there.
-    """
+    """Write files that belong together, and their folders: none takes its place before all are written, the last one last."""
     with ExitStack() as stack:
         for target, content in reversed(list(contents.items())):  # what was opened last is closed first
             stack.enter_context(new_folder(target))
@@ -106,11 +88,7 @@ def atomic_write_all(contents: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def as_file_error(target: Path) -> Iterator[None]:
-    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile.
-
-    Raises:
-        FileError: Instead of any OSError.
-    """
+    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile."""
     try:
         yield
     except FileError:
@@ -121,11 +99,7 @@ def as_file_error(target: Path) -> Iterator[None]:
 
 @contextmanager
 def new_folder(target: Path) -> Iterator[None]:
-    """Make the folder of a file; if anything is raised meanwhile, remove those folders that were not there and are empty.
-
-    Raises:
-        FileError: If it cannot be made.
-    """
+    """Make the folder of a file; if anything is raised meanwhile, remove those folders that were not there and are empty."""
     new = [folder for folder in target.parents if not folder.exists()]
     with_folder(target)
     try:

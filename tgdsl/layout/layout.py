@@ -6,12 +6,10 @@ Shapes: `taxel` rows, sorted by link; every position and direction is in the fra
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-
-from tgdsl.fields.indices import indices
 
 
 @dataclass(frozen=True)
@@ -45,13 +43,13 @@ class Layout:
 
     links: tuple[Link, ...]
     groups: Mapping[str, tuple[str, ...]]
-    link_id: Int[np.ndarray, " taxel"] = field(metadata=indices(lambda layout, part, plan: len(layout.links)))
+    link_id: Int[np.ndarray, " taxel"]
     pos: Float[np.ndarray, "taxel 3"]
     normal: Float[np.ndarray, "taxel 3"]
     tangent: Float[np.ndarray, "taxel 3"]
     radius: Float[np.ndarray, " taxel"]
     area: Float[np.ndarray, " taxel"]
-    cell: Int[np.ndarray, "taxel 2"] = field(metadata=indices(None, least=-1))
+    cell: Int[np.ndarray, "taxel 2"]
 
     @staticmethod
     def of_links(links: tuple[Link, ...], groups: Mapping[str, tuple[str, ...]]) -> Layout:

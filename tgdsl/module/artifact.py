@@ -8,14 +8,13 @@ from pathlib import Path
 
 import torch
 
-from tgdsl.errors import ArtifactError, TgdslError
+from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.plan_file import METADATA_KEY as METADATA_KEY
 from tgdsl.module.plan_file import load_plan, save_plan
 from tgdsl.module.taxels.identity import Taxels, check_taxels
-from tgdsl.plan import ranges
 from tgdsl.sensors import Kind
-from tgdsl.sensors.known import kinds_by_sensor, known_kinds, quantities_of
+from tgdsl.sensors.known import known_kinds, quantities_of
 from tgdsl.tensors.devices import device_of, dtype_of
 
 
@@ -56,20 +55,13 @@ def load(
         taxels: The taxels that are expected, such as those that a policy learned with: see `identity.check_taxels`.
 
     Raises:
-        ArtifactError: If the file is not an artefact, is damaged, is of another version, or holds indices of what is not there.
+        ArtifactError: If the file is not an artefact, is damaged or is of another version.
         TaxelError: If it has other taxels than expected, or in another order: it says how they differ.
         TgdslError: If it uses a kind that is neither installed nor given, or there is no such dtype or device.
     """
     dtype, device = dtype_of(dtype), device_of(device)
     all_kinds = known_kinds(kinds)
     plan = load_plan(path, quantities_of(all_kinds))
-    by_sensor = kinds_by_sensor(all_kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
-    try:
-        for sensor in plan.sensors:
-            counts = by_sensor[sensor.name].indices(sensor.constants, len(sensor.taxels))
-            ranges.check_constants(f"sensors/{sensor.name}", sensor.constants, counts)
-    except ArtifactError as error:
-        raise ArtifactError(f"{path}: {error}") from error
     touch = TactileModule(plan, all_kinds, dtype)
     if taxels is not None:
         check_taxels(touch, taxels, str(path))

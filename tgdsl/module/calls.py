@@ -34,12 +34,7 @@ class Calls:
         self.graphed: dict[str, Graphed] = {}
 
     def compile(self, graph: bool, **options: Any) -> None:
-        """Have steps compiled when they are first called, and replayed as CUDA graphs if wanted.
-
-        Args:
-            graph: Whether calls without derivatives replay a CUDA graph.
-            **options: Handed to `torch.compile`.
-        """
+        """Have steps compiled when they are first called, and calls without derivatives replayed as CUDA graphs if wanted."""
         self._wanted, self.compiled, self.graphed = (graph, options), {}, {}
 
     def of(self, step: Step) -> Step:

@@ -13,17 +13,10 @@ from tgdsl.plan.inputs import Inputs
 
 
 def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, spread: float) -> SceneState:
-    """Return a random state of all wanted fields, with bodies close enough to touch.
+    """Return a random state of all wanted fields, with bodies close enough to touch: see `TactileModule.example_state`.
 
     Contacts lie around their links, with unit normals and forces inside a friction cone of 0.5; every third slot is unused, and
     the net force is the slots' sum.
-
-    Args:
-        inputs: What is wanted.
-        num_envs: Number of environments.
-        seed: Seed of the draw.
-        dtype: Dtype of the tensors.
-        spread: Standard deviation of the bodies' positions, and of contacts from their links [m].
     """
     generator = torch.Generator().manual_seed(seed)
     values: dict[str, Any] = {}

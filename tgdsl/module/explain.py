@@ -128,19 +128,15 @@ def explain(touch: Explained) -> str:
     lines += _links(touch) + [""]
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
-    lines += [line for each in touch.quantities for line in _account(touch, each)]
+    for asked in touch.quantities:
+        for headline, account in asked.account(plan.quantities[asked.name], plan.objects).items():
+            lines += ["", headline, *(f"  {line}" for line in account)]
     lines += [""] + _observations(touch) + _inputs(touch)
     lines += ["left out"] + [f"  {name}: {why}" for name, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
     if plan.unfelt:
         lines += [f"{len(unfelt_ids(plan.unfelt))} taxels cannot feel", *(f"  {taxels}" for taxels in plan.unfelt), ""]
     return "\n".join(lines + _costs(touch))
-
-
-def _account(touch: Explained, asked: Quantity) -> list[str]:
-    """Return what was measured of what a quantity computes beforehand."""
-    result = asked.account(touch.plan.quantities[asked.name], touch.plan.objects)
-    return [line for headline, lines in result.items() for line in ["", headline, *(f"  {line}" for line in lines)]]
 
 
 def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:

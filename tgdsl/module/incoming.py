@@ -20,6 +20,7 @@ from tgdsl.plan.plan import Plan
 from tgdsl.sensors.base import Kind
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.env_ids import EnvIds, env_mask, is_out_of_sight
+from tgdsl.tensors.on_host import HostCopy
 
 TOLERANCE = 1e-3
 """Part of a pair's force that slots may lack unnoticed: far above what single precision makes of a sum."""
@@ -40,8 +41,7 @@ class SlotWatch:
         self._warned: set[int] = set()
         self._num_calls = 0
         self._wanted: Tensor | None = None
-        self._seen: Tensor | None = None
-        self._copied: torch.cuda.Event | None = None
+        self._copy = HostCopy()
 
     @property
     def is_done(self) -> bool:
@@ -57,7 +57,7 @@ class SlotWatch:
         with torch.inference_mode(False), torch.no_grad():
             if self._wanted is None or self._wanted.device != whole.device:
                 self._wanted = torch.zeros(whole.shape[1], dtype=torch.float32, device=whole.device)
-                self._seen, self._copied = None, None
+                self._copy = HostCopy()
         with torch.no_grad():
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
             size = whole.abs().amax(dim=-1) + force.abs().amax(dim=(2, 3))
@@ -68,7 +68,7 @@ class SlotWatch:
 
     def warn(self) -> None:
         """Warn of what has been noted. A GPU is not waited for: what it notes may be seen a call or more later."""
-        wanted = self._shown()
+        wanted = None if self._wanted is None else self._copy.poll(self._wanted)
         if wanted is None:
             return
         new = [i for i, number in enumerate(wanted.tolist()) if number and i not in self._warned]
@@ -84,23 +84,6 @@ class SlotWatch:
             stacklevel=6,
         )
 
-    def _shown(self) -> Tensor | None:
-        """Return what has been noted, on the host; None if it is not there yet."""
-        if self._wanted is None or self._wanted.device.type != "cuda":
-            return self._wanted
-        if torch.cuda.is_current_stream_capturing():
-            return None
-        if self._copied is not None and not self._copied.query():
-            return None
-        seen = None if self._copied is None or self._seen is None else self._seen.clone()
-        with torch.inference_mode(False):
-            if self._seen is None:
-                self._seen = torch.zeros(self._wanted.shape, dtype=torch.float32, pin_memory=True)
-            self._seen.copy_(self._wanted, non_blocking=True)
-        self._copied = torch.cuda.Event()
-        self._copied.record(torch.cuda.current_stream(self._wanted.device))
-        return seen
-
 
 SAME_TIME = 1e-9
 """Relative difference up to which two times are one: what is left when a call's time is divided by its substeps."""
@@ -110,13 +93,7 @@ class Incoming:
     """Takes states apart for a module, and warns once of what is odd about them."""
 
     def __init__(self, plan: Plan, kinds: Mapping[str, Kind], constants: Constants):
-        """Begin; nothing has come in.
-
-        Args:
-            plan: The plan.
-            kinds: The kind of each sensor, by the sensor's name.
-            constants: The module's constants, of which some may depend on the time between calls.
-        """
+        """Begin; nothing has come in."""
         self._plan, self._kinds, self._constants = plan, kinds, constants
         self._timesteps = {sensor.name: sensor.timestep for sensor in plan.sensors if sensor.timestep}
         self._dt: tuple[float, Tensor] | None = None
@@ -130,11 +107,6 @@ class Incoming:
 
     def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return the fields of a state that are wanted, by name; those of earlier substeps as `substep/<i>/<field>`.
-
-        Args:
-            state: The state.
-            dtype: Dtype of the module.
-            device: Where it is.
 
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.

@@ -20,13 +20,10 @@ from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
 from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
-from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory.memory import Memory, kept, store
-from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows, rows_of
-from tgdsl.module.observing import ObservationTerm, observation_terms, observe
-from tgdsl.module.outputs import Output, outputs_of
-from tgdsl.module.sensing import Sensing, in_order, sense
+from tgdsl.module.memory.memory import Memory, chosen_rows, few_rows, kept, read_rows, rows_of, store
+from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, observe, outputs_of
+from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
 from tgdsl.module.state import SceneState
 from tgdsl.module.taxels.identity import SavedTaxels
 from tgdsl.module.taxels.tables import images_of, row_tables, taxel_table

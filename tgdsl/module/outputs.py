@@ -1,14 +1,24 @@
-"""What a module's readings are, for users.
+"""What a module's readings and observations are, and the observations that are made of readings.
 
-Shapes: `row` taxels, bodies, joints or actuators, `channel` numbers per row, `step` stacked calls.
+Shapes: `env` environments, `step` stacked calls, `row` taxels, bodies, joints or actuators, `channel` numbers per row,
+`feature` numbers of an observation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from tgdsl.console.tables import Outputs
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.console.tables import Observations, Outputs
+from tgdsl.errors import ObservationError, did_you_mean
+from tgdsl.observations import observations
 from tgdsl.plan.plan import Plan
+from tgdsl.plan.sensors import PlannedReading
+from tgdsl.tensors.buffers import Constants
 
 
 @dataclass(frozen=True)
@@ -52,3 +62,98 @@ def outputs_of(plan: Plan) -> tuple[Output, ...]:
         for r in plan.proprioception
     )
     return Outputs(sensed + joints)
+
+
+@dataclass(frozen=True)
+class ObservationTerm:
+    """One term of an observation group.
+
+    Attributes:
+        name: The reading that is observed, or the type where there is none; `<name>[<i>]` where several terms of the group have
+            that name, i being the term's number.
+        type: Its type.
+        size: How many features it gives.
+        slice: Where they stand among the group's.
+    """
+
+    name: str
+    type: str
+    size: int
+    slice: slice
+
+
+def observation_terms(plan: Plan) -> dict[str, tuple[ObservationTerm, ...]]:
+    """Return the terms of each observation group, in the order in which they are concatenated; it prints as a table."""
+    groups: dict[str, list[ObservationTerm]] = {}
+    plain = [(term.group, term.reading or term.type) for term in plan.observations]
+    for term, (group, name) in zip(plan.observations, plain, strict=True):
+        earlier = groups.setdefault(group, [])
+        start = earlier[-1].slice.stop if earlier else 0
+        term_name = name if plain.count((group, name)) == 1 else f"{name}[{term.index}]"
+        earlier.append(ObservationTerm(term_name, term.type, term.num_features, slice(start, start + term.num_features)))
+    return Observations({group: tuple(terms) for group, terms in groups.items()})
+
+
+def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+    """Return the observation groups of a plan, each the concatenation of its terms, every term flattened channel-major.
+
+    Raises:
+        ObservationError: If a reading that is observed is missing or of another shape, if readings are of different numbers of
+            environments, or an observation is one that only the real hand has.
+    """
+    if not isinstance(readings, Mapping):
+        raise ObservationError(
+            f"found a {type(readings).__name__}, expected readings by name, as a call of the module returns them"
+        )
+    num_envs = _checked(plan, readings)
+    groups: dict[str, list[Tensor]] = {}
+    for term in plan.observations:
+        features = [torch.empty((num_envs, 0), dtype=constants.dtype, device=constants.device)]
+        if term.reading is not None:
+            folded = constants.tree["observations"][term.key]
+            reading = readings[term.reading]
+            steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
+            features = [observations.observe(term.type, step, term.channels, folded) for step in steps]
+        groups.setdefault(term.group, []).extend(features)
+    return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+
+
+def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
+    """Look at the readings that are observed, and return of how many environments they are.
+
+    Raises:
+        ObservationError: As `observe`.
+    """
+    all_readings = plan.readings()
+    for term in plan.observations:
+        if term.type in observations.HAND_ONLY:
+            raise observations.hand_only_error(term.group, term.index, term.type)
+        if term.reading is None:
+            continue
+        where = f"observation {term.group}[{term.index}] ({term.type})"
+        if term.reading not in readings:
+            given_names = f"found {', '.join(readings)}" if readings else "found none"
+            raise ObservationError(f'{where} wants the reading "{term.reading}"; {given_names}')
+        _check(where, all_readings[term.reading], readings[term.reading])
+    if not readings:
+        raise ObservationError("there are no readings, so nothing says how many environments there are")
+    counts = {name: len(reading) for name, reading in readings.items() if name in all_readings}
+    if not counts:
+        unknown = next(iter(readings))
+        raise ObservationError(f'this module has no reading "{unknown}"; {did_you_mean(unknown, all_readings, "readings")}')
+    first = next(iter(counts))
+    for name, count in counts.items():
+        if count != counts[first]:
+            raise ObservationError(f'reading "{name}" is of {count} environments, "{first}" of {counts[first]}')
+    return counts[first]
+
+
+def _check(where: str, planned: PlannedReading, reading: object) -> None:
+    want = (*([planned.steps] if planned.steps else []), planned.num_rows, len(planned.channels))
+    if not isinstance(reading, Tensor):
+        raise ObservationError(f'{where}: reading "{planned.name}" is a {type(reading).__name__}, expected a torch tensor')
+    if reading.ndim != len(want) + 1 or tuple(reading.shape[1:]) != want:
+        expected = ", ".join(map(str, want))
+        raise ObservationError(
+            f'{where}: reading "{planned.name}" has shape {tuple(reading.shape)}, expected (env, {expected})'
+        )

@@ -6,30 +6,116 @@ Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row, 
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, listed
-from tgdsl.module.gathering import Tree, gather, gathered_of, scene_of
 from tgdsl.module.memory.clock import Clock
 from tgdsl.module.memory.history import pushed, reduced
 from tgdsl.module.memory.memory import WINDOW
+from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
-from tgdsl.quantities.base import Gathered, Quantity
+from tgdsl.quantities.base import Gathered, Quantity, Scene
 from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
 from tgdsl.sensors.base import UNTIMED, Context, Kind
 from tgdsl.sensors.noise.gain import GAIN
+from tgdsl.sensors.noise.radius import RADIUS
 from tgdsl.sensors.noise.release import RELEASE
 from tgdsl.sensors.noise.stage import NO_CLOCK, Now
 from tgdsl.sensors.noise.stages import AnyStage, Drawn, disturb, draw
 from tgdsl.sensors.upstream import Upstream
 from tgdsl.tensors.fusion import materialised
+
+Tree = Mapping[str, Any]
+"""What `parts` returns, with tensors for arrays."""
+
+
+def parts(plan: Plan) -> dict[str, Any]:
+    """Return what of a plan is read at run time, its arrays being a module's constants."""
+    return {
+        "pairs": plan.pairs,
+        "quantities": plan.quantities,
+        "sensors": {sensor.name: sensor.constants for sensor in plan.sensors},
+        "noise": {sensor.name: sensor.noise.constants for sensor in plan.sensors if sensor.noise is not None},
+        "observations": {term.key: term.constants for term in plan.observations},
+    }
+
+
+def constant_arrays(plan: Plan) -> dict[str, np.ndarray]:
+    """Return the arrays of these parts, by the names that the plan gives them."""
+    names, result = {id(array): name for name, array in plan.arrays.items()}, {}
+    tree.mapped(parts(plan), lambda array: result.setdefault(names[id(array)], array), _stays_on_host)
+    return result
+
+
+def bind(plan: Plan, kinds: Mapping[str, Kind], tensor_of: Callable[[str], Tensor]) -> Tree:
+    """Return these parts with a tensor in the place of each array, and constants as the kind of each sensor has them."""
+    names = {id(array): name for name, array in plan.arrays.items()}
+    bound = tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]), _is_prepared)
+    return {**bound, "sensors": {name: kinds[name].typed(constants) for name, constants in bound["sensors"].items()}}
+
+
+def _stays_on_host(record: Any) -> bool:
+    """Return whether a part of the plan is no constant of a module, but the source of one."""
+    return getattr(record, "stays_on_host", False)
+
+
+def _is_prepared(record: Any) -> bool:
+    """Return the same, after making now what is made of it: no compiler traces that."""
+    return _stays_on_host(record) and record.prepared is not None
+
+
+def scene_of(
+    plan: Plan,
+    own: Tree,
+    tensors: Mapping[str, Tensor],
+    nows: Mapping[str, Now],
+    drawn: Mapping[str, Drawn],
+    dtype: torch.dtype,
+) -> Scene:
+    """Return what quantities are gathered from; drawn values of noise may disturb the taxels' radii."""
+    shifts = {}
+    for sensor in plan.sensors:
+        if sensor.noise is not None and RADIUS.name in sensor.noise.terms:
+            values = drawn[sensor.name][RADIUS.name]
+            probes = values.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
+            shifts[sensor.name] = RADIUS.shift(values, nows[sensor.name], probes)
+    return Scene(tensors, plan.objects, _pairs(own["pairs"], tensors, dtype) if plan.objects else None, shifts, dtype)
+
+
+def gather(quantities: Sequence[Quantity], own: Tree, scene: Scene) -> dict[str, tuple[Any, ...]]:
+    """Return the values of all uses of each quantity, by its name."""
+    values_of = {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
+    for name, values in values_of.items():
+        if not isinstance(values, (tuple, list)):
+            problem = f"expected a tuple with a value for each use, found {type(values).__name__}"
+            raise TgdslError(f'`gather` of the quantity "{name}": {problem}')
+    return values_of
+
+
+def gathered_of(sensor: PlannedSensor, quantities: Sequence[Quantity], values: Mapping[str, tuple[Any, ...]]) -> Gathered:
+    """Return what a sensor asked for."""
+    used = [quantity for quantity in quantities if quantity.name in sensor.uses]
+    for name in (quantity.name for quantity in used):
+        if sensor.uses[name] >= len(values[name]):
+            problem = f'{len(values[name])} values, and sensor "{sensor.name}" has use {sensor.uses[name]} (from 0)'
+            raise TgdslError(f'`gather` of the quantity "{name}" returns {problem}; expected one for each use')
+    return Gathered({quantity.request: values[quantity.name][sensor.uses[quantity.name]] for quantity in used})
+
+
+def _pairs(table: PairTable[Tensor], tensors: Mapping[str, Tensor], dtype: torch.dtype) -> Pairs:
+    gate = gates(tensors["contact_found"], table.gate, dtype) if "contact_found" in tensors else None
+    motion = tensors.get("body_linvel"), tensors.get("body_angvel")
+    return relate(tensors["body_pos"], tensors["body_quat"], table.link, table.object, dtype, *motion, gate)
+
 
 Tensors = dict[str, Tensor]
 
@@ -37,14 +123,7 @@ Tensors = dict[str, Tensor]
 def joined_signal(
     kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Any]
 ) -> Float[Tensor, "env channel taxel"]:
-    """Return the signals of sensors that are computed as one, one sensor's taxels after the other's.
-
-    Args:
-        kind: Their kind.
-        sensors: The sensors.
-        gathered: What they asked for, of the taxels of all of them.
-        constants: What was folded for each of them: scalars.
-    """
+    """Return the signals of sensors that are computed as one, one sensor's taxels after the other's."""
     of_taxels: Tensors = {}
     if names := tuple(sensors[0].constants):
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
@@ -73,18 +152,6 @@ def read(
 
     Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
     fuses then has the equation write all channels side by side, and would else form them again for each number of the noise.
-
-    Args:
-        sensor: The sensor.
-        kind: Its kind.
-        gathered: What it asked for.
-        context: When its kind is called.
-        constants: What its kind folded.
-        stages: The stages of its noise.
-        drawn: Their values.
-        memory: The state of all sensors, by `sensor:name`.
-        now: When it is read.
-        joined: Its signal, if that was computed with others'.
     """
     if GAIN in stages and kind.gains_depth:
         felt, gains = gathered[ContactDepth], drawn[GAIN.name]
@@ -129,14 +196,6 @@ def block(
     """Return the reading of a sensor that is advanced at each substep, its new state, and what its kind returned at each.
 
     The reading is (env, sample, row, channel).
-
-    Args:
-        sensor: The sensor.
-        kind: Its kind.
-        gathered: What it asked for, at each substep.
-        contexts: When its kind is called.
-        constants: What its kind folded.
-        memory: The state of all sensors, by `sensor:name`.
     """
     samples, answers, state = [], [], _kind_state(sensor, memory)
     for part, context in zip(gathered, contexts, strict=True):
@@ -189,12 +248,10 @@ def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None
 
 
 def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env *sample channel row"]:
-    """Return what a kind found as one tensor: by its name, or of the planes of its channels."""
     return found[name] if name in found else torch.stack([found[channel] for channel in channels], dim=1)
 
 
 def _kind_state(sensor: PlannedSensor, memory: Mapping[str, Tensor]) -> Tensors:
-    """Return what the kind remembers."""
     return {name: memory[f"{sensor.name}:{name}"] for name in sensor.state if "/" not in name}
 
 
@@ -290,7 +347,6 @@ def sense(
 
 
 def _with_upstream(sensor: PlannedSensor, gathered: Gathered, answers: Mapping[str, list[Tensors]], substep: int) -> Gathered:
-    """Return what a sensor asked for, with the planes of the sensors that it reads."""
     if not sensor.upstream:
         return gathered
     return gathered.replaced(Upstream, {name: answers[name][substep] for name in sensor.upstream})
@@ -304,14 +360,12 @@ def _gathered(
     drawn: Mapping[str, Drawn],
     dtype: torch.dtype,
 ) -> dict[str, Gathered]:
-    """Return by sensor what it asked for, of one state."""
     scene = scene_of(sensing.plan, own, tensors, nows, drawn, dtype)
     values = gather(sensing.quantities, own, scene)
     return {sensor.name: gathered_of(sensor, sensing.quantities, values) for sensor in sensing.plan.sensors}
 
 
 def _substeps(plan: Plan, tensors: Mapping[str, Tensor]) -> list[Tensors]:
-    """Return the fields of each substep before the last one."""
     names = [name for name in plan.inputs.fields if name != "dt"]
     return [{name: tensors[f"substep/{i}/{name}"] for name in names} for i in range(plan.inputs.substeps - 1)]
 

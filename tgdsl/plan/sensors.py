@@ -11,7 +11,6 @@ from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
-from tgdsl.fields.indices import indices
 from tgdsl.layout.layout import Link
 from tgdsl.plan.tree import INLINE
 
@@ -124,7 +123,7 @@ class PlannedSensor(Generic[Array]):
     sensor: str
     kind: str
     links: tuple[Link, ...]
-    taxels: Array = field(metadata=indices(lambda sensor, part, plan: plan.layout.num_taxels))
+    taxels: Array
     uses: Mapping[str, int]
     joined: tuple[str, ...]
     rows: tuple[int, int]
@@ -184,15 +183,9 @@ class PlannedObservation(Generic[Array]):
     index: int
     type: str
     reading: str | None
-    channels: tuple[int, ...] = field(
-        metadata=indices(lambda term, part, plan: len(plan.readings()[term.reading].channels) if term.reading else 0)
-    )
+    channels: tuple[int, ...]
     num_features: int
-    constants: Mapping[str, Array] = field(
-        metadata=indices(
-            lambda term, part, plan: {"rows": plan.readings()[term.reading].num_rows} if term.reading else {}, inline=True
-        )
-    )
+    constants: Mapping[str, Array] = field(metadata=INLINE)
     axes: Literal["", "xyz", "zyx"] = ""
 
     @property

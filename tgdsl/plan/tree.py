@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import types
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-
-from tgdsl.errors import ArtifactError
 
 LEAF = "array"
 """Key of what stands for an array in JSON: its name."""
 INLINE = {"inline": True}
 """Metadata of a dataclass's field for a mapping whose keys follow on the path of what holds it."""
-DTYPES = (np.float64, np.float32, np.int64, np.int32)
-"""Dtypes that arrays of the Plan have."""
 
 
 def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
@@ -34,7 +30,10 @@ def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
             arrays[name] = value
             return {LEAF: name}
         if _is_record(value):
-            return {f.name: plain(getattr(value, f.name), below(path, f)) for f in dataclasses.fields(value)}
+            return {
+                field.name: plain(getattr(value, field.name), path if field.metadata == INLINE else _joined(path, field.name))
+                for field in dataclasses.fields(value)
+            }
         if isinstance(value, Mapping):
             return {str(key): plain(part, _joined(path, str(key))) for key, part in value.items()}
         if isinstance(value, (tuple, list)):
@@ -44,22 +43,10 @@ def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
     return plain(value, path), arrays
 
 
-def named(plain: Any) -> set[str]:
-    """Return the names of the arrays that a tree which was made plain has."""
-    if isinstance(plain, dict):
-        if set(plain) == {LEAF} and isinstance(plain[LEAF], str):
-            return {plain[LEAF]}
-        return set().union(*map(named, plain.values()))
-    return set().union(*map(named, plain)) if isinstance(plain, list) else set()
-
-
 def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[Any], bool] = lambda record: False) -> Any:
-    """Return a tree with other leaves; what has none stays as it is. An array that stands in several places is changed once.
+    """Return a tree with other leaves; a dataclass that `is_kept` keeps its arrays.
 
-    Args:
-        value: The tree.
-        change: Returns what stands for an array.
-        is_kept: Whether a dataclass keeps its arrays.
+    What has no array stays as it is. An array that stands in several places is changed once.
     """
     made: dict[int, Any] = {}
 
@@ -85,25 +72,6 @@ def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[A
     return walk(value)
 
 
-def members(parts: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield the members of a tuple or mapping, each after its name."""
-    if isinstance(parts, Mapping):
-        yield from ((_joined(path, str(key)), part) for key, part in parts.items())
-    else:
-        yield from ((_joined(path, _key(part, i)), part) for i, part in enumerate(parts))
-
-
-def records(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield the dataclasses of a tree, those that hold others first, each after its name."""
-    if _is_record(value):
-        yield path, value
-        for field in dataclasses.fields(value):
-            yield from records(getattr(value, field.name), below(path, field))
-    elif isinstance(value, (Mapping, tuple, list)):
-        for name, part in members(value, path):
-            yield from records(part, name)
-
-
 def frozen(array: np.ndarray) -> np.ndarray:
     """Return an array in one of the Plan's dtypes, row by row in memory and read-only: float64 or float32, int64 or int32."""
     kept = (np.float32, np.int32)
@@ -113,42 +81,38 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def restored(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray], path: str = "plan") -> Any:
+def restored(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """Return the tree of a type that `flatten` made plain.
 
     Args:
         kind: The type: a dataclass, maybe generic, or what its fields may be.
         plain: What JSON held.
         arrays: The arrays by name.
-        path: Where it stands, for messages.
 
     Raises:
-        ArtifactError: If the values are not of the type.
+        TypeError: As ValueError, KeyError and AttributeError, if the values are not of the type.
     """
     origin = get_origin(kind) or kind
+    if plain is None:
+        return None
     if isinstance(kind, TypeVar) or _is_array(origin):
-        return _leaf(plain, arrays, path)
-    if kind is Any:
-        return plain
+        return arrays[plain[LEAF]]
     if origin in (Union, types.UnionType):
-        return _one_of(get_args(kind), plain, arrays, path)
-    if origin is Literal:
-        if plain not in get_args(kind):
-            raise _wrong(path, plain, f"one of {', '.join(map(str, get_args(kind)))}")
-        return plain
+        kinds = [part for part in get_args(kind) if part is not type(None)]
+        if len(kinds) > 1 and isinstance(plain, dict):
+            kinds = [part for part in kinds if _fields(get_origin(part) or part) == set(plain)]
+        (one,) = kinds
+        return restored(one, plain, arrays)
     if dataclasses.is_dataclass(origin):
-        return _record(origin, plain, arrays, path)
+        hints = get_type_hints(origin)
+        return origin(**{name: restored(hints[name], part, arrays) for name, part in plain.items()})
     if origin is tuple:
-        return _members(get_args(kind), plain, arrays, path)
+        first, *rest = get_args(kind)
+        each = [first] * len(plain) if rest[-1:] == [Ellipsis] else [first, *rest]
+        return tuple(restored(part_kind, part, arrays) for part_kind, part in zip(each, plain, strict=True))
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        if not isinstance(plain, dict):
-            raise _wrong(path, plain, "a mapping")
-        return {key: restored(get_args(kind)[1], part, arrays, _joined(path, key)) for key, part in plain.items()}
-    if origin is float and isinstance(plain, int) and not isinstance(plain, bool):
-        return float(plain)
-    if not isinstance(plain, origin) or (isinstance(plain, bool) and origin is not bool):
-        raise _wrong(path, plain, getattr(origin, "__name__", str(origin)))
-    return plain
+        return {key: restored(get_args(kind)[1], part, arrays) for key, part in plain.items()}
+    return float(plain) if origin is float else plain
 
 
 def _is_record(value: Any) -> bool:
@@ -159,9 +123,8 @@ def _is_array(origin: Any) -> bool:
     return origin is np.ndarray or hasattr(origin, "array_type")
 
 
-def below(path: str, field: dataclasses.Field) -> str:
-    """Return the name of a field of what is at a path."""
-    return path if field.metadata.get("inline") else _joined(path, field.name)
+def _fields(kind: Any) -> set[str]:
+    return {field.name for field in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set()
 
 
 def _joined(path: str, name: str) -> str:
@@ -170,46 +133,3 @@ def _joined(path: str, name: str) -> str:
 
 def _key(part: Any, i: int) -> str:
     return str(getattr(part, "key", None) or getattr(part, "name", None) or i)
-
-
-def _leaf(plain: Any, arrays: Mapping[str, np.ndarray], path: str) -> np.ndarray:
-    if not isinstance(plain, dict) or set(plain) != {LEAF} or plain[LEAF] not in arrays:
-        raise _wrong(path, plain, "the name of an array")
-    return arrays[plain[LEAF]]
-
-
-def _one_of(kinds: tuple[Any, ...], plain: Any, arrays: Mapping[str, np.ndarray], path: str) -> Any:
-    """Return the value of the one type of a union that it can be of: none, or the record with its fields."""
-    if plain is None and type(None) in kinds:
-        return None
-    kinds = tuple(kind for kind in kinds if kind is not type(None))
-    if len(kinds) > 1 and isinstance(plain, dict):
-        kinds = tuple(kind for kind in kinds if _fields(get_origin(kind) or kind) == set(plain))
-    if len(kinds) != 1:
-        raise _wrong(path, plain, "another value")
-    return restored(kinds[0], plain, arrays, path)
-
-
-def _fields(kind: Any) -> set[str]:
-    return {field.name for field in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set()
-
-
-def _record(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray], path: str) -> Any:
-    if not isinstance(plain, dict) or set(plain) != _fields(kind):
-        raise _wrong(path, plain, f"the fields {', '.join(sorted(_fields(kind)))}")
-    hints = get_type_hints(kind)
-    return kind(**{name: restored(hints[name], part, arrays, _joined(path, name)) for name, part in plain.items()})
-
-
-def _members(kinds: tuple[Any, ...], plain: Any, arrays: Mapping[str, np.ndarray], path: str) -> tuple[Any, ...]:
-    if not isinstance(plain, list):
-        raise _wrong(path, plain, "a list")
-    each = [kinds[0]] * len(plain) if kinds[-1] is Ellipsis else list(kinds)
-    if len(each) != len(plain):
-        raise _wrong(path, plain, f"{len(each)} values")
-    return tuple(restored(k, part, arrays, _joined(path, str(i))) for i, (k, part) in enumerate(zip(each, plain, strict=True)))
-
-
-def _wrong(path: str, plain: Any, expected: str) -> ArtifactError:
-    found = repr(plain)
-    return ArtifactError(f"not a plan: {path}: found {found if len(found) <= 80 else f'{found[:77]}…'}, expected {expected}")

@@ -235,16 +235,9 @@ class GeomDistance:
 
 
 def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, name: str) -> GeomDistance:
-    """Bake a mesh, or keep its triangles, as its options say; a primitive needs neither.
+    """Bake a mesh to the largest distance that any sensor asks for [m], or keep its triangles, as its options say.
 
-    Args:
-        felt: The geom.
-        options: How the distance to triangles is computed.
-        margin: Largest distance from the surface that any sensor asks for [m].
-        name: What warnings call the object or link: "object cube".
-
-    Raises:
-        BakeError: If no face has an area, or no grid within the budget holds the tolerance.
+    A primitive needs neither. `name` is what warnings call the object or link: "object cube".
     """
     if felt.surface is None:
         return GeomDistance(felt, felt.shape, {}, {})

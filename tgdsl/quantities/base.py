@@ -10,7 +10,7 @@ Shapes: `env` environments, `taxel` taxels, `pair` (link, object) pairs, `row` r
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
@@ -28,7 +28,7 @@ from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.sensed import SensedObject
 
 Value = TypeVar("Value")
-Report = Callable[[Sequence[str | int], str, str], None]
+Report = Callable[[tuple[str | int, ...], str, str], None]
 """Notes a mistake: its place in the document, the problem, and a hint."""
 
 
@@ -97,6 +97,11 @@ class Use:
     radius_noise: str = ""
     largest_shift: float = 0.0
 
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The bodies of its links, each once, in their order."""
+        return tuple(dict.fromkeys(link.body for link in self.links))
+
 
 @dataclass(frozen=True, eq=False)
 class Planning:
@@ -151,6 +156,21 @@ class Planning:
     def allowed(self, request: Request) -> set[Pair]:
         """Return a request's pairs: all, or only pairs that can be in contact."""
         return set(self.contact_pairs if request.is_gated else self.pairs)
+
+    def body_ids(self, bodies: Sequence[str]) -> Int[np.ndarray, " body"]:
+        """Return where bodies are in the state; 0 of one that touches nothing, which has no pose there and no contacts."""
+        return np.array([self.bodies.index(body) if body in self.bodies else 0 for body in bodies], dtype=np.int64)
+
+    def contact_table(
+        self, bodies: Sequence[str], names: Sequence[str], missing: Collection[str] = ()
+    ) -> Int[np.ndarray, "body object"]:
+        """Return the index of each body's pair with each object among the pairs of the state; their number where there is none.
+
+        None is looked up of objects that are `missing`.
+        """
+        index = {(pair.link, pair.object): i for i, pair in enumerate(self.contact_pairs) if pair.object not in missing}
+        table = [[index.get((body, name), len(self.contact_pairs)) for name in names] for body in bodies]
+        return np.array(table, dtype=np.int64).reshape(len(bodies), len(names))
 
     def pair_table(self, names: Sequence[str], taxels: Int[np.ndarray, " taxel"]) -> Int[np.ndarray, "object taxel"]:
         """Return the index of each taxel's pair with each object among that object's pairs; 0 where there is none."""

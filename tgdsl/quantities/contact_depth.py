@@ -9,7 +9,7 @@ Shapes: `taxel` probes, `object` felt objects, `geom` geoms of an object.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -18,7 +18,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import BakeError
-from tgdsl.fields.indices import indices
 from tgdsl.geometry.planes import vec
 from tgdsl.geometry.reference import TIE
 from tgdsl.geometry.shapes import SHAPES
@@ -56,7 +55,7 @@ class SearchPart(Generic[Array]):
         geoms: Their geoms, (1, geom, row); None in the same case.
     """
 
-    pair: Array = field(metadata=indices(lambda search, part, plan: len(plan.pairs.link)))
+    pair: Array
     spheres: Array | None
     geoms: Array | None
 
@@ -71,9 +70,9 @@ class ProbeQuery(Generic[Array]):
         pair: Index of each probe's pair with each object among that object's pairs, (object, taxel).
     """
 
-    objects: tuple[int, ...] = field(metadata=indices(lambda query, part, plan: len(plan.objects)))
+    objects: tuple[int, ...]
     pos: Array
-    pair: Array = field(metadata=indices(lambda query, part, plan: [[plan.objects[i].num_pairs] for i in query.objects]))
+    pair: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +89,8 @@ class DepthUse(Generic[Array]):
         search: What a search by a kernel is given; None where it is of no use.
     """
 
-    query: int = field(metadata=indices(lambda use, part, plan: len(part.queries)))
-    objects: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(part.queries[use.query].objects)))
+    query: int
+    objects: tuple[int, ...]
     is_gated: bool
     wants: tuple[str, ...]
     radius_noise: str
@@ -382,6 +381,5 @@ def _search(
 
 
 def _geoms(table: GeomTable[np.ndarray]) -> Geoms:
-    """Return primitives that are the same in all environments as tensors."""
     size, pos, rotation = (torch.from_numpy(np.asarray(part)) for part in (table.size, table.pos, table.rotation))
     return Geoms(table.shapes, table.is_centred, size, pos, rotation, None, None, (None,) * len(table.shapes))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,11 +16,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Plane, Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
-from tgdsl.quantities.pairs import Pair, PairedObject
+from tgdsl.quantities.pairs import PairedObject
 from tgdsl.quantities.reference import ReferenceScene
 from tgdsl.tensors.on_host import on_host
 
@@ -89,8 +88,8 @@ class ContactsUse(Generic[Array]):
         pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
     """
 
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
+    bodies: Array
+    pairs: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,12 +108,7 @@ class ContactsPart(Generic[Array]):
 def _use(planning: Planning, use: Use) -> ContactsUse[np.ndarray]:
     objects = [name for name in use.request.objects if planning.object_id(name) is not None]
     counted = [name for name in objects if not is_counted(planning, name, use.request.objects)]
-    bodies = tuple(dict.fromkeys(link.body for link in use.links))
-    pairs = {pair: i for i, pair in enumerate(planning.contact_pairs)}
-    table = [[pairs.get(Pair(body, name), len(pairs)) for name in counted] for body in bodies]
-    # One that touches nothing has no pose in the state, and no contacts.
-    places = [planning.bodies.index(body) if body in planning.bodies else 0 for body in bodies]
-    return ContactsUse(np.array(places, dtype=np.int64), np.array(table, dtype=np.int64).reshape(len(bodies), len(counted)))
+    return ContactsUse(planning.body_ids(use.bodies), planning.contact_table(use.bodies, counted))
 
 
 def is_counted(planning: Planning, name: str, felt: Sequence[str]) -> bool:
@@ -133,15 +127,7 @@ def contacts_of(
     index: Int[Tensor, "body object"],
     dtype: torch.dtype,
 ) -> ContactPoints:
-    """Bring the contacts of a state into the frames of the bodies, in the state's dtype, and then cast them.
-
-    Args:
-        state: Fields of `SceneState`: body_pos, body_quat, contact_netforce and, unless the slots are not wanted, contact_pos,
-            contact_force, contact_torque and contact_normal.
-        bodies: Indices of the bodies in the state.
-        index: Pair of each body and object; their number where there is none.
-        dtype: Dtype of the result.
-    """
+    """Bring the contacts of a state into the frames of the bodies, in the state's dtype, and then cast them."""
     quat = state["body_quat"].index_select(1, bodies)
     whole = _of_pairs(state["contact_netforce"], index)
     *rotation, x, y, z = on_host(_in_frame, quat, whole.sum(dim=2))
@@ -150,21 +136,19 @@ def contacts_of(
         none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
         vectors = [(none, none, none)] * 4
     else:
-        each = planes.rot(part[..., None] for part in rotation)
-        names = ("contact_force", "contact_torque", "contact_normal", "contact_pos")
-        force, torque, normal, pos = (planes.split(_of_pairs(state[name], index)) for name in names)
-        is_used = _is_any((*force, *torque, *normal))
-        force, normal = _completed(planes.split(whole), force, is_used), _told(normal, is_used)
-        force, torque, normal, pos = (planes.vec(part.flatten(2) for part in vector) for vector in (force, torque, normal, pos))
+        contacts = pair_contacts(state, index, has_torque=True)
+        assert contacts.torque is not None
+        fields = (contacts.pos, contacts.force, contacts.torque, contacts.normal)
+        pos, force, torque, normal = (planes.vec(part.flatten(2) for part in vector) for vector in fields)
         origin = planes.split(state["body_pos"][:, bodies, None])
-        away = planes.vec(torch.where(is_used.flatten(2), part, 0.0) for part in planes.sub(pos, origin))
+        away = planes.vec(torch.where(contacts.is_used.flatten(2), part, 0.0) for part in planes.sub(pos, origin))
+        each = planes.rot(part[..., None] for part in rotation)
         vectors = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
     pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*vectors, net))
     return ContactPoints(pos, force, torque, normal, net)
 
 
 def _in_frame(quat: Plane, vector: Plane) -> list[Plane]:
-    """Return the planes of the rotations of bodies, (env, body), and of vectors of the world in their frames."""
     rotation = planes.rotation(quat)
     return [*rotation, *planes.rotate_back(rotation, planes.split(vector))]
 
@@ -175,28 +159,28 @@ class PairContacts(NamedTuple):
     Attributes:
         pos: Contact points [m].
         force: Force on the body at each [N], what the slots lack of each pair's whole force shared out.
+        torque: Torque on the body at each [N·m]; None if it was not asked for.
         normal: Unit normal out of the object; NaN where the state has a force without one.
         is_used: Which slots are contacts.
     """
 
     pos: Vec
     force: Vec
+    torque: Vec | None
     normal: Vec
     is_used: Bool[Tensor, "env body object slot"]
 
 
-def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]) -> PairContacts:
-    """Return the contacts of bodies and objects where they are, without torques.
-
-    Args:
-        state: Fields of `SceneState`: contact_netforce, contact_pos, contact_force and contact_normal.
-        index: Pair of each body and object; their number where there is none.
-    """
-    names = ("contact_pos", "contact_force", "contact_normal")
-    pos, force, normal = (planes.split(_of_pairs(state[name], index)) for name in names)
-    is_used = _is_any((*force, *normal))
+def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"], has_torque: bool = False) -> PairContacts:
+    """Return the contacts of bodies and objects where they are; without torques one that has nothing else is none."""
+    names = ("contact_pos", "contact_force", "contact_normal", *(["contact_torque"] if has_torque else []))
+    pos, force, normal, *rest = (planes.split(_of_pairs(state[name], index)) for name in names)
+    torque = rest[0] if rest else None
+    is_used = _is_any((*force, *(torque or ()), *normal))
     whole = planes.split(_of_pairs(state["contact_netforce"], index))
-    return PairContacts(pos, _completed(whole, force, is_used), _told(normal, is_used), is_used)
+    is_missing = is_used & (planes.dot(normal, normal) == 0)
+    normal = planes.vec(torch.where(is_missing, torch.nan, part) for part in normal)
+    return PairContacts(pos, _completed(whole, force, is_used), torque, normal, is_used)
 
 
 def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
@@ -205,12 +189,6 @@ def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
     for part in parts[1:]:
         result = result | (part != 0)
     return result
-
-
-def _told(normal: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
-    """Return normals, not-a-number where a contact has none."""
-    is_missing = is_used & (planes.dot(normal, normal) == 0)
-    return planes.vec(torch.where(is_missing, torch.nan, part) for part in normal)
 
 
 def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
@@ -224,7 +202,6 @@ def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object sl
 
 
 def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
-    """Return a field (env, pair, *rest) as (env, body, object, *rest), zero where there is no pair."""
     padding = field.new_zeros((field.shape[0], 1, *field.shape[2:]))
     return torch.cat([field, padding], dim=1).index_select(1, index.flatten()).unflatten(1, index.shape)
 
@@ -250,8 +227,14 @@ class ReferenceContacts:
     net: Float[np.ndarray, "body 3"]
 
 
-def completed(contacts: list[list[np.ndarray]], whole: np.ndarray) -> list[list[np.ndarray]]:
+def reference_contacts(scene: ReferenceScene, pair: int) -> list[list[np.ndarray]]:
     """Return a pair's contacts (place, force, torque, normal), what they lack of its whole force added by shares of force."""
+    if "contact_force" not in scene.fields:
+        return []
+    whole = scene.fields["contact_netforce"][pair]
+    none = np.zeros_like(scene.fields["contact_force"][pair])
+    slots = zip(*(scene.fields[name][pair] if name in scene.fields else none for name in SLOT_FIELDS), strict=True)
+    contacts = [row for row in slots if np.any(row[1:])]
     sizes = [float(np.linalg.norm(force)) for _, force, _, _ in contacts]
     sizes = sizes if sum(sizes) > 0 else [1.0] * len(contacts)
     lacking = whole - sum((force for _, force, _, _ in contacts), np.zeros(3))
@@ -278,13 +261,8 @@ class _Contacts(Quantity):
         for b, name in enumerate(scene.layout.bodies):
             body = scene.body(name)
             for p in (p for p in table[b].tolist() if p < num_pairs):
-                whole = scene.fields["contact_netforce"][p]
-                net[b] += body.rotation.T @ whole
-                slots = (
-                    zip(*(scene.fields[name][p] for name in SLOT_FIELDS), strict=True) if SLOT_FIELDS[0] in scene.fields else ()
-                )
-                used = [list(row) for row in slots if np.any(row[1:])]
-                for pos, *vectors in completed(used, whole):
+                net[b] += body.rotation.T @ scene.fields["contact_netforce"][p]
+                for pos, *vectors in reference_contacts(scene, p):
                     rows.append((b, [body.rotation.T @ vector for vector in (pos - body.pos, *vectors)]))
         pos, force, torque, normal = np.array([row for _, row in rows]).reshape(len(rows), 4, 3).transpose(1, 0, 2)
         return ReferenceContacts(np.array([b for b, _ in rows], dtype=np.int64), pos, force, torque, normal, net)

@@ -10,12 +10,10 @@ Shapes: `env` environments, `taxel` probes, `pair` pairs, `object` felt objects,
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
@@ -53,31 +51,17 @@ def find(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object *e
 def _deepest(
     pose: list[Tensor], pos: list[Tensor], pair: Tensor, reach: Tensor, gate: Tensor | None, spheres: Tensor, geoms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    return launch(wrap_triton(deepest_kernel), pose, pos, pair, reach, gate, spheres, geoms)
-
-
-def launch(
-    run: Any,
-    pose: list[Float[Tensor, "env pair"]],
-    pos: list[Float[Tensor, " taxel"]],
-    pair: Int[Tensor, "object taxel"],
-    reach: Float[Tensor, "object *env taxel"],
-    gate: Float[Tensor, "env pair"] | None,
-    spheres: Float[Tensor, "case object 2"],
-    geoms: Float[Tensor, "case geom row"],
-) -> tuple[Float[Tensor, "env taxel"], Float[Tensor, "3 env taxel"], Int[Tensor, "env taxel"]]:
-    """Run the kernel, plain or wrapped, and return what `Deepest` holds.
+    """Return depth (env, taxel), normal (3, env, taxel) and pair (env, taxel) of `Deepest`.
 
     Args:
-        run: The kernel.
         pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
-            that lie in memory alike.
-        pos: Positions of the probes in their links' frames [m].
-        pair: Index of each probe's pair among all.
-        reach: As `deepest` has it.
-        gate: 0 where a pair counts, −∞ where it does not.
-        spheres: The objects, see `Tables`.
-        geoms: Their geoms, in the same way.
+            (env, pair) that lie in memory alike.
+        pos: Positions of the probes in their links' frames, (taxel,) [m].
+        pair: Index of each probe's pair among all, (object, taxel).
+        reach: As `find` has it.
+        gate: 0 where a pair counts, −∞ where it does not, (env, pair).
+        spheres: See `Tables`.
+        geoms: See `Tables`.
     """
     num_envs, (num_objects, num_taxels) = pose[0].shape[0], pair.shape
     depth = pose[0].new_empty((num_envs, num_taxels))
@@ -86,7 +70,7 @@ def launch(
     num_points = num_envs * num_taxels
     tables = [table.contiguous() for table in (reach, spheres, geoms)]
     strides = tables[0].stride()
-    run[(triton.cdiv(num_points, BLOCK),)](
+    wrap_triton(deepest_kernel)[(triton.cdiv(num_points, BLOCK),)](
         depth, normal, winner, *pose, *pos, pair, *tables, pose[0] if gate is None else gate, num_points, num_objects,
         *pose[0].stride(), *(gate if gate is not None else pose[0]).stride(), strides[0],
         strides[1] if reach.ndim == 3 and reach.shape[1] != 1 else 0,
@@ -103,7 +87,7 @@ def deepest_kernel(
     reach_object, reach_env, sphere_env, geom_env,
     NUM_TAXELS: tl.constexpr, IS_GATED: tl.constexpr, IS_ONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Find what `BLOCK` probes are deepest in, counted through all environments; see `launch`."""
+    """Find what `BLOCK` probes are deepest in, counted through all environments."""
     start = tl.program_id(0).to(tl.int64) * BLOCK
     is_probe = start + tl.arange(0, BLOCK) < num_points
     # Environments after the program's first are counted from it, in 32 bits. Lanes beyond the last probe work on that one.

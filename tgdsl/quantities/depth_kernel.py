@@ -10,8 +10,6 @@ object differs between environments, `node` nodes of all grids.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import triton
 import triton.language as tl
@@ -55,7 +53,7 @@ def meet(
 
 
 def grid_tables(links: Geoms, g: int) -> tuple[Float[Tensor, "link 16"], Int[Tensor, "link 4"], Float[Tensor, " node"]]:
-    """Return the tables of one geom of the links, `frames`, `counts` and `values`, see `launch`."""
+    """Return the tables of one geom of the links, `frames`, `counts` and `values`, see `_meet`."""
     grid = links.surfaces[g]
     assert isinstance(grid, Grid)
     frames = torch.cat([links.pos[:, g], links.rotation[:, g], torch.stack([*grid.origin, grid.cell], dim=-1)[:, 0]], dim=1)
@@ -74,38 +72,23 @@ def _meet(
     values: Tensor,
     is_cubic: bool,
 ) -> Tensor:
-    return launch(wrap_triton(depth_kernel), pose, gate, pair, points, frames, counts, values, is_cubic)
-
-
-def launch(
-    run: Any,
-    pose: list[Float[Tensor, "env pair"]],
-    gate: Float[Tensor, "env pair"] | None,
-    pair: Int[Tensor, " link"],
-    points: Float[Tensor, "3 case point"],
-    frames: Float[Tensor, "link 16"],
-    counts: Int[Tensor, "link 4"],
-    values: Float[Tensor, " node"],
-    is_cubic: bool,
-) -> Float[Tensor, "7 env link point"]:
-    """Run the kernel, plain or wrapped, and return places, distance and gradient.
+    """Return places, distance and gradient, (7, env, link, point).
 
     Args:
-        run: The kernel.
         pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: nine planes
-            that lie in memory alike, and three.
-        gate: Negative where a pair does not count.
+            (env, pair) that lie in memory alike, and three.
+        gate: Negative where a pair does not count, (env, pair).
         pair: Index of each link's pair.
-        points: Places in the object's frame [m].
-        frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes [m].
-        counts: Index of each grid's first node, and the number of its nodes along each axis.
-        values: `Grid.values`.
+        points: Places in the object's frame, (3, case, point) [m].
+        frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes, (link, 16) [m].
+        counts: Index of each grid's first node, and the number of its nodes along each axis, (link, 4).
+        values: `Grid.values`, (node,).
         is_cubic: Whether it is interpolated by cubes.
     """
     num_envs, num_links, num_points = pose[0].shape[0], pair.shape[0], points.shape[2]
     result = pose[0].new_empty((7, num_envs, num_links, num_points))
     points, gates = points.contiguous(), pose[0] if gate is None else gate
-    run[(num_envs * num_links,)](
+    wrap_triton(depth_kernel)[(num_envs * num_links,)](
         result, *pose, gates, pair, points, frames.contiguous(), counts.contiguous(), values,
         num_links, num_points, *pose[0].stride(), *pose[9].stride(), *gates.stride(), points.stride(0),
         points.stride(1) if points.shape[1] != 1 else 0,
@@ -120,7 +103,7 @@ def depth_kernel(
     num_links, num_points, turn_env, turn_pair, offset_env, offset_pair, gate_env, gate_pair, point_axis, point_env,
     IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write what all points are to one link of one environment; see `launch`."""
+    """Write what all points are to one link of one environment."""
     env, link = (tl.program_id(0) // num_links).to(tl.int64), tl.program_id(0) % num_links
     pair = tl.load(pairs + link)
     planes = xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz

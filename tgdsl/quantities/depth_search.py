@@ -225,7 +225,6 @@ def _distance(pairs: Pairs, probes: Probes, geoms: Geoms, own: slice, pair: Tens
 
 
 def _at_probes(rotation: Rot, offset: Vec, pair: Tensor) -> Frame:
-    """Return how an object, or a geom of it, sees each probe, of how it sees the links."""
     turn, shift = ([at_probes(part, slice(None), pair) for part in parts] for parts in (rotation, offset))
     return Frame(planes.rot(turn), planes.vec(shift))
 
@@ -255,15 +254,9 @@ def search(
     reach: Reach,
     wants: Collection[str],
 ) -> Penetration | None:
-    """Return what `query.penetration` would, found by one kernel; None where that cannot run.
+    """Return what `penetration` would of searchable targets, by one kernel; None where that cannot run.
 
-    Args:
-        pairs: Relative poses of all pairs of the plan.
-        probes: The probes.
-        targets: The targets, which are searchable; the first of equals wins.
-        known: Their tables by name, as `Tables` has them: `pair`, and the others where they are the same at all calls.
-        reach: As `query.penetration` has it.
-        wants: As `query.penetration` has them.
+    `known` has their tables by name, as in `Tables`: `pair`, and the others where they are the same at all calls.
     """
     if not DEEPEST.takes_kernel(pairs, probes, targets, known, reach):
         return None
@@ -279,15 +272,7 @@ def search(
 
 
 def deepest(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapping[str, Tensor], reach: Reach) -> Deepest:
-    """Return what the probes are deepest in.
-
-    Args:
-        pairs: Relative poses of all pairs of the plan; the gate holds.
-        probes: The probes.
-        targets: The targets; the first of equals wins.
-        known: As `search` has it, as `reach`.
-        reach: Radius of each probe towards each object [m].
-    """
+    """Return what the probes are deepest in, the first of equals; `known` as `search` has it, the pairs' gate holds."""
     pairs_of = torch.stack([pair - target.object.first_pair for pair, target in zip(known["pair"], targets, strict=True)])
     near = measure(pairs, Probes(probes.pos, pairs_of), targets)
     # What moves along x by the number of its pair tells which pair is felt.

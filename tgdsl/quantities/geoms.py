@@ -7,7 +7,7 @@ geoms, columns of a table; `node` nodes of all grids of a column.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.bvh import TriangleMesh, nearest
 from tgdsl.geometry.grid import METHODS, Grid
@@ -91,12 +90,7 @@ def union_distance(point: Vec, frames: Sequence[Frame | None], geoms: Geoms) -> 
 
 
 def united(geoms: Iterable[tuple[Tensor, Vec]], is_absent: Bool[Tensor, "case geom"] | None) -> tuple[Tensor, Vec]:
-    """Return the least of the distances to an object's geoms [m], the first among equals, and its gradient.
-
-    Args:
-        geoms: Signed distance to each geom [m] and its gradient, planes (case, …, point).
-        is_absent: Which geoms a case lacks; None if none does.
-    """
+    """Return the least of the distances to an object's geoms [m], the first among equals, and its gradient."""
     least, outward = None, None
     for g, (distance, gradient) in enumerate(geoms):
         if is_absent is not None:
@@ -146,10 +140,8 @@ class GridTable(Generic[Array]):
     """
 
     values: Array
-    first: Array = field(
-        metadata=indices(lambda grids, part, plan: len(grids.values) + 1 - np.prod(grids.num, axis=1, dtype=float))
-    )
-    num: Array = field(metadata=indices(None, least=2))
+    first: Array
+    num: Array
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -167,7 +159,7 @@ class TriangleTable:
 
     stays_on_host: ClassVar[bool] = True
     vertices: tuple[np.ndarray, ...]
-    faces: tuple[np.ndarray, ...] = field(metadata=indices(lambda table, part, plan: tuple(map(len, table.vertices))))
+    faces: tuple[np.ndarray, ...]
     max_distance: float
 
     @cached_property
@@ -205,18 +197,13 @@ class GeomTable(Generic[Array]):
     size: Array
     pos: Array
     rotation: Array
-    is_absent: Array | None = field(metadata=indices(lambda table, part, plan: 2))
+    is_absent: Array | None
     surfaces: tuple[GridTable[Array] | TriangleTable | None, ...]
     accuracy: tuple[tuple[Mapping[str, float], ...], ...]
 
 
 def account_of_geoms(table: GeomTable[np.ndarray], names: Sequence[str]) -> list[str]:
-    """Return the measured errors of a table's grids, for users.
-
-    Args:
-        table: The table.
-        names: What to call each case.
-    """
+    """Return the measured errors of a table's grids for users, who know each case by a name."""
     lines = []
     for case, (name, row) in enumerate(zip(names, table.accuracy, strict=True)):
         for i, accuracy in enumerate(row):
@@ -296,7 +283,6 @@ def _surface(
 
 
 def _chosen(array: Tensor, variant: Tensor | None) -> Tensor:
-    """Return an array with one row per environment, or a single one if it is the same in all."""
     return array if variant is None else array[variant]
 
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Rot, Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
@@ -77,7 +76,7 @@ class _Motion(Quantity):
         return {"body_pos", "body_quat", "body_linvel", "body_angvel"}
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(link.body for link in use.links))
+        return use.bodies
 
     def explain(self, part: MotionPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
         return ["poses and velocities of its links"]
@@ -102,7 +101,7 @@ class Places(Request[Vec]):
 class PlacesUse(Generic[Array]):
     """One request: the bodies in the state (point,), and the points in their frames (point, 3) [m]."""
 
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
+    bodies: Array
     offset: Array
 
 
@@ -147,23 +146,17 @@ class _Places(Quantity):
 class JointDrive(NamedTuple):
     """How a sensor's joints move and are driven, in the order of its layout's links; planes (env, joint).
 
+    The reference's are arrays (joint,), its places (joint, 3).
+
     Attributes:
         velocity: Velocity ω [rad/s; slides: m/s].
         effort: What the actuators exert τ [N·m; slides: N].
         place: Where the joint's anchor is in the world [m], in the dtype of the state.
     """
 
-    velocity: Float[Tensor, "env joint"]
-    effort: Float[Tensor, "env joint"]
-    place: Vec
-
-
-class ReferenceDrive(NamedTuple):
-    """`JointDrive` of one environment."""
-
-    velocity: Float[np.ndarray, " joint"]
-    effort: Float[np.ndarray, " joint"]
-    place: Float[np.ndarray, "joint 3"]
+    velocity: Any
+    effort: Any
+    place: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +171,8 @@ class Joints(Request[JointDrive]):
 class JointsUse(Generic[Array]):
     """One request: joints and their bodies in the state (joint,), and the joints' anchors in these bodies' frames [m]."""
 
-    joints: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.joints)))
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
+    joints: Array
+    bodies: Array
     anchor: Array
 
 
@@ -208,23 +201,22 @@ class _Joints(Quantity):
             values.append(JointDrive(velocity, effort, _places(scene, use.bodies, use.anchor)))
         return tuple(values)
 
-    def reference(self, part: JointsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceDrive:
+    def reference(self, part: JointsPart[np.ndarray], use: int, scene: ReferenceScene) -> JointDrive:
         use_part = part.uses[use]
         velocity, effort = (scene.fields[name][use_part.joints] for name in ("joint_vel", "joint_effort"))
-        return ReferenceDrive(velocity, effort, _reference_places(scene, use_part.bodies, use_part.anchor))
+        return JointDrive(velocity, effort, _reference_places(scene, use_part.bodies, use_part.anchor))
 
     def fields(self, part: JointsPart) -> set[str]:
         return {"body_pos", "body_quat", "joint_vel", "joint_effort"}
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(link.body for link in use.links))
+        return use.bodies
 
     def explain(self, part: JointsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
         return ["velocity, effort and place of its joints"]
 
 
 def _places(scene: Scene, bodies: Tensor, offset: Tensor) -> Vec:
-    """Return points of bodies in the world (env, point) [m], in the state's dtype."""
     pos, quat = (scene.tensors[name][:, bodies] for name in ("body_pos", "body_quat"))
     return planes.add(planes.split(pos), planes.rotate(planes.rotation(quat), planes.split(offset.to(pos.dtype))))
 

@@ -7,25 +7,26 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
-from tgdsl.quantities.contacts import PairContacts, completed, is_counted, pair_contacts
-from tgdsl.quantities.pairs import Pair, PairedObject
+from tgdsl.quantities.contacts import PairContacts, is_counted, pair_contacts, reference_contacts
+from tgdsl.quantities.pairs import PairedObject
 from tgdsl.quantities.reference import ReferenceScene
 
 
 class PairLoads(NamedTuple):
     """What each body and object do to one another; planes (env, body, object), zero where they do not touch.
+
+    The reference's are arrays (body, object, …), its centre and mean normal always there.
 
         F = Σ_c max(0, f_c · n_c),   W = Σ_c max(0, f_c · n_c) |v_c − (v_c · n_c) n_c|
 
@@ -42,10 +43,10 @@ class PairLoads(NamedTuple):
             touch. None if the centre was not asked for.
     """
 
-    force: Tensor
-    sliding: Tensor
-    center: Vec | None
-    along: Vec | None = None
+    force: Any
+    sliding: Any
+    center: Any
+    along: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +93,9 @@ class LoadsUse(Generic[Array]):
         center: The frame of the centre of contacts; empty: no centre is computed.
     """
 
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    objects: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
+    bodies: Array
+    objects: Array
+    pairs: Array
     center: Literal["", "link", "object"]
 
 
@@ -109,21 +110,13 @@ def _use(planning: Planning, use: Use) -> LoadsUse[np.ndarray]:
     request = use.request
     assert isinstance(request, Loads)
     names = request.objects
-    bodies = tuple(dict.fromkeys(link.body for link in use.links))
-    pairs = {pair: i for i, pair in enumerate(planning.contact_pairs)}
-    counted = [name for name in names if request.of == "object" or not is_counted(planning, name, names)]
-    table = [[pairs.get(Pair(body, name), len(pairs)) if name in counted else len(pairs) for name in names] for body in bodies]
+    counted = [] if request.of == "object" else [name for name in names if is_counted(planning, name, names)]
     return LoadsUse(
-        bodies=_places(planning, bodies),
-        objects=_places(planning, [planning.sensed[name].body for name in names]),
-        pairs=np.array(table, dtype=np.int64).reshape(len(bodies), len(names)),
+        bodies=planning.body_ids(use.bodies),
+        objects=planning.body_ids([planning.sensed[name].body for name in names]),
+        pairs=planning.contact_table(use.bodies, names, missing=counted),
         center=request.of if request.has_center else "",
     )
-
-
-def _places(planning: Planning, bodies: Sequence[str]) -> np.ndarray:
-    """Return where bodies stand in the state; one that touches nothing has no pose there, and no contacts."""
-    return np.array([planning.bodies.index(body) if body in planning.bodies else 0 for body in bodies], dtype=np.int64)
 
 
 def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtype) -> PairLoads:
@@ -145,12 +138,10 @@ def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtyp
 
 
 def _of_link(plane: Tensor) -> Tensor:
-    """Return a plane (env, body) as it broadcasts with (env, body, object, slot)."""
     return plane[:, :, None, None]
 
 
 def _of_object(plane: Tensor) -> Tensor:
-    """Return a plane (env, object) as it broadcasts with (env, body, object, slot)."""
     return plane[:, None, :, None]
 
 
@@ -187,26 +178,6 @@ def _away(found: PairContacts, pos: Vec) -> Vec:
     return planes.vec(torch.where(found.is_used, part, 0.0) for part in planes.sub(found.pos, pos))
 
 
-SLOT_FIELDS = ("contact_pos", "contact_force", "contact_normal")
-
-
-@dataclass(frozen=True, eq=False)
-class ReferenceLoads:
-    """What each body and object do to one another: see `PairLoads`.
-
-    Attributes:
-        force: Sum of the contacts' normal forces [N].
-        sliding: Normal force times sliding speed [W].
-        center: Centre of the contacts weighted by force [m].
-        along: Mean of their normals weighted by force, into what rings.
-    """
-
-    force: Float[np.ndarray, "body object"]
-    sliding: Float[np.ndarray, "body object"]
-    center: Float[np.ndarray, "body object 3"]
-    along: Float[np.ndarray, "body object 3"]
-
-
 class _Loads(Quantity):
     name, request, part = "loads", Loads, LoadsPart
     has_rows = True
@@ -217,17 +188,15 @@ class _Loads(Quantity):
     def gather(self, part: LoadsPart[Tensor], scene: Scene) -> tuple[PairLoads, ...]:
         return tuple(_loads(use, scene.tensors, scene.dtype) for use in part.uses)
 
-    def reference(self, part: LoadsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceLoads:
-        use_part, fields = part.uses[use], scene.fields
+    def reference(self, part: LoadsPart[np.ndarray], use: int, scene: ReferenceScene) -> PairLoads:
+        use_part = part.uses[use]
         force, sliding, center, along = (np.zeros((*use_part.pairs.shape, *rest)) for rest in ((), (), (3,), (3,)))
         for (b, o), pair in np.ndenumerate(use_part.pairs):
             if pair == len(scene.contact_pairs):
                 continue
             link, target = scene.body(scene.bodies[use_part.bodies[b]]), scene.body(scene.bodies[use_part.objects[o]])
             ringing, sign = (target, -1.0) if use_part.center == "object" else (link, 1.0)
-            slots = [list(row) for row in zip(*(fields[name][pair] for name in SLOT_FIELDS), strict=True) if np.any(row[1:])]
-            contacts = [[pos, on_link, np.zeros(3), normal] for pos, on_link, normal in slots]
-            for pos, on_link, _, normal in completed(contacts, fields["contact_netforce"][pair]):
+            for pos, on_link, _, normal in reference_contacts(scene, pair):
                 pressed = max(0.0, float(on_link @ normal))
                 apart = target.velocity_at(pos) - link.velocity_at(pos)
                 force[b, o] += pressed
@@ -236,10 +205,11 @@ class _Loads(Quantity):
                 along[b, o] += pressed * sign * (ringing.rotation.T @ normal)
             center[b, o] /= force[b, o] or 1.0
             along[b, o] /= force[b, o] or 1.0
-        return ReferenceLoads(force, sliding, center, along)
+        return PairLoads(force, sliding, center, along)
 
     def fields(self, part: LoadsPart) -> set[str]:
-        return {"body_linvel", "body_angvel", *SLOT_FIELDS, "contact_found", "contact_netforce"}
+        slots = {"contact_pos", "contact_force", "contact_normal"}
+        return {"body_linvel", "body_angvel", *slots, "contact_found", "contact_netforce"}
 
     def num_rows(self, part: LoadsPart, use: int) -> int:
         return part.uses[use].pairs.size

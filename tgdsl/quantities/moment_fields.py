@@ -196,7 +196,11 @@ def _bake(geoms: Sequence[SurfaceGeom], radius: float, limits: Limits, with_slop
         raise BakeError("there is no surface to bake moments of: planes are exact")
     coarse, exact = pieces.quadrature(spacing), fine.quadrature(spacing / FINER)
     held_back = _around(fine, radius, REPORT_POINTS, seed=2), _around(fine, radius, CHOICE_POINTS, seed=1)
-    report, choice = (_truth(exact, pos, radius, gradient_tolerance is not None) for pos in held_back)
+    with_gradients = gradient_tolerance is not None
+    report, choice = (
+        Truth(pos, moment_sums(exact, pos, radius, 4, block=1), gradient_sums(exact, pos, radius) if with_gradients else None)
+        for pos in held_back
+    )
     while True:
         origin, num = _lattice(coarse.pos, radius, cell)
         needed = 4 * channels * int(np.prod(num))
@@ -220,12 +224,6 @@ def _too_large(radius: float, limits: Limits, needed: int) -> str:
         f" {needed / 2**20:.3g} MiB ({needed} bytes), and the budget is {limits.budget / 2**20:.3g} MiB"
         f" ({limits.budget} bytes); raise the tolerance or the budget, or sum over points"
     )
-
-
-def _truth(surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: float, with_gradients: bool) -> Truth:
-    """Return what a field is measured against at points."""
-    gradients = gradient_sums(surface, pos, radius) if with_gradients else None
-    return Truth(pos, moment_sums(surface, pos, radius, 4, block=1), gradients)
 
 
 def gradient_sums(surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: float) -> Float[np.ndarray, "n 4 3"]:
@@ -393,9 +391,6 @@ def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.nd
     Args:
         geoms: The geoms of one variant of an object, none of them a plane.
         count: Number of points.
-
-    Raises:
-        BakeError: A mesh has no face with an area.
     """
 
     def make() -> tuple[np.ndarray, float]:
@@ -424,9 +419,6 @@ def sample_cloud(
         count: Number of points.
         budget: Largest size of the lists [bytes].
         radius_noise: By how much probes may reach farther [m]; the points are the same with and without.
-
-    Raises:
-        BakeError: Nothing to sample, or no lists within the budget.
     """
     return cache.cached(
         moments_key(geoms, b"cloud", radius, count, budget, radius_noise),

@@ -97,7 +97,11 @@ def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = 
         field: The field.
         radius_shift: By how much the radius is larger than the field's [m], to first order; the field then has 8 channels.
     """
-    base, weights = _spline_weights(point, field) if field.is_smooth else _linear_weights(point, field)
+    if field.is_smooth:
+        base, weights = _spline_weights(point, field)
+    else:
+        base, (x, y, z) = _cell_of(point, field.origin, field.cell, field.num, last=2)
+        weights = ((1 - x, x), (1 - y, y), (1 - z, z))
     _, num_y, num_z = field.num
     total = [torch.zeros_like(weights[0][0])] * (4 if radius_shift is None else 8)
     for (i, wx), (j, wy), (k, wz) in product(*(list(enumerate(along)) for along in weights)):
@@ -109,18 +113,13 @@ def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = 
     return Moments(total[0], (total[1], total[2], total[3]))
 
 
-def _linear_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Pair, Pair, Pair]]:
-    """Return the index of the lowest of the nodes around points, and the weights of both along each axis."""
-    base, (x, y, z) = _cell_of(point, field.origin, field.cell, field.num, last=2)
-    return base, ((1 - x, x), (1 - y, y), (1 - z, z))
-
-
 def _spline_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Vec, Vec, Vec]]:
     """Return the index of the lowest of the nodes around points, and the weights of three along each axis.
 
     A quadratic B-spline reaches over the nodes next to the nearest one, so the lattice ends half a cell before its last node.
     """
-    nodes = [within((part - start) / field.cell - 0.5, count - 2) for part, start, count in _axes(point, field)]
+    axes = zip(point, field.origin, field.num, strict=True)
+    nodes = [within((part - start) / field.cell - 0.5, count - 2) for part, start, count in axes]
     lower = [within(part.floor().long(), count - 3) for part, count in zip(nodes, field.num, strict=True)]
     base = (lower[0] * field.num[1] + lower[1]) * field.num[2] + lower[2]
     x, y, z = (_quadratic(part - corner) for part, corner in zip(nodes, lower, strict=True))
@@ -128,14 +127,8 @@ def _spline_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Vec, 
 
 
 def _quadratic(t: Tensor) -> Vec:
-    """Return the weights of the three nodes of a quadratic B-spline's piece, 0 ≤ t ≤ 1 through it."""
     rest = 1 - t
     return 0.5 * rest * rest, 0.5 + t * rest, 0.5 * t * t
-
-
-def _axes(point: Vec, field: MomentField) -> zip[tuple[Tensor, Tensor, Count]]:
-    """Return for each axis where points are, where the lattice begins, and how many nodes it has."""
-    return zip(point, field.origin, field.num, strict=True)
 
 
 def plane_moments(point: Vec, radius: Tensor) -> Moments:

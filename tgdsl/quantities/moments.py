@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -16,7 +16,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import BakeError, LowerError
-from tgdsl.fields.indices import indices
 from tgdsl.geometry.grid import Count
 from tgdsl.geometry.planes import rot, split, vec
 from tgdsl.quantities.base import Planning, Quantity, Scene, Use, pairs_for, variant_of
@@ -52,10 +51,8 @@ class FieldTable(Generic[Array]):
     """
 
     values: Array
-    first: Array = field(
-        metadata=indices(lambda fields, part, plan: len(fields.values) + 1 - np.prod(fields.num, axis=1, dtype=float))
-    )
-    num: Array = field(metadata=indices(None, least=2))
+    first: Array
+    num: Array
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -79,11 +76,9 @@ class CloudTable(Generic[Array]):
 
     points: Array
     weight: Array
-    lists: Array = field(metadata=indices(lambda clouds, part, plan: clouds.points.shape[1]))
-    first: Array = field(
-        metadata=indices(lambda clouds, part, plan: len(clouds.lists) + 1 - np.prod(clouds.num, axis=1, dtype=float))
-    )
-    num: Array = field(metadata=indices(None, least=1))
+    lists: Array
+    first: Array
+    num: Array
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -103,7 +98,7 @@ class MomentTable(Generic[Array]):
         accuracy: Measured errors of each field, variant after variant, radius by radius: see `FieldErrors`.
     """
 
-    object: int = field(metadata=indices(lambda table, part, plan: len(plan.objects)))
+    object: int
     radii: tuple[float, ...]
     area: Array
     plane_pos: Array
@@ -126,13 +121,11 @@ class MomentUse(Generic[Array]):
         motion: Whether the objects' motions are asked for.
     """
 
-    tables: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(part.tables)))
+    tables: tuple[int, ...]
     pos: Array
-    pair: Array = field(
-        metadata=indices(lambda use, part, plan: [[plan.objects[part.tables[i].object].num_pairs] for i in use.tables])
-    )
+    pair: Array
     reach: Array
-    radius_id: Array = field(metadata=indices(lambda use, part, plan: [[len(part.tables[i].radii)] for i in use.tables]))
+    radius_id: Array
     radius_noise: str
     motion: bool
 
@@ -381,13 +374,11 @@ def _way(use: Use) -> tuple[Any, ...]:
 
 
 def _radii(planning: Planning, uses: Sequence[Use], use: Use, name: str) -> list[float]:
-    """Return the radii of all probes whose tables are this use's [m], ascending."""
     alike = [other for other in uses if _way(other) == _way(use) and name in other.request.objects]
     return sorted({float(r) for other in alike for r in _radius(planning, other) if r > 0})
 
 
 def _radius(planning: Planning, use: Use) -> Float[np.ndarray, " taxel"]:
-    """Return the sensing radius of each probe [m]; at most 0 where it is inactive."""
     radius, of_all = planning.layout.radius[use.taxels], _request(use).radius
     return radius if of_all is None else np.where(radius > 0, of_all, radius)
 
@@ -418,14 +409,9 @@ def _use(planning: Planning, use: Use, tables: Sequence[MomentTable[np.ndarray]]
 def moment_table(
     sensed: SensedObject, request: MomentsRequest, radii: Sequence[float], radius_noise: float = 0.0, number: int | None = 0
 ) -> MomentTable[np.ndarray]:
-    """Compute the moments of an object beforehand.
+    """Compute the moments of an object, the Plan's `number`-th, beforehand.
 
-    Args:
-        sensed: The object.
-        request: The request, which gives the method.
-        radii: The sensing radii of its probes [m], ascending, each above 0.
-        radius_noise: By how much radii may differ from these [m].
-        number: The object's place in the Plan.
+    They are for sensing radii [m], ascending, which noise may change by `radius_noise` [m].
 
     Raises:
         LowerError: If its size is part of the state ("feels"), or the tolerance takes more than the budget.
@@ -488,12 +474,11 @@ def _fields(
         is_smooth=request.gradient_tolerance is not None,
     )
     pairs = zip(baked, [*radii] * len(variants), strict=True)
-    return table, [{**_measured(field.errors), "radius": radius, "cell": field.cell} for field, radius in pairs]
-
-
-def _measured(errors: Any) -> dict[str, float]:
-    """Return the errors that were measured, by name."""
-    return {name: value for name, value in dataclasses.asdict(errors).items() if value is not None}
+    accuracy: list[Mapping[str, float]] = []
+    for field, radius in pairs:
+        measured = {name: value for name, value in dataclasses.asdict(field.errors).items() if value is not None}
+        accuracy.append({**measured, "radius": radius, "cell": field.cell})
+    return table, accuracy
 
 
 def _clouds(variants: Solid, request: MomentsRequest, radius: float, radius_noise: float) -> CloudTable[np.ndarray]:

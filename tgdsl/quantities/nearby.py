@@ -102,10 +102,7 @@ class MomentSource(NamedTuple):
 def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> SurfaceMoments:
     """Return the moments of objects about probes, their motions if pairs have them, and their areas.
 
-    Args:
-        pairs: Relative poses of all pairs of the plan.
-        pos: Where the probes are in their links' frames [m], planes (taxel,).
-        sources: The objects.
+    `pos` is where the probes are in their links' frames [m].
     """
     result: dict[str, Moments] = {}
     motions: dict[str, Motion] = {}

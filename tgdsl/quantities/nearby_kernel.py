@@ -9,8 +9,6 @@ Shapes: `env` environments, `taxel` probes, `pair` pairs of the object, `node` n
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import triton
 import triton.language as tl
@@ -74,61 +72,31 @@ def _felt_moments(
     table: Tensor | None,
     numbers: list[int],
 ) -> Tensor:
-    return launch(wrap_triton(nearby_kernel), pose, pos, pair, radius, shift, values, lattice, table, numbers)
-
-
-def launch(
-    run: Any,
-    pose: list[Float[Tensor, "env pair"]],
-    pos: list[Float[Tensor, " taxel"]],
-    pair: Int[Tensor, " taxel"],
-    radius: Float[Tensor, "*env taxel"],
-    shift: Float[Tensor, "env taxel"] | None,
-    values: Float[Tensor, "node channel"],
-    lattice: Float[Tensor, "*point 4"],
-    table: Int[Tensor, "*point 4"] | None,
-    numbers: list[int],
-) -> Float[Tensor, "4 env taxel"]:
-    """Run the kernel and return S0 and S1 [m³, m⁴], in the frame of each probe's link.
+    """Return S0 and S1, (4, env, taxel) [m³, m⁴], in the frame of each probe's link.
 
     Args:
-        run: The kernel.
         pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
-            that lie in memory alike.
-        pos: Positions of the probes in their links' frames [m].
-        pair: Index of each probe's pair.
-        radius: Sensing radius of each probe [m]; 0 where it is inactive.
-        shift: By how much that is more than the field's [m].
+            (env, pair) that lie in memory alike.
+        pos: Positions of the probes in their links' frames, (taxel,) [m].
+        pair: Index of each probe's pair, (taxel,).
+        radius: See `felt_moments`.
+        shift: See `felt_moments`.
         values: `MomentField.values`.
-        lattice: Origin and spacing of the field's nodes [m].
-        table: Index of the field's node (0, 0, 0), and the number of its nodes along each axis; None: as `numbers` has them.
+        lattice: Origin and spacing of the field's nodes, (*point, 4) [m].
+        table: Index of the field's node (0, 0, 0), and the number of its nodes along each axis, (*point, 4); None: as `numbers`
+            has them.
         numbers: The same where all points ask one field.
     """
     num_envs, num_taxels = pose[0].shape[0], pair.shape[0]
     moments = pose[0].new_empty((4, num_envs, num_taxels))
     num_points = num_envs * num_taxels
-    run[(triton.cdiv(num_points, BLOCK),)](
-        moments,
-        *pose,
-        *pos,
-        pair,
-        radius.contiguous(),
-        radius if shift is None else shift.contiguous(),
-        values,
-        lattice,
-        lattice if table is None else table,
-        num_points,
-        *numbers,
-        *pose[0].stride(),
+    wrap_triton(nearby_kernel)[(triton.cdiv(num_points, BLOCK),)](
+        moments, *pose, *pos, pair, radius.contiguous(), radius if shift is None else shift.contiguous(),
+        values, lattice, lattice if table is None else table, num_points, *numbers, *pose[0].stride(),
         num_taxels if radius.ndim == 2 and radius.shape[0] > 1 else 0,
-        *_steps(lattice),
-        *((0, 0) if table is None else _steps(table)),
-        NUM_TAXELS=num_taxels,
-        NUM_CHANNELS=values.shape[1],
-        IS_SHIFTED=shift is not None,
-        IS_ONE=table is None,
-        BLOCK=BLOCK,
-    )
+        *_steps(lattice), *((0, 0) if table is None else _steps(table)),
+        NUM_TAXELS=num_taxels, NUM_CHANNELS=values.shape[1], IS_SHIFTED=shift is not None, IS_ONE=table is None, BLOCK=BLOCK,
+    )  # fmt: skip
     return moments
 
 
@@ -148,47 +116,14 @@ def _along(place, num):
 
 @triton.jit
 def nearby_kernel(
-    moments_ptr,
-    xx_ptr,
-    xy_ptr,
-    xz_ptr,
-    yx_ptr,
-    yy_ptr,
-    yz_ptr,
-    zx_ptr,
-    zy_ptr,
-    zz_ptr,
-    offset_x_ptr,
-    offset_y_ptr,
-    offset_z_ptr,
-    x_ptr,
-    y_ptr,
-    z_ptr,
-    pair_ptr,
-    radius_ptr,
-    shift_ptr,
-    values_ptr,
-    lattice_ptr,
-    table_ptr,
-    num_points,
-    first,
-    num_x,
-    num_y,
-    num_z,
-    pose_env_step,
-    pose_pair_step,
-    radius_env_step,
-    lattice_env_step,
-    lattice_taxel_step,
-    table_env_step,
-    table_taxel_step,
-    NUM_TAXELS: tl.constexpr,
-    NUM_CHANNELS: tl.constexpr,
-    IS_SHIFTED: tl.constexpr,
-    IS_ONE: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
-    """Write the moments of `BLOCK` probes, counted through all environments; see `launch`."""
+    moments_ptr, xx_ptr, xy_ptr, xz_ptr, yx_ptr, yy_ptr, yz_ptr, zx_ptr, zy_ptr, zz_ptr,
+    offset_x_ptr, offset_y_ptr, offset_z_ptr, x_ptr, y_ptr, z_ptr,
+    pair_ptr, radius_ptr, shift_ptr, values_ptr, lattice_ptr, table_ptr,
+    num_points, first, num_x, num_y, num_z, pose_env_step, pose_pair_step, radius_env_step,
+    lattice_env_step, lattice_taxel_step, table_env_step, table_taxel_step,
+    NUM_TAXELS: tl.constexpr, NUM_CHANNELS: tl.constexpr, IS_SHIFTED: tl.constexpr, IS_ONE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write the moments of `BLOCK` probes, counted through all environments."""
     start = tl.program_id(0).to(tl.int64) * BLOCK
     is_probe = start + tl.arange(0, BLOCK) < num_points
     # Environments after the program's first are counted from it, in 32 bits.

@@ -6,14 +6,13 @@ a taxel's are not, so everything that depends on the pair alone is formed first 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Plane, Rot, Vec
 from tgdsl.tensors.on_host import on_host
@@ -45,11 +44,11 @@ class PairedObject:
 
     name: str
     body: str
-    first_pair: int = field(metadata=indices(lambda target, part, plan: len(plan.pairs.link) + 1))
-    num_pairs: int = field(metadata=indices(lambda target, part, plan: len(plan.pairs.link) + 1 - target.first_pair))
-    num_variants: int = field(metadata=indices(None, least=1))
+    first_pair: int
+    num_pairs: int
+    num_variants: int
     is_sized: bool
-    varied: int = field(metadata=indices(lambda target, part, plan: len(plan.inputs.objects), least=-1))
+    varied: int
 
     @property
     def pairs(self) -> slice:
@@ -67,9 +66,9 @@ class PairTable(Generic[Array]):
         gate: Its place among `inputs.pairs`, whose contacts are read; 0 where no request wants to know.
     """
 
-    link: Array = field(metadata=indices(lambda table, part, plan: len(plan.inputs.bodies)))
-    object: Array = field(metadata=indices(lambda table, part, plan: len(plan.inputs.bodies)))
-    gate: Array = field(metadata=indices(lambda table, part, plan: max(len(plan.inputs.pairs), 1)))
+    link: Array
+    object: Array
+    gate: Array
 
 
 class Motion(NamedTuple):
@@ -170,12 +169,6 @@ def at_probes(part: Float[Tensor, "env pairs"], own: slice, pair: Int[Tensor, " 
 
 
 def gates(found: Tensor, place: Int[Tensor, " pair"], dtype: torch.dtype) -> Float[Tensor, "env pair"]:
-    """Return 0 where a pair is in contact, −∞ where it is not; not-a-number where the state does not know.
-
-    Args:
-        found: The state's `contact_found`.
-        place: Where each pair stands in it.
-        dtype: Dtype of the result.
-    """
+    """Return 0 where a pair is in contact by the state's `contact_found`, −∞ where it is not; not-a-number where that is."""
     column = found[:, place]
     return torch.where(column > 0, 0.0, torch.where(column.isnan(), torch.nan, -torch.inf)).to(dtype)

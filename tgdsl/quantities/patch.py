@@ -92,11 +92,6 @@ def slots_of(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Slot]
 
     What the forces of a pair lack of its whole force is shared out as `contacts` does; the force of a contact without normal is
     not a number.
-
-    Args:
-        contacts: What there is.
-        sides: Which of it counts.
-        dtype: Dtype of the result; sums have the contacts' dtype.
     """
     fields = [_of_pairs(field, sides).flatten(3).unbind(-1) for field in contacts[:4]]
     touches = []
@@ -244,13 +239,7 @@ class Patch(NamedTuple):
 
 
 def patch(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> Patch:
-    """Return the patches of bodies and objects that may meet.
-
-    Args:
-        contacts: What the solver says.
-        sides: Which of it makes a patch.
-        dtype: Dtype of the result.
-    """
+    """Return the patches of bodies and objects that may meet."""
     slots = slots_of(contacts, sides, dtype)
     force = [slot.force for slot in slots]
     total = sum(force[1:], start=force[0])
@@ -265,7 +254,6 @@ def patch(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> Patch:
 
 
 def _mean(share: Sequence[Tensor], of: Sequence[Vec]) -> Vec:
-    """Return the sum of vectors, each times its share."""
     parts = [planes.scale(weight, vector) for weight, vector in zip(share, of, strict=True)]
     return reduce(planes.add, parts)
 
@@ -280,7 +268,6 @@ def _direction(force: Sequence[Tensor], share: Sequence[Tensor], normals: Sequen
 
 
 def _unit(vector: Vec) -> Vec:
-    """Return a direction; zero where there is none."""
     squared = planes.dot(vector, vector)
     inverse = torch.where(squared > 0, torch.rsqrt(torch.where(squared > 0, squared, 1.0)), 0.0)
     return planes.scale(inverse, vector)

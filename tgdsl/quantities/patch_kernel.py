@@ -8,11 +8,8 @@ Shapes of blocks: `P` pairs of a body and an object, environment by environment;
 
 from __future__ import annotations
 
-from typing import Any
-
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
@@ -34,23 +31,16 @@ def contact_patch(contacts: list[Tensor], pairs: Tensor, bodies: Tensor, cancell
 
     Args:
         contacts: The fields of `Contacts`.
-        pairs: As in `Sides`.
-        bodies: The same.
+        pairs: `Sides.pairs`.
+        bodies: `Sides.bodies`.
         cancelled: Length of the mean of unit normals below which it has no direction.
     """
-    return launch(wrap_triton(patch_kernel), contacts, pairs, bodies, cancelled)
-
-
-def launch(
-    run: Any, contacts: list[Tensor], pairs: Int[Tensor, "body object"], bodies: Int[Tensor, " body"], cancelled: float
-) -> Float[Tensor, "8 env body object"]:
-    """Run the kernel, plain or wrapped, on the arguments of `contact_patch`."""
     fields = [part.contiguous() for part in contacts]
     num_envs, num_pairs, num_slots = fields[0].shape[:3]
     num_bodies, num_objects = pairs.shape
     result = fields[0].new_empty((8, num_envs, num_bodies, num_objects))
     num = num_envs * num_bodies * num_objects
-    run[(triton.cdiv(num, BLOCK),)](
+    wrap_triton(patch_kernel)[(triton.cdiv(num, BLOCK),)](
         result, *fields, pairs.contiguous(), bodies, num, num_pairs, fields[5].shape[1], cancelled,
         BODIES=num_bodies, OBJECTS=num_objects, SLOTS=num_slots, SLOT=1 << (num_slots - 1).bit_length(),
         BLOCK=BLOCK, num_warps=WARPS,

@@ -7,7 +7,7 @@ request, `choice` materials that one may have, `variant` its variants.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,11 +16,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
-from tgdsl.quantities.contacts import SLOT_FIELDS, completed, is_counted
+from tgdsl.quantities.contacts import SLOT_FIELDS, is_counted, reference_contacts
 from tgdsl.quantities.pairs import Pair, PairedObject
 from tgdsl.quantities.patch import CONTACT_PATCH, Contacts, Sides, cancelled
 from tgdsl.quantities.reference import ReferenceScene
@@ -247,17 +246,17 @@ class PatchesUse(Generic[Array]):
 
     topology: Topology
     is_star: bool
-    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
-    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
-    relations: Array = field(metadata=indices(lambda use, part, plan: len(plan.pairs.link) + 1))
+    bodies: Array
+    pairs: Array
+    relations: Array
     boxes: Array
     start: Array
     has_start: Array
     materials: Array
     shapes: Array
     grids: Array
-    variants: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(plan.inputs.objects), least=-1))
-    heated: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(plan.inputs.heated), least=-1))
+    variants: tuple[int, ...]
+    heated: tuple[int, ...]
     has_own_start: tuple[bool, ...]
     num_materials: tuple[int, ...]
     sides: Mapping[str, Array]
@@ -405,7 +404,7 @@ def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
 def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
     assert isinstance(use.request, ContactPatches)
     names = use.request.objects
-    bodies = tuple(dict.fromkeys(link.body for link in use.links))
+    bodies = use.bodies
     heats = [heat for name in names if (heat := planning.sensed[name].heat) is not None]
     objects = [next((target for target in planning.objects if target.name == name), None) for name in names]
     gate = {pair: i for i, pair in enumerate(planning.contact_pairs)}
@@ -420,7 +419,8 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
         ]
         return np.array(rows, dtype=np.int64).reshape(len(bodies), len(names))
 
-    choices, variants = (max([len(options) for options in part] + [1]) for part in _parts(heats))
+    choices = max([len(heat.materials) for heat in heats] + [1])
+    variants = max([len(heat.volume) for heat in heats] + [1])
     return PatchesUse(
         topology=topology,
         is_star=use.request.is_star,
@@ -431,7 +431,9 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
         start=np.array([heat.temperature or 0.0 for heat in heats]),
         has_start=np.array([float(heat.temperature is not None) for heat in heats]),
         materials=np.array([_padded([_thermal(m) for m in heat.materials], choices) for heat in heats]).reshape(-1, choices, 4),
-        shapes=np.array([_padded(_shapes(heat), variants) for heat in heats]).reshape(-1, variants, 3),
+        shapes=np.array(
+            [_padded(np.stack([heat.volume, heat.area, heat.curvature], axis=1).tolist(), variants) for heat in heats]
+        ).reshape(-1, variants, 3),
         grids=np.array([_grid(heat) for heat in heats]).reshape(-1, 2, 3),
         variants=tuple(-1 if target is None or target.num_variants == 1 else target.varied for target in objects),
         heated=tuple(_place(planning, name, heat) for name, heat in zip(names, heats, strict=True)),
@@ -460,23 +462,14 @@ def _topology(planning: Planning, bodies: Sequence[str], names: Sequence[str], h
 
 
 def _place(planning: Planning, name: str, heat: ObjectHeat) -> int:
-    """Return where an object is in the state's fields of heat, if they say anything of it; else −1."""
     is_told = heat.is_per_env or len(heat.materials) > 1
     return planning.heated.index(name) if is_told and name in planning.heated else -1
-
-
-def _parts(heats: Sequence[ObjectHeat]) -> tuple[list, list]:
-    return [heat.materials for heat in heats], [heat.volume for heat in heats]
 
 
 def _thermal(material) -> list[float]:  # type: ignore[no-untyped-def]
     modulus, ratio = material.youngs_modulus, material.poissons_ratio
     compliance = 0.0 if modulus is None else (1.0 - (ratio or 0.0) ** 2) / modulus
     return [material.conductivity, material.density * material.specific_heat, material.emissivity, compliance]
-
-
-def _shapes(heat: ObjectHeat) -> list[list[float]]:
-    return [[float(v) for v in row] for row in zip(heat.volume, heat.area, heat.curvature, strict=True)]
 
 
 def _grid(heat: ObjectHeat) -> list[np.ndarray]:
@@ -511,22 +504,11 @@ def _patches(use: PatchesUse[Tensor], scene: Scene) -> ContactPatch:
     force, area, centre, normal = CONTACT_PATCH(Contacts(*(tensors[name] for name in FIELDS)), sides, scene.dtype)
     seen: tuple[Vec | None, Vec | None] = None, None
     if use.topology.interfaces:
-        seen = _as_objects_see(use, scene, centre, normal)
+        assert scene.pairs is not None
+        rotation = planes.rot(pad(part, (0, 1))[:, use.relations] for part in scene.pairs.rotation)
+        offset = planes.vec(pad(part, (0, 1))[:, use.relations] for part in scene.pairs.offset)
+        seen = planes.add(planes.rotate(rotation, centre), offset), planes.rotate(rotation, normal)
     return ContactPatch(force, area, centre, normal, *seen, objects, use.topology, use.sides, cells, boxes)
-
-
-def _as_objects_see(use: PatchesUse[Tensor], scene: Scene, centre: Vec, normal: Vec) -> tuple[Vec, Vec]:
-    """Return centres and normals in the frames of the objects."""
-    assert scene.pairs is not None
-
-    rotation = planes.rot(_pairs_of(use.relations, part) for part in scene.pairs.rotation)
-    offset = planes.vec(_pairs_of(use.relations, part) for part in scene.pairs.offset)
-    return planes.add(planes.rotate(rotation, centre), offset), planes.rotate(rotation, normal)
-
-
-def _pairs_of(relations: Tensor, plane: Tensor) -> Tensor:
-    """Return a plane (env, pair) as (env, body, object); 0 where they never meet."""
-    return pad(plane, (0, 1))[:, relations]
 
 
 def _objects(use: PatchesUse[Tensor], scene: Scene) -> HeatOfObjects:
@@ -602,9 +584,8 @@ class ReferencePatches:
 def _reference_patch(scene: ReferenceScene, b: int, name: str, pair: int, is_star: bool) -> ReferencePatch | None:
     link = scene.body(scene.layout.bodies[b])
     target = scene.object_body(next(each for each in scene.objects if each.name == name))
-    slots = zip(*(scene.fields[field][pair] for field in SLOT_FIELDS), strict=True)
-    used = completed([list(row) for row in slots if np.any(row[1:])], scene.fields["contact_netforce"][pair])
-    pressing = [(pos, float(force @ normal), normal) for pos, force, _, normal in used if not force @ normal <= 0]
+    contacts = reference_contacts(scene, pair)
+    pressing = [(pos, float(force @ normal), normal) for pos, force, _, normal in contacts if not force @ normal <= 0]
     if not pressing:
         return None
     weights = np.array([force for _, force, _ in pressing])
@@ -685,7 +666,7 @@ class _Patches(Quantity):
         return fields
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(link.body for link in use.links)) if use.request.objects else ()
+        return use.bodies if use.request.objects else ()
 
     def num_rows(self, part: PatchesPart, use: int) -> int:
         cells = part.uses[use].topology.cells

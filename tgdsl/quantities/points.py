@@ -7,7 +7,7 @@ differs between environments, `tile` groups of taxels that a GPU's kernel takes 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,11 +16,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import BakeError, LowerError
-from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec, vec
-from tgdsl.layout.layout import Link
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use, pairs_for, variant_of
 from tgdsl.quantities.geoms import Geoms, GeomTable, account_of_geoms, body_distance, distance_to, geoms_of, link_geoms, united
 from tgdsl.quantities.pairs import Pair, PairedObject, Pairs
@@ -102,9 +100,7 @@ def link_points(own: ObjectPoints) -> LinkPoints:
 def point_tiles(taxels: Sequence[tuple[int, int]], num_taxels: int) -> list[tuple[int, int, int]]:
     """Return tiles that cover all taxels of a query: the number of a link, −1 for none, its first taxel, one beyond the last.
 
-    Args:
-        taxels: First of each link's taxels, and one beyond the last.
-        num_taxels: Number of the query's taxels.
+    `taxels` has the first of each link's taxels, and one beyond the last.
     """
     size, result, end = tile_size(taxels), [], 0
     owners = sorted((first, last, link) for link, (first, last) in enumerate(taxels))
@@ -170,7 +166,7 @@ class CloudPart(Generic[Array]):
         area: Surface that each stands for [m²], (variant,).
     """
 
-    object: int = field(metadata=indices(lambda cloud, part, plan: len(plan.objects)))
+    object: int
     points: Array
     area: Array
 
@@ -188,14 +184,12 @@ class MetObject(Generic[Array]):
         tiles: What `points.point_tiles` returns of the taxels, (tile, 3).
     """
 
-    cloud: int = field(metadata=indices(lambda met, part, plan: len(part.clouds)))
-    links: tuple[int, ...] = field(metadata=indices(lambda met, part, plan: len(part.links)))
-    taxels: tuple[tuple[int, int], ...] = field(metadata=indices(lambda met, part, plan: plan.layout.num_taxels + 1))
-    pair: Array = field(metadata=indices(lambda met, part, plan: len(plan.pairs.link)))
-    link: Array = field(metadata=indices(lambda met, part, plan: len(part.links)))
-    tiles: Array = field(
-        metadata=indices(lambda met, part, plan: [len(met.links), *[plan.layout.num_taxels + 1] * 2], least=-1)
-    )
+    cloud: int
+    links: tuple[int, ...]
+    taxels: tuple[tuple[int, int], ...]
+    pair: Array
+    link: Array
+    tiles: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,25 +382,16 @@ def _links(planning: Planning, uses: Sequence[Use]) -> dict[str, list[Any]]:
                 continue
             planning.progress(f"link {link.name}: distances")
             try:
-                margin = _margin(planning, link, uses)
+                users = [other for other in uses if link in other.links]
+                # Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
+                radii = [planning.layout.radius[other.taxels].max() for other in users]
+                margin = float(max([*radii, *(_request(other).range for other in users)]))
                 geoms = planning.geoms_of(link.name)
                 result[link.name] = [geom_distance(geom, LINKS, margin, f"link {link.name}") for geom in geoms]
             except BakeError as error:
                 place = ("sensors", use.sensors[0], "links")
                 planning.report(place, f'link "{link.name}": {error}', "or use `anchors: taxels`")
     return result
-
-
-def _margin(planning: Planning, link: Link, uses: Sequence[Use]) -> float:
-    """Return the largest distance from a link's own surface that any sensor on it asks for [m].
-
-    Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
-    """
-    results = []
-    for use in uses:
-        if link in use.links:
-            results += [_request(use).range, float(planning.layout.radius[use.taxels].max())]
-    return max(results)
 
 
 def _use(planning: Planning, use: Use, clouds: dict[tuple[int, str], int], links: Sequence[str]) -> PointsUse[np.ndarray]:

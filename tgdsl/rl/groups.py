@@ -18,7 +18,7 @@ from tgdsl.rl.task import HandNow, Now
 
 
 class MeasuredVelocity:
-    """Joint velocities as an XHand1's driver has them: `tgdsl.runtime.xhand1.velocity.VelocityFilter`, of all environments.
+    """Joint velocities as an XHand1's driver has them: `tgdsl.runtime.xhand1.source.VelocityFilter`, of all environments.
 
     Attributes:
         value: The velocities after the last positions [rad/s].

@@ -37,8 +37,7 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.table import GraspTable
 from tgdsl.rl.spec import TaskSpec, Weight
 from tgdsl.runtime.simulators.model_ids import Joints
-from tgdsl.runtime.simulators.start_contacts import Contacts
-from tgdsl.runtime.simulators.state_values import StateValues
+from tgdsl.runtime.simulators.state_values import Contacts, StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
 from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 

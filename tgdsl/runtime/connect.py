@@ -25,13 +25,11 @@ from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.warp.simulation import WarpSimulation
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
-from tgdsl.runtime.xhand1.connection import HandConnection, moved_joints
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource, SimulatedBody, SimulatedTips
-from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.log.replay import ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
-from tgdsl.runtime.xhand1.observe import HandObserver
+from tgdsl.runtime.xhand1.observe import HandConnection, HandObserver, moved_joints, warn_of_noise
 from tgdsl.runtime.xhand1.source import XHand1Source, refuse_beyond_watchdog
 from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
 from tgdsl.runtime.xhand1.wire.serial_port import list_ports
@@ -267,7 +265,6 @@ def _set_control_step(sim: Simulation, control_step: float) -> None:
 
 
 def _stepping(scene: SteppedScene, control_step: float) -> SteppedScene:
-    """Return a scene, after a look at the duration of its control steps."""
     if abs(scene.control_step - control_step) > 1e-9:
         raise SimulationError(f"control steps of {control_step:g} s, and the scene's are {scene.control_step:g} s")
     return scene

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from tgdsl.errors import ObservationError
 from tgdsl.module.module import TactileModule
-from tgdsl.runtime.source import Control, Simulator, Source
+from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.source import Control, Source
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.tensors.env_ids import EnvIds
 
@@ -135,12 +136,11 @@ class Connection(ABC):
 class SimulationConnection(Connection):
     """A connection to a simulator of the module's scene, or to a scene that reads the module's sensors itself."""
 
-    def __init__(self, touch: TactileModule, source: Simulator | SteppedScene):
+    def __init__(self, touch: TactileModule, source: Simulation | SteppedScene):
         super().__init__(source)
         self._touch, self._scene = touch, source
 
     def read(self) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the observation groups of the state."""
         scene = self._scene
         return self._touch.observe(scene.readings if isinstance(scene, SteppedScene) else self._touch(scene.state()))
 

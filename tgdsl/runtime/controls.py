@@ -35,9 +35,9 @@ def write_controls(
     values = control_tensor(control, *ctrl.shape)
     is_read_here = not (values.is_cuda and ctrl.is_cuda)
     values = values.to(ctrl.device, ctrl.dtype)
-    if is_read_here and refuses_unfinite:
-        refuse_unfinite(values)
-    is_bad = is_unfinite(values)
+    is_bad = ~torch.isfinite(values).all(dim=-1)
+    if is_read_here and refuses_unfinite and (rows := torch.nonzero(is_bad.reshape(-1)).flatten().tolist()):
+        raise SimulationError(f"control is not finite in environments {listed([str(row) for row in rows])}")
     ctrl.copy_(torch.where(is_bad[..., None], ctrl, values))
     return is_bad
 
@@ -57,15 +57,3 @@ def warn_of_range(control: Tensor | np.ndarray, model: mujoco.MjModel) -> bool:
     problem = f'control of actuator "{model.actuator(int(i)).name}" is {values[env, i]:g} in {where}'
     warnings.warn(f"{problem}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; this is said once", stacklevel=4)
     return True
-
-
-def is_unfinite(values: Float[Tensor, "*env actuator"]) -> Bool[Tensor, "*env"]:
-    """Return which environments' controls hold a number that is not finite; of controls for all alike, whether these do."""
-    return ~torch.isfinite(values).all(dim=-1)
-
-
-def refuse_unfinite(values: Float[Tensor, "*env actuator"]) -> None:
-    """Raise an error if any control on the host is not finite."""
-    rows = torch.nonzero(is_unfinite(values).reshape(-1)).flatten().tolist()
-    if rows:
-        raise SimulationError(f"control is not finite in environments {listed([str(row) for row in rows])}")

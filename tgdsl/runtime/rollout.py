@@ -22,9 +22,9 @@ from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.controls import control_tensor
-from tgdsl.runtime.simulators.memory import refuse_beyond_memory
+from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id
-from tgdsl.runtime.source import Simulator
+from tgdsl.runtime.simulators.simulation import Simulation
 
 PLACES = ("link", "body", "pos", "normal", "area")
 """Columns of `taxels.taxel_table` that a recording holds."""
@@ -56,11 +56,7 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
 
 
 def controls_between(targets: Sequence[Float[np.ndarray, " actuator"]], seconds: float, control_step: float) -> Controls:
-    """Return controls that hold each of some targets for some seconds and move evenly to the next in as long.
-
-    Raises:
-        SimulationError: If the duration is not positive, or takes more steps than there is memory for.
-    """
+    """Return controls that hold each of some targets for some seconds and move evenly to the next in as long."""
     if not 0 < seconds < np.inf:
         raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
     steps, times = max(round(seconds / control_step), 1), 2 * len(targets) - 1
@@ -70,12 +66,6 @@ def controls_between(targets: Sequence[Float[np.ndarray, " actuator"]], seconds:
         ramp = np.linspace(0.0, 1.0, steps)[:, None]
         parts += [start + ramp * (end - start), np.tile(end, (steps, 1))]
     return np.concatenate(parts)
-
-
-def default_keyframes(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return `rest` and `squeeze`, if the scene has both; else nothing."""
-    known = {model.key(i).name for i in range(model.nkey)}
-    return ("rest", "squeeze") if {"rest", "squeeze"} <= known else ()
 
 
 def held_controls(model: mujoco.MjModel, seconds: float, control_step: float) -> Controls:
@@ -106,12 +96,8 @@ def recorded_controls(path: Path) -> Controls:
     return controls.astype(np.float64)
 
 
-def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterator[Step]:
-    """Step a scene through controls and yield the readings after each control step.
-
-    Raises:
-        SimulationError: If the controls do not fit the scene, or a step fails: then it says which one, from 0.
-    """
+def rollout(touch: TactileModule, sim: Simulation, controls: Controls) -> Iterator[Step]:
+    """Step a scene through controls and yield the readings after each control step."""
     control_tensor(controls[0], sim.num_envs, sim.model.nu)
     for index, control in enumerate(controls):
         try:

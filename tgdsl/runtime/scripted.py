@@ -9,7 +9,7 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.closing.closing import START, Closing, closing_of
-from tgdsl.runtime.rollout import Controls, controls_between, default_keyframes, held_controls, scripted_controls
+from tgdsl.runtime.rollout import Controls, controls_between, held_controls, scripted_controls
 from tgdsl.scene.options import Options
 from tgdsl.scene.scene import scene_model
 
@@ -36,11 +36,7 @@ class Script:
     note: str = ""
 
     def begin(self, touch: TactileModule, num_envs: int, substeps: int, seconds: float, options: Options | None = None) -> Run:
-        """Start the scene; each hold and each move takes some seconds.
-
-        Raises:
-            SimulationError: If the scene has no such keyframe, or cannot be simulated.
-        """
+        """Start the scene; each hold and each move takes some seconds."""
         if self.closing is not None:
             prepare = self.closing.prepare
             sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=START, options=options, prepare=prepare)
@@ -62,7 +58,11 @@ def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, pr
 
     Else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
     """
-    names = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
+    names = keyframes
+    if names is None:
+        model = scene_model(touch.plan.scene)
+        is_scripted = {"rest", "squeeze"} <= {model.key(i).name for i in range(model.nkey)}
+        names = ("rest", "squeeze") if is_scripted else ()
     if names or keyframes is not None:
         return Script(names)
     progress("finding out how the hand closes")

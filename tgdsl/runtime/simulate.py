@@ -10,7 +10,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connect import known_sources
 from tgdsl.runtime.connection import SimulatorKind, keyword_options
-from tgdsl.runtime.simulators.devices import checked_device
+from tgdsl.runtime.simulators.machine import checked_device
 from tgdsl.runtime.simulators.simulation import SimOptions
 from tgdsl.runtime.warp import WarpSimulation
 

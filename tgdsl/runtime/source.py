@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
-import mujoco
 import numpy as np
-from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.module.state import SceneState
 from tgdsl.tensors.env_ids import EnvIds
 
 Control = Tensor | np.ndarray | None
@@ -41,38 +37,4 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Release the simulator, the device or the file."""
-        ...
-
-
-@runtime_checkable
-class Simulator(Source, Protocol):
-    """A source that steps MuJoCo's model of the scene: what rollouts and pictures ask of it.
-
-    Attributes:
-        model: The compiled scene; where objects differ between environments, that of the first.
-    """
-
-    model: mujoco.MjModel
-
-    def state(self) -> SceneState:
-        """Return what the module wants, all of it from one instant; its `dt` is that of a control step."""
-        ...
-
-    def substates(self, control: Control = None) -> Iterator[SceneState]:
-        """Advance all environments by one control step, and yield the state after each of its physics steps.
-
-        The `dt` of these states is that of a physics step.
-        """
-        ...
-
-    def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
-        """Return where all bodies of the model are in one environment, at the state's instant.
-
-        Returns:
-            Origins [m] and quaternions w, x, y, z, both in the world.
-        """
-        ...
-
-    def env_model(self, env: int) -> mujoco.MjModel:
-        """Return the model of one environment, its objects as they are there."""
         ...

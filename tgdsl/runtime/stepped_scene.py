@@ -40,12 +40,10 @@ class SteppedScene:
 
     @property
     def num_envs(self) -> int:
-        """One."""
         return 1
 
     @property
     def control_step(self) -> float:
-        """Duration of one control step [s]."""
         return self.sim.control_step
 
     def put(self, actuators: Int[np.ndarray, " n"], setpoints: Float[np.ndarray, " n"]) -> None:
@@ -57,9 +55,6 @@ class SteppedScene:
 
         Args:
             control: Set-points of all actuators, (actuator,) or (1, actuator); default: as they were.
-
-        Raises:
-            SimulationError: If they do not fit, or the scene diverges.
         """
         if control is not None:
             values = control_tensor(control, *self.sim.ctrl.shape).reshape(-1)

@@ -142,7 +142,7 @@ def load(
     spec = validate(source, (), model, problems, required)
     if spec is None:
         raise SpecError(problems)
-    loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
+    loaded = Loaded(spec=spec, source=source, folder=folder, problems=problems)  # type: ignore[arg-type]
     loaded.layout = _layout(loaded)
     problems += reference_problems(loaded, kinds)
     warn_of_unusual(source, spec)
@@ -176,7 +176,7 @@ def load_layout(path: Path) -> LoadedLayout:
         SpecError: All its mistakes.
     """
     spec, source = read_spec(path, LayoutSpec, ("resolutions",))
-    return LoadedLayout(spec, source, (), path.parent)
+    return LoadedLayout(spec=spec, source=source, folder=path.parent, problems=[])
 
 
 def read_spec(path: Path, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
@@ -262,7 +262,9 @@ def _layout(loaded: Loaded) -> LoadedLayout | None:
             return None
         loaded.problems += source.problems
     spec = validate(source, prefix, LayoutSpec, loaded.problems, required=("resolutions",))
-    return LoadedLayout(spec, source, prefix, folder) if isinstance(spec, LayoutSpec) else None
+    if not isinstance(spec, LayoutSpec):
+        return None
+    return LoadedLayout(spec=spec, source=source, folder=folder, problems=loaded.problems, prefix=prefix)
 
 
 def _layout_file(loaded: Loaded, wanted: str | None) -> Path | None:
@@ -271,18 +273,14 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> Path | None:
         if find.is_file(path):
             return path
         hint = "paths are relative to this document"
-        loaded.problems.append(loaded.source.problem(("robot", "layout"), f'there is no file "{wanted}"', hint))
+        loaded.note(("robot", "layout"), f'there is no file "{wanted}"', hint)
         return None
     known = find.robot_names().get(loaded.spec.robot.model)
     if known is not None and (path := find.layout_file(known)) is not None:
         return path
     if loaded.is_without_layout:
         return None
-    loaded.problems.append(
-        loaded.source.problem(
-            ("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True
-        )
-    )
+    loaded.note(("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True)
     return None
 
 

@@ -6,48 +6,62 @@ from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
-from tgdsl.errors import Problem, SpecError
+from tgdsl.errors import LowerError, Problem, SpecError
 from tgdsl.files import find
 from tgdsl.schema.document import Spec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.schema.yaml import Path, Source
 
 
-@dataclass
-class LoadedLayout:
-    """A layout, as found and as read. The paths of its problems start at `prefix`, which is not empty if it is in line."""
+@dataclass(kw_only=True)
+class Section:
+    """A document, or its layout, as found, and its mistakes so far.
 
-    spec: LayoutSpec
+    Attributes:
+        source: Its text's values and places.
+        folder: Folder that file names in it are relative to.
+        problems: Mistakes found so far, of the document and its layout; later stages add theirs.
+        prefix: Where its paths start in the source: of a layout in line, where that stands in its document.
+    """
+
     source: Source
-    prefix: Path
     folder: FilePath
+    problems: list[Problem]
+    prefix: Path = ()
 
     def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
-        """Return a mistake at a path of the layout."""
+        """Return a mistake at a path."""
         return self.source.problem((*self.prefix, *path), what, hint, on_key)
 
+    def note(self, path: Path, what: str | LowerError, hint: str = "", on_key: bool = False) -> None:
+        """Note a mistake at a path; a `LowerError` at the field of it that the error names."""
+        if isinstance(what, LowerError):
+            path, what, hint = (*path, *([what.field] if what.field else [])), what.what, what.hint
+        self.problems.append(self.problem(path, what, hint, on_key))
+
     def raw(self, path: Path) -> Any:
-        """Return the plain value at a path of the layout, or None."""
+        """Return the plain value at a path, or None."""
         return self.source.get((*self.prefix, *path))
 
 
-@dataclass
-class Loaded:
+@dataclass(kw_only=True)
+class LoadedLayout(Section):
+    """A layout, as found and as read."""
+
+    spec: LayoutSpec
+
+
+@dataclass(kw_only=True)
+class Loaded(Section):
     """A document, as found and as read. With `problems`, faulty entries are left out of `spec`.
 
     Attributes:
         spec: The document.
-        source: Its text's values and places.
-        folder: Folder that file names in it are relative to.
         layout: Its layout; None if that could not be read, or if it `is_without_layout`.
-        problems: Mistakes found so far; later stages add theirs.
     """
 
     spec: Spec
-    source: Source
-    folder: FilePath
-    layout: LoadedLayout | None
-    problems: list[Problem]
+    layout: LoadedLayout | None = None
 
     @property
     def robot_file(self) -> FilePath | None:
@@ -68,14 +82,6 @@ class Loaded:
             return self.spec.resolution
         names = list(self.layout.spec.resolutions)
         return names[0] if len(names) == 1 else None
-
-    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
-        """Return a mistake at a path of the document."""
-        return self.source.problem(path, what, hint, on_key)
-
-    def raw(self, path: Path) -> Any:
-        """Return the plain value at a path of the document, or None."""
-        return self.source.get(path)
 
     def raise_problems(self) -> None:
         """Raise all mistakes found so far, if any."""

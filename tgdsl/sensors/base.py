@@ -319,11 +319,6 @@ def no_alternatives(spec: Any) -> Sequence[Alternative]:
     return ()
 
 
-def no_indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> Mapping[str, int]:
-    """Return of how many things constants are indices: none is one."""
-    return {}
-
-
 @dataclass(frozen=True)
 class Kind:
     """A kind of sensor.
@@ -349,7 +344,6 @@ class Kind:
         retimed: `(constants, dt) → constants`: those of its constants that depend on the time between calls of `forward` [s],
             again. The module calls it whenever that time is another one than `Lowered.timestep`, or was at the last call.
         quantities: Quantities of its own that it asks for, which no installed package brings.
-        indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
         alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
             measured against the last that can be had. One that the spec does not allow, or its links do not, is left out.
         provides: Planes that `forward` can return beside its channels for other sensors to read, see `sensors.upstream`:
@@ -375,7 +369,6 @@ class Kind:
     is_random: bool = False
     retimed: Callable[[Mapping[str, np.ndarray], float], Mapping[str, np.ndarray]] | None = None
     quantities: tuple[Quantity, ...] = ()
-    indices: Callable[[Mapping[str, np.ndarray], int], Mapping[str, int]] = no_indices
     alternatives: Callable[[Any], Sequence[Alternative]] = no_alternatives
     provides: frozenset[str] = frozenset()
     reads: str = ""

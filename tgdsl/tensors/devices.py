@@ -52,13 +52,7 @@ def device_of(device: torch.device | str) -> torch.device:
 
 
 def why_there_is_none(device: object, error: Exception, known: Sequence[str] = ("cpu", "cuda")) -> str:
-    """Return the message for a device that torch lacks: the available ones, or torch's own words.
-
-    Args:
-        device: The device.
-        error: What torch raised.
-        known: Types of devices of which one may be meant.
-    """
+    """Return the message for a device that torch lacks: the available types, or torch's own words."""
     if str(device).partition(":")[0] in known:
         return f": {str(error).partition(chr(10))[0]}" + ('; expected "cpu"' if "cpu" in known else "")
     if str(device).startswith("gpu") and "cuda" in known:

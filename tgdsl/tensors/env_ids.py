@@ -110,13 +110,7 @@ def few_ids(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
 
 
 def put_rows(target: Tensor, chosen: Bool[Tensor, " env"], new: Tensor | float) -> None:
-    """Write new values into chosen environments of a tensor (env, …), by one kernel.
-
-    Args:
-        target: Is written into.
-        chosen: The environments.
-        new: One number, or values that broadcast to the tensor, of its dtype.
-    """
+    """Write one number, or values that broadcast, into chosen environments of a tensor (env, …), by one kernel."""
     put(target, broadcast_over(chosen, target), new)
 
 

@@ -24,13 +24,7 @@ class FusedCall(Generic[P, T]):
     """
 
     def __init__(self, method: Callable[P, T], is_compiled: bool, has_fixed_shapes: bool = True):
-        """Take a bound method.
-
-        Args:
-            method: The method.
-            is_compiled: Whether it is to be compiled.
-            has_fixed_shapes: Whether its tensors have the same shapes at each call.
-        """
+        """Take a bound method; its tensors may have the same shapes at each call."""
         self._method, self._is_compiled, self._has_fixed_shapes = method, is_compiled, has_fixed_shapes
         self._compiled: Callable[P, T] | None = None
         self._has_begun = False

@@ -40,12 +40,7 @@ class Graphed:
     """
 
     def __init__(self, function: Function, capture: Callable[[Callable[[], Tensors]], tuple[Replay, Tensors]] = captured):
-        """Capture nothing yet.
-
-        Args:
-            function: Takes inputs and memory by name, and returns tensors by name; without derivatives.
-            capture: Captures a call.
-        """
+        """Capture nothing yet; the function takes inputs and memory by name, and returns tensors without derivatives."""
         self._function = function
         self._capture = capture
         self._key: object = None

@@ -14,12 +14,10 @@ Shapes: as in `link_products`, and `tile` tiles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
@@ -46,16 +44,9 @@ def link_products(lines: Tensor, matrices: Sequence[Tensor]) -> Tensor:
     """Return Σ_from line[from] matrix[from] of each link, (plane, line, row).
 
     Args:
-        lines: What there is before, (line, row), contiguous.
+        lines: The values that are multiplied, (line, row), contiguous.
         matrices: (from, plane, to) of each link, in the order of their rows, which together are all.
     """
-    return launch(wrap_triton(link_products_kernel), lines, matrices)
-
-
-def launch(
-    run: Any, lines: Float[Tensor, "line row"], matrices: Sequence[Float[Tensor, "_from plane _to"]]
-) -> Float[Tensor, "plane line row"]:
-    """Run the kernel, plain or wrapped, on the arguments of `link_products`."""
     assert lines.is_contiguous()
     num_lines, num_rows = lines.shape
     num_planes = matrices[0].shape[1]
@@ -68,7 +59,7 @@ def launch(
     steps = 1 if not is_held else min(max(num_blocks * num_tiles // NUM_PROGRAMS, 1), MAX_STEPS)
     stages = (2 if rest == BLOCK else 3) if is_held else 1  # more do not fit
     if lines.numel() > 0:
-        run[(num_tiles * triton.cdiv(num_blocks, steps),)](
+        wrap_triton(link_products_kernel)[(num_tiles * triton.cdiv(num_blocks, steps),)](
             lines, flat, tiles, result, num_lines, num_rows, num_planes, num_tiles, steps,
             LINES=LINES, SIZE=block, REST=rest, DEPTH=DEPTH, IS_HELD=is_held, num_warps=4, num_stages=stages,
         )  # fmt: skip

@@ -8,8 +8,8 @@ gives a kind all the tests below for its float64 `reference`. Its author adds th
 `test_compiled_equals_eager`, compiles kernels and takes long: `pytest -k "not compiled_equals_eager"` leaves it out.
 """
 
-from tgdsl.module.accuracy.changed import moved, only
 from tgdsl.module.accuracy.reference import ReferenceModule
+from tgdsl.module.accuracy.states import moved, only
 from tgdsl.testing.conformance import (
     FAR_TOLERANCE,
     FLOAT32_TOLERANCE,

@@ -22,8 +22,8 @@ from torch import Tensor
 
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.errors import UnfeltWarning
-from tgdsl.module.accuracy.changed import moved, only
 from tgdsl.module.accuracy.reference import ReferenceModule
+from tgdsl.module.accuracy.states import moved, only
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState

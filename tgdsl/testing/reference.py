@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
-from tgdsl.module.accuracy.agreement import full_scale_error, row_errors
-from tgdsl.module.accuracy.reference import ReferenceModule
+from tgdsl.module.accuracy.reference import ReferenceModule, full_scale_error, row_errors
 from tgdsl.module.state import SceneState
 
 __all__ = ["assert_agrees", "full_scale_error"]

@@ -20,7 +20,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.module.memory.history import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.runtime.source import Simulator
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.markers import Markers
 from tgdsl.view.scene import Paint, Seen, draw_colour_bar, draw_image, draw_scale_bar, rendered
 from tgdsl.view.style import WARMTH
@@ -143,7 +143,7 @@ def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Floa
     return result
 
 
-def draw_boxes(axes: Axes, sim: Simulator, seen: Seen, boxes: Boxes, env: int) -> None:
+def draw_boxes(axes: Axes, sim: Simulation, seen: Seen, boxes: Boxes, env: int) -> None:
     """Draw the robot in the colours of the boxes of its links, with a bar that says them; objects are faint."""
     norm = boxes.norm
     scene = rendered(seen, boxes.painter(sim.model, Pose(*sim.body_poses(env))))

@@ -11,8 +11,8 @@ import numpy as np
 
 from tgdsl.console.live import LiveTable
 from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.driver import Reading
 from tgdsl.runtime.xhand1.log.log import Fault
-from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, JOINTS
 
 BAR = 32

@@ -17,7 +17,7 @@ from tgdsl.module.memory.history import last_step
 from tgdsl.module.memory.memory import Memory
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.runtime.source import Simulator
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.taxels import Pose, Taxels, in_world
 
 Array = np.ndarray
@@ -110,7 +110,7 @@ def _number(number: float) -> str:
     return f"{number:.{3 if number >= 0.1 else 2}g}"
 
 
-def markers_of(touch: TactileModule, sim: Simulator, output: Output, values: Tensor, env: int) -> Markers:
+def markers_of(touch: TactileModule, sim: Simulation, output: Output, values: Tensor, env: int) -> Markers:
     """Return where the taxels of a reading are in one environment, and what they read.
 
     A reading of bodies has one marker for each, amid its taxels.
@@ -159,7 +159,7 @@ def magnitude(values: Float[Array, "taxel channel"], units: Sequence[str]) -> Fl
 
 
 def touched(
-    touch: TactileModule, sim: Simulator, output: Output, readings: Mapping[str, Tensor], env: int
+    touch: TactileModule, sim: Simulation, output: Output, readings: Mapping[str, Tensor], env: int
 ) -> Bool[Array, " taxel"] | None:
     """Return which taxels of a reading with noise would read something without it; None if the reading has no noise.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.runtime.source import Simulator
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.boxes import Boxes, boxes_of, draw_boxes, is_boxed
 from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import Markers, markers_of, touched
@@ -42,7 +42,7 @@ def drawn_outputs(touch: TactileModule) -> list[Output]:
 
 def overview(
     touch: TactileModule,
-    sim: Simulator,
+    sim: Simulation,
     readings: Mapping[str, Tensor],
     path: Path,
     *,
@@ -81,7 +81,7 @@ def overview(
 
 def drawing(
     touch: TactileModule,
-    sim: Simulator,
+    sim: Simulation,
     readings: Mapping[str, Tensor],
     *,
     env: int = 0,
@@ -135,7 +135,7 @@ def drawing(
 
 def _lead(
     touch: TactileModule,
-    sim: Simulator,
+    sim: Simulation,
     readings: Mapping[str, Tensor],
     markers: Mapping[str, Markers],
     boxes: Mapping[str, Boxes],

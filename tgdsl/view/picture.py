@@ -19,7 +19,7 @@ from tgdsl.errors import did_you_mean
 from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.runtime.source import Simulator
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import Markers, markers_of, touched
 from tgdsl.view.raster import Viewport, unit
@@ -37,7 +37,7 @@ _TITLE = {1: 11, 2: 11, 3: 9, 4: 7.8}  # size of the maps' titles, by how many s
 
 def picture(
     touch: TactileModule,
-    sim: Simulator,
+    sim: Simulation,
     readings: Mapping[str, Tensor],
     path: Path,
     *,
@@ -74,7 +74,7 @@ def picture(
 
 def drawing(
     touch: TactileModule,
-    sim: Simulator,
+    sim: Simulation,
     readings: Mapping[str, Tensor],
     *,
     env: int = 0,

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
-from tgdsl.runtime.source import Simulator
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.cameras import best_camera, camera_of
 from tgdsl.view.markers import Markers
 from tgdsl.view.meshes import mesh_of, robot_bodies
@@ -51,7 +51,7 @@ class Seen(NamedTuple):
 
 
 def render_scene(
-    touch: TactileModule, sim: Simulator, markers: Markers, env: int, width: int, height: int, view: str | None = None
+    touch: TactileModule, sim: Simulation, markers: Markers, env: int, width: int, height: int, view: str | None = None
 ) -> RenderedScene:
     """Draw robot and felt objects, seen from where some taxels are in view: see `seen`."""
     return rendered(seen(touch, sim, markers, env, width, height, view))
@@ -59,7 +59,7 @@ def render_scene(
 
 def seen(
     touch: TactileModule,
-    sim: Simulator,
+    sim: Simulation,
     markers: Markers,
     env: int,
     width: int,

@@ -2,10 +2,10 @@
 
 import pytest
 from faulty_lines import FaultyEmulator
+from first_order_hands import first_order_hand
 from resting_hands import resting
 
 from tgdsl.runtime.xhand1 import driver
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.wire import ports
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, encode_command
@@ -19,7 +19,9 @@ ALLOWED = {Command.VERSION, Command.READ_REGISTER, Command.EXCHANGE}
 def emulator():
     """A hand at rest; at the end, no request may have held a set-point that moves a joint."""
     registers = {Register.SERIAL_NUMBER: b"X1-0042" + bytes(25), Register.NAME: b"\xff\x00", Register.SIDE: b"\x01"}
-    with FaultyEmulator(EmulatedHand(forces=resting, registers=registers)) as emulator:
+    hand = first_order_hand(forces=resting)
+    hand.registers = registers
+    with FaultyEmulator(hand) as emulator:
         yield emulator
         assert {frame.command for _, frame in emulator.requests} <= ALLOWED
         assert {frame.payload for _, frame in emulator.requests if frame.command == Command.EXCHANGE} <= {

@@ -3,8 +3,8 @@
 import os
 
 from faulty_lines import Faults, FaultyEmulator
+from first_order_hands import first_order_hand
 
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.wire.protocol import Command
 
 
@@ -49,7 +49,7 @@ def test_a_computer_without_ports(plugged, here, tmp_path):
 
 
 def test_no_hand_or_several_are_an_error_that_lists_them(emulator, plugged, here, tmp_path):
-    with FaultyEmulator(EmulatedHand(3)) as second:
+    with FaultyEmulator(first_order_hand(3)) as second:
         plugged(emulator.device, second.device)
         code, _, error = here(tmp_path, "hand", "monitor", "--seconds", "0.1")
         assert code == 2

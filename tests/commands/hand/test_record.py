@@ -12,7 +12,7 @@ from faulty_lines import Faults
 from resting_hands import TARE
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.log import record
+from tgdsl.runtime.xhand1.log import log as log_file
 from tgdsl.runtime.xhand1.log.log import open_log
 from tgdsl.runtime.xhand1.wire.protocol import Command
 
@@ -51,7 +51,7 @@ def test_replay_of_what_is_no_log(here, tmp_path):
 
 def test_a_recording_through_failures_shows_and_keeps_them(emulator, here, tmp_path, monkeypatch):
     """The line is cut after ten readings, and a recording ends with the failures that follow."""
-    plain = record.events
+    plain = log_file.events
 
     def cut(hand, seconds):
         num_faults = 0
@@ -63,7 +63,7 @@ def test_a_recording_through_failures_shows_and_keeps_them(emulator, here, tmp_p
             if num_faults == 3:
                 return
 
-    monkeypatch.setattr(record, "events", cut)
+    monkeypatch.setattr(log_file, "events", cut)
     code, said, error = here(tmp_path, "hand", "record", "a.npz", "--port", emulator.device, "--hand-id", "0")
     assert code == 0, error
     assert "NO NEW READING: " in said

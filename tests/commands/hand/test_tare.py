@@ -1,11 +1,11 @@
 """`tgdsl hand tare` against emulated hands."""
 
 import numpy as np
+from first_order_hands import first_order_hand
 from resting_hands import TARE
 
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator, TipForces
 
 
 def test_tare(emulator, plugged, here, tmp_path):
@@ -44,7 +44,7 @@ def test_tare_of_a_hand_that_is_touched(here, tmp_path):
         force[1, 2] += 12 * (next(calls) % 2)
         return TipForces(force, np.zeros((5, 120, 3)))
 
-    with Emulator(EmulatedHand(forces=moving)) as emulator:
+    with Emulator(first_order_hand(forces=moving)) as emulator:
         tare = ("hand", "tare", "--port", emulator.device, "--hand-id", "0")
         code, _, error = here(tmp_path, *tare)
         assert code == 2

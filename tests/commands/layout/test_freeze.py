@@ -7,8 +7,7 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.compiler.frozen import all_layouts
-from tgdsl.compiler.pipeline import compile_plan, layouts
+from tgdsl.compiler.pipeline import all_layouts, compile_plan, placed
 from tgdsl.files.write import atomic_write_all
 from tgdsl.layout.layout import Layout
 from tgdsl.placement.freeze import frozen_files
@@ -69,7 +68,7 @@ def test_odd_names_grids_samples_and_points_keep_their_bits(tmp_path, here):
     assert said.splitlines()[:2] == ["low/1: 26 taxels", said.splitlines()[1]]
     documents = [{"tgdsl": 1, "robot": {"model": str(tmp_path / "hand.xml"), "layout": str(tmp_path / own)}}
                  for own in ("layout.yaml", "new/my frozen.yaml")]  # fmt: skip
-    first, second = (layouts(document)[1] for document in documents)
+    first, second = (placed(document).layouts for document in documents)
     assert list(first) == list(second) == ["low/1", "low.1"]
     for name in first:
         assert_same_bits(first[name], second[name])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from oracles.hard import case
 from oracles.hard.case import Errors
 from oracles.hard.scene import pair_of, quiet, worst_of
-from tgdsl.module.accuracy.changed import moved, only
+from tgdsl.module.accuracy.states import moved, only
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.sensors import KINDS

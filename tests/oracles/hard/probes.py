@@ -18,7 +18,7 @@ from oracles.setups.scenes import BALL, BOX, probed, state
 from tgdsl.geometry.planes import split
 from tgdsl.geometry.reference import TIE, signed_distance
 from tgdsl.geometry.shapes import SHAPES
-from tgdsl.module.accuracy.changed import moved
+from tgdsl.module.accuracy.states import moved
 from tgdsl.module.state import SceneState
 
 R = 0.01

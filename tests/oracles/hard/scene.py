@@ -12,8 +12,7 @@ import torch
 from oracles.setups.scenes import folder
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.errors import UnfeltWarning
-from tgdsl.module.accuracy.agreement import row_errors
-from tgdsl.module.accuracy.reference import ReferenceModule
+from tgdsl.module.accuracy.reference import ReferenceModule, row_errors
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan

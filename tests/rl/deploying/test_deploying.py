@@ -13,7 +13,7 @@ from tgdsl.rl.deploying.deploy import Deployment, deploy
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.evaluation import SEED, evaluate
 from tgdsl.rl.playing.policy import policy_for, read_policy
-from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.source import VelocityFilter
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

@@ -16,7 +16,7 @@ from tgdsl.rl.grasps.grasps import Grasps, read_grasps, write_grasps
 from tgdsl.rl.grasps.table import GraspTable
 from tgdsl.rl.load import load_task
 from tgdsl.rl.sensed import compile_sensed
-from tgdsl.runtime.simulators.start_contacts import FIELDS
+from tgdsl.runtime.simulators.state_values import FIELDS
 from tgdsl.scene.digest import scene_digest
 
 BY_HAND = Grasps(

@@ -10,7 +10,7 @@ from warp_cases import SCENE, module, wanting_contacts, warp
 
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.simulators.start_contacts import FIELDS
+from tgdsl.runtime.simulators.state_values import FIELDS
 
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 DEEP = np.array([0, 0, 0.0295, 1, 0, 0, 0, 0.4, -0.1])

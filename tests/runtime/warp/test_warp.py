@@ -30,7 +30,7 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.runtime.warp.faults import constraint_rows
+from tgdsl.runtime.warp.simulation import constraint_rows
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 
 

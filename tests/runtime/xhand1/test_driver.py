@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faulty_lines import Faults, FaultyEmulator
+from first_order_hands import first_order_hand
 from xhand1_hands import PATIENT, Stamps, WrittenBytes, open_again, read_again, wait_until
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
-from tgdsl.runtime.xhand1.identity import identify
+from tgdsl.runtime.xhand1.emulator.emulator import TipForces
 from tgdsl.runtime.xhand1.wire import payloads, serial_port
 from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
@@ -21,7 +21,7 @@ from tgdsl.runtime.xhand1.wire.errors import (
     HandTimeoutError,
     MotionError,
 )
-from tgdsl.runtime.xhand1.wire.ports import find_hands
+from tgdsl.runtime.xhand1.wire.ports import find_hands, identify
 from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
 
 READ = encode_frame(Frame(0xFE, 0x80, 2, payloads.encode_command(payloads.PASSIVE)))
@@ -33,7 +33,7 @@ BRISK = SerialTiming(reply_timeout_s=0.2, silence_s=0.1)
 def test_every_reading_is_new_and_knows_its_age():
     stamps = Stamps()
     with (
-        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(first_order_hand(forces=stamps)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, max_age_s=20.0) as hand,
     ):
         readings = [hand.read(20.0) for _ in range(60)]
@@ -44,7 +44,7 @@ def test_every_reading_is_new_and_knows_its_age():
 def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
     """Every byte, over failures of all kinds, a pulled cable and the end."""
     written, stamps = WrittenBytes(), Stamps()
-    with FaultyEmulator(EmulatedHand(forces=stamps), faults=Faults.each(0.1)) as emulator:
+    with FaultyEmulator(first_order_hand(forces=stamps), faults=Faults.each(0.1)) as emulator:
         with open_again(emulator.device, timing=BRISK, open_port=written.open) as hand:
             while len(written.writes) < 100:
                 with contextlib.suppress(HandError):
@@ -67,7 +67,7 @@ def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
 
 def test_identity_and_tare_write_no_set_point_either():
     written = WrittenBytes()
-    with FaultyEmulator(EmulatedHand(forces=Stamps())) as emulator:
+    with FaultyEmulator(first_order_hand(forces=Stamps())) as emulator:
         (found,) = find_hands(emulator.device, (0,), timing=PATIENT, open_port=written.open)
         identity = identify(found, timing=PATIENT, open_port=written.open)
         assert (identity.version, identity.name, identity.side) == (b"tgdsl emulator", b"emulated", None)
@@ -88,7 +88,7 @@ def test_a_saturated_fingertip_cannot_be_tared():
         return TipForces(np.full((5, 3), 300.0), np.zeros((5, 120, 3)))
 
     with (
-        FaultyEmulator(EmulatedHand(forces=pressed)) as emulator,
+        FaultyEmulator(first_order_hand(forces=pressed)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, max_age_s=20.0) as hand,
     ):
         assert hand.read().state.total_force.tolist() == [[127, 127, 255]] * 5
@@ -108,7 +108,7 @@ def failure_of(hand: XHand1) -> HandError | None:
 def test_all_faults_at_once():
     """What comes is new and whole, and what does not come has a name."""
     stamps, readings, errors = Stamps(), [], []
-    with FaultyEmulator(EmulatedHand(forces=stamps), seed=5) as emulator, open_again(emulator.device, timing=CALM) as hand:
+    with FaultyEmulator(first_order_hand(forces=stamps), seed=5) as emulator, open_again(emulator.device, timing=CALM) as hand:
         emulator.set_faults(Faults.each(0.05))
 
         def is_read() -> bool:
@@ -126,7 +126,7 @@ def test_all_faults_at_once():
 
 def test_a_silent_device_is_named():
     stamps = Stamps()
-    with FaultyEmulator(EmulatedHand(forces=stamps)) as emulator:
+    with FaultyEmulator(first_order_hand(forces=stamps)) as emulator:
         with open_again(emulator.device, timing=CALM) as hand:
             emulator.set_faults(Faults(silence=1.0))
             assert wait_until(lambda: isinstance(failure_of(hand), HandTimeoutError))
@@ -153,7 +153,7 @@ def test_a_line_that_damages_everything():
 
 def test_unplug_and_replug():
     stamps = Stamps()
-    with FaultyEmulator(EmulatedHand(forces=stamps)) as emulator, open_again(emulator.device, timing=CALM) as hand:
+    with FaultyEmulator(first_order_hand(forces=stamps)) as emulator, open_again(emulator.device, timing=CALM) as hand:
         for _ in range(3):
             emulator.unplug()
             assert wait_until(lambda: isinstance(failure_of(hand), HandDisconnectedError))
@@ -165,7 +165,7 @@ def test_unplug_and_replug():
 
 
 def test_the_wrong_hand():
-    with FaultyEmulator(EmulatedHand(3)) as emulator:
+    with FaultyEmulator(first_order_hand(3)) as emulator:
         with pytest.raises(HandTimeoutError):
             XHand1.open(emulator.device)
         with XHand1.open(emulator.device, Addresses(3), timing=PATIENT) as hand:

@@ -7,14 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 from faulty_lines import Faults, FaultyEmulator
+from first_order_hands import first_order_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from xhand1_hands import PATIENT, Stamps, WrittenBytes, drive_until, open_again, wait_until
 
 from tgdsl.files.find import robot_names
-from tgdsl.runtime.xhand1 import reader
+from tgdsl.runtime.xhand1 import driver
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, MotionError, WatchdogError
@@ -197,7 +197,7 @@ def becomes_passive(emulator: FaultyEmulator) -> bool:
 
 
 def test_an_emulated_hand_goes_where_it_is_told_and_close_makes_it_passive():
-    with FaultyEmulator(EmulatedHand(time_constant_s=0.02)) as emulator:
+    with FaultyEmulator(first_order_hand(time_constant_s=0.02)) as emulator:
         with XHand1.open(emulator.device, timing=PATIENT, motion=limits(speed=5.0, watchdog_s=1.0)) as hand:
             assert emulator.hand.is_passive
             drive_until(hand, REST, lambda: abs(emulator.hand.position - REST).max() < 0.01)
@@ -235,7 +235,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
 def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back():
     stamps = Stamps()
     with (
-        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(first_order_hand(forces=stamps)) as emulator,
         XHand1.open(emulator.device, timing=PATIENT, motion=limits(watchdog_s=1.0)) as hand,
     ):
         drive(hand, emulator)
@@ -265,7 +265,7 @@ def test_a_reader_that_fails_for_a_reason_of_its_own_leaves_the_hand_passive(mon
 
     with FaultyEmulator() as emulator, XHand1.open(emulator.device, timing=PATIENT, motion=limits(watchdog_s=1.0)) as hand:
         drive(hand, emulator)
-        monkeypatch.setattr(reader, "decode_state", broken)
+        monkeypatch.setattr(driver, "decode_state", broken)
         assert becomes_passive(emulator)
         hand._reader.join()
         for call in (lambda: hand.command(REST), hand.read):

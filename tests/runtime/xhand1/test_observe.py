@@ -9,11 +9,9 @@ import tgdsl
 from tgdsl.errors import ObservationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.fingertips import finger_of, hand_terms, warn_of_noise
-from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.reader import Reading
-from tgdsl.runtime.xhand1.source import HandSample
-from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.driver import Reading
+from tgdsl.runtime.xhand1.observe import HandObserver, finger_of, hand_terms, warn_of_noise
+from tgdsl.runtime.xhand1.source import HandSample, VelocityFilter
 from tgdsl.runtime.xhand1.wire.payloads import HandState
 
 AGGREGATES = [

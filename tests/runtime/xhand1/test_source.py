@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from first_order_hands import first_order_hand
 from virtual_hands import virtual_hand
 from xhand1_hands import PATIENT, wait_until
 
@@ -12,11 +13,9 @@ from tgdsl.errors import StateError
 from tgdsl.runtime.source import Source
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator, TipForces
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.source import XHand1Source
-from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.source import VelocityFilter, XHand1Source
 from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogError
 
 CALM = {"timing": PATIENT, "max_age_s": 20.0}
@@ -61,7 +60,7 @@ def test_plain_differences_the_first_reading_and_one_that_is_not_later():
 
 def test_a_sample_and_its_features():
     newton = Calibration("N", np.full((5, 3), 0.1), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), np.zeros((5, 3)))
-    with Emulator(EmulatedHand(forces=pressed)) as emulator, XHand1.open(emulator.device, **CALM) as hand:
+    with Emulator(first_order_hand(forces=pressed)) as emulator, XHand1.open(emulator.device, **CALM) as hand:
         source: Source = XHand1Source(hand, control_step=0.02, calibration=newton, read_timeout_s=20.0)
         assert isinstance(source, XHand1Source)
         source.step()
@@ -113,7 +112,10 @@ def test_each_step_gives_a_new_reading_and_no_sooner():
 
 def test_controls_are_joint_angles():
     limits = MotionLimits((0.0,) * 12, (1.0,) * 12, (10.0,) * 12, (300,) * 12, kp=100, watchdog_s=1.0)
-    with Emulator(EmulatedHand(time_constant_s=0.01)) as emulator, XHand1.open(emulator.device, motion=limits, **CALM) as hand:
+    with (
+        Emulator(first_order_hand(time_constant_s=0.01)) as emulator,
+        XHand1.open(emulator.device, motion=limits, **CALM) as hand,
+    ):
         with pytest.raises(MotionError, match="a control step of 1000 ms, and the watchdog bites after 1000 ms"):
             XHand1Source(hand, control_step=1.0)
         source = XHand1Source(hand, control_step=0.02, read_timeout_s=20.0)

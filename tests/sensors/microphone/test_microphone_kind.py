@@ -4,7 +4,7 @@ import pytest
 import torch
 from oracles.setups.listening import TONE
 
-from tgdsl.module.accuracy.changed import only
+from tgdsl.module.accuracy.states import only
 from tgdsl.sensors import MICROPHONE
 from tgdsl.testing import KindConformance
 

@@ -23,7 +23,7 @@ class Monitor:
     def run(self) -> None:
         """Draw the table over itself; at the end, once more."""
         from tgdsl.runtime.xhand1.driver import XHand1
-        from tgdsl.runtime.xhand1.log.record import events
+        from tgdsl.runtime.xhand1.log.log import events
         from tgdsl.runtime.xhand1.wire.ports import the_hand
         from tgdsl.view.hand_table import HandView
 

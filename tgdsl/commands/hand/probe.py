@@ -16,8 +16,7 @@ class Probe:
 
     def run(self) -> None:
         """Print the list."""
-        from tgdsl.runtime.xhand1.identity import identify
-        from tgdsl.runtime.xhand1.wire.ports import ask_ports
+        from tgdsl.runtime.xhand1.wire.ports import ask_ports, identify
 
         ports = ask_ports(self.port, self.hand_id)
         if not ports:

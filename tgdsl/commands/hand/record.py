@@ -32,9 +32,8 @@ class Record:
         """Write the log; after Ctrl-C too."""
         from tgdsl.files.write import with_folder
         from tgdsl.runtime.xhand1.driver import XHand1
-        from tgdsl.runtime.xhand1.identity import identify
-        from tgdsl.runtime.xhand1.log.record import LogWriter, events
-        from tgdsl.runtime.xhand1.wire.ports import the_hand
+        from tgdsl.runtime.xhand1.log.log import LogWriter, events
+        from tgdsl.runtime.xhand1.wire.ports import identify, the_hand
         from tgdsl.view.hand_table import HandView
 
         refuse_to_replace(self.out, self.force)

@@ -39,7 +39,7 @@ class Freeze:
 
     def run(self) -> None:
         """Write the files and say what they hold."""
-        from tgdsl.compiler.frozen import all_layouts
+        from tgdsl.compiler.pipeline import all_layouts
         from tgdsl.files.write import atomic_write_all
         from tgdsl.placement.freeze import frozen_files
 

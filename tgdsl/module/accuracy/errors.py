@@ -73,12 +73,7 @@ def halves(num_envs: int) -> tuple[slice, slice]:
 
 
 def magnitude_of(expected: Readings, quantities: Sequence[str]) -> Magnitude:
-    """Return what errors of a reading are relative to.
-
-    Args:
-        expected: The exact readings.
-        quantities: What each channel is a component of.
-    """
+    """Return what errors of a reading are relative to; `quantities` names what each channel is a component of."""
     rest = np.median(expected.reshape(-1, expected.shape[-1]), axis=0)
     away = np.abs(expected - rest)
     largest = away.max(axis=(0, 1, 2), initial=0.0)
@@ -91,13 +86,6 @@ def errors_of(found: Readings, expected: Readings, magnitude: Magnitude, is_rela
     """Return the errors of readings, each relative to its channel's magnitude.
 
     Intervals are a bootstrap's over environments, whose states depend on each other in time but not among themselves.
-
-    Args:
-        found: The readings.
-        expected: The exact ones.
-        magnitude: What they are relative to.
-        is_relative: Whether errors are divided by the magnitude.
-        seed: Of the bootstrap.
     """
     is_finite = bool(np.isfinite(found).all())
     error = np.abs(found - expected) / (magnitude.scale if is_relative else 1.0)
@@ -106,10 +94,13 @@ def errors_of(found: Readings, expected: Readings, magnitude: Magnitude, is_rela
     counts = magnitude.active.sum(axis=(0, 2, 3))
     sampled = np.random.default_rng(seed).integers(error.shape[1], size=(RESAMPLES, error.shape[1]))
     rms = np.sqrt(squares[sampled].sum(axis=1) / np.maximum(counts[sampled].sum(axis=1), 1))
+    flat, num_worse = error.reshape(-1), int(counts.sum()) // 100
+    place = len(flat) - 1 - num_worse
+    p99 = float(np.partition(flat, place)[place]) if place >= 0 else 0.0
     return Errors(
         rms=_interval(float(np.sqrt(squares.sum() / max(counts.sum(), 1))), rms),
         largest=_interval(float(worst.max(initial=0.0)), worst[sampled].max(axis=1)),
-        p99=_exceeded_by(error, int(counts.sum()) // 100),
+        p99=p99,
         is_finite=is_finite,
     )
 
@@ -117,9 +108,3 @@ def errors_of(found: Readings, expected: Readings, magnitude: Magnitude, is_rela
 def _interval(value: float, samples: Float[np.ndarray, " sample"]) -> Interval:
     low, high = np.percentile(samples, TAILS, method="nearest")
     return Interval(value, min(float(low), value), max(float(high), value))
-
-
-def _exceeded_by(error: Readings, count: int) -> float:
-    """Return the least of the errors that no more than so many exceed."""
-    flat = error.reshape(-1)
-    return float(np.partition(flat, len(flat) - 1 - count)[len(flat) - 1 - count]) if count < len(flat) else 0.0

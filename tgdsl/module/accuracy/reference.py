@@ -1,4 +1,4 @@
-"""A plan's first sensor by its kind's float64 reference.
+"""A plan's sensor by its kind's float64 reference, and how far readings are from it, at ties from the nearer side.
 
 Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row.
 """
@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.plan import Plan
@@ -36,15 +37,7 @@ class ReferenceModule:
         others: Mapping[str, tuple[Kind, AnySensorSpec]] | None = None,
         sensor: str | None = None,
     ):
-        """Begin an episode.
-
-        Args:
-            plan: The plan.
-            kind: The kind of the sensor.
-            spec: Its spec.
-            others: Kind and spec of the sensors that it reads, by their names.
-            sensor: The name of the sensor; default: the plan's first one.
-        """
+        """Begin an episode of a sensor (default: the plan's first); `others`: kind and spec of sensors that it reads."""
         self.plan = plan
         self.kind = kind
         self.spec = spec
@@ -109,3 +102,36 @@ class ReferenceModule:
         parts, uses = self.plan.quantities, self.sensor.uses
         values: dict[type, Any] = {q.request: q.reference(parts[q.name], uses[q.name], scene) for q in self.quantities}
         return References(values | ({Upstream: upstream} if self.sensor.upstream else {}))
+
+
+TIE_SHIFT = 1e-7
+"""Shift of an object [m] that covers float32 rounding: on which side of a tie a reading falls is not defined closer."""
+
+
+def full_scale_error(found: Tensor, expected: np.ndarray) -> np.ndarray:
+    """Return |found − expected| over the largest magnitude of each channel in the batch (env, *sample, row, channel)."""
+    scale = np.abs(expected).max(axis=tuple(range(expected.ndim - 1)), keepdims=True)
+    error = np.abs(found.detach().double().numpy() - expected)
+    return error / np.where(scale > 0, scale, 1.0)
+
+
+def row_errors(found: Tensor, reference: ReferenceModule, state: SceneState, enough: float = 0.0) -> np.ndarray:
+    """Return the error of each row over full scale (env, *sample, row); the reference then remembers this state.
+
+    Args:
+        found: Readings.
+        reference: The reference of the sensor.
+        state: What was read.
+        enough: Errors up to this need no look at the other sides of ties.
+    """
+    shifts = [np.zeros(3)] + [sign * TIE_SHIFT * axis for axis in np.eye(3) for sign in (1, -1)]
+    worst = np.full(tuple(found.shape[:-1]), np.inf)
+    memory = None
+    for shift in shifts:
+        expected, after = reference(state, shift)
+        memory = memory or after
+        worst = np.minimum(worst, full_scale_error(found, expected).max(axis=-1))
+        if worst.max() <= enough:
+            break
+    reference.remember(memory or {})
+    return worst

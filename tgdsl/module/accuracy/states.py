@@ -1,4 +1,4 @@
-"""Recorded states: some fields of them for a module that wants fewer, and what a module reads of them.
+"""Recorded states: moved, some of their fields or environments, and what a module reads of them.
 
 Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` numbers per row.
 """
@@ -11,23 +11,46 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int, Shaped
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from tgdsl.errors import StateError, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.inputs import Inputs
+from tgdsl.quantities.contacts import SLOT_FIELDS
+
+
+def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:
+    """Return the whole scene, rotated about the origin and then shifted [m]; float64."""
+    rotation = torch.from_numpy(turn.as_matrix())
+    values = {name: getattr(state, name) for name in (*SHAPES, "dt")}
+    for name in ("body_pos", "body_linvel", "body_angvel", *SLOT_FIELDS, "contact_netforce"):
+        if values[name] is not None:
+            values[name] = values[name].double() @ rotation.T
+    values["body_pos"] = values["body_pos"] + torch.from_numpy(offset)
+    if values["contact_pos"] is not None:
+        is_used = (values["contact_normal"] != 0).any(dim=-1, keepdim=True)
+        values["contact_pos"] = torch.where(is_used, values["contact_pos"] + torch.from_numpy(offset), 0.0)
+    quats = Rotation.from_quat(values["body_quat"].reshape(-1, 4).numpy(), scalar_first=True)
+    turned = torch.from_numpy((turn * quats).as_quat(scalar_first=True))
+    values["body_quat"] = turned.reshape(values["body_quat"].shape)
+    return SceneState(**values, substeps=tuple(moved(part, offset, turn) for part in state.substeps))
+
+
+def only(state: SceneState, envs: Any) -> SceneState:
+    """Return some of the environments of a state."""
+    values: dict[str, Any] = {name: getattr(state, name) for name in (*SHAPES, "dt")}
+    chosen: dict[str, Any] = {name: value[envs] if isinstance(value, Tensor) else value for name, value in values.items()}
+    return SceneState(**chosen, substeps=tuple(only(part, envs) for part in state.substeps))
+
 
 TOGETHER = 1e-6
 """Distances [m] that differ by less count as equal where a row is looked for by its place."""
 
 
 def narrowed(state: SceneState, have: Mapping[str, Sequence[str]], inputs: Inputs) -> SceneState:
-    """Return what a module wants of a state that has more.
-
-    Args:
-        state: The state.
-        have: What stands at its places: `Inputs.names` of the module that it was recorded for.
-        inputs: What is wanted.
+    """Return what a module wants of a state that has more; `have` is `Inputs.names` of the module that it was recorded for.
 
     Raises:
         StateError: If it has less.
@@ -109,17 +132,14 @@ def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
         channels = np.array([channel_index.get(channel, -1) for channel in one.channels])
     samples, more = (output.shape[0] if len(output.shape) > 2 else 1 for output in (one, two))
     if samples == more:
-        return Common(None, there if there is None else _repeated(there, samples, two.shape[-2]), channels)
+        width = two.shape[-2]
+        rows_there = None if there is None else [k * width + at for k in range(samples) for at in there]
+        return Common(None, rows_there, channels)
     times = [(k, (k + 1) * more // samples - 1) for k in range(samples) if (k + 1) * more % samples == 0]
     rows, width = one.shape[-2], two.shape[-2]
     alone = [np.array([row]) for row in range(rows)] if there is None else there
     here = np.concatenate([k * rows + np.arange(rows) for k, _ in times])
     return Common(here, [j * width + at for _, j in times for at in alone], channels)
-
-
-def _repeated(there: Sequence[np.ndarray], samples: int, width: int) -> list[np.ndarray]:
-    """Return the rows of one sample for all samples of a block."""
-    return [k * width + at for k in range(samples) for at in there]
 
 
 def _rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np.ndarray, " row"]] | None:

@@ -63,12 +63,7 @@ def variants_of(
 ) -> Variants:
     """Return the variants of a sensor.
 
-    Args:
-        kind: Its kind.
-        name: Its name.
-        spec: Its fields.
-        queries: Of the objects with meshes that it feels, their fields.
-        alternatives: How distances to meshes may be found.
+    `queries` has the fields of the objects with meshes that it feels, `alternatives` how distances to meshes may be found.
     """
     fields = _variants((f"sensors.{name}",), (spec,), kind.alternatives(spec))
     ways = _variants(tuple(f"objects.{query}" for query in queries), tuple(queries.values()), alternatives) if queries else ()

@@ -62,17 +62,10 @@ class Clock(HookedModule):
 
     @property
     def _num_calls(self) -> int:
-        """How many calls before the present one some ring remembers."""
         return self.get_buffer("ages").shape[-1] if hasattr(self, "ages") else 0
 
     def start(self, num_envs: int, calls: int, like: Tensor) -> None:
-        """Begin to count.
-
-        Args:
-            num_envs: Number of environments.
-            calls: How many calls before the present one some ring remembers.
-            like: Has the module's device and dtype.
-        """
+        """Begin to count; some ring remembers so many calls before the present one. `like`: the module's device and dtype."""
         whole = {"device": like.device, "dtype": torch.int64}
         for name in ("seed", "first_env"):
             self.register_buffer(name, torch.zeros((), **whole))
@@ -146,14 +139,7 @@ class Clock(HookedModule):
         return nows
 
     def context(self, sensor: PlannedSensor, memory: Mapping[str, Tensor], dt: Tensor | None, substep: int = 0) -> Context:
-        """Return when a sensor's kind is called; nothing of it if the kind does not want to know.
-
-        Args:
-            sensor: The sensor.
-            memory: What `tensors` returned.
-            dt: Time since the last call [s].
-            substep: Which of its substeps it is.
-        """
+        """Return when a sensor's kind is called at one of its substeps; nothing of it if the kind does not want to know."""
         if not sensor.is_timed:
             return UNTIMED
         assert dt is not None
@@ -218,6 +204,5 @@ def _env(memory: Mapping[str, Tensor]) -> Tensor:
 
 
 def _rank() -> int:
-    """Return the number of this process among those of a distributed run; 0 if there is none."""
     distributed = torch.distributed
     return distributed.get_rank() if distributed.is_available() and distributed.is_initialized() else 0

@@ -32,15 +32,12 @@ def reduced(window: Window, reduce: str) -> Float[Tensor, "env *step row channel
     """Return what is read of a window: all of it (`stack`), or the `mean` or `median` of each number."""
     if reduce == "stack":
         return window.transpose(2, 3)
-    return (window.mean(dim=1) if reduce == "mean" else _median(window)).transpose(1, 2)
+    if reduce == "mean":
+        return window.mean(dim=1).transpose(1, 2)
+    ordered, count = window.sort(dim=1).values, window.shape[1]  # of an even number the mean of both middle ones
+    return (0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])).transpose(1, 2)
 
 
 def last_step(reading: Float[Tensor, "env *step row channel"]) -> Float[Tensor, "env row channel"]:
     """Return the last one of stacked calls, or a reading that is of one call."""
     return reading[:, -1] if reading.ndim == 4 else reading
-
-
-def _median(window: Window) -> Float[Tensor, "env channel row"]:
-    """Return the middle of each number's readings, the mean of both middle ones if their count is even."""
-    ordered, count = window.sort(dim=1).values, window.shape[1]
-    return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])

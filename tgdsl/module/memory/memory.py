@@ -11,16 +11,18 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import StateError, listed
-from tgdsl.module.memory.clock import Clock
+from tgdsl.module.memory.clock import ENV, SHARED, Clock
+from tgdsl.module.memory.history import reduced
 from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
 from tgdsl.sensors.base import Kind
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.tensors.env_ids import broadcast_over, few_ids
 from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.on_host import HostCopy
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 
 EVERY = 16
@@ -40,7 +42,7 @@ class StateWatch:
         ]
         self._said: set[str] = set()
         self._num_calls = 0
-        self._copies: dict[str, tuple[Tensor, torch.cuda.Event]] = {}
+        self._copies = {path: HostCopy() for path, *_ in self._watched}
 
     def look(self, memory: Mapping[str, Tensor]) -> None:
         """Look at what is remembered, and warn of what is new. What a GPU holds may be seen some calls later."""
@@ -48,31 +50,13 @@ class StateWatch:
             return
         self._num_calls += 1
         for path, sensor, rows, warn in self._watched:
-            shown = self._shown(path, memory[path])
-            for message in () if shown is None else warn(sensor.sensor, sensor.constants, rows, shown):
+            if memory[path].is_cuda and self._num_calls % EVERY != 1:
+                continue
+            largest = self._copies[path].poll(memory[path].detach().amax(dim=0))
+            for message in () if largest is None else warn(sensor.sensor, sensor.constants, rows, largest.numpy()):
                 if message not in self._said:
                     self._said.add(message)
                     warnings.warn(message, stacklevel=6)
-
-    def _shown(self, path: str, state: Tensor) -> np.ndarray | None:
-        """Return the largest numbers of all environments, on the host; None if they are not there yet."""
-        if state.device.type != "cuda":
-            return state.detach().amax(dim=0).numpy()
-        if torch.cuda.is_current_stream_capturing():
-            return None
-        last_copy = self._copies.get(path)
-        if last_copy is not None and last_copy[1].query():
-            del self._copies[path]
-            return last_copy[0].numpy()
-        if last_copy is None and self._num_calls % EVERY == 1:
-            with torch.inference_mode(False), torch.no_grad():
-                largest = state.amax(dim=0)
-                copy = torch.empty(largest.shape, dtype=largest.dtype, pin_memory=True)
-                copy.copy_(largest, non_blocking=True)
-            event = torch.cuda.Event()
-            event.record(torch.cuda.current_stream(state.device))
-            self._copies[path] = copy, event
-        return None
 
 
 WINDOW, KEPT = "history/", "kept/"
@@ -94,13 +78,7 @@ class Memory(HookedModule):
         readings: Mapping[str, PlannedReading],
         kinds: Mapping[str, Kind] | None = None,
     ):
-        """Note what sensors carry, and what all readings are.
-
-        Args:
-            sensors: The sensors.
-            readings: All readings, by name.
-            kinds: The kind of each sensor, by its name, where what kinds warn of is to be watched.
-        """
+        """Note what sensors carry, and what all readings are; `kinds` by sensor, where what they warn of is to be watched."""
         super().__init__()
         self._watch = StateWatch(sensors, kinds or {})
         self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
@@ -138,12 +116,6 @@ class Memory(HookedModule):
 
     def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
-
-        Args:
-            num_envs: Number of environments: of those whose state is held, if there are any.
-            dt: Time since the last call [s], if some sensor wants to know it.
-            dtype: Dtype of what is remembered.
-            device: Where.
 
         Raises:
             StateError: If dt is so short that a ring is too short.
@@ -310,3 +282,68 @@ def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:
     if planned.past == 0 or dt is None:
         return ()
     return (max(math.ceil(planned.past / dt - 1e-6), 1),)
+
+
+Tensors = dict[str, Tensor]
+
+
+def chosen_rows(
+    mask: Bool[Tensor, " env"], readings: Tensors, updated: Tensors, memory: Mapping[str, Tensor]
+) -> tuple[Tensors, Tensors]:
+    """Return readings and new state of the environments of a mask; of the others what they had, as it was handed out before."""
+    updated, result = chosen_only(memory, updated, mask), dict(readings)
+    for name, reading in readings.items():
+        if f"{KEPT}{name}" in memory:
+            result[name] = torch.where(
+                broadcast_over(mask, reading), reading.transpose(-2, -1), memory[f"{KEPT}{name}"]
+            ).transpose(-2, -1)
+        elif f"{WINDOW}{name}" in memory:
+            result[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
+    return result, updated
+
+
+def few_rows(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
+    """Return the environments of a mask, if they are on a CPU and few enough to be read as a batch of their own.
+
+    One alone is read twice: compiled code that serves every batch from two on is then not made again for it.
+    """
+    rows = None if torch.is_grad_enabled() else few_ids(mask)
+    if rows is None or not len(rows):
+        return None
+    return rows if len(rows) > 1 else rows.repeat(2)
+
+
+def rows_of(tensors: Mapping[str, Tensor], rows: Int[Tensor, " n"]) -> Tensors:
+    """Return some environments' rows of a state's fields."""
+    return {name: value[rows] if value.ndim else value for name, value in tensors.items() if name != "mask"}
+
+
+def read_rows(
+    core: Callable[[Tensors, Tensors], Tensors],
+    rows: Int[Tensor, " n"],
+    tensors: Mapping[str, Tensor],
+    memory: Mapping[str, Tensor],
+) -> Tensors:
+    """Read some environments, put their new state in the place of the old one, and return the readings of all.
+
+    `core` returns readings as `reading/<name>`, and new state as `state/<name>`.
+    """
+    held = {name: value if name in SHARED else value[rows] for name, value in memory.items()}
+    outputs = core(dict(tensors), held | {ENV: rows})
+    for path, value in outputs.items():
+        part, _, name = path.partition("/")
+        if part == "state" and value.ndim < memory[name].ndim:
+            memory[name].index_put_((rows, held["clock/step"] % memory[name].shape[1]), value)
+        elif part == "state":
+            memory[name][rows] = value
+    readings: Tensors = {}
+    for path, value in outputs.items():
+        part, _, name = path.partition("/")
+        if part != "reading":
+            continue
+        if f"{KEPT}{name}" in memory:
+            memory[f"{KEPT}{name}"][rows] = value.transpose(-2, -1)
+            readings[name] = memory[f"{KEPT}{name}"].clone().transpose(-2, -1)
+        else:
+            readings[name] = reduced(memory[f"{WINDOW}{name}"].clone(), "stack")
+    return readings

@@ -17,10 +17,9 @@ from torch import Tensor
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
-from tgdsl.module.accuracy.changed import only
 from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.accuracy.reference import ReferenceModule
-from tgdsl.module.accuracy.states import common_of, readings_of
+from tgdsl.module.accuracy.states import common_of, only, readings_of
 from tgdsl.module.accuracy.variants import Variant, queried_objects
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState

@@ -17,8 +17,7 @@ from tgdsl.errors import SimulationError, listed
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.grasps import Grasps
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.runtime.simulators.start_contacts import FIELDS
-from tgdsl.runtime.simulators.state_values import StateValues
+from tgdsl.runtime.simulators.state_values import FIELDS, StateValues
 
 
 class Drawn(NamedTuple):

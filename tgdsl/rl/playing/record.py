@@ -16,7 +16,7 @@ from torch import Tensor
 from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Moment
-from tgdsl.runtime.simulators.memory import refuse_beyond_memory
+from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 
 Column = Shaped[np.ndarray, "row ..."]
 

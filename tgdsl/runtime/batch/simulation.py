@@ -8,6 +8,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
+import copy
 import importlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -17,20 +18,19 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
-from tgdsl.module.memory.some_rows import few_rows
+from tgdsl.module.memory.memory import few_rows
 from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
-from tgdsl.runtime.batch.properties import BatchProperties
-from tgdsl.runtime.simulators.devices import checked_device
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
 from tgdsl.runtime.simulators.fields import STATE_ARRAYS, BodyFields, JointColumns
-from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
+from tgdsl.runtime.simulators.machine import bytes_per_env, checked_device, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id, geoms_of
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
-from tgdsl.runtime.simulators.objects.properties import PER_ENV
+from tgdsl.runtime.simulators.objects.properties import PER_ENV, ObjectProperties, RigidObject, refuse_other_fields
 from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
@@ -39,8 +39,127 @@ from tgdsl.tensors.env_ids import EnvIds, env_mask
 if TYPE_CHECKING:
     import mujoco.batch
 
-
 Array = np.ndarray
+_DERIVED_FROM = ("body_mass", "body_inertia", "geom_friction")
+"""Fields that are changed in models of single environments; MuJoCo derives the others."""
+
+
+class BatchProperties(ObjectProperties):
+    """Masses and frictions of a batch: expanded fields of its model, or a model for each environment.
+
+    Expanded fields share all else. Variants that differ in what cannot be expanded, such as trees of bounding volumes,
+    take a model for each environment; changed ones are copies.
+    """
+
+    def __init__(
+        self,
+        batch: mujoco.batch.Batch,
+        model: mujoco.MjModel,
+        bodies_of: Mapping[str, str],
+        variants: Sequence[mujoco.MjModel],
+        is_open: bool,
+    ):
+        super().__init__(model, bodies_of, batch.nsim, torch.device("cpu"))
+        self._batch = batch
+        self._fields: dict[str, Array] = {}
+        self._chosen = [model] * batch.nsim
+        differ = {name for other in variants for name in _differing(model, other)}
+        is_apart = is_open or bool(differ - set(mujoco.batch.MODEL_FIELDS))  # in what cannot be expanded
+        self._models = list(self._chosen) if is_apart else None
+        self._is_derived = False
+
+    def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
+        """Give environments other models; those that keep theirs keep their masses and frictions too."""
+        changed = [env for env, model in enumerate(models) if model is not self._chosen[env]]
+        self._chosen = list(models)
+        if self._models is not None:
+            for env in changed:
+                self._models[env] = models[env]
+            self._batch.set_models(self._models)
+            return
+        for model in {id(models[env]): models[env] for env in changed}.values():
+            for name in _differing(self._model, model):
+                self._field(name)
+        for env in changed:
+            for name, values in self._fields.items():
+                value = getattr(models[env], name)
+                values[env] = value[: len(values[env])] if values[env].ndim else value
+        if self._is_derived and changed:
+            self._batch.set_const(np.array(changed))
+
+    def fields(self) -> dict[str, Tensor]:
+        names = list(self._fields) if self._models is None else list(_DERIVED_FROM)
+        return {name: self._values(name) for name in names}
+
+    def set_fields(self, fields: Mapping[str, Tensor]) -> None:
+        names = [name for name in fields if name in mujoco.batch.MODEL_FIELDS]
+        refuse_other_fields(fields, {name: self._values(name) for name in names})
+        changed = set()
+        for name, value in fields.items():
+            now = self._arrays_of(name)
+            for env in np.flatnonzero((now != value.numpy()).reshape(len(now), -1).any(axis=1)).tolist():
+                self._row(name, env)[...] = value[env].numpy()
+                changed.add(env)
+        if "body_mass" in fields:
+            self._derive(np.array(sorted(changed), dtype=np.int64))
+        elif self._models is not None:
+            self._batch.set_models(self._models)
+
+    def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
+        ids = np.flatnonzero(mask.numpy())
+        for env, wanted in zip(ids.tolist(), mass.numpy()[ids], strict=True):
+            model, bodies = self._chosen[env], target.bodies  # not of what it has now: rounding would add up
+            factor = wanted / model.body_mass[bodies].sum()
+            self._row("body_mass", env)[bodies] = factor * model.body_mass[bodies]
+            self._row("body_inertia", env)[bodies] = factor * model.body_inertia[bodies]
+        self._derive(ids)
+
+    def _derive(self, ids: Int[Array, " n"]) -> None:
+        """Have what follows from masses follow in some environments."""
+        self._is_derived = True
+        if self._models is None:
+            if len(ids):
+                self._batch.set_const(ids)
+            return
+        for env in ids:
+            mujoco.mj_setConst(self._models[env], mujoco.MjData(self._models[env]))
+        self._batch.set_models(self._models)
+
+    def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
+        ids = np.flatnonzero(mask.numpy())
+        for env, wanted in zip(ids.tolist(), friction.numpy()[ids], strict=True):
+            self._row("geom_friction", env)[target.geoms, 0] = wanted
+        if self._models is not None:
+            self._batch.set_models(self._models)
+
+    def _values(self, field: str) -> Float[Tensor, "env ..."]:
+        return torch.from_numpy(np.array(self._arrays_of(field)))
+
+    def _arrays_of(self, name: str) -> Array:
+        """Return a field of all environments, to be read."""
+        if self._models is not None:
+            return np.stack([getattr(model, name) for model in self._models])
+        base = getattr(self._model, name)
+        return self._fields[name] if name in self._fields else np.broadcast_to(base, (self._batch.nsim, *base.shape))
+
+    def _row(self, name: str, env: int) -> Array:
+        """Return a field of one environment, to be changed."""
+        if self._models is None:
+            return self._field(name)[env]
+        if self._models[env] is self._chosen[env]:
+            self._models[env] = copy.copy(self._models[env])
+        return getattr(self._models[env], name)
+
+    def _field(self, name: str) -> Array:
+        if name not in self._fields:
+            self._fields[name] = self._batch.expand(name)
+        return self._fields[name]
+
+
+def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
+    names = [name for name in dir(one) if isinstance(getattr(one, name), Array)]
+    return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
+
 
 CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")
 """Fields of a state that are read of contact sensors."""
@@ -177,7 +296,6 @@ def _least_margin(model: mujoco.MjModel, sensor: int) -> float | None:
 
 
 def _geoms(model: mujoco.MjModel, kind: int, index: int) -> Int[np.ndarray, " geom"]:
-    """Return the geoms of what a contact sensor names: a geom, a body, or a body and all below it."""
     is_geom = kind == mujoco.mjtObj.mjOBJ_GEOM
     return np.array([index]) if is_geom else geoms_of(model, index, kind == mujoco.mjtObj.mjOBJ_XBODY)
 
@@ -266,11 +384,9 @@ class BatchSimulation(Simulation):
     _reader: BatchReader
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return where all bodies are in one environment: see `Simulation.body_poses`."""
         return self.batch.xpos[env], self.batch.xquat[env]
 
     def env_model(self, env: int) -> mujoco.MjModel:
-        """Return the model of one environment."""
         return self.batch.get_model(env)
 
     def read(self, env_ids: EnvIds | None = None) -> dict[str, torch.Tensor]:
@@ -318,8 +434,7 @@ class BatchSimulation(Simulation):
         self._readers.append(BatchReader(inputs, self.model, self.batch))
         return self._readers[-1]
 
-    def _refresh(self) -> None:
-        """Do nothing: environments are evaluated at once."""
+    def _refresh(self) -> None: ...
 
     def _use_objects(self, objects: EnvObjects) -> None:
         models = objects.models()

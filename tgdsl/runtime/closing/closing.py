@@ -10,7 +10,9 @@ another, and the object moves as through oil, so that it waits for the last fing
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 
@@ -22,10 +24,264 @@ from tgdsl.errors import SimulationError, listed
 from tgdsl.formats.model import Model
 from tgdsl.module.module import TactileModule
 from tgdsl.placement.propose.limits import angles_are_misread
-from tgdsl.runtime.closing.moving import Movement, movement
-from tgdsl.runtime.closing.place import OVERLAP, Sweep
+from tgdsl.placement.propose.propose import closing_motion
 from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.scene import SceneModels
+
+_SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+_LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+
+
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """How the hand of a scene moves.
+
+    Shapes: joints and bodies are MuJoCo's indices.
+
+    Attributes:
+        model: The scene.
+        trees: Topmost bodies of the kinematic trees that carry taxels.
+        ends: Open and closed end of each joint that closes the hand and follows no other such, be it by way of others
+            [rad, of slides m].
+        follows: By joint, those that an equality has follow another: that one, and the polynomial's coefficients.
+    """
+
+    model: mujoco.MjModel
+    trees: frozenset[int]
+    ends: Mapping[int, tuple[float, float]]
+    follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]]]
+
+    @cached_property
+    def closing(self) -> tuple[int, ...]:
+        """Joints that close the hand, those that follow such included: each after the one that it follows."""
+        followers = [joint for joint in self.follows if set(leaders(joint, self.follows)) & self.ends.keys()]
+        return (*self.ends, *sorted(followers, key=lambda joint: len(leaders(joint, self.follows))))
+
+    @cached_property
+    def hand(self) -> frozenset[int]:
+        """Bodies of the smallest subtrees, one of each tree, that hold all that closes; an arm is none of them."""
+        result: set[int] = set()
+        for tree in {self._root(joint) for joint in self.closing}:
+            paths = [self.path(int(self.model.jnt_bodyid[joint])) for joint in self.closing if self._root(joint) == tree]
+            common = set.intersection(*map(set, paths))
+            above = max(common - {int(self.model.jnt_bodyid[joint]) for joint in self.closing}, default=tree)
+            result |= {body for body in range(1, self.model.nbody) if above in self.path(body)}
+        return frozenset(result)
+
+    @cached_property
+    def num_joints(self) -> int:
+        """Number of the hand's hinges and slides, of those that follow another only the ones that close it."""
+        wanted = [joint for joint in self.joints if joint in self.ends or joint not in self.follows]
+        return sum(self.is_scalar(joint) and int(self.model.jnt_bodyid[joint]) in self.hand for joint in wanted)
+
+    @cached_property
+    def joints(self) -> tuple[int, ...]:
+        """All joints of the trees."""
+        return tuple(joint for joint in range(self.model.njnt) if self._root(joint) in self.trees)
+
+    @cached_property
+    def held(self) -> tuple[int, ...]:
+        """Joints of the trees that neither close the hand nor follow or lead another that does, nor are in a closed loop."""
+        looped = self._looped()
+        led = {leader for joint in self.ends for leader in leaders(joint, self.follows)}
+        coupled = {*self.ends, *self.follows, *led}
+        return tuple(j for j in self.joints if j not in coupled and int(self.model.jnt_bodyid[j]) not in looped)
+
+    @cached_property
+    def tips(self) -> tuple[int, ...]:
+        """Bodies with geoms below the joints that close, which have no other such below them."""
+        below = {int(self.model.jnt_bodyid[joint]) for joint in self.closing}
+        moved = {b for b in range(self.model.nbody) if self.model.body_geomnum[b] and below & set(self.path(b))}
+        return tuple(sorted(moved - {above for body in moved for above in self.path(body)[1:]}))
+
+    def pose(self, share: float) -> Float[np.ndarray, " qpos"]:
+        """Return where the joints are when the hand has closed by a share; all else is at its start."""
+        result = self.model.qpos0.copy()
+        for joint, (opened, closed) in self.ends.items():
+            result[self.model.jnt_qposadr[joint]] = (1.0 - share) * opened + share * closed
+        for joint in self.closing[len(self.ends) :]:
+            leader, coefficients = self.follows[joint]
+            moved = result[self.model.jnt_qposadr[leader]] - self.model.qpos0[self.model.jnt_qposadr[leader]]
+            result[self.model.jnt_qposadr[joint]] += np.polynomial.polynomial.polyval(moved, coefficients)
+        return result
+
+    def path(self, body: int) -> list[int]:
+        """Return a body and all above it but the world, upward."""
+        results = []
+        while body:
+            results.append(body)
+            body = int(self.model.body_parentid[body])
+        return results
+
+    def is_scalar(self, joint: int) -> bool:
+        """Return whether a joint is a hinge or a slide."""
+        return int(self.model.jnt_type[joint]) in (_SLIDE, _HINGE)
+
+    def _root(self, joint: int) -> int:
+        return int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
+
+    def _looped(self) -> set[int]:
+        """Return the bodies between two that an equality holds together, and where their paths upward meet."""
+        model, result = self.model, set[int]()
+        for i in np.flatnonzero(np.isin(model.eq_type, _LOOPS) & model.eq_active0.astype(bool)):
+            ids = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+            if int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE):
+                ids = int(model.site_bodyid[ids[0]]), int(model.site_bodyid[ids[1]])
+            one, two = (set(self.path(max(body, 0))) for body in ids)
+            result |= (one ^ two) if one and two else set()
+        return result
+
+
+def leaders(joint: int, follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]]]) -> list[int]:
+    """Return the joint that one follows, the one that this follows, and so on; `follows` as in `Movement`."""
+    results: list[int] = []
+    while joint in follows and follows[joint][0] not in results:
+        joint = follows[joint][0]
+        results.append(joint)
+    return results
+
+
+def movement(scene: Model, bodies: frozenset[str]) -> Movement:
+    """Return how the hand of a scene moves whose `bodies` carry sensors; nothing closes if it is not clear how."""
+    model = scene.compiled
+    trees = frozenset(int(model.body_rootid[model.body(name).id]) for name in bodies) - {0}
+    follows = {}
+    for i in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool)):
+        if (leader := int(model.eq_obj2id[i])) >= 0:
+            follows[int(model.eq_obj1id[i])] = leader, model.eq_data[i, :5].copy()
+    ends = {int(model.joint(name).id): pair for name, pair in closing_motion(scene).items()}
+    ends = {joint: pair for joint, pair in ends.items() if int(model.body_rootid[model.jnt_bodyid[joint]]) in trees}
+    driven = {joint: pair for joint, pair in ends.items() if not set(leaders(joint, follows)) & ends.keys()}
+    return Movement(model, trees, driven, follows)
+
+
+SHARES = np.linspace(0.0, 1.0, 9)
+"""How far the hand is closed: where its tips are tried, and where touch is looked for."""
+TOWARD_PALM = (0.0, 0.2, 0.4, 0.6, -0.25, -0.5)
+"""How far from the tips' middle to the palm a place is tried."""
+OPPOSED = -0.3
+"""Two links that touch an object oppose each other if the cosine between their directions is less than this."""
+OVERLAP = 0.1
+"""How deep an object may lie in the open hand where it is left, as a share of its radius."""
+_UNBOUNDED = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+
+
+@dataclass(frozen=True)
+class Grip:
+    """What a hand that closes meets of an object, at the first share at which each link does.
+
+    Attributes:
+        overlap: How deep the object lies in the open hand [m]; negative: how far it is from it.
+        links: Bodies that meet it.
+        is_opposed: Whether two of these do so from opposite sides.
+        imbalance: Length of the mean of the directions from which they do.
+    """
+
+    overlap: float
+    links: frozenset[int]
+    is_opposed: bool
+    imbalance: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether several links meet the object, from opposite sides."""
+        return len(self.links) > 1 and self.is_opposed
+
+
+class Sweep:
+    """A hand that closes on an object, pose by pose."""
+
+    def __init__(self, movement: Movement, body: int):
+        self.movement, self.model, self.body = movement, movement.model, body
+        self.data = mujoco.MjData(self.model)
+        self.is_free = int(self.model.body_dofnum[body]) == 6 and int(self.model.body_jntnum[body]) == 1
+        weld = self.model.body_weldid
+        rigid = [b for b in range(self.model.nbody) if weld[b] == weld[body] and body in (*movement.path(b), 0)]
+        self.object_geoms = [geom for b in rigid for geom in self._touchable(b)]
+        self.hand_geoms = [geom for b in sorted(movement.hand) for geom in self._touchable(b)]
+        self._posed(0.0)
+        offsets = [self.data.geom_xpos[geom] - self.data.xpos[body] for geom in self.object_geoms]
+        self.middle = self.data.xmat[body].reshape(3, 3).T @ np.mean(offsets, axis=0) if offsets else np.zeros(3)
+        reach = [np.linalg.norm(p - np.mean(offsets, axis=0)) for p in offsets]
+        self.radius = max((r + self.model.geom_rbound[g] for r, g in zip(reach, self.object_geoms, strict=True)), default=0.0)
+
+    def place(self) -> Float[np.ndarray, " 3"] | None:
+        """Return where the object's frame lies for a grip as good as any, in the world [m]; None if nowhere clear of the hand.
+
+        First between all fingertips; if it cannot be held there, such as what is smaller than the gaps, between one fingertip
+        and the palm, or two.
+        """
+        best, result = (False, 0, -np.inf), None
+        tips = self.movement.tips
+        for among in ([tips], [*((tip,) for tip in tips), *combinations(tips, 2)]):
+            for candidate in self._candidates(among):
+                origin = candidate - self.data.xmat[self.body].reshape(3, 3) @ self.middle
+                grip = self.grip(origin)
+                value = grip.is_opposed, len(grip.links), -grip.imbalance
+                if grip.overlap <= 0 and grip.links and value > best:
+                    best, result = value, origin
+            if best[0]:
+                break
+        return result
+
+    def grip(self, origin: Float[np.ndarray, " 3"] | None = None) -> Grip:
+        """Return what the hand meets as it closes, the object's frame at `origin` in the world [m] or where it starts."""
+        sides: dict[int, np.ndarray] = {}
+        overlap = -np.inf
+        for share in SHARES:
+            self._posed(float(share), origin)
+            middle = self.data.xpos[self.body] + self.data.xmat[self.body].reshape(3, 3) @ self.middle
+            for geom in self.hand_geoms:
+                link = int(self.model.geom_bodyid[geom])
+                away = np.linalg.norm(self.data.geom_xpos[geom] - middle) - self.model.geom_rbound[geom]
+                if link in sides or (share > 0 and away > self.radius):
+                    continue
+                gap, point = self._gap(geom)
+                overlap = max(overlap, -gap) if share == 0 else overlap
+                if gap < 0:
+                    sides[link] = (point - middle) / max(float(np.linalg.norm(point - middle)), 1e-9)
+        ways = np.array(list(sides.values())).reshape(-1, 3)
+        is_opposed = bool(len(ways) and (ways @ ways.T).min() < OPPOSED)
+        imbalance = float(np.linalg.norm(ways.mean(axis=0))) if len(ways) else 1.0
+        return Grip(float(overlap), frozenset(sides), is_opposed, imbalance)
+
+    def _candidates(self, among: Sequence[Sequence[int]]) -> list[Float[np.ndarray, " 3"]]:
+        """Return places between fingertips, and from there toward the palm, while the hand closes."""
+        results = []
+        base = [b for b in sorted(self.movement.hand) if self._touchable(b)]
+        for share in SHARES:
+            self._posed(float(share))
+            for bodies in among:
+                tips = np.mean([self._middle_of(body) for body in bodies], axis=0)
+                palm = self._middle_of(base[0]) if base[0] not in self.movement.tips else tips
+                results += [(1.0 - toward) * tips + toward * palm for toward in TOWARD_PALM]
+        return results
+
+    def _middle_of(self, body: int) -> Float[np.ndarray, " 3"]:
+        geoms = self._touchable(body)
+        return np.mean(self.data.geom_xpos[geoms], axis=0) if geoms else self.data.xpos[body]
+
+    def _gap(self, geom: int) -> tuple[float, Float[np.ndarray, " 3"]]:
+        """Return the distance of a geom from the object [m], and the object's nearest point."""
+        best, point, ends = 1.0, np.zeros(3), np.zeros(6)
+        for other in self.object_geoms:
+            gap = mujoco.mj_geomDistance(self.model, self.data, other, geom, 1.0, ends)
+            if gap < best:
+                best, point = gap, ends[:3].copy()
+        return best, point
+
+    def _posed(self, share: float, origin: Float[np.ndarray, " 3"] | None = None) -> None:
+        self.data.qpos[:] = self.movement.pose(share)
+        if origin is not None and self.is_free:
+            address = int(self.model.jnt_qposadr[self.model.body_jntadr[self.body]])
+            self.data.qpos[address : address + 3] = origin
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _touchable(self, body: int) -> list[int]:
+        first, num = int(self.model.body_geomadr[body]), int(self.model.body_geomnum[body])
+        geoms = [geom for geom in range(first, first + num) if int(self.model.geom_type[geom]) not in _UNBOUNDED]
+        return [geom for geom in geoms if self.model.geom_contype[geom] or self.model.geom_conaffinity[geom]] or geoms
+
 
 START = "tgdsl/open"
 """The keyframe with the hand open."""
@@ -270,7 +526,6 @@ def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:
 
 
 def _slacken(joint: mujoco.MjsJoint) -> None:
-    """Free a joint of springs, friction and limits of its force."""
     joint.stiffness, joint.damping, joint.frictionloss = [0, 0, 0], [0, 0, 0], 0.0
     joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
 

@@ -52,15 +52,7 @@ class BodyFields:
         take: Callable[[Any, Any], Any],
         cross: Callable[[Any, Any], Any],
     ):
-        """Look the bodies up.
-
-        Args:
-            inputs: What the module wants.
-            model: The scene.
-            index: Makes indices of the arrays that are read: NumPy's, or tensors on their device.
-            take: Returns the rows of an array (env, row, …) that such indices name.
-            cross: Their cross product along the last axis.
-        """
+        """Look the bodies up; indices, rows of an array (env, row, …) and cross products are NumPy's or torch's."""
         ids = np.array([element_id(model, "body", name) for name in inputs.bodies], dtype=np.int64)
         self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
         self._fields = inputs.fields
@@ -78,23 +70,11 @@ class BodyFields:
             if "body_linvel" in self._fields:
                 pos = values["body_pos"] if "body_pos" in values else self._take(arrays["xpos"], self._bodies)
                 arm = pos - self._take(arrays["subtree_com"], self._roots)
-                values["body_linvel"] = origin_velocity(spatial, arm, self._cross)
+                # MuJoCo gives velocities at the centre of mass of a body's kinematic tree.
+                values["body_linvel"] = spatial[..., 3:] + self._cross(spatial[..., :3], arm)
             if "body_angvel" in self._fields:
                 values["body_angvel"] = spatial[..., :3]
         return values
-
-
-def origin_velocity(spatial: T, arm: T, cross: Callable[[T, T], T]) -> T:
-    """Return the velocity of a body frame's origin from MuJoCo's spatial velocity `cvel`.
-
-    MuJoCo gives the latter at the centre of mass of the body's kinematic tree.
-
-    Args:
-        spatial: Angular and linear velocity, (…, 6), in the world [rad/s], [m/s].
-        arm: From that centre of mass to the origin, (…, 3), in the world [m].
-        cross: Cross product along the last axis.
-    """
-    return spatial[..., 3:] + cross(spatial[..., :3], arm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +91,7 @@ class JointColumns:
 
     @classmethod
     def of(cls, inputs: Inputs, model: mujoco.MjModel) -> JointColumns:
-        """Look them up.
-
-        Raises:
-            SimulationError: If the model lacks a joint or an actuator, or a joint is no hinge or slide.
-        """
+        """Look them up."""
         joints = np.array([_joint_id(model, name) for name in inputs.joints], dtype=np.intp)
         actuators = np.array([element_id(model, "actuator", name) for name in inputs.actuators], dtype=np.intp)
         dofs = model.jnt_dofadr[joints].astype(np.intp)

@@ -27,11 +27,9 @@ from tgdsl.runtime.controls import warn_of_range, write_controls
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults, OnFault
 from tgdsl.runtime.simulators.fields import warn_of_mocap
 from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
-from tgdsl.runtime.simulators.objects.choices import EnvObjects, SharedMeshModels, Values
-from tgdsl.runtime.simulators.objects.heat import EnvHeat
+from tgdsl.runtime.simulators.objects.choices import EnvHeat, EnvObjects, SharedMeshModels, Values
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
-from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
-from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable, StateValues
+from tgdsl.runtime.simulators.state_values import INTEGRATED, Contacts, Rows, StartContacts, StateTable, StateValues
 from tgdsl.runtime.simulators.watch import Watch, Watched, WatchReader
 from tgdsl.runtime.source import Control
 from tgdsl.scene.options import Options
@@ -92,11 +90,7 @@ class SubstepStates:
         return self._wanted > 1
 
     def begin(self, substeps: int) -> None:
-        """Forget the last control step; the next one has so many physics steps.
-
-        Raises:
-            SimulationError: If the module wants another number.
-        """
+        """Forget the last control step; the next one has so many physics steps."""
         if substeps != self._wanted:
             steps = f"{self._wanted} physics step{'' if self._wanted == 1 else 's'}"
             problem = f"this module has sensors that are advanced at {steps} per call"
@@ -613,7 +607,6 @@ class Simulation(ABC):
         self._has_warned_of_range = self._has_warned_of_range or warn_of_range(control, self.model)
 
     def _saved_arrays(self) -> dict[str, Tensor]:
-        """Return the live tensors of a saved state, by their names there."""
         arrays = {f"state/{name}": self._arrays[name] for name in INTEGRATED}
         return arrays | self.heat.saved | {"faults/counts": self._faults.counts}
 

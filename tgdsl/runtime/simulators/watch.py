@@ -5,7 +5,7 @@ Shapes: `env` environments, `body`, `site`, `joint`, `actuator` and `pair` as a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
@@ -140,17 +140,9 @@ class WatchReader:
         )
 
     def _sites(self, pos: Float[Tensor, "env body 3"], quat: Float[Tensor, "env body 4"]) -> tuple[Tensor, Tensor]:
-        """Return position [m] and orientation of each site from the bodies'."""
         carried = quat[:, self._carriers]
         site_pos, site_quat = (local.to(pos.dtype).expand(len(pos), -1, -1) for local in (self._site_pos, self._site_quat))
         return pos[:, self._carriers] + rotated(carried, site_pos), product(carried, site_quat)
-
-
-def merged_joints(inputs: Inputs, watch: WatchReader | None) -> Inputs:
-    """Return inputs with the joints' fields that a watch needs too, which are kept from before a physics step."""
-    if watch is None:
-        return inputs
-    return replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *watch.inputs.fields))))
 
 
 def _carrier(model: mujoco.MjModel, site: int) -> str:

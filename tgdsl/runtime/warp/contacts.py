@@ -128,7 +128,6 @@ class PairContacts:
 
 
 def _geoms(model: mujoco.MjModel, parts: Sequence[ContactPart]) -> tuple[int, ...]:
-    """Return the indices of the geoms of an object's or a link's parts, ascending."""
     return tuple(np.unique(np.concatenate([part_geoms(model, part) for part in parts])).tolist())
 
 

@@ -72,11 +72,7 @@ class WorldObjects:
         self.model = shared_model(chosen.scenes, inputs)
 
     def write_to(self, parameters: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
-        """Write the fields of environments whose objects were chosen again, in place; the others keep their masses.
-
-        Raises:
-            SimulationError: If a field that all environments share would differ.
-        """
+        """Write the fields of environments whose objects were chosen again, in place; the others keep their masses."""
         choices = [self._choices(env) for env in range(len(self._chosen.variant))]
         before, self._written = self._written or [None] * len(choices), choices
         device = arrays["qpos"].device
@@ -169,11 +165,9 @@ class WorldProperties(ObjectProperties):
                 value.copy_(array[:, columns])
 
     def fields(self) -> dict[str, Tensor]:
-        """Return the fields that differ: see `ObjectProperties.fields`."""
         return dict(self._fields)
 
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        """Set the fields that differ: see `ObjectProperties.set_fields`."""
         refuse_other_fields(fields, self._fields)
         for name, value in fields.items():
             self._fields[name].copy_(value)

@@ -6,30 +6,111 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.errors import SimulationError
+from tgdsl.errors import SimulationError, listed
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.faults import BAD_VALUES
+from tgdsl.runtime.simulators.faults import BAD_VALUES, DIVERGED, NO_ROOM, EnvFaults
 from tgdsl.runtime.simulators.fields import FORCES, STATE_ARRAYS, BodyFields, JointColumns
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
 from tgdsl.runtime.simulators.objects.properties import PER_ENV
 from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
-from tgdsl.runtime.simulators.watch import merged_joints
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
-from tgdsl.runtime.warp.faults import Faults, constraint_rows
 from tgdsl.runtime.warp.objects import OBJECT_FIELDS, WorldObjects, WorldProperties
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
 from tgdsl.tensors.env_ids import put_rows
+from tgdsl.tensors.on_host import HostCopy
 from tgdsl.tensors.torch_internals import copy_each
+
+POOLS = {
+    0: "njmax={njmax} is too small in environments {envs}: constraints are left out, {nefc} were wanted last",
+    1: "njmax={njmax} is too small in environments {envs}: entries of the constraints' Jacobian are left out",
+    2: "nconmax={nconmax} is too small: pairs of near geoms are left out, in all environments together {ncollision} were "
+    "wanted last, and nconmax × num_envs is {naconmax}",
+    3: "nconmax={nconmax} is too small: contacts are left out, in all environments together {nacon} were wanted last, and "
+    "nconmax × num_envs is {naconmax}",
+    4: "nconmax={nconmax} is too small in environments {envs}: contacts of convex shapes are left out",
+    5: "contacts with a height field are left out in environments {envs}: a finer field meets too many of its cells",
+    6: "contacts that a contact sensor of the model's own should report are left out in environments {envs}: it matches more "
+    'than {maxmatch}; raise it with <custom><numeric name="contact_sensor_maxmatch" data="…"/></custom> in the scene',
+    7: "nvmax is too small in environments {envs}: degrees of freedom are left out",
+    11: "contacts of MuJoCo's tactile sensors are left out in environments {envs}",
+}
+"""What each bit of MuJoCo Warp's `overflow` says of a pool. Bits 9 and 10, a solver at its last iteration, are no faults: it
+goes on."""
+_MASK = sum(1 << bit for bit in POOLS)
+_HORIZON = 1 << 8
+"""Bit of a search that ran out of room: of a size that nobody can choose, and a matter of its environment alone."""
+_LARGEST = 1e10
+"""Positions and velocities above it have diverged: MuJoCo's own limit, `mjMAXVAL`."""
+
+
+class Faults(EnvFaults):
+    """Faults of each environment since it was last reset: its own, and full pools, which many share."""
+
+    def __init__(self, arrays: Mapping[str, Tensor], on_fault: str):
+        device = arrays["qpos"].device
+        super().__init__(len(arrays["qpos"]), device, on_fault)
+        self._arrays = arrays
+        self._peak = torch.zeros(len(arrays["qpos"]), dtype=torch.float32, device=device)
+        self._counts: Int[Tensor, " count"] = torch.zeros(1 + len(self.totals), dtype=torch.int64, device=device)
+        self._copy = HostCopy()
+
+    def check_divergence(self) -> None:
+        """Look for divergence after a physics step, on the device."""
+        for name in ("qpos", "qvel"):
+            if self._arrays[name].shape[1]:
+                # The maximum of a NaN is NaN.
+                torch.maximum(self._peak, self._arrays[name].abs().amax(dim=1), out=self._peak)
+
+    def update(self) -> Bool[Tensor, " env"]:
+        """Count faults that are new; return which environments have any of their own."""
+        self.note(DIVERGED, ~(self._peak < _LARGEST))
+        self.note(NO_ROOM, (self._arrays["overflow"] & _HORIZON) != 0)
+        self._peak.zero_()
+        is_faulty = super().update()
+        has_pool_fault = (self._arrays["overflow"] & _MASK) != 0
+        to_raise = (has_pool_fault | is_faulty) if self.on_fault == "raise" else has_pool_fault
+        self._counts.copy_(torch.cat([to_raise.any()[None].long(), self.totals]))
+        return is_faulty
+
+    def polled(self) -> tuple[bool, list[int]]:
+        """Return whether to raise, and the number of faults of each kind so far.
+
+        A GPU is not waited for: there both are of an earlier call.
+        """
+        counts = self._copy.poll(self._counts)
+        first, *totals = [0] if counts is None else counts.tolist()
+        return bool(first), totals
+
+    def message(self, sizes: Mapping[str, int]) -> str:
+        """Return what went wrong and where, in words with the pools' sizes; nothing if nothing did. It waits for a GPU."""
+        result, overflow = self.messages(), self._arrays["overflow"].cpu()
+        for bit, text in POOLS.items():
+            envs = torch.nonzero((overflow >> bit) & 1).flatten().tolist()
+            if envs:
+                result.append("MuJoCo Warp: " + text.format(envs=listed([str(env) for env in envs]), **sizes))
+        return "; ".join(result)
+
+
+def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
+    """Return how many rows of constraints a number of contacts makes at most, and all limits and equalities besides."""
+    dim = max([1, *model.geom_condim.tolist(), *model.pair_dim.tolist()])
+    is_pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    per_contact = 2 * (dim - 1) if is_pyramidal and dim > 1 else dim
+    limits = np.count_nonzero(model.jnt_limited) + 2 * np.count_nonzero(model.tendon_limited)
+    friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
+    return int(num_contacts * per_contact + 6 * model.neq + 2 * limits + friction)
+
 
 T = TypeVar("T")
 _VELOCITIES = ("cvel", "cdof_dot")
@@ -131,7 +212,6 @@ class WarpSimulation(Simulation):
         return readings
 
     def repeated(self, body: Callable[[], T]) -> Callable[[], T]:
-        """Return work that is done again and again, such as a whole step of an environment: see `Simulation.repeated`."""
         call = GraphedCall(self._stream, body)
         placed: tuple[Bool[Tensor, " env"] | None, dict[str, Tensor]] = (None, {})
 
@@ -150,7 +230,6 @@ class WarpSimulation(Simulation):
         return done
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
-        """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
         self._refresh()
         pos, quat = (self.arrays[name][env].double().cpu().numpy() for name in ("xpos", "xquat"))
         return pos, quat
@@ -232,11 +311,7 @@ class WarpSimulation(Simulation):
         self._driven = self.drive
 
     def _put_model(self, model: mujoco.MjModel, per_env: list[str], num_envs: int, keyframe: int, options: SimOptions) -> None:
-        """Put model and data on the device, all environments at the start.
-
-        Raises:
-            SimulationError: If MuJoCo Warp does not support something of the model, or a field cannot differ.
-        """
+        """Put model and data on the device, all environments at the start."""
         refuse_two_instants(model, "bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
         nconmax, njmax = options.get("nconmax"), options.get("njmax")
         self._nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
@@ -245,7 +320,9 @@ class WarpSimulation(Simulation):
         start = mujoco.MjData(model)
         if keyframe >= 0:
             mujoco.mj_resetDataKeyframe(model, start, keyframe)
-        inputs, stream = merged_joints(self._touch.inputs, self._watch), self._stream
+        inputs, stream = self._touch.inputs, self._stream
+        if self._watch is not None:  # its joints too are kept from before a physics step
+            inputs = replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *self._watch.inputs.fields))))
         with stream.scope():
             try:
                 self.warp_model = self._mjw.put_model(model, batch_sizes=dict.fromkeys(per_env, num_envs))
@@ -449,7 +526,6 @@ class WarpSimulation(Simulation):
 
 
 def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return copies of float32 arrays, made by one kernel."""
     copies = {name: torch.empty_like(array) for name, array in arrays.items()}
     copy_each(list(copies.values()), list(arrays.values()))
     return copies

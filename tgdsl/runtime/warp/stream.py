@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 import torch
 
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.simulators.devices import checked_device
+from tgdsl.runtime.simulators.machine import checked_device
 
 T = TypeVar("T")
 _EAGER_CALLS = 2

@@ -146,7 +146,8 @@ class Calibration:
 
     def text(self) -> str:
         """Return the YAML that `load_calibration` reads."""
-        lines = ["tgdsl: 1", *([f"hand: {_quoted(self.hand)}"] if self.hand else []), f"units: {self.units}"]
+        quoted = self.hand.replace("'", "''")
+        lines = ["tgdsl: 1", *([f"hand: '{quoted}'"] if self.hand else []), f"units: {self.units}"]
         if self.contact_threshold is not None:
             lines.append(f"contact_threshold: {self.contact_threshold!r}")
         lines.append("fingers:")
@@ -186,7 +187,3 @@ def _calibration(spec: CalibrationSpec) -> Calibration:
 
 def _row(values: Float[np.ndarray, " axis"]) -> str:
     return f"[{', '.join(repr(float(value)) for value in values)}]"
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"

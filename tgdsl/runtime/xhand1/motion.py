@@ -144,15 +144,6 @@ class JointControls:
         return control.reshape(-1)[self.actuator_id].astype(np.float64)
 
 
-def check_ranges(model: mujoco.MjModel, limits: MotionLimits) -> None:
-    """Raise an error unless motion limits stay within the robot file's."""
-    ranges = model.jnt_range[joint_ids(model)]
-    for name, lower, upper, (least, largest) in zip(JOINTS, limits.lower, limits.upper, ranges, strict=True):
-        if lower < least - ROUNDING or upper > largest + ROUNDING:
-            problem = f"{name}: limits from {lower:g} to {upper:g} rad"
-            raise MotionError(f"{problem}, expected them within the robot file's {least:g} to {largest:g}")
-
-
 def _actuator(model: mujoco.MjModel, name: str, joint: int) -> int:
     """Return the one actuator of a joint, whose control is the angle to go to [rad]."""
     is_of_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)

@@ -20,11 +20,47 @@ from tgdsl.errors import StateError
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.reader import Reading
-from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError
 from tgdsl.tensors.env_ids import EnvIds
+
+
+class VelocityFilter:
+    """Differences of successive angles through a first-order low-pass filter: v ← v + (1 − exp(−Δt/τ)) (Δq/Δt − v).
+
+    For angles that move evenly, the error of the speed decays as exp(−t/τ). Of a sine of angular frequency ω, much slower
+    than the readings, 1/√(1 + ω²τ²) is left, late by arctan(ωτ).
+    """
+
+    def __init__(self, time_constant_s: float):
+        """Start at rest.
+
+        Args:
+            time_constant_s: The filter's time constant τ [s]; 0: plain differences.
+        """
+        self._time_constant_s = time_constant_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all readings."""
+        self._time_s: float | None = None
+        self._position = self._velocity = np.zeros(0)
+
+    def update(self, time_s: float, position: Float[np.ndarray, " joint"]) -> Float[np.ndarray, " joint"]:
+        """Take the angles [rad] at a time [s] and return the speeds [rad/s]; those of the first reading are 0.
+
+        A time that is not later than the last changes nothing.
+        """
+        if self._time_s is None:
+            self._velocity = np.zeros(len(position))
+        elif time_s > self._time_s:
+            elapsed = time_s - self._time_s
+            share = 1.0 if self._time_constant_s == 0 else -math.expm1(-elapsed / self._time_constant_s)
+            self._velocity = self._velocity + share * ((position - self._position) / elapsed - self._velocity)
+        else:
+            return self._velocity
+        self._time_s, self._position = time_s, position.astype(np.float64)
+        return self._velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +236,6 @@ class XHand1Source(HandSource):
 
     @property
     def control_step(self) -> float:
-        """Duration of one control step [s]."""
         return self._control_step
 
     def step(self, control: Control = None) -> None:
@@ -232,19 +267,12 @@ class XHand1Source(HandSource):
 
     @property
     def age_s(self) -> float | None:
-        """How old the sample is at most, now [s]."""
         return self.sample().reading.age_s()
 
     def resume(self) -> None:
-        """Let a hand move again after an error made it passive."""
         self.hand.resume()
 
     def close(self) -> None:
-        """Close the hand.
-
-        Raises:
-            HandError: If it was moving and did not confirm that it is passive.
-        """
         self.hand.close()
 
     def _restart(self) -> None:
@@ -268,7 +296,6 @@ class XHand1Source(HandSource):
         return -math.inf
 
     def _time_of(self, reading: Reading) -> float:
-        """Return when the joints were where a reading says that they were [s]."""
         return reading.requested_at
 
     def _read(self, requested_after: float) -> HandSample:

@@ -86,7 +86,7 @@ from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses, of_rows, ris
 from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
 from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
-from tgdsl.sensors.contact_audio.shares import indices, shares, tables
+from tgdsl.sensors.contact_audio.shares import shares, tables
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec, alternatives
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
@@ -247,7 +247,6 @@ CONTACT_AUDIO = Kind(
     is_timed=True,
     is_random=True,
     retimed=retimed,
-    indices=indices,
     alternatives=alternatives,
     provides=SOUND,
 )

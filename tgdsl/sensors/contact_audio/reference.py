@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.kinematics import Places
-from tgdsl.quantities.loads import Loads, ReferenceLoads
+from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
 from tgdsl.sensors.contact_audio.bands import middle
@@ -80,7 +80,7 @@ def reference(
     return heard[..., None], after, {SAMPLES: radiated() * heard, PLACE: gathered[Places].T}
 
 
-def _shares(spec: ContactAudioSpec, modes: Ringing, loads: ReferenceLoads) -> Float[np.ndarray, "body object mode"]:
+def _shares(spec: ContactAudioSpec, modes: Ringing, loads: PairLoads) -> Float[np.ndarray, "body object mode"]:
     """Return by how much more or less than by its gain each load strikes each mode of what it acts on."""
     if spec.gains == "mean":
         return np.ones((*loads.force.shape, 1))

@@ -13,7 +13,7 @@ nodes of all grids, `mode` modes of the row with most, `field` fields of the row
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -57,11 +57,6 @@ def tables(shapes: Sequence[ModeShapes], num_modes: int) -> dict[str, np.ndarray
     }
     # Without any that are one, field i is mode i.
     return result if (owner.sum(axis=1) <= 1).all() else result | {"shape_owner": owner}
-
-
-def indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> Mapping[str, int]:
-    """Return of how many nodes the first one of a grid is one."""
-    return {"shape_first": len(constants["shape_value"])} if "shape_first" in constants else {}
 
 
 def shares(center: Vec, along: Vec, constants: Constants) -> Float[Tensor, "env body object mode"]:

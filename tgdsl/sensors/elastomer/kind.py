@@ -163,6 +163,5 @@ ELASTOMER = Kind(
     reference,
     knobs=TAXEL,
     gains_depth=True,
-    indices=lambda found, _: operators.indices(found),
     alternatives=alternatives,
 )

@@ -176,12 +176,6 @@ def _use_spectrum(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
     return tuple(results)
 
 
-def indices(constants: Mapping[str, np.ndarray]) -> dict[str, int]:
-    """Return of how many cells a transform's constants are indices, by their names."""
-    grids = {name.removesuffix("cells"): cells.size for name, cells in constants.items() if name.endswith("/cells")}
-    return {f"{prefix}{name}": size for prefix, size in grids.items() for name in ("cells", "places")}
-
-
 def _joined(planes: list[Tensor]) -> Tensor:
     return planes[0] if len(planes) == 1 else torch.cat(planes, dim=-1)
 

@@ -28,7 +28,6 @@ still sum to the solver's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Generic, Literal
 
@@ -201,11 +200,6 @@ def forward(
     return readings, {}
 
 
-def indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> dict[str, int]:
-    """Return of how many things constants are indices: of taxels, and of places of all bodies' padded taxels."""
-    return {"taxel": num_taxels, "first": num_taxels + 1, "row": constants["taxel"].size}
-
-
 def alternatives(spec: ForceTaxelSpec) -> list[Alternative]:
     """Return numbers of Newton steps towards the contacts' moment."""
     return [Alternative(f"{num} Newton steps", {"moment_iterations": num}) for num in (0, 1, 2, 4, 8, 16)]
@@ -217,7 +211,6 @@ FORCE_TAXEL = Kind(
     forward,
     reference,
     knobs=FORCE,
-    indices=indices,
     alternatives=alternatives,
     constants=ForceTaxelConstants,
 )

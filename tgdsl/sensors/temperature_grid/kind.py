@@ -36,7 +36,6 @@ faces from losses.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -256,11 +255,6 @@ def _reports(heat: Heat, constants: Constants) -> dict[str, Tensor]:
     return reports
 
 
-def indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> dict[str, int]:
-    """Return of how many things constants are indices: of cells."""
-    return {"read": constants["is_cell"].size} if "read" in constants else {}
-
-
 TEMPERATURE_GRID = Kind(
     TemperatureGridSpec,
     lower,
@@ -268,6 +262,5 @@ TEMPERATURE_GRID = Kind(
     reference,
     knobs=BASE,
     is_timed=True,
-    indices=indices,
     alternatives=alternatives,
 )

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faulty_lines import Faults, FaultyEmulator, FaultyLine
+from first_order_hands import first_order_hand
 from xhand1_hands import wait_until
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import EmulatedLine
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
+from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, EmulatedLine, TipForces
 from tgdsl.runtime.xhand1.wire.errors import HandError
 from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, HandState, JointCommand, Mode, decode_state, encode_command
 from tgdsl.runtime.xhand1.wire.protocol import Command, Frame, FrameParser, encode_frame
@@ -28,7 +28,7 @@ def ask(hand: EmulatedHand, now: float, joints=PASSIVE) -> HandState:
 
 
 def test_joints_follow_first_order_and_stay_when_passive():
-    hand = EmulatedHand(time_constant_s=0.05)
+    hand = first_order_hand(time_constant_s=0.05)
     ask(hand, 10.0, MOVING)
     for after in (0.01, 0.05, 0.2):
         expected = 0.1 * np.arange(12) * (1 - math.exp(-after / 0.05))
@@ -41,7 +41,7 @@ def test_joints_follow_first_order_and_stay_when_passive():
 
 @pytest.mark.parametrize("lacking", [{"mode": Mode.PASSIVE}, {"kp": 0}, {"current_limit": 0}])
 def test_a_joint_without_mode_gain_or_current_stays(lacking):
-    hand = EmulatedHand()
+    hand = first_order_hand()
     joint = JointCommand(**({"position": 1.0, "kp": 100, "current_limit": 300, "mode": Mode.POSITION} | lacking))
     ask(hand, 1.0, [joint] * 12)
     assert (ask(hand, 2.0, [joint] * 12).position == 0).all()
@@ -53,14 +53,14 @@ def test_fingertips_feel_the_field_rounded_and_cut_to_a_byte():
         taxel[1, 7] = [-300, 300, -5]
         return TipForces(np.full((5, 3), time_s), taxel)
 
-    state = ask(EmulatedHand(forces=field), 12.4)
+    state = ask(first_order_hand(forces=field), 12.4)
     assert (state.total_force == 12).all()
     assert state.taxel_force[1, 7].tolist() == [-128, 127, 0]
     assert np.count_nonzero(state.taxel_force) == 2
 
 
 def test_what_a_hand_does_not_know_it_refuses_and_what_is_for_others_it_ignores():
-    hand = EmulatedHand(2)
+    hand = first_order_hand(2)
     assert hand.answer(Frame(0xFE, 0x80, Command.VERSION), 0.0) is None
     assert hand.answer(Frame(0xFE, 0x82, Command.RESET), 0.0) == Frame(0x82, 0xFE, 0, b"\x14")
     assert hand.answer(Frame(0xFE, 0x82, Command.EXCHANGE, b"short"), 0.0) == Frame(0x82, 0xFE, 0, b"\x02")
@@ -69,7 +69,7 @@ def test_what_a_hand_does_not_know_it_refuses_and_what_is_for_others_it_ignores(
 
 def test_bytes_take_their_time_and_follow_one_another():
     """They come out as at the far end of an adapter: 124 at a time, whatever frame they are of, and the rest at the end."""
-    line, byte, both = EmulatedLine(EmulatedHand()), 10 / BAUD, b"a" * 2217 + b"b" * 297
+    line, byte, both = EmulatedLine(first_order_hand()), 10 / BAUD, b"a" * 2217 + b"b" * 297
     line.send(both[:2217], 5.0)
     line.send(both[2217:], 5.001)
     out = b""
@@ -86,7 +86,7 @@ def test_bytes_take_their_time_and_follow_one_another():
 
 
 def test_after_a_pause_the_line_starts_anew():
-    line = EmulatedLine(EmulatedHand())
+    line = EmulatedLine(first_order_hand())
     line.send(b"a" * 100, 5.0)
     line.send(b"b" * 100, 6.0)
     assert line.due(5.0 + 1001 / BAUD) == b"a" * 100
@@ -144,7 +144,7 @@ def test_a_thread_that_ends_says_so_to_who_waits(monkeypatch):
     def broken(time_s, position):
         raise ValueError("a mistake of ours")
 
-    emulator = FaultyEmulator(EmulatedHand(forces=broken))
+    emulator = FaultyEmulator(first_order_hand(forces=broken))
     message = r"the emulator's thread ended: ValueError\('a mistake of ours'\)"
     with pytest.raises(HandError):
         XHand1.open(emulator.device)

@@ -5,11 +5,11 @@ import contextlib
 import numpy as np
 import pytest
 from faulty_lines import Faults
+from first_order_hands import first_order_hand
 from virtual_hands import VirtualPort, VirtualTime, virtual_hand
 from xhand1_hands import Stamps
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
@@ -72,7 +72,7 @@ def driving(port: VirtualPort) -> list[float]:
 
 def test_readings_come_as_fast_as_the_line_carries_them(monkeypatch):
     stamps = Stamps()
-    with virtual_hand(monkeypatch, EmulatedHand(forces=stamps)) as (hand, _, time):
+    with virtual_hand(monkeypatch, first_order_hand(forces=stamps)) as (hand, _, time):
         readings, errors = read_for(hand, time, stamps, 100)
     periods = np.diff([reading.received_at for reading in readings])
     assert errors == [] and (periods >= EXCHANGE_S).all() and (periods < EXCHANGE_S + 0.002).all()
@@ -82,7 +82,7 @@ def test_readings_come_as_fast_as_the_line_carries_them(monkeypatch):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_one_reply_in_twenty_is_faulty(fault, monkeypatch):
     stamps = Stamps()
-    with virtual_hand(monkeypatch, EmulatedHand(forces=stamps), seed=3) as (hand, port, time):
+    with virtual_hand(monkeypatch, first_order_hand(forces=stamps), seed=3) as (hand, port, time):
         hand.read()
         port.set_faults(Faults(**{fault: 0.05}))
         readings, _ = read_for(hand, time, stamps, 600)
@@ -93,7 +93,7 @@ def test_one_reply_in_twenty_is_faulty(fault, monkeypatch):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_every_reply_is_faulty(fault, monkeypatch):
     """A reading or a named error comes in time whatever the line does, call after call."""
-    with virtual_hand(monkeypatch, EmulatedHand(forces=Stamps()), seed=3) as (hand, port, time):
+    with virtual_hand(monkeypatch, first_order_hand(forces=Stamps()), seed=3) as (hand, port, time):
         hand.read()
         port.set_faults(Faults(**{fault: 1.0}))
         for _ in range(60):
@@ -104,7 +104,7 @@ def test_every_reply_is_faulty(fault, monkeypatch):
 
 def test_all_faults_at_once(monkeypatch):
     stamps = Stamps()
-    with virtual_hand(monkeypatch, EmulatedHand(forces=stamps), seed=5) as (hand, port, time):
+    with virtual_hand(monkeypatch, first_order_hand(forces=stamps), seed=5) as (hand, port, time):
         hand.read()
         port.set_faults(Faults.each(0.05))
         readings, errors = read_for(hand, time, stamps, 600)
@@ -113,7 +113,7 @@ def test_all_faults_at_once(monkeypatch):
 
 def test_minutes_with_one_fault_of_each_kind_in_twenty(monkeypatch):
     stamps = Stamps()
-    with virtual_hand(monkeypatch, EmulatedHand(forces=stamps), seed=7) as (hand, port, time):
+    with virtual_hand(monkeypatch, first_order_hand(forces=stamps), seed=7) as (hand, port, time):
         hand.read()
         port.set_faults(Faults.each(0.05))
         start = time.now
@@ -124,7 +124,7 @@ def test_minutes_with_one_fault_of_each_kind_in_twenty(monkeypatch):
 
 def test_a_silent_device_is_named_at_once_and_again(monkeypatch):
     stamps = Stamps()
-    with virtual_hand(monkeypatch, EmulatedHand(forces=stamps)) as (hand, port, time):
+    with virtual_hand(monkeypatch, first_order_hand(forces=stamps)) as (hand, port, time):
         hand.read()
         port.set_faults(Faults(silence=1.0))
         with contextlib.suppress(HandError):  # what was under way
@@ -140,7 +140,7 @@ def test_a_silent_device_is_named_at_once_and_again(monkeypatch):
 
 def test_a_pulled_cable_is_named_in_time_and_a_new_one_found(monkeypatch):
     stamps = Stamps()
-    with virtual_hand(monkeypatch, EmulatedHand(forces=stamps)) as (hand, port, time):
+    with virtual_hand(monkeypatch, first_order_hand(forces=stamps)) as (hand, port, time):
         for i in range(3):
             hand.read()
             port.unplug()
@@ -183,7 +183,7 @@ def test_a_call_waits_as_long_as_two_replies_may_take(monkeypatch):
 
 
 def test_a_hand_goes_where_it_is_told_and_close_makes_it_passive(monkeypatch):
-    emulated = EmulatedHand(time_constant_s=0.02)
+    emulated = first_order_hand(time_constant_s=0.02)
     with virtual_hand(monkeypatch, emulated, motion=limits()) as (hand, _, time):
         hand.read()
         assert emulated.is_passive
@@ -195,7 +195,7 @@ def test_a_hand_goes_where_it_is_told_and_close_makes_it_passive(monkeypatch):
 
 def test_a_policy_that_stalls_leaves_the_hand_passive(monkeypatch):
     """Requests drive the hand for just the watchdog's time after the last command, and an exchange at most less."""
-    emulated = EmulatedHand()
+    emulated = first_order_hand()
     with virtual_hand(monkeypatch, emulated, motion=limits()) as (hand, port, time):
         hand.read()
         for _ in range(3):
@@ -224,7 +224,7 @@ def test_a_policy_that_stalls_leaves_the_hand_passive(monkeypatch):
     ],
 )
 def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_understood(monkeypatch, faults, error):
-    emulated = EmulatedHand()
+    emulated = first_order_hand()
     with virtual_hand(monkeypatch, emulated, motion=limits(watchdog_s=1.0)) as (hand, port, time):
         hand.read()
         drive(hand, time)
@@ -242,7 +242,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
 
 def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back(monkeypatch):
     stamps = Stamps()
-    emulated = EmulatedHand(forces=stamps)
+    emulated = first_order_hand(forces=stamps)
     with virtual_hand(monkeypatch, emulated, motion=limits(watchdog_s=1.0)) as (hand, port, time):
         hand.read()
         drive(hand, time)
@@ -258,7 +258,7 @@ def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back(mon
 
 
 def test_a_target_outside_its_range_leaves_the_hand_passive(monkeypatch):
-    emulated = EmulatedHand()
+    emulated = first_order_hand()
     with virtual_hand(monkeypatch, emulated, motion=limits()) as (hand, _, time):
         hand.read()
         for wrong, message in ((np.full(12, 5.0), "thumb_bend_joint: target 5 rad"), (np.zeros(3), r"shape \(3,\), expected")):

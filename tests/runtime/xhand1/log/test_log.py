@@ -7,19 +7,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from faulty_lines import Faults, FaultyEmulator
+from first_order_hands import first_order_hand
 from hand_logs import assert_same_reading, random_readings, write_log
 from xhand1_hands import Stamps
 
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
-from tgdsl.runtime.xhand1.identity import HandIdentity
-from tgdsl.runtime.xhand1.log.log import CHUNK, RECORD, STATE, Fault, LogError, open_log
-from tgdsl.runtime.xhand1.log.record import LogWriter, events
-from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.driver import Reading, XHand1
+from tgdsl.runtime.xhand1.log.log import CHUNK, RECORD, STATE, Fault, LogError, LogWriter, events, open_log
 from tgdsl.runtime.xhand1.wire import errors
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.payloads import STATE_SIZE
+from tgdsl.runtime.xhand1.wire.ports import HandIdentity
 
 IDENTITY = HandIdentity("/dev/ttyUSB7", 3, b"\x01\xff", None, b"SN-1\0\0", b"")
 
@@ -222,7 +220,7 @@ def test_files_that_are_no_logs(tmp_path):
 def test_recording_an_emulated_hand_through_failures(tmp_path):
     stamps = Stamps()
     with (
-        FaultyEmulator(EmulatedHand(forces=stamps)) as emulator,
+        FaultyEmulator(first_order_hand(forces=stamps)) as emulator,
         XHand1.open(emulator.device) as hand,
         LogWriter(tmp_path / "a.npz") as log,
     ):

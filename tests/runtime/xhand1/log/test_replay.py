@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 from faulty_lines import Faults, FaultyEmulator
+from first_order_hands import first_order_hand
 from hand_logs import assert_same_reading, random_readings, write_log
 
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.runtime.source import Source
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
-from tgdsl.runtime.xhand1.log.log import Fault, LogError
-from tgdsl.runtime.xhand1.log.record import LogWriter
+from tgdsl.runtime.xhand1.emulator.emulator import TipForces
+from tgdsl.runtime.xhand1.log.log import Fault, LogError, LogWriter
 from tgdsl.runtime.xhand1.log.replay import ReplayOverError, ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.source import HandSample, XHand1Source
@@ -54,7 +54,7 @@ def run_live(path) -> list[HandSample | Fault]:
     """Let a hand move, press beyond its range and fall silent for a while; log all of it, and return it."""
     live: list[HandSample | Fault] = []
     with (
-        FaultyEmulator(EmulatedHand(forces=swelling, time_constant_s=0.1)) as emulator,
+        FaultyEmulator(first_order_hand(forces=swelling, time_constant_s=0.1)) as emulator,
         XHand1.open(emulator.device, motion=LIMITS, timing=SerialTiming(reply_timeout_s=2.0, silence_s=1.0)) as hand,
         LogWriter(path, calibration=NEWTON) as log,
     ):

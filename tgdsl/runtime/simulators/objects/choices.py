@@ -1,4 +1,7 @@
-"""Objects that differ between environments: which variant and size each environment has, and the models to match."""
+"""Objects that differ between environments: variants, sizes, temperatures and materials, and the models to match.
+
+Shapes: `env` environments, `heated` objects of the module's `inputs.heated`, `n` chosen environments.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.fields.units import ZEROS
 from tgdsl.plan.inputs import Inputs
 from tgdsl.scene.contact_bits import free_bit
 from tgdsl.scene.scene import Choice, SceneModels, with_choices
@@ -74,7 +80,9 @@ class EnvObjects:
         """Say what objects are like in some environments: see `Simulation.set_objects`."""
         chosen = [dict(self._choices[env]) for env in ids]
         for name, value in variants.items():
-            for choices, variant in zip(chosen, self._variants(name, value, len(ids)), strict=True):
+            self._check_known(name)
+            numbers = checked_numbers(f"variants of object {name}", value, len(ids), self._num_variants[name])
+            for choices, variant in zip(chosen, numbers, strict=True):
                 choices[name] = Choice(int(variant))
         for name, value in sizes.items():
             for choices, size in zip(chosen, self._sizes(name, value, len(ids)), strict=True):
@@ -105,17 +113,13 @@ class EnvObjects:
     def _size(self, name: str, choice: Choice) -> tuple[float, float, float]:
         return self.scenes.size(name, choice) if self.scenes.objects[name].is_sized else (0.0, 0.0, 0.0)
 
-    def _known(self, name: str) -> None:
+    def _check_known(self, name: str) -> None:
         if name not in self._num_variants:
             hint = did_you_mean(name, self._num_variants, "objects that do")
             raise SimulationError(f'no object "{name}" differs between environments; {hint}')
 
-    def _variants(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
-        self._known(name)
-        return checked_numbers(f"variants of object {name}", value, count, self._num_variants[name])
-
     def _sizes(self, name: str, value: Values, count: int) -> Float[np.ndarray, "n size"]:
-        self._known(name)
+        self._check_known(name)
         if not self.scenes.objects[name].is_sized:
             raise SimulationError(f"the size of object {name} is fixed; the document frees it with `size: per_env`")
         result = np.atleast_1d(np.asarray(value, dtype=np.float64))
@@ -130,3 +134,80 @@ def checked_numbers(what: str, value: Values, count: int, num: int) -> Int[np.nd
     if result.shape not in ((), (count,)) or result.dtype.kind not in "iu" or (result < 0).any() or (result >= num).any():
         raise SimulationError(f"{what}: expected {count} integers from 0 to {num - 1}, found {value}")
     return np.broadcast_to(result, count).astype(np.int64)
+
+
+COLDEST = ZEROS["K"]
+"""Absolute zero [°C]."""
+
+
+class EnvHeat:
+    """What the objects that hold heat are like in each environment.
+
+    To begin with, all have the document's temperature, and environment i the material i modulo their number. Values
+    written into the tensors are part of the next state: a sensor takes them when it begins an episode.
+
+    Attributes:
+        names: The objects, in the order of the tensors' columns: `inputs.heated`.
+        temperature: The field `object_temperature` of a state [°C], a live tensor; 0 for objects whose temperature is not part
+            of it.
+        material: The field `object_material`, a live tensor; 0 for objects that have just one.
+    """
+
+    temperature: Float[Tensor, "env heated"]
+    material: Int[Tensor, "env heated"]
+
+    def __init__(self, inputs: Inputs, num_envs: int, device: torch.device, dtype: torch.dtype):
+        self.names = inputs.heated
+        self._starts, self._num_materials = inputs.start_temperatures, inputs.num_materials
+        with torch.inference_mode(False):
+            starts = [0.0 if start is None else start for start in self._starts]
+            self.temperature = torch.tensor(starts, dtype=dtype, device=device).repeat(num_envs, 1)
+            numbers = torch.tensor(self._num_materials, dtype=torch.int64, device=device)
+            self.material = torch.arange(num_envs, device=device)[:, None] % numbers
+
+    @property
+    def saved(self) -> dict[str, Tensor]:
+        """The live tensors by the names that a saved simulation has for them; none without objects that hold heat."""
+        return {"heat/temperature": self.temperature, "heat/material": self.material} if self.names else {}
+
+    def read(self) -> dict[str, Tensor]:
+        """Return copies for a state, by field."""
+        if not self.names:
+            return {}
+        return {"object_temperature": self.temperature.clone(), "object_material": self.material.clone()}
+
+    def choose(
+        self, ids: Int[np.ndarray, " n"], temperatures: Mapping[str, Values], materials: Mapping[str, Values]
+    ) -> dict[tuple[str, int], np.ndarray]:
+        """Return, checked, what `write` writes: see `Simulation.set_objects`."""
+        result = {("temperature", self._column(name)): self._degrees(name, v, len(ids)) for name, v in temperatures.items()}
+        for name, value in materials.items():
+            column = self._column(name)
+            numbers = checked_numbers(f"materials of object {name}", value, len(ids), self._num_materials[column])
+            result["material", column] = numbers
+        return result
+
+    def write(self, ids: Int[np.ndarray, " n"], chosen: Mapping[tuple[str, int], np.ndarray]) -> None:
+        """Write what was chosen for some environments, in place."""
+        rows = torch.from_numpy(np.ascontiguousarray(ids)).to(self.material.device)
+        with torch.inference_mode(False), torch.no_grad():
+            for (name, column), values in chosen.items():
+                target = getattr(self, name)
+                target[rows, column] = torch.from_numpy(values).to(target.device, target.dtype)
+
+    def _column(self, name: str) -> int:
+        if name not in self.names:
+            if not self.names:
+                raise SimulationError("no temperature or material differs between environments for a sensor of this module")
+            raise SimulationError(f'no object "{name}" holds heat; {did_you_mean(name, self.names, "objects that do")}')
+        return self.names.index(name)
+
+    def _degrees(self, name: str, value: Values, count: int) -> Float[np.ndarray, " n"]:
+        if self._starts[self._column(name)] is None:
+            hint = "the document frees it with `temperature: {per_env: 45 degC}`"
+            raise SimulationError(f"the temperature of object {name} is fixed; {hint}")
+        degrees = np.asarray(value, dtype=np.float64)
+        if degrees.shape not in ((), (count,)) or not np.isfinite(degrees).all() or (degrees < COLDEST).any():
+            expected = f"{count} numbers of at least {COLDEST} °C"
+            raise SimulationError(f"temperatures of object {name}: expected {expected}, found {value}")
+        return np.broadcast_to(degrees, count).copy()

@@ -103,11 +103,7 @@ class ObjectProperties(ABC):
 
     @abstractmethod
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        """Set fields that `fields` has returned.
-
-        Raises:
-            SimulationError: If these are of other environments or another model.
-        """
+        """Set fields that `fields` has returned."""
 
     @abstractmethod
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None: ...
@@ -140,11 +136,7 @@ def refuse_other_fields(given: Mapping[str, Tensor], known: Mapping[str, Tensor]
 
 
 def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str]) -> RigidObject:
-    """Return an object by its name in the document, or by its body's in the scene.
-
-    Raises:
-        SimulationError: If there is no such object or body, or it has no mass.
-    """
+    """Return an object by its name in the document, or by its body's in the scene."""
     try:
         body = int(model.body(bodies_of.get(name, name)).id)
     except KeyError as error:

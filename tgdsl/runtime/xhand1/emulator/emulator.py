@@ -1,8 +1,12 @@
-"""An emulated hand behind a pseudo-terminal, which opens like a serial port. POSIX only."""
+"""An emulated hand: it takes frames and gives frames, on a pseudo-terminal that opens like a serial port. POSIX only.
+
+Its body says how joints move and what fingertips feel. Shapes: `joint`, `finger` and `taxel` as in `payloads`.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import tempfile
@@ -10,14 +14,151 @@ import threading
 import time
 import tty
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol, runtime_checkable
 
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
-from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD, Frame, FrameParser, encode_frame
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.runtime.xhand1.wire.errors import HandError, ProtocolError
+from tgdsl.runtime.xhand1.wire.payloads import (
+    FINGERS,
+    FORCE_MAX,
+    FORCE_MIN,
+    NUM_JOINTS,
+    NUM_TAXELS,
+    PASSIVE,
+    HandState,
+    JointCommand,
+    Mode,
+    decode_command,
+    encode_state,
+)
+from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD, Command, Frame, FrameParser, Register, encode_frame, hand_address
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD
+
+VERSION = b"tgdsl emulator"
+_ROOM_TEMPERATURE = 25
+_COUNTS_PER_TURN = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class TipForces:
+    """What the fingertips feel [counts]; rounded and cut to a byte, as a sensor would.
+
+    Attributes:
+        total: Force of each fingertip.
+        taxel: Force of each taxel.
+    """
+
+    total: Float[np.ndarray, "finger 3"]
+    taxel: Float[np.ndarray, "finger taxel 3"]
+
+    @classmethod
+    def zero(cls) -> TipForces:
+        """Return fingertips that feel nothing."""
+        return cls(np.zeros((len(FINGERS), 3)), np.zeros((len(FINGERS), NUM_TAXELS, 3)))
+
+
+@runtime_checkable
+class Body(Protocol):
+    """Joints and fingertips."""
+
+    def command(self, time_s: float, joints: Sequence[JointCommand]) -> None:
+        """Take the joints' commands at a time [s]."""
+        ...
+
+    def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
+        """Return the joint angles [rad] and the fingertips' forces at that time [s]; called once per state."""
+        ...
+
+
+class StillBody:
+    """Joints that stay at zero, and fingertips that feel nothing."""
+
+    def command(self, time_s: float, joints: Sequence[JointCommand]) -> None: ...
+
+    def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
+        return np.zeros(NUM_JOINTS), TipForces.zero()
+
+
+def is_driven(joint: JointCommand) -> bool:
+    """Return whether a drive goes to its set-point: with the mode for it, a gain and a current."""
+    return joint.mode == Mode.POSITION and joint.kp > 0 and joint.current_limit > 0
+
+
+class EmulatedHand:
+    """The hand behind the line.
+
+    Attributes:
+        address: Its address.
+        commands: The last commands of its joints.
+        position: Joint angles that it last sent [rad].
+        registers: Contents of its registers, by number.
+    """
+
+    def __init__(self, hand_id: int = 0, body: Body | None = None):
+        """Switch it on, with a `StillBody` by default."""
+        self.commands: tuple[JointCommand, ...] = PASSIVE
+        self.address = hand_address(hand_id)
+        self.position: Float[np.ndarray, " joint"] = np.zeros(NUM_JOINTS)
+        self.registers: dict[int, bytes] = {Register.HAND_ID: bytes([hand_id]), Register.NAME: b"emulated"}
+        self._body: Body = StillBody() if body is None else body
+
+    @property
+    def is_passive(self) -> bool:
+        """Whether the last commands hold or move no joint."""
+        return all(joint.mode == Mode.PASSIVE and not joint.kp and not joint.current_limit for joint in self.commands)
+
+    def answer(self, frame: Frame, now: float) -> Frame | None:
+        """Return the hand's reply to a frame at a time [s]; None if it is for another."""
+        if frame.destination != self.address:
+            return None
+        try:
+            command, payload = self._answer(frame, now)
+        except ProtocolError:
+            command, payload = Command.ERROR, bytes([frame.command])
+        return Frame(self.address, frame.source, command, payload)
+
+    def _answer(self, frame: Frame, now: float) -> tuple[int, bytes]:
+        if frame.command == Command.EXCHANGE:
+            commands = decode_command(frame.payload)
+            self._body.command(now, commands)
+            self.position, forces = self._body.felt(now)
+            self.commands = commands
+            return frame.command, encode_state(self._state(forces))
+        if frame.command == Command.VERSION:
+            return frame.command, VERSION
+        number = int.from_bytes(frame.payload, "little")
+        if frame.command == Command.READ_REGISTER and number in self.registers:
+            return frame.command, self.registers[number]
+        return Command.ERROR, bytes([frame.command])
+
+    def _state(self, forces: TipForces) -> HandState:
+        setpoint, gain, limit = np.array([(joint.position, joint.kp, joint.current_limit) for joint in self.commands]).T
+        raw_position = np.round(self.position * _COUNTS_PER_TURN / (2 * math.pi)).astype(np.int64) % 0x10000
+        return HandState(
+            joint_id=np.arange(NUM_JOINTS, dtype=np.uint8),
+            sensor_id=np.zeros(NUM_JOINTS, dtype=np.uint8),
+            position=self.position.astype(np.float32),
+            current=np.minimum(abs((setpoint - self.position) * gain), limit).astype(np.uint16),
+            raw_position=raw_position.astype(np.uint16),
+            joint_temperature=np.full(NUM_JOINTS, _ROOM_TEMPERATURE, dtype=np.uint16),
+            joint_error=np.zeros((NUM_JOINTS, 3), dtype=np.uint16),
+            reserved=np.zeros((NUM_JOINTS, 3), dtype=np.uint16),
+            total_force=_counts(forces.total),
+            taxel_force=_counts(forces.taxel),
+            taxel_temperature=np.full((len(FINGERS), 20), _ROOM_TEMPERATURE, dtype=np.uint8),
+            total_temperature=np.full(len(FINGERS), _ROOM_TEMPERATURE, dtype=np.uint8),
+        )
+
+
+def _counts(force: Float[np.ndarray, "*batch 3"]) -> np.ndarray:
+    return np.clip(np.round(force), FORCE_MIN, FORCE_MAX).astype(np.int16)
+
 
 _IDLE_S = 0.05
 _KEPT_REQUESTS = 20_000
@@ -34,13 +175,7 @@ class EmulatedLine:
     """
 
     def __init__(self, hand: EmulatedHand, *, baud: int = BAUD, turnaround_s: float = 0.0002):
-        """Connect a hand.
-
-        Args:
-            hand: The hand.
-            baud: Bits per second.
-            turnaround_s: Time from a request's last byte to the reply's first [s].
-        """
+        """Connect a hand that answers `turnaround_s` after a request's last byte [s], on a line of `baud` bits per second."""
         self.hand = hand
         self.requests: deque[tuple[float, Frame]] = deque(maxlen=_KEPT_REQUESTS)
         self._byte_s, self._turnaround_s = 10 / baud, turnaround_s
@@ -95,18 +230,13 @@ class Emulator:
 
     Attributes:
         line: The hand's line.
-        device: The serial port's name. It stays the same when the hand is unplugged and plugged in again.
+        device: The serial port's name.
         num_lost_bytes: Bytes that nobody read in time.
         failure: The error that ended its thread, or None. The port is then gone, and every call raises it.
     """
 
     def __init__(self, hand: EmulatedHand | None = None, *, line: EmulatedLine | None = None):
-        """Plug the hand in and switch it on.
-
-        Args:
-            hand: The hand; default: one with id 0 that feels nothing.
-            line: Its line, in place of a hand.
-        """
+        """Plug a hand in, by default one with id 0 that feels nothing, or a line with a hand, and switch it on."""
         self.line = line or EmulatedLine(hand or EmulatedHand())
         self.num_lost_bytes = 0
         self.failure: Exception | None = None
@@ -129,25 +259,6 @@ class Emulator:
     def requests(self) -> deque[tuple[float, Frame]]:
         """The latest requests that arrived, with the time of `time.monotonic` [s]."""
         return self.line.requests
-
-    def unplug(self) -> None:
-        """Pull the cable: the port goes away, and the bytes on their way are lost."""
-        self.call(self._unplug)
-
-    def replug(self) -> None:
-        """Plug it in again: the port is there under the same name. The hand was on all the time."""
-        self.call(self._plug)
-
-    def call(self, change: Callable[[], None]) -> None:
-        """Change the emulator or its line between two of the thread's turns.
-
-        Raises:
-            HandError: If the thread has ended, and why.
-        """
-        with self._lock:
-            self.check()
-            change()
-        os.write(self._wake_write, b"!")
 
     def check(self) -> None:
         """Look whether the emulator still answers.

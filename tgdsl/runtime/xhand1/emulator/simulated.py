@@ -14,7 +14,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -30,16 +30,14 @@ from tgdsl.plan.sensors import PlannedObservation
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import Emulator
-from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces, is_driven
-from tgdsl.runtime.xhand1.fingertips import HandTerm
+from tgdsl.runtime.xhand1.driver import Reading, XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, Emulator, TipForces, is_driven
 from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
-from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.observe import HandTerm
 from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import WatchdogError
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, NUM_TAXELS, PASSIVE, JointCommand
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, PASSIVE, JointCommand
 
 PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 """For an emulator on a busy machine, where bytes are late but not lost: pseudo-terminals then take up to half a second."""
@@ -144,9 +142,8 @@ class SimulatedBody:
             self._joints = tuple(joints)
 
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
-        """Return angles and counts after the last step."""
         with self._lock:
-            return self._position.copy(), TipForces(self._counts, np.zeros((len(FINGERS), NUM_TAXELS, 3)))
+            return self._position.copy(), replace(TipForces.zero(), total=self._counts)
 
     def goes_to(self, target: Float[np.ndarray, " joint"]) -> bool:
         """Return whether the last command sends all joints just there, as far as the wire's floats can say it."""
@@ -155,11 +152,7 @@ class SimulatedBody:
         return len(setpoints) == NUM_JOINTS and np.array_equal(np.array(setpoints, np.float32), target.astype(np.float32))
 
     def step(self) -> None:
-        """Make one control step.
-
-        Raises:
-            SimulationError: If it diverges.
-        """
+        """Make one control step."""
         with self._lock:
             self._scene.step()
             self.time += self._scene.control_step
@@ -223,19 +216,7 @@ class EmulatedSource(XHand1Source):
         timing: SerialTiming | None = None,
         lockstep: bool = False,
     ):
-        """Plug the hand in and open it.
-
-        Args:
-            body: The simulation, whose control step is the same.
-            control_step: Duration of one control step [s].
-            calibration: What its counts mean.
-            motion: Leave to move it; default: none.
-            timing: Times of the line; default: `PATIENT`.
-            lockstep: Whether the simulation waits for `step`, and makes one control step then; else it runs in real time.
-
-        Raises:
-            HandError: If the hand does not answer.
-        """
+        """Plug the hand in and open it; in lockstep the simulation makes a control step when stepped, else it runs in time."""
         self.body, self._is_lockstep, self._has_warned = body, lockstep, False
         with ExitStack() as opened:
             opened.callback(body.close)
@@ -269,7 +250,6 @@ class EmulatedSource(XHand1Source):
             warnings.warn(f"{problem}; see the calibration's scale and rotation", stacklevel=2)
 
     def close(self) -> None:
-        """Close the hand, pull the plug and end the simulation."""
         self._opened.close()
 
     def _restart(self) -> None:

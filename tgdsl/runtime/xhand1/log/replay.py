@@ -17,9 +17,8 @@ import numpy as np
 from tgdsl.errors import TgdslError
 from tgdsl.runtime.source import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S
+from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S, Reading
 from tgdsl.runtime.xhand1.log.log import Fault, open_log
-from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.source import HandSample, HandSource
 from tgdsl.runtime.xhand1.wire.errors import HandTimeoutError
 
@@ -134,7 +133,6 @@ class ReplaySource(HandSource):
         self._take(0)
 
     def close(self) -> None:
-        """Release the file."""
         self._readings = iter(())
         self._now = self._end
         self._next_reading, self._next_fault = self.log.num_readings, len(self.log.faults)
