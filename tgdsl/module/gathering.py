@@ -16,9 +16,8 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity, Scene
 from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
 from tgdsl.sensors.base import Kind
-from tgdsl.sensors.noise.radius import RADIUS
-from tgdsl.sensors.noise.stage import Now
-from tgdsl.sensors.noise.stages import Drawn
+from tgdsl.sensors.noise.stage import Now, Stage
+from tgdsl.sensors.noise.stages import Radius
 
 Tensors = Mapping[str, Tensor]
 Tree = Mapping[str, Any]
@@ -61,7 +60,7 @@ def _is_prepared(record: Any) -> bool:
 
 
 def scene_of(
-    plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], drawn: Mapping[str, Drawn], dtype: torch.dtype
+    plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], noise: Mapping[str, Sequence[Stage]], dtype: torch.dtype
 ) -> Scene:
     """Return what quantities are gathered from.
 
@@ -70,15 +69,15 @@ def scene_of(
         own: Its parts, bound.
         tensors: The fields of `SceneState` that `inputs` names.
         nows: When sensors are read, by their names.
-        drawn: Values of their noise, which may disturb the taxels' radii.
+        noise: Stages of their noise, which may disturb the taxels' radii.
         dtype: Dtype of what is gathered.
     """
     shifts = {}
     for sensor in plan.sensors:
-        if sensor.noise is not None and RADIUS.name in sensor.noise.terms:
-            values = drawn[sensor.name][RADIUS.name]
-            probes = values.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
-            shifts[sensor.name] = RADIUS.shift(values, nows[sensor.name], probes)
+        for stage in noise.get(sensor.name, ()):
+            if isinstance(stage, Radius):
+                probes = stage.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
+                shifts[sensor.name] = stage.shift(nows[sensor.name], probes)
     return Scene(tensors, plan.objects, _pairs(own["pairs"], tensors, dtype) if plan.objects else None, shifts, dtype)
 
 

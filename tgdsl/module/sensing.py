@@ -24,10 +24,9 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.sensors.base import UNTIMED, Context, Kind
-from tgdsl.sensors.noise.gain import GAIN
-from tgdsl.sensors.noise.release import RELEASE
-from tgdsl.sensors.noise.stage import NO_CLOCK, Now
-from tgdsl.sensors.noise.stages import AnyStage, Drawn, disturb, draw
+from tgdsl.sensors.noise.pipeline import StageType, disturb, draw
+from tgdsl.sensors.noise.stage import NO_CLOCK, Now, Stage
+from tgdsl.sensors.noise.stages import Gain, Release
 from tgdsl.sensors.upstream import Upstream
 from tgdsl.tensors.fusion import materialised
 
@@ -63,8 +62,7 @@ def read(
     gathered: Gathered,
     context: Context,
     constants: Any,
-    stages: Sequence[AnyStage],
-    drawn: Drawn,
+    stages: Sequence[Stage],
     memory: Mapping[str, Tensor],
     now: Now,
     joined: Float[Tensor, "env channel row"] | None = None,
@@ -80,21 +78,22 @@ def read(
         gathered: What it asked for.
         context: When its kind is called.
         constants: What its kind folded.
-        stages: The stages of its noise.
-        drawn: Their values.
+        stages: The stages of its noise, with their values.
         memory: The state of all sensors, by `sensor:name`.
         now: When it is read.
         joined: Its signal, if that was computed with others'.
     """
-    if GAIN in stages and kind.gains_depth:
-        felt, gains = gathered[ContactDepth], drawn[GAIN.name]
-        gathered = gathered.replaced(ContactDepth, felt._replace(depth=GAIN.of_taxels(gains, now, felt.depth) * felt.depth))
-        stages = [stage for stage in stages if stage is not GAIN]
+    gain = next((stage for stage in stages if isinstance(stage, Gain)), None)
+    if gain is not None and kind.gains_depth:
+        felt = gathered[ContactDepth]
+        gathered = gathered.replaced(ContactDepth, felt._replace(depth=gain.of_taxels(now, felt.depth) * felt.depth))
+        stages = [stage for stage in stages if stage is not gain]
+    released = {stage.name: stage.release_threshold[:, 0] for stage in stages if isinstance(stage, Release)}
     state, path = _kind_state(sensor, memory), f"{sensor.name}:"
     result, new = ({}, {}) if joined is not None else _answer(sensor, kind, gathered, context, constants, state)
     new = {path + name: value for name, value in new.items()}
     signal = clean = _stacked(result, "signal", sensor.signal) if joined is None else joined
-    signal, noted = disturb(signal, stages, drawn, f"{path}noise/", memory, now)
+    signal, noted = disturb(signal, stages, f"{path}noise/", memory, now)
     new |= noted
     signal_readings = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
     readings: Tensors = {} if sensor.noise is None else {f"{sensor.name}/signal": clean}
@@ -103,7 +102,6 @@ def read(
             planes_now = torch.where(now.is_sample[..., None], planes_now, memory[f"{path}sample/{which}"])
             new[f"{path}sample/{which}"] = planes_now
         if kind.decide is not None:
-            released = {"release_threshold": drawn[RELEASE.name].release_threshold[:, 0]} if RELEASE in stages else {}
             planes = dict(zip(sensor.signal, planes_now.unbind(1), strict=True))
             own_constants = {**constants, **released} if kind.constants is None else replace(constants, **released)
             planes, decided = kind.decide(planes, own_constants, state)
@@ -221,7 +219,7 @@ class Sensing(NamedTuple):
     plan: Plan
     kinds: Mapping[str, Kind]
     quantities: tuple[Quantity, ...]
-    stages: Mapping[str, Sequence[AnyStage]]
+    stages: Mapping[str, Sequence[StageType]]
     clock: Clock
     order: tuple[PlannedSensor, ...]
 
@@ -255,9 +253,9 @@ def sense(
     """
     plan, dt = sensing.plan, tensors.get("dt")
     nows = sensing.clock.nows(memory, dt)
-    drawn = {name: draw(sensing.stages[name], constants, nows.get(name, NO_CLOCK)) for name, constants in own["noise"].items()}
-    gathered = _gathered(sensing, own, tensors, nows, drawn, dtype)
-    earlier = [_gathered(sensing, own, part, nows, drawn, dtype) for part in _substeps(plan, tensors)]
+    noise = {name: draw(sensing.stages[name], constants, nows.get(name, NO_CLOCK)) for name, constants in own["noise"].items()}
+    gathered = _gathered(sensing, own, tensors, nows, noise, dtype)
+    earlier = [_gathered(sensing, own, part, nows, noise, dtype) for part in _substeps(plan, tensors)]
     readings: Tensors = {}
     joined: dict[tuple[str, ...], Tensor] = {}
     answers: dict[str, list[Tensors]] = {}
@@ -276,9 +274,8 @@ def sense(
                     joined[sensor.joined] = _joined(sensing, own, sensor, gathered[sensor.name])
                 signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
             context = sensing.clock.context(sensor, memory, dt)
-            noise = sensing.stages[sensor.name], drawn.get(sensor.name, {})
-            now = nows.get(sensor.name, NO_CLOCK)
-            outputs, new, answer = read(sensor, kind, inputs, context, constants, *noise, memory, now, signal)
+            now, stages = nows.get(sensor.name, NO_CLOCK), noise.get(sensor.name, ())
+            outputs, new, answer = read(sensor, kind, inputs, context, constants, stages, memory, now, signal)
             answered = [answer]
         if sensor.provides:
             answers[sensor.name] = answered
@@ -301,11 +298,11 @@ def _gathered(
     own: Tree,
     tensors: Mapping[str, Tensor],
     nows: Mapping[str, Now],
-    drawn: Mapping[str, Drawn],
+    noise: Mapping[str, Sequence[Stage]],
     dtype: torch.dtype,
 ) -> dict[str, Gathered]:
     """Return by sensor what it asked for, of one state."""
-    scene = scene_of(sensing.plan, own, tensors, nows, drawn, dtype)
+    scene = scene_of(sensing.plan, own, tensors, nows, noise, dtype)
     values = gather(sensing.quantities, own, scene)
     return {sensor.name: gathered_of(sensor, sensing.quantities, values) for sensor in sensing.plan.sensors}
 

@@ -13,10 +13,9 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from tgdsl.layout.layout import Layout, Link
-from tgdsl.sensors.noise import Knobs, random, stages
-from tgdsl.sensors.noise.lower import lower_noise
+from tgdsl.sensors.noise import Knobs, random
+from tgdsl.sensors.noise.pipeline import ReferenceNoise, disturb, draw, lower_noise, stages_of
 from tgdsl.sensors.noise.stage import Now
-from tgdsl.sensors.noise.stages import ReferenceNoise
 
 MM = 1e-3
 """A millimetre [m]."""
@@ -60,7 +59,7 @@ class Noise:
         self.channels, self.num_envs, self.dtype = tuple(channels), num_envs, dtype
         self._rows, self.key = [sets[i] for i in which], random.sensor_key(seed, name)
         self.lowered = lower_noise(sets, which, channels, self.layout)
-        self.stages = stages.stages_of(self.lowered.terms)
+        self.stages = stages_of(self.lowered.terms)
         self.constants = {key: torch.tensor(value, dtype=dtype) for key, value in self.lowered.constants.items()}
         self.memory = {key: torch.full((num_envs, len(channels), count), math.nan, dtype=dtype) for key in self.lowered.memory}
         if "ring" in self.memory:
@@ -87,8 +86,7 @@ class Noise:
         shape = (self.num_envs, self.layout.num_taxels, len(self.channels))
         signal = torch.as_tensor(signal, dtype=self.dtype).expand(shape).transpose(1, 2)
         now = self.now(dt, is_sample)
-        values = stages.draw(self.stages, self.constants, now)
-        signal, new = stages.disturb(signal, self.stages, values, "", self.memory, now)
+        signal, new = disturb(signal, draw(self.stages, self.constants, now), "", self.memory, now)
         for key, value in new.items():
             buffer = self.memory[key]
             place = buffer[:, self.step % buffer.shape[1]] if key == "ring" else buffer

@@ -13,7 +13,7 @@ from oracles.setups.signals import MM
 import tgdsl
 from tgdsl.module.module import TactileModule
 from tgdsl.sensors.noise import Knobs, random
-from tgdsl.sensors.noise.stages import ReferenceNoise
+from tgdsl.sensors.noise.pipeline import ReferenceNoise
 
 PADS = """
 <mujoco><worldbody>

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt64
 from tgdsl.fields.models import Range
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.fields import ALL, Amplitude, range_of
+from tgdsl.sensors.noise.spec import ALL, Amplitude, range_of
 
 Signal = Float[np.ndarray, "row channel"]
 Words = UInt64[np.ndarray, "*word"]
