@@ -23,7 +23,7 @@ from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.sensors.base import UNTIMED, Context, Kind
+from tgdsl.sensors.base import UNTIMED, Context, Kind, state_by_name
 from tgdsl.sensors.noise.pipeline import StageType, disturb, draw
 from tgdsl.sensors.noise.stage import NO_CLOCK, Now, Stage
 from tgdsl.sensors.noise.stages import Gain, Release
@@ -104,9 +104,9 @@ def read(
         if kind.decide is not None:
             planes = dict(zip(sensor.signal, planes_now.unbind(1), strict=True))
             own_constants = {**constants, **released} if kind.constants is None else replace(constants, **released)
-            planes, decided = kind.decide(planes, own_constants, state)
+            planes, decided = kind.decide(planes, own_constants, kind.typed_state(state))
             planes_now = torch.stack([planes[name] for name in reading.channels], dim=1)
-            new |= {path + name: value for name, value in decided.items()}
+            new |= {path + name: value for name, value in state_by_name(decided).items()}
         readings[reading.name] = planes_now.transpose(1, 2)
     for reading in sensor.readings[len(signal_readings) :]:
         report = reading.name.rpartition("/")[2]
@@ -156,18 +156,19 @@ def _answer(
     Raises:
         TgdslError: If it is not what the kind said when it was lowered.
     """
-    answer = kind.forward(gathered, context, constants, state)
+    answer = kind.forward(gathered, context, constants, kind.typed_state(state))
     if not torch.compiler.is_compiling():
-        _check_answer(sensor, answer, state)
+        _check_answer(sensor, kind, answer, state)
     result, new = answer
-    return dict(result), dict(new)
+    return dict(result), state_by_name(new)
 
 
-def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None:
+def _check_answer(sensor: PlannedSensor, kind: Kind, answer: Any, state: Tensors) -> None:
     where = f'sensor "{sensor.name}": `forward` of the kind "{sensor.kind}" returns'
-    if not (isinstance(answer, tuple) and len(answer) == 2 and all(isinstance(part, Mapping) for part in answer)):
+    is_pair = isinstance(answer, tuple) and len(answer) == 2
+    if not (is_pair and isinstance(answer[0], Mapping) and isinstance(answer[1], kind.state or Mapping)):
         raise TgdslError(f"{where} {type(answer).__name__}, expected planes by channel, and the new state by name")
-    outputs, new = answer
+    outputs, new = answer[0], state_by_name(answer[1])
     if missing := [name for name in sensor.provides if name not in outputs]:
         raise TgdslError(f"{where} {listed(list(outputs)) or 'nothing'}, without {missing[0]}, which the kind provides")
     if missing := [name for name in sensor.signal if name not in outputs and "signal" not in outputs]:

@@ -166,13 +166,25 @@ def body_axis(layout: Layout) -> Axis:
     return Axis("body", len(layout.bodies), {"body": layout.bodies}, np.array(first, dtype=np.int64))
 
 
+def _named(constants: Any, path: str = "") -> dict[str, Any]:
+    """Return the arrays of dataclasses, mappings and tuples by their paths; what is None is left out."""
+    if dataclasses.is_dataclass(constants):
+        constants = {part.name: getattr(constants, part.name) for part in dataclasses.fields(constants)}
+    elif isinstance(constants, tuple):
+        constants = {str(i): part for i, part in enumerate(constants)}
+    if not isinstance(constants, Mapping):
+        return {} if constants is None else {path: constants}
+    parts = [_named(part, f"{path}/{name}" if path else name) for name, part in constants.items()]
+    return {name: array for part in parts for name, array in part.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Lowered:
     """A sensor, ready to be planned.
 
     Attributes:
         channels: What the sensor's own reading holds, in order.
-        constants: Arrays that `forward` gets as tensors.
+        constants: Arrays that `forward` gets as tensors: a mapping, or a dataclass, of which this is the mapping by path.
         state: What is carried from one call to the next.
         requests: What is asked of the scene, at most one of each type.
         rows: What the reading has one row of; None: of each taxel, or of each body if the kind is not on taxels.
@@ -191,7 +203,7 @@ class Lowered:
     """
 
     channels: tuple[Channel, ...]
-    constants: Mapping[str, np.ndarray] = field(default_factory=dict)
+    constants: Any = field(default_factory=dict)
     state: Mapping[str, Memory] = field(default_factory=dict)
     requests: tuple[Request, ...] = ()
     rows: Axis | None = None
@@ -205,6 +217,10 @@ class Lowered:
     provides: frozenset[str] = frozenset()
     sound: int = 0
     upstream: Upstream | None = None
+
+    def __post_init__(self) -> None:
+        """Name the constants."""
+        object.__setattr__(self, "constants", _named(self.constants))
 
 
 class ReadSensor(NamedTuple):
@@ -358,8 +374,10 @@ class Kind:
         warns: Names of its state, and `(sensor's name, constants, rows of the sensors that it reads, largest numbers of all
             environments) → messages`: what users are to be warned of, each once.
         fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from sensors that it reads.
-        constants: A dataclass with a field for each constant, None where it may be left out: `forward` and `decide` get one,
-            and `lower` makes `Lowered.constants` of one by `by_name`. None: they get a mapping.
+        constants: A dataclass with a field for each constant, None where it may be left out, or what makes one of constants by
+            keyword: `forward` and `decide` get one, and `Lowered.constants` is one too. None: they are mappings.
+        state: A NamedTuple with a field for each of its state, None where a sensor may lack one: `forward` and `decide` get and
+            return one. None: they are mappings.
     """
 
     spec: type[AnySensorSpec]
@@ -381,11 +399,16 @@ class Kind:
     reads: str = ""
     warns: tuple[tuple[str, Warn], ...] = ()
     fit: Callable[[Any, Lowered, Fitting], Lowered] | None = None
-    constants: type[Any] | None = None
+    constants: Callable[..., Any] | None = None
+    state: type[Any] | None = None
 
     def typed(self, constants: Mapping[str, Tensor]) -> Any:
         """Return constants as `forward` gets them."""
         return constants if self.constants is None else self.constants(**constants)
+
+    def typed_state(self, state: Mapping[str, Tensor]) -> Any:
+        """Return state as `forward` gets it."""
+        return state if self.state is None else self.state(**state)
 
     @property
     def name(self) -> str:
@@ -394,10 +417,10 @@ class Kind:
         return name
 
 
-def by_name(constants: Any) -> dict[str, np.ndarray]:
-    """Return the fields of a dataclass of constants as `Lowered.constants` has them, without those that are None."""
-    fields = {part.name: getattr(constants, part.name) for part in dataclasses.fields(constants)}
-    return {name: value for name, value in fields.items() if value is not None}
+def state_by_name(state: Any) -> dict[str, Tensor]:
+    """Return a kind's state by name."""
+    fields = zip(state._fields, state, strict=True) if isinstance(state, tuple) else state.items()  # type: ignore[attr-defined]
+    return {name: value for name, value in fields if value is not None}
 
 
 def scalar(value: float) -> Float[np.ndarray, ""]:

@@ -66,7 +66,6 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
-    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import FORCE
@@ -204,7 +203,7 @@ def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
     motion = bool(spec.normal_damping or spec.shear_damping or (has_torque and spec.spin_damping))
     depth = ContactDepth(spec.objects, spec.is_gated, normal=True, motion=motion)
     requests = (depth, Contacts(spec.objects, slots=spec.slots)) if is_balanced else (depth,)
-    return Lowered(tuple(channels), by_name(constants), requests=requests)
+    return Lowered(tuple(channels), constants, requests=requests)
 
 
 def forward(

@@ -46,7 +46,6 @@ from tgdsl.sensors.base import (
     State,
     SurfaceOf,
     body_axis,
-    by_name,
     scalar,
 )
 
@@ -99,7 +98,7 @@ def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lower
     parts = {"contact": (Channel("contact", "1"),), "force": force, "normal_force": (Channel("normal_force", "N"),)}
     channels = tuple(channel for name, own in parts.items() if name in spec.outputs for channel in own)
     signal, slots = (force + parts["normal_force"], spec.slots) if "normal_force" in spec.outputs else (force, 0)
-    constants = by_name(LinkContactConstants(scalar(spec.threshold)))
+    constants = LinkContactConstants(scalar(spec.threshold))
     return Lowered(channels, constants, requests=(Contacts(spec.objects, slots=slots),), rows=body_axis(layout), signal=signal)
 
 

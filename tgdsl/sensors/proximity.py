@@ -23,7 +23,8 @@ to the torque about the taxel.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal
 
 import numpy as np
 from pydantic import Field, StrictInt, model_validator
@@ -38,8 +39,8 @@ from tgdsl.quantities.moments import MomentsRequest, SurfaceMoments
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Alternative,
+    Array,
     Channel,
-    Constants,
     Context,
     Kind,
     Lowered,
@@ -125,22 +126,35 @@ def reference(
     return np.stack(rows), {}
 
 
+@dataclass(frozen=True, eq=False)
+class ProximityConstants(Generic[Array]):
+    """Coefficients times density, with the sign of the model; None: the objects' area, and torques about the taxel."""
+
+    normal: Array
+    stiffness: Array
+    damping: Array
+    is_absolute: Array
+    """Whether slip is of the object's absolute angular velocity."""
+    area: Array | None = None
+    about_link: Array | None = None
+
+
 def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Fold sign and density into the stiffness; leave out what no output needs."""
-    constants = {
-        "normal": layout.normal.T,
-        "stiffness": scalar(spec.normal_sign * spec.normal_stiffness * spec.density),
-        "damping": scalar(spec.shear_damping * spec.density),
-        "is_absolute": np.asarray(spec.model == "paper"),
-    }
-    if spec.reference_area is not None:
-        constants["area"] = scalar(spec.reference_area)
+    is_about_link = "torque" in spec.outputs and spec.torque_about == "link"
+    constants = ProximityConstants(
+        normal=layout.normal.T,
+        stiffness=scalar(spec.normal_sign * spec.normal_stiffness * spec.density),
+        damping=scalar(spec.shear_damping * spec.density),
+        is_absolute=np.asarray(spec.model == "paper"),
+        area=None if spec.reference_area is None else scalar(spec.reference_area),
+        about_link=scalar(1.0) if is_about_link else None,
+    )
     channels: list[Channel] = []
     if "force" in spec.outputs:
         channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
     if "torque" in spec.outputs:
         channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
-        constants |= {"about_link": scalar(1.0)} if spec.torque_about == "link" else {}
     request = MomentsRequest(
         objects=spec.objects,
         radius=spec.radius,
@@ -150,29 +164,31 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         gradient_tolerance=spec.gradient_tolerance,
         max_bytes=spec.max_bytes,
         with_area=spec.reference_area is None,
-        motion=bool(spec.shear_damping and ("force" in spec.outputs or "about_link" in constants)),
+        motion=bool(spec.shear_damping and ("force" in spec.outputs or is_about_link)),
     )
     return Lowered(tuple(channels), constants, requests=(request,))
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: ProximityConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the force planes [N] and the torque planes [N·m]; what is not asked for is not used."""
-    normal = planes.split(constants["normal"].T)
+    normal = planes.split(constants.normal.T)
     felt = gathered[MomentsRequest]
     zero = felt.none
     mass, first, slip = zero, (zero, zero, zero), (zero, zero, zero)
     for name, near in felt.moments.items():
         mass, first = mass + near.mass, planes.add(first, near.first)
         if name in felt.motions:
-            slip = planes.add(slip, _slip(felt, name, constants["is_absolute"]))
-    area = constants["area"] if "area" in constants else sum(felt.area.values(), start=zero[:1, :1])
-    stiffness, damping = constants["stiffness"] / area, constants["damping"] / area
+            slip = planes.add(slip, _slip(felt, name, constants.is_absolute))
+    area = sum(felt.area.values(), start=zero[:1, :1]) if constants.area is None else constants.area
+    stiffness, damping = constants.stiffness / area, constants.damping / area
     # Less its part along the normal. Without the inner product, which all three components would share, a compiler that fuses
     # computes all channels in one pass; it would else compute each of them for every number of a reading.
     slip = planes.cross(planes.cross(normal, slip), normal)
     force = planes.add(planes.scale(stiffness * mass, normal), planes.scale(damping, slip))
     torque = planes.scale(stiffness, planes.cross(first, normal))
-    if "about_link" in constants:
+    if constants.about_link is not None:
         torque = planes.add(torque, planes.cross(felt.pos, force))
     return {f"{n}_{axis}": p for n, v in (("force", force), ("torque", torque)) for axis, p in zip("xyz", v, strict=True)}, {}
 
@@ -196,4 +212,4 @@ def alternatives(spec: ProximitySpec) -> list[Alternative]:
     return [*clouds, *fields, Alternative("field, 0.2 %", finest, of_points)]
 
 
-PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE, alternatives=alternatives)
+PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE, alternatives=alternatives, constants=ProximityConstants)

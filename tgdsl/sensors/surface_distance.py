@@ -40,7 +40,6 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
-    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import PROBE
@@ -82,7 +81,7 @@ def lower(spec: SurfaceDistanceSpec, layout: Layout, surface_of: SurfaceOf) -> L
     channels = [Channel(f"distance_{name}", "m") for name in spec.feels]
     if spec.nearest:
         channels += [Channel(f"nearest_{name}_{axis}", "m") for name in spec.feels for axis in "xyz"]
-    constants = by_name(SurfaceDistanceConstants(scalar(spec.max_range)))
+    constants = SurfaceDistanceConstants(scalar(spec.max_range))
     request = ContactDepth(spec.objects, spec.is_gated, range=spec.max_range, distance=True)
     return Lowered(tuple(channels), constants, requests=(request,))
 

@@ -57,7 +57,6 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
-    by_name,
 )
 from tgdsl.sensors.force_taxel import footprint
 from tgdsl.sensors.noise import FORCE
@@ -172,7 +171,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         "residual": tuple(Channel(f"residual_{axis}", "N·m") for axis in "xyz"),
     }
     requests = (ContactDepth(spec.objects, spec.is_gated), Contacts(spec.objects, slots=spec.slots))
-    return Lowered(tuple(channels), by_name(constants), requests=requests, reports=reports)
+    return Lowered(tuple(channels), constants, requests=requests, reports=reports)
 
 
 def forward(
