@@ -13,7 +13,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.sensors.base import SurfaceOf
 from tgdsl.sensors.elastomer.bonded_layer import Layer
 from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, LinkTaxels
-from tgdsl.sensors.elastomer.operators import OperatorForm, Response, fold
+from tgdsl.sensors.elastomer.operators import Operator, OperatorForm, Response, fold
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -49,32 +49,30 @@ def weights(spec: ElastomerSpec, part: LinkTaxels) -> Float[np.ndarray, " taxel"
     return np.where(part.is_active, area, 0.0)
 
 
-def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
-    """Return the constants of all operators of all links, `<operator>/<link>/<constant>`.
+def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> dict[str, tuple[Operator[np.ndarray], ...]]:
+    """Return the operators of all links by name.
 
     Raises:
         LowerError: If a convolution is asked for where it cannot be, or the pad's edge cannot be clamped.
     """
-    constants = {}
+    of_links = []
     for i, link in enumerate(layout.links):
         try:
-            constants |= _fold_link(spec, layout, i, surface_of)
+            of_links.append(_fold_link(spec, layout, i, surface_of))
         except LowerError as error:
             field = error.field or "boundary"  # what a surface says knows no field
             raise LowerError(f'link "{link.name}": {error.what}', field, error.hint) from error
-    return constants
+    return {name: tuple(operators[name] for operators in of_links) for name in of_links[0]}
 
 
-def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
-    """Return the constants of one link's operators, `<operator>/<link>/<constant>`."""
+def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, Operator[np.ndarray]]:
     part = link_taxels(layout, link)
     pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
-    wanted, constants = OperatorForm(spec.operator, spec.tolerance), {}
-    for name, response in responses(spec, part, pad).items():
-        is_alike = not (name == "spread" and pad is not None)
-        folded = fold(response, PLANES[name], part, wanted, is_alike)
-        constants |= {f"{name}/{link}/{key}": value for key, value in folded.items()}
-    return constants
+    form = OperatorForm(spec.operator, spec.tolerance)
+    return {
+        name: fold(response, PLANES[name], part, form, is_alike=pad is None or name != "spread")
+        for name, response in responses(spec, part, pad).items()
+    }
 
 
 def responses(spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None) -> dict[str, Response]:

@@ -15,8 +15,9 @@ error is within a tolerance of the matrix, by Frobenius' norm. The choice is by 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import LowerError
+from tgdsl.sensors.base import Array
 from tgdsl.sensors.elastomer.kernels import LinkTaxels
 from tgdsl.tensors.link_products import LINK_PRODUCTS
 
@@ -34,6 +36,80 @@ SAME = 1e-6
 
 Response = Callable[[Int[np.ndarray, " source"]], Float[np.ndarray, "out in target source"]]
 """Returns what some source taxels do to all taxels of the link."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dense(Generic[Array]):
+    """The matrix (in, source, out, target)."""
+
+    matrix: Array
+
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels of the link."""
+        return self.matrix.shape[1]
+
+    def __call__(self: Dense[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
+        """Return the planes (…, taxel) that come out of those that go in."""
+        sources, targets = self.matrix.shape[1], self.matrix.shape[3]
+        return (_joined(planes) @ self.matrix.reshape(len(planes) * sources, -1)).split(targets, dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Truncated(Generic[Array]):
+    """Factors of the matrix, (in, source, rank) and (rank, out, target)."""
+
+    left: Array
+    right: Array
+
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels of the link."""
+        return self.left.shape[1]
+
+    def __call__(self: Truncated[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
+        """Return the planes (…, taxel) that come out of those that go in."""
+        left, right = self.left, self.right
+        out = (_joined(planes) @ left.reshape(-1, left.shape[2])) @ right.reshape(right.shape[0], -1)
+        return out.split(right.shape[2], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Convolution(Generic[Array]):
+    """The transform of the response, (out, in, row, column, 2); the taxel of each cell; and the cell of each taxel."""
+
+    spectrum: Array
+    cells: Array
+    places: Array
+
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels of the link."""
+        return self.places.shape[0]
+
+    def __call__(self: Convolution[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
+        """Return the planes (…, taxel) that come out of those that go in."""
+        spectrum = torch.view_as_complex(self.spectrum)
+        rows, columns = self.cells.shape
+        size = spectrum.shape[2], 2 * (spectrum.shape[3] - 1)
+        order = self.cells.reshape(-1)
+        waves = [torch.fft.rfft2(plane[..., order].unflatten(-1, (rows, columns)), s=size) for plane in planes]
+        results = []
+        for response in spectrum:
+            total = sum((wave * factor for wave, factor in zip(waves, response, strict=True)), start=torch.zeros_like(waves[0]))
+            plane = torch.fft.irfft2(total, s=size)[..., :rows, :columns]
+            results.append(plane.flatten(-2)[..., self.places])
+        return tuple(results)
+
+
+Operator: TypeAlias = Dense[Array] | Truncated[Array] | Convolution[Array]
+
+
+def operator_of(constants: Mapping[str, Array]) -> Operator[Array]:
+    """Return the operator of one link with these constants."""
+    return next(
+        form(**constants) for form in (Dense, Truncated, Convolution) if form.__dataclass_fields__.keys() == constants.keys()
+    )
 
 
 class OperatorForm(NamedTuple):
@@ -50,8 +126,8 @@ class OperatorForm(NamedTuple):
 
 def fold(
     response: Response, planes: tuple[int, int], taxels: LinkTaxels, wanted: OperatorForm, is_alike: bool = True
-) -> dict[str, np.ndarray]:
-    """Return the constants of one link's operator.
+) -> Operator[np.ndarray]:
+    """Return one link's operator.
 
     Args:
         response: Its matrix.
@@ -75,8 +151,8 @@ def fold(
     if wanted.form == "svd" or (wanted.form == "auto" and wanted.tolerance is not None):
         left, right = _truncated(matrix, wanted.error)
         if wanted.form == "svd" or COST["svd"] * (left.size + right.size) < dense:
-            return {"left": left, "right": right}
-    return {"matrix": matrix}
+            return Truncated(left, right)
+    return Dense(matrix)
 
 
 def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
@@ -102,78 +178,23 @@ def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
     return cells
 
 
-def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Tensor, "*env taxel"]]) -> tuple[Tensor, ...]:
-    """Return the planes (…, taxel) that come out of an operator, link after link.
+def apply(operators: Sequence[Operator[Tensor]], planes: Sequence[Float[Tensor, "*env taxel"]]) -> tuple[Tensor, ...]:
+    """Return the planes (…, taxel) that come out of the operators of all links, link after link.
 
     Args:
-        constants: Holds the operator's constants as `<name>/<link>/<constant>`.
-        name: The operator's name.
+        operators: Of each link.
         planes: What goes in: any number of leading axes, taxels last.
     """
-    if (matrices := _matrices(constants, name)) and LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
-        lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
-        result = reduce(torch.add, [LINK_PRODUCTS(own, each) for own, each in zip(lines, matrices, strict=True)])
-        return tuple(result.unflatten(1, planes[0].shape[:-1]).unbind())
-    parts: list[tuple[Tensor, ...]] = []
-    start = 0
-    while (form := _form(constants, f"{name}/{len(parts)}")) is not None:
-        constant, num, use = form
-        parts.append(use(constant, [plane[..., start : start + num] for plane in planes]))
-        start += num
+    dense = [operator.matrix for operator in operators if isinstance(operator, Dense)]
+    if len(dense) == len(operators):
+        matrices = [[matrix[i] for matrix in dense] for i in range(len(planes))]
+        if LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
+            lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
+            result = reduce(torch.add, [LINK_PRODUCTS(line, each) for line, each in zip(lines, matrices, strict=True)])
+            return tuple(result.unflatten(1, planes[0].shape[:-1]).unbind())
+    of_links = zip(*(plane.split([operator.num_taxels for operator in operators], dim=-1) for plane in planes), strict=True)
+    parts = [operator(list(sources)) for operator, sources in zip(operators, of_links, strict=True)]
     return tuple(part[0] if len(part) == 1 else torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
-
-
-def _matrices(constants: Mapping[str, Tensor], name: str) -> list[list[Float[Tensor, "_source out _target"]]]:
-    """Return the matrices of all links, for each plane that goes in; nothing if there are other forms."""
-    results: list[Tensor] = []
-    while (form := _form(constants, f"{name}/{len(results)}")) is not None:
-        if "matrix" not in form[0]:
-            return []
-        results.append(form[0]["matrix"])
-    return [[matrix[i] for matrix in results] for i in range(len(results[0]))] if results else []
-
-
-Block = Mapping[str, Tensor]
-Use = Callable[[Block, list[Tensor]], tuple[Tensor, ...]]
-
-
-def _form(constants: Mapping[str, Tensor], prefix: str) -> tuple[Block, int, Use] | None:
-    """Return the constants of one link, its number of taxels, and how to apply them; None if there is no such link."""
-    if (matrix := constants.get(f"{prefix}/matrix")) is not None:
-        return {"matrix": matrix}, matrix.shape[1], _use_matrix
-    if (left := constants.get(f"{prefix}/left")) is not None:
-        return {"left": left, "right": constants[f"{prefix}/right"]}, left.shape[1], _use_factors
-    if (places := constants.get(f"{prefix}/places")) is not None:
-        names = ("spectrum", "cells", "places")
-        return {name: constants[f"{prefix}/{name}"] for name in names}, places.shape[0], _use_spectrum
-    return None
-
-
-def _use_matrix(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
-    matrix = block["matrix"]
-    sources, targets = matrix.shape[1], matrix.shape[3]
-    out = _joined(planes) @ matrix.reshape(len(planes) * sources, -1)
-    return out.split(targets, dim=-1)
-
-
-def _use_factors(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
-    left, right = block["left"], block["right"]
-    out = (_joined(planes) @ left.reshape(-1, left.shape[2])) @ right.reshape(right.shape[0], -1)
-    return out.split(right.shape[2], dim=-1)
-
-
-def _use_spectrum(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
-    cells, spectrum = block["cells"], torch.view_as_complex(block["spectrum"])
-    rows, columns = cells.shape
-    size = spectrum.shape[2], 2 * (spectrum.shape[3] - 1)
-    order = cells.reshape(-1)
-    waves = [torch.fft.rfft2(plane[..., order].unflatten(-1, (rows, columns)), s=size) for plane in planes]
-    results = []
-    for response in spectrum:
-        total = sum((wave * factor for wave, factor in zip(waves, response, strict=True)), start=torch.zeros_like(waves[0]))
-        plane = torch.fft.irfft2(total, s=size)[..., :rows, :columns]
-        results.append(plane.flatten(-2)[..., block["places"]])
-    return tuple(results)
 
 
 def indices(constants: Mapping[str, np.ndarray]) -> dict[str, int]:
@@ -198,7 +219,7 @@ def _fft_cost(planes: tuple[int, int], shape: tuple[int, ...]) -> float:
     return COST["fft"] * points * (sum(planes) * np.log2(points) + np.prod(planes))
 
 
-def _spectrum(response: Response, cells: Int[np.ndarray, "row column"]) -> dict[str, np.ndarray]:
+def _spectrum(response: Response, cells: Int[np.ndarray, "row column"]) -> Convolution[np.ndarray]:
     """Return the transform of the response to one cell: seen from the four corners it shows every offset there is."""
     size = np.array([_padded(num) for num in cells.shape])
     kernel = None
@@ -211,7 +232,7 @@ def _spectrum(response: Response, cells: Int[np.ndarray, "row column"]) -> dict[
     assert kernel is not None
     wave = np.fft.rfft2(kernel)
     spectrum = np.stack([wave.real, wave.imag], axis=-1)
-    return {"spectrum": spectrum, "cells": cells, "places": np.argsort(cells.reshape(-1), kind="stable")}
+    return Convolution(spectrum, cells, np.argsort(cells.reshape(-1), kind="stable"))
 
 
 def _truncated(matrix: Float[np.ndarray, "in source out target"], tolerance: float) -> tuple[np.ndarray, np.ndarray]:

@@ -153,6 +153,12 @@ class ElastomerSpec(ContactProbeSpec):
         return 2.0 * (1.0 - self.poissons_ratio) / (2.0 - self.poissons_ratio)
 
     @property
+    def shear_stiffness(self) -> float:
+        """K_t [Pa/m] of an elastic skin."""
+        assert self.normal_stiffness is not None
+        return self.normal_stiffness * self.stiffness_ratio
+
+    @property
     def slip(self) -> float | None:
         """Largest tangential displacement per depth, μ K_n/K_t [1]; None if the skin never slides."""
         return None if self.friction is None else self.friction / self.stiffness_ratio
