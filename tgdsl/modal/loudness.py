@@ -60,8 +60,8 @@ def of_groups(
     fields: Float[np.ndarray, "*point field"], owner: Int[np.ndarray, " field"], count: int
 ) -> Float[np.ndarray, "*point group"]:
     """Return the share of each of so many groups: its field, or of several the root of the sum of their squares."""
-    own = [fields[..., owner == group] for group in range(count)]
-    results = [part[..., 0] if part.shape[-1] == 1 else np.sqrt((part**2).sum(axis=-1)) for part in own]
+    by_group = [fields[..., owner == group] for group in range(count)]
+    results = [part[..., 0] if part.shape[-1] == 1 else np.sqrt((part**2).sum(axis=-1)) for part in by_group]
     return np.stack(results, axis=-1) if results else fields[..., :0]
 
 
@@ -86,23 +86,23 @@ def loudness(
         area: Surface that each point stands for.
         mass: The body's.
     """
-    found = groups(wave_number)[:-1]
-    gain, mixtures = np.zeros(len(found)), []
-    for i, own in enumerate(found):
-        shape, mixture = normal[:, own] * np.sqrt(mass), np.zeros((len(wave_number), own.stop - own.start))
+    mode_groups = groups(wave_number)[:-1]
+    gain, mixtures = np.zeros(len(mode_groups)), []
+    for i, group in enumerate(mode_groups):
+        shape, mixture = normal[:, group] * np.sqrt(mass), np.zeros((len(wave_number), group.stop - group.start))
         products = (shape * area[:, None]).T @ shape / area.sum()
         gain[i] = np.linalg.norm(products)
         if gain[i] > 0 and mixture.shape[1] == 1:
-            mixture[own] = sign_of(shape[:, 0]) / np.sqrt(gain[i])
+            mixture[group] = sign_of(shape[:, 0]) / np.sqrt(gain[i])
         elif gain[i] > 0:
             square, vector = np.linalg.eigh(products)
-            mixture[own] = vector * np.sqrt(np.maximum(square, 0.0)) / gain[i]
+            mixture[group] = vector * np.sqrt(np.maximum(square, 0.0)) / gain[i]
         mixtures.append(np.sqrt(mass) * mixture)
-    square = np.array([np.mean(wave_number[own] ** 2) for own in found])
-    multiplicity = np.array([own.stop - own.start for own in found], np.int64)
+    square = np.array([np.mean(wave_number[group] ** 2) for group in mode_groups])
+    multiplicity = np.array([group.stop - group.start for group in mode_groups], np.int64)
     heard = gain > INAUDIBLE * gain.max(initial=0.0)
     mixture = np.concatenate(
-        [np.zeros((len(wave_number), 0)), *(own for own, is_own in zip(mixtures, heard, strict=True) if is_own)], axis=1
+        [np.zeros((len(wave_number), 0)), *(part for part, is_heard in zip(mixtures, heard, strict=True) if is_heard)], axis=1
     )
     owner = np.repeat(np.arange(int(heard.sum())), multiplicity[heard])
     return Loudness(np.sqrt(square)[heard], multiplicity[heard], gain[heard], mixture, owner)

@@ -36,7 +36,7 @@ class SurfaceGains:
 
 @dataclass(frozen=True, eq=False)
 class ModeShapes:
-    """Mode shapes on a grid through the body, as vectors, over the root mean square of what is normal to the surface.
+    """Mode shapes on a grid through the body, as vectors, over the root mean square of their normal component on the surface.
 
     Attributes:
         axes: The grid's axes, as rows, of the body's frame.
@@ -70,7 +70,7 @@ class ModeShapes:
         return of_groups(np.einsum("xif,xi->xf", result, along @ self.axes.T), self.owner, int(self.owner.max()) + 1)
 
     def of(self, kept: Bool[np.ndarray, " mode"]) -> ModeShapes:
-        """Return those of some modes."""
+        """Return the shapes of some modes."""
         mine = kept[self.owner]
         number = np.cumsum(kept) - 1
         return replace(self, value=self.value[:, :, mine], owner=number[self.owner[mine]], error=self.error[mine])

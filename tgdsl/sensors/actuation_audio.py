@@ -10,19 +10,19 @@ friction has the spectral density (β_fric ω)² [Pa²/Hz] whatever that rate, a
 slides ω is in m/s and τ in N.
 
 - Within a step ω and ℓ are linear between the values at its ends, so that nothing jumps; φ is the exact integral of ω and goes
-  on from step to step, backwards where the joint turns back: the pitch is that of |ω|.
+  on from step to step, backwards where the joint turns back, so the pitch follows |ω|.
 - w fades a multiple out between 0.40 and 0.45 of the sample rate, so that none is aliased, and in up to 20 Hz: a joint that
   stands under load makes no steady pressure.
-- At the first call after a reset φ = 0, and velocity and load have been what they are.
+- At the first call after a reset φ = 0, and velocity and load are taken as constant before it.
 
 A sample k = 1 … K is at the time t + kΔt/K of a step that begins at t; the last one is at its end.
 
 Source: the paper, appendix on audio, "Actuation audio". Departures: φ is integrated and levels are linear within a step; the
-paper says neither, nor what becomes of multiples that the rate does not hold. It makes all three of two-pole resonators, whose
-phase is lost as they are retuned.
+paper specifies neither, nor multiples above the sample rate. It makes all three of two-pole resonators, which lose their phase
+when they are retuned.
 
-Limits: strengths are no motor's: they are to be measured. Harmonics alone are modelled, neither side bands nor resonances of
-the housing, and sound comes from the joint's anchor.
+Limits: the default strengths are of no real motor; measure them. Harmonics are modelled, side bands and resonances of the
+housing are not. Sound comes from the joint's anchor.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class ActuationAudioSpec(OnJointsSpec):
 def reference(
     spec: ActuationAudioSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return s (sample, joint, 1) [Pa], what is remembered, and what is heard of it elsewhere."""
+    """Return s (sample, joint, 1) [Pa], the new state, and the planes for microphones."""
     drive, num = gathered[Joints], spec.samples
     now = np.array([drive.velocity, spec.load * np.abs(drive.effort) + spec.power * np.abs(drive.effort * drive.velocity)])
     start = now if context.is_first else np.array([state["velocity"], state["level"]])
@@ -135,7 +135,7 @@ def reference(
 
 
 def noise_of(context: ReferenceContext, num_samples: int, num_rows: int) -> Float[np.ndarray, "sample row"]:
-    """Return n: of each word two numbers, for a sample and the one after it."""
+    """Return n: two numbers per random word, for a sample and the next one."""
     count = (num_samples + 1) // 2
     pairs = normal_pair(context.words(np.arange(count * num_rows, dtype=np.uint64)))
     return np.stack([part.reshape(count, num_rows) for part in pairs], axis=1).reshape(-1, num_rows)[:num_samples]
@@ -195,7 +195,7 @@ def lower(spec: ActuationAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
 def forward(
     gathered: Gathered, context: Context, constants: ActuationAudioConstants[Tensor], state: ActuationAudioState
 ) -> tuple[dict[str, Tensor], ActuationAudioState]:
-    """Return s (env, sample, 1, joint) [Pa], and what others hear of it."""
+    """Return s (env, sample, 1, joint) [Pa] with the planes for microphones, and the new state."""
     drive, is_first = gathered[Joints], context.is_first
     share, dt = constants.share[:, None], context.dt
     velocity, begun = drive.velocity, torch.where(is_first, drive.velocity, state.velocity)
@@ -234,7 +234,7 @@ def _whine(
 
 
 def _noise(context: Context, like: Float[Tensor, "env sample joint"]) -> Float[Tensor, "env sample joint"]:
-    """Return normal numbers, of each word two, for a sample and the one after it."""
+    """Return normal numbers, two per random word, for a sample and the next one."""
     _, num_samples, num_rows = like.shape
     count = (num_samples + 1) // 2
     assert context.stream is not None
@@ -244,7 +244,7 @@ def _noise(context: Context, like: Float[Tensor, "env sample joint"]) -> Float[T
 
 
 def _wrapped(angle: Tensor) -> Tensor:
-    """Return an angle within a turn, so that single precision does not lose it."""
+    """Return an angle within a turn, so that it keeps its precision in float32."""
     return angle - 2 * pi() * torch.round(angle / (2 * pi()))
 
 

@@ -23,7 +23,7 @@ solver's contacts on that body with all objects of the sensor, f_c their forces 
 probe's radius [m].
 
 With `balance: solver` the magnitudes of a body's normal forces, each along its own m_j, sum to the solver's W, in the
-proportions of the law above: where normals diverge, under a ball or beside an edge, their vector sum is smaller. Friction
+proportions of the law above: where normals diverge, under a ball or near an edge, their vector sum is smaller. Friction
 follows the law up to a limit, the cone of `friction_cone` or else the solver's total tangential force; with the latter a
 frictionless contact has none. The spin torque is limited to l_j R_j: a contact patch is no larger than its probe. Forces stay
 bounded as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. A negative (tensile) f_n,j has no share of W. ε is the normal force
@@ -147,12 +147,12 @@ def reference_balance(pressed: np.ndarray, body_id: np.ndarray, contacts: Refere
     """Return normal forces f_n that sum to the solver's on each body [N], and the limits l of friction [N]: (taxel,)."""
     normal, limit = np.zeros_like(pressed), np.zeros_like(pressed)
     for b in np.unique(body_id):
-        own, at = body_id == b, contacts.body == b
+        on_body, at = body_id == b, contacts.body == b
         along = np.sum(contacts.force[at] * contacts.normal[at], axis=1)
         across = np.linalg.norm(contacts.force[at] - along[:, None] * contacts.normal[at], axis=1)
-        part = np.maximum(0.0, pressed[own])
+        part = np.maximum(0.0, pressed[on_body])
         share = part * part.sum() / (part.sum() ** 2 + unloaded() ** 2)
-        normal[own], limit[own] = share * along.sum(), share * across.sum()
+        normal[on_body], limit[on_body] = share * along.sum(), share * across.sum()
     return normal, limit
 
 
@@ -213,31 +213,31 @@ def forward(
 
     Where nothing is touched, depth, normal and motion are all zero, and so is every term.
     """
-    felt = gathered[ContactDepth]
-    assert felt.normal is not None
-    stiffness = planes.power(felt.depth, constants.depth_exponent)
+    touch = gathered[ContactDepth]
+    assert touch.normal is not None
+    stiffness = planes.power(touch.depth, constants.depth_exponent)
     pressed, shear, limit = constants.normal_stiffness * stiffness, None, None
-    if felt.velocity is not None:
-        approach = planes.dot(felt.velocity, felt.normal)
+    if touch.velocity is not None:
+        approach = planes.dot(touch.velocity, touch.normal)
         pressed = pressed + constants.normal_damping * stiffness * approach
-        shear = planes.scale(constants.shear_damping, planes.sub(felt.velocity, planes.scale(approach, felt.normal)))
+        shear = planes.scale(constants.shear_damping, planes.sub(touch.velocity, planes.scale(approach, touch.normal)))
     if constants.member is not None and constants.body is not None:
         pressed, limit = _balanced(pressed, gathered[Contacts], constants.member, constants.body)
     if constants.friction_cone is not None:
         limit = constants.friction_cone * pressed.clamp(min=0)
-    force = planes.scale(pressed, felt.normal)
+    force = planes.scale(pressed, touch.normal)
     if shear is not None:
         force = planes.add(force, shear if limit is None else _within(limit, shear))
     readings = {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
     if constants.spin_damping is not None:
-        none = felt.depth * 0.0  # not-a-number where the pose is
-        torque = planes.cross(felt.pos, force) if constants.about_link is not None else (none, none, none)
-        if felt.angular is not None:
-            spin = constants.spin_damping * planes.dot(felt.angular, felt.normal)
+        none = touch.depth * 0.0  # not-a-number where the pose is
+        torque = planes.cross(touch.pos, force) if constants.about_link is not None else (none, none, none)
+        if touch.angular is not None:
+            spin = constants.spin_damping * planes.dot(touch.angular, touch.normal)
             if constants.patch is not None and limit is not None:
                 largest = constants.patch * limit
                 spin = torch.minimum(torch.maximum(spin, -largest), largest)
-            torque = planes.add(torque, planes.scale(spin, felt.normal))
+            torque = planes.add(torque, planes.scale(spin, touch.normal))
         readings |= {f"torque_{axis}": plane for axis, plane in zip("xyz", torque, strict=True)}
     return readings, {}
 

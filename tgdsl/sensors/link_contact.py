@@ -9,9 +9,9 @@ normal out of the object. One row per body that carries the sensor, in the order
 summed before the threshold: a body squeezed between two objects with equal forces reads zero and no contact, and s_b twice that
 force; to separate objects, give each its own sensor. The bit is a step function and has no gradient.
 
-The normal force is how hard a body presses, whatever its direction: that of two contacts that oppose one another is their sum,
-and friction is no part of it. It reads contacts one by one, `slots` of each pair of body and object. What others carry is
-shared out over these, see `quantities.contacts`: exact where all normals are the same, as under a flat face.
+The normal force is a sum of magnitudes: two opposing contacts add up, and friction is not part of it. It reads contacts one by
+one, `slots` of each pair of body and object. What others carry is shared out over these, see `quantities.contacts`: exact where
+all normals are the same, as under a flat face.
 
 Source: MuJoCo's contact sensor, with the reduction `netforce` for f_b and contact by contact for s_b (XML reference,
 sensor/contact).
@@ -96,7 +96,7 @@ def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lower
     """The net force alone is wanted, without slots, unless normal forces are; and no probe."""
     force = tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
     parts = {"contact": (Channel("contact", "1"),), "force": force, "normal_force": (Channel("normal_force", "N"),)}
-    channels = tuple(channel for name, own in parts.items() if name in spec.outputs for channel in own)
+    channels = tuple(channel for name, part in parts.items() if name in spec.outputs for channel in part)
     signal, slots = (force + parts["normal_force"], spec.slots) if "normal_force" in spec.outputs else (force, 0)
     constants = LinkContactConstants(scalar(spec.threshold))
     return Lowered(channels, constants, requests=(Contacts(spec.objects, slots=slots),), rows=body_axis(layout), signal=signal)

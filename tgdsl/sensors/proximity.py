@@ -172,16 +172,16 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
 def forward(
     gathered: Gathered, context: Context, constants: ProximityConstants[Tensor], state: State
 ) -> tuple[dict[str, Tensor], State]:
-    """Return the force planes [N] and the torque planes [N·m]; what is not asked for is not used."""
+    """Return the force planes [N] and the torque planes [N·m]; the module drops those that are not read."""
     normal = planes.split(constants.normal.T)
-    felt = gathered[MomentsRequest]
-    zero = felt.none
+    surfaces = gathered[MomentsRequest]
+    zero = surfaces.none
     mass, first, slip = zero, (zero, zero, zero), (zero, zero, zero)
-    for name, near in felt.moments.items():
+    for name, near in surfaces.moments.items():
         mass, first = mass + near.mass, planes.add(first, near.first)
-        if name in felt.motions:
-            slip = planes.add(slip, _slip(felt, name, constants.is_absolute))
-    area = sum(felt.area.values(), start=zero[:1, :1]) if constants.area is None else constants.area
+        if name in surfaces.motions:
+            slip = planes.add(slip, _slip(surfaces, name, constants.is_absolute))
+    area = sum(surfaces.area.values(), start=zero[:1, :1]) if constants.area is None else constants.area
     stiffness, damping = constants.stiffness / area, constants.damping / area
     # Less its part along the normal. Without the inner product, which all three components would share, a compiler that fuses
     # computes all channels in one pass; it would else compute each of them for every number of a reading.
@@ -189,14 +189,14 @@ def forward(
     force = planes.add(planes.scale(stiffness * mass, normal), planes.scale(damping, slip))
     torque = planes.scale(stiffness, planes.cross(first, normal))
     if constants.about_link is not None:
-        torque = planes.add(torque, planes.cross(felt.pos, force))
+        torque = planes.add(torque, planes.cross(surfaces.pos, force))
     return {f"{n}_{axis}": p for n, v in (("force", force), ("torque", torque)) for axis, p in zip("xyz", v, strict=True)}, {}
 
 
-def _slip(felt: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:
+def _slip(surfaces: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:
     """Return Σ of an object [m⁴/s]."""
-    near, motion = felt.moments[name], felt.motions[name]
-    velocity = planes.add(motion.linear, planes.cross(motion.angular, felt.pos))
+    near, motion = surfaces.moments[name], surfaces.motions[name]
+    velocity = planes.add(motion.linear, planes.cross(motion.angular, surfaces.pos))
     omega = planes.add(motion.angular, planes.scale(is_absolute, motion.turn))
     return planes.add(planes.scale(near.mass, velocity), planes.cross(omega, near.first))
 

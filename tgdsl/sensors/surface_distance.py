@@ -11,7 +11,7 @@ the radius of active ones has no effect.
 Source: Chung et al., *Tactile Genesis*, appendix, "SurfaceDistanceProbe".
 
 Departures: the range, beyond which the reading is constant; the sign inside; the vector u. Inside a compound of overlapping
-geoms the magnitude is that of the deepest geom alone, which is at most the true one.
+geoms the magnitude is of the deepest geom alone, which is at most the true one.
 """
 
 from __future__ import annotations
@@ -60,12 +60,12 @@ def reference(
     spec: SurfaceDistanceSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return y of all objects, then u of all objects: (taxel, object) or (taxel, 4 object) [m]."""
-    met = gathered[ContactDepth]
-    distance = np.minimum(met.distance, spec.max_range)
+    touch = gathered[ContactDepth]
+    distance = np.minimum(touch.distance, spec.max_range)
     if not spec.nearest:
         return distance, {}
-    in_range = (met.distance <= spec.max_range)[..., None]
-    vector = np.where(in_range, -distance[..., None] * met.outward, 0.0)
+    in_range = (touch.distance <= spec.max_range)[..., None]
+    vector = np.where(in_range, -distance[..., None] * touch.outward, 0.0)
     return np.concatenate([distance, vector.reshape(len(vector), -1)], axis=1), {}
 
 

@@ -126,7 +126,7 @@ def test_a_large_grid_is_convolved_without_its_matrix():
 IRREGULAR = {
     "have no row and column": lambda p: LinkTaxels(p.pos, p.normal, p.area, np.full_like(p.cell, -1), p.is_active),
     "cells are empty or inactive": lambda p: LinkTaxels(p.pos, p.normal, p.area, p.cell, np.arange(12) != 5),
-    "beside its place": lambda p: LinkTaxels(p.pos + 1e-8 * np.eye(12, 3), p.normal, p.area, p.cell, p.is_active),
+    "off its place": lambda p: LinkTaxels(p.pos + 1e-8 * np.eye(12, 3), p.normal, p.area, p.cell, p.is_active),
     "the normals differ": lambda p: LinkTaxels(p.pos, p.normal + 1e-5 * np.eye(12, 3), p.area, p.cell, p.is_active),
     "the areas differ": lambda p: LinkTaxels(p.pos, p.normal, p.area * np.linspace(1, 1.001, 12), p.cell, p.is_active),
 }

@@ -23,10 +23,10 @@ PLANES = {"spread": (3, 1), "bulge": (1, 1), "drag": (1, 1), "traction": (3, 3),
 
 def link_taxels(layout: Layout, link: int) -> LinkTaxels:
     """Return the taxels of one link; inactive ones, whose area may be nothing, get the others' mean."""
-    own = layout.link_id == link
-    is_active, area = layout.radius[own] > 0, layout.area[own]
+    at = layout.link_id == link
+    is_active, area = layout.radius[at] > 0, layout.area[at]
     mean = area[is_active].mean() if is_active.any() else 1.0
-    return LinkTaxels(layout.pos[own], layout.normal[own], np.where(is_active, area, mean), layout.cell[own], is_active)
+    return LinkTaxels(layout.pos[at], layout.normal[at], np.where(is_active, area, mean), layout.cell[at], is_active)
 
 
 def gaussian(spec: ElastomerSpec, part: LinkTaxels) -> Gaussian:
@@ -86,8 +86,8 @@ def responses(spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None) -> dic
         clamped = kernel.spread(part.pos, part.normal, part.pos) + clamping(spec, part, pad)
 
     def spread(source: np.ndarray) -> np.ndarray:
-        own = kernel.spread(part.pos, part.normal, part.pos[source]) if clamped is None else clamped[..., source]
-        return is_active * own * weight[source]
+        response = kernel.spread(part.pos, part.normal, part.pos[source]) if clamped is None else clamped[..., source]
+        return is_active * response * weight[source]
 
     def bulge(source: np.ndarray) -> np.ndarray:
         return is_active * kernel.bulge(part, source) * weight[source]
@@ -120,11 +120,11 @@ def clamping(spec: ElastomerSpec, part: LinkTaxels, pad: Surface) -> Float[np.nd
     added = np.zeros((3, 1, len(part.pos), len(part.pos)))
     if not part.is_active.any():
         return added
-    own, drag = np.flatnonzero(part.is_active), spec.boundary.drag
+    active, drag = np.flatnonzero(part.is_active), spec.boundary.drag
     extent = float(np.ptp(pad.corners.reshape(-1, 3), axis=0).max())
-    sheet = unroll(pad, part.pos[own], part.normal[own], element_size(spec.thickness, drag, extent))
+    sheet = unroll(pad, part.pos[active], part.normal[active], element_size(spec.thickness, drag, extent))
     free = gaussian(spec, part).spread(sheet.edge_pos, sheet.edge_normal, part.pos)[:, 0]
     back = -np.einsum("eak,kei->aei", sheet.edge_axes, free).reshape(-1, len(part.pos))
-    inside = (correction(sheet, spec.thickness, drag, spec.boundary.bulk) @ back).reshape(2, len(own), -1)
-    added[:, 0, own] = np.einsum("jak,aji->kji", sheet.taxel_axes, inside)
+    inside = (correction(sheet, spec.thickness, drag, spec.boundary.bulk) @ back).reshape(2, len(active), -1)
+    added[:, 0, active] = np.einsum("jak,aji->kji", sheet.taxel_axes, inside)
     return added

@@ -1,6 +1,6 @@
 """Elastomer: displacement of the markers in a soft skin that is pressed and dragged, as a vision-based sensor sees them.
 
-Taxels are markers and sources alike; those of one link act on each other. With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
+Taxels are both markers and sources; taxels of one link act on each other. With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
 r_ij = Π_nj(x_j − x_i), depth h_i = max(0, s − min_o φ_o(x_i)) of the felt objects o under the skin's height s [m], and t_i
 the tangential displacement of the object's material since the taxel stuck to it [m] (`anchors`), the Gaussian kernel gives
 
@@ -63,19 +63,19 @@ CHANNELS = tuple(Channel(f"displacement_{axis}", "m") for axis in "xyz")
 
 
 Operators: TypeAlias = tuple[Operator[Array], ...] | None
-"""An operator of each link; None where the skin has it not."""
+"""An operator of each link; None if the skin does not need it."""
 
 
 @dataclass(frozen=True, eq=False)
 class ElastomerConstants(Generic[Array]):
-    """Operators, strengths and stiffnesses; None where the skin has them not, see `ElastomerSpec` for what each is.
+    """Operators, strengths and stiffnesses, see `ElastomerSpec`; None if the skin does not need them.
 
     Attributes:
         normal: Normals (3, taxel).
         slip: Largest tangential displacement per depth [1].
         shear_stiffness: K_t [Pa/m].
         is_active: 1 of taxels that are moved by points, else 0.
-        flat: By its first taxel, each link whose taxels have one normal; the values say nothing.
+        flat: Links whose taxels have one normal, by the first taxel; the values are unused.
     """
 
     normal: Array
@@ -109,7 +109,7 @@ class ElastomerConstants(Generic[Array]):
                 of_parent = of_parent.setdefault(parent, {})
             of_parent[name] = value
         operators = {name: value for name, value in fields.items() if isinstance(value, dict) and name != "flat"}
-        links = {name: tuple(operator_of(own[str(i)]) for i in range(len(own))) for name, own in operators.items()}
+        links = {name: tuple(operator_of(each[str(i)]) for i in range(len(each))) for name, each in operators.items()}
         return cls(**{**fields, **links})
 
 
@@ -117,7 +117,7 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     """Fold geometry and material into one operator per link; strengths and stiffnesses stay numbers.
 
     Raises:
-        LowerError: If the operator or the clamped boundary cannot be had on these links.
+        LowerError: If these links do not allow the operator or the clamped boundary.
     """
     has_shear, on_points, is_elastic = spec.has_shear, spec.anchored == "points", spec.kernel != "gaussian"
     constants = ElastomerConstants(
@@ -162,21 +162,21 @@ def forward(
 ) -> tuple[dict[str, Tensor], State]:
     """Return the displacement planes [m] and the new anchors."""
     normal = planes.split(constants.normal.T)
-    felt = gathered[ContactDepth]
+    touch = gathered[ContactDepth]
     shear, loads, after = None, None, {}
     if constants.standoff is not None and constants.enter is not None and constants.exit is not None:
         stick_slip = anchors.StickSlip(constants.standoff, constants.enter, constants.exit, constants.slip)
         if constants.shear_falloff is not None:
             loads, after = point_anchors.SHEAR_LOADS(list(gathered[Points].values()), stick_slip, state)
         else:
-            shear, after = anchors.advance(felt, felt.pos, normal, stick_slip, state)
+            shear, after = anchors.advance(touch, touch.pos, normal, stick_slip, state)
     move = _gaussian if constants.normal_stiffness is None else _elastic
-    result = move(felt.depth, shear, normal, constants)
+    result = move(touch.depth, shear, normal, constants)
     if loads is not None and constants.shear_falloff is not None:
         assert constants.shear_strength is not None
         flat = frozenset(int(first) for first in constants.flat)
-        markers = Markers(felt.pos, normal, constants.shear_falloff, constants.reference_area, flat)
-        dragged = point_anchors.drag(loads, markers, felt.depth.shape[0])
+        markers = Markers(touch.pos, normal, constants.shear_falloff, constants.reference_area, flat)
+        dragged = point_anchors.drag(loads, markers, touch.depth.shape[0])
         result = planes.add(result, planes.scale(constants.shear_strength * constants.is_active, dragged))
     return {channel.name: plane for channel, plane in zip(CHANNELS, result, strict=True)}, after
 

@@ -1,6 +1,6 @@
 """Applying a fixed matrix per link to planes (…, taxel): as it is, cut to its rank, or as a convolution on a regular grid.
 
-Every form is made at compile time and is known by its constants:
+Every form is built at compile time:
 
 | form | constants, per link | what it costs per environment, in multiply-adds |
 |---|---|---|
@@ -30,12 +30,12 @@ from tgdsl.sensors.elastomer.kernels import LinkTaxels
 from tgdsl.tensors.link_products import LINK_PRODUCTS
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
-"""Time per multiply-add of each form, over that of a large matrix product (one CPU core, float32, 512 environments)."""
+"""Time per multiply-add, relative to a large matrix product (one CPU core, float32, 512 environments)."""
 SAME = 1e-6
 """Relative difference up to which spacings, areas and normals of a grid count as equal."""
 
 Response = Callable[[Int[np.ndarray, " source"]], Float[np.ndarray, "out in target source"]]
-"""Returns what some source taxels do to all taxels of the link."""
+"""Returns the responses of all taxels of the link to some source taxels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Dense(Generic[Array]):
         return self.matrix.shape[1]
 
     def __call__(self: Dense[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
-        """Return the planes (…, taxel) that come out of those that go in."""
+        """Return the output planes (…, taxel)."""
         sources, targets = self.matrix.shape[1], self.matrix.shape[3]
         return (_joined(planes) @ self.matrix.reshape(len(planes) * sources, -1)).split(targets, dim=-1)
 
@@ -68,7 +68,7 @@ class Truncated(Generic[Array]):
         return self.left.shape[1]
 
     def __call__(self: Truncated[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
-        """Return the planes (…, taxel) that come out of those that go in."""
+        """Return the output planes (…, taxel)."""
         left, right = self.left, self.right
         out = (_joined(planes) @ left.reshape(-1, left.shape[2])) @ right.reshape(right.shape[0], -1)
         return out.split(right.shape[2], dim=-1)
@@ -88,7 +88,7 @@ class Convolution(Generic[Array]):
         return self.places.shape[0]
 
     def __call__(self: Convolution[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
-        """Return the planes (…, taxel) that come out of those that go in."""
+        """Return the output planes (…, taxel)."""
         spectrum = torch.view_as_complex(self.spectrum)
         rows, columns = self.cells.shape
         size = spectrum.shape[2], 2 * (spectrum.shape[3] - 1)
@@ -113,7 +113,7 @@ def operator_of(constants: Mapping[str, Array]) -> Operator[Array]:
 
 
 class OperatorForm(NamedTuple):
-    """What the user asked for: a form or "auto", and the relative error that is allowed; None: none, if there is a choice."""
+    """The user's form or "auto", and the allowed relative error; None: exact forms, if there is a choice."""
 
     form: str
     tolerance: float | None
@@ -131,10 +131,10 @@ def fold(
 
     Args:
         response: Its matrix.
-        planes: Numbers of planes that go out and in.
+        planes: Numbers of output and input planes.
         taxels: The link's taxels.
         wanted: The form and its error.
-        is_alike: Whether the response depends on nothing but the way from source to target where the taxels are alike.
+        is_alike: Whether, between equal taxels, the response depends only on the offset from source to target.
 
     Raises:
         LowerError: If a convolution is asked for where the taxels are no regular grid.
@@ -156,7 +156,7 @@ def fold(
 
 
 def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
-    """Return the taxel in each cell of a full, regular, planar grid, or else say what it lacks."""
+    """Return the taxel in each cell of a full, regular, planar grid, or the reason why it is not one."""
     if (taxels.cell < 0).any():
         return f"{int((taxels.cell < 0).any(axis=1).sum())} taxels have no row and column"
     cell = taxels.cell - taxels.cell.min(axis=0)
@@ -170,7 +170,7 @@ def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
     off = np.linalg.norm(taxels.pos - first - cell @ np.stack(steps), axis=1).max()
     pitch = min((float(np.linalg.norm(step)) for step in steps if step.any()), default=1.0)
     if off > SAME * pitch:
-        return f"a taxel is {off:.2g} m beside its place, the spacing is {pitch:.2g} m"
+        return f"a taxel is {off:.2g} m off its place, the spacing is {pitch:.2g} m"
     if np.linalg.norm(taxels.normal - taxels.normal[0], axis=1).max() > SAME:
         return "the normals differ"
     if np.ptp(taxels.area) > SAME * taxels.area.max():
@@ -179,11 +179,11 @@ def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
 
 
 def apply(operators: Sequence[Operator[Tensor]], planes: Sequence[Float[Tensor, "*env taxel"]]) -> tuple[Tensor, ...]:
-    """Return the planes (…, taxel) that come out of the operators of all links, link after link.
+    """Return the output planes (…, taxel) of the operators of all links, link after link.
 
     Args:
         operators: Of each link.
-        planes: What goes in: any number of leading axes, taxels last.
+        planes: Input planes, taxels last.
     """
     dense = [operator.matrix for operator in operators if isinstance(operator, Dense)]
     if len(dense) == len(operators):

@@ -48,7 +48,7 @@ class ElastomerSpec(ContactProbeSpec):
 
     kind: Literal["elastomer"]
     """Displacement of the markers in a soft skin [m]."""
-    like: Annotated[str | None, AfterValidator(skins.known), WithJsonSchema({"enum": [*skins.SKINS]})] = None
+    like: Annotated[str | None, AfterValidator(skins.checked_skin), WithJsonSchema({"enum": [*skins.SKINS]})] = None
     """Skin whose values hold where none is given here: paper_gel, soft_gel or firm_rubber, see `elastomer.skins`."""
     kernel: Literal["gaussian", "half_space", "bonded_layer"] = "gaussian"
     """How a load spreads: the paper's Gaussian, or an elastic half-space or layer bonded to a rigid base."""
@@ -118,9 +118,9 @@ class ElastomerSpec(ContactProbeSpec):
             return ()
         skin = skins.SKINS[self.like]
         parts = []
-        shown = {*skin, "normal_stiffness"} & self.model_fields_set
+        displayed = {*skin, "normal_stiffness"} & self.model_fields_set
         for name, field in type(self).model_fields.items():
-            if name in shown:
+            if name in displayed:
                 value = getattr(self, name)
                 unit = re.search(r"\[(.+?)\]", field.description or "")
                 text = f"{value:g}" if isinstance(value, float) else str(value)

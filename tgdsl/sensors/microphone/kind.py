@@ -74,7 +74,7 @@ class MicrophoneConstants(Generic[Array]):
 
 
 class MicrophoneState(NamedTuple):
-    """What is remembered of sources; see `fit` for shapes.
+    """State of the sources; see `fit` for shapes.
 
     Attributes:
         history: Samples that have not yet arrived from the largest distance [Pa].
@@ -94,12 +94,12 @@ class MicrophoneState(NamedTuple):
 
 
 def lower(spec: MicrophoneSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
-    """A single row; sizes are those of the sources, see `fit`."""
+    """A single row; sizes follow from the sources, see `fit`."""
     pos = (0.0, 0.0, 0.0) if spec.pos is None else spec.pos
     requests = () if spec.body is None else (Places(bodies=(spec.body,), offset=np.array([pos])),)
     rows = Axis("microphone", 1, {"body": ["world" if spec.body is None else spec.body], "pos": np.array([pos])})
-    asked = Upstream(sensors=spec.hears or (), planes=SOUND, what="sound")
-    return Lowered((Channel("pressure", "Pa"),), requests=requests, rows=rows, upstream=asked)
+    upstream = Upstream(sensors=spec.hears or (), planes=SOUND, what="sound")
+    return Lowered((Channel("pressure", "Pa"),), requests=requests, rows=rows, upstream=upstream)
 
 
 def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
@@ -109,7 +109,7 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
         LowerError: If sources make different numbers of samples, or a level is of none of them.
     """
     first = next(iter(fitting.upstream))
-    blocks = {name: own.lowered.sound for name, own in fitting.upstream.items()}
+    blocks = {name: source.lowered.sound for name, source in fitting.upstream.items()}
     for name, count in blocks.items():
         if count != blocks[first]:
             problem = f'"{name}" makes {count} samples per physics step, "{first}" {blocks[first]}'
@@ -118,9 +118,9 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
         if name not in fitting.upstream:
             raise LowerError(f'it does not hear "{name}"', "levels", did_you_mean(name, fitting.upstream, "sources"))
     levels, timestep = [], fitting.timestep
-    for name, own in fitting.upstream.items():
-        timestep = own.lowered.timestep or timestep
-        levels += [spec.levels.get(name, 1.0)] * own.rows.size
+    for name, source in fitting.upstream.items():
+        timestep = source.lowered.timestep or timestep
+        levels += [spec.levels.get(name, 1.0)] * source.rows.size
     samples, substeps = blocks[first], fitting.upstream[first].lowered.substeps
     num_nodes = math.ceil(spec.reach / (spec.speed * timestep)) + 1
     room, num_rows = (num_nodes + 1) * samples + TAPS, len(levels)
@@ -191,7 +191,7 @@ def forward(
 def _path(place: Tensor, state: MicrophoneState, is_first: Tensor) -> Tensor:
     """Return where sources were at each node, from where they are now (env, 3, node, row) [m].
 
-    Differences are formed in the precision of `place`, of which the state holds two numbers of the module's dtype.
+    Differences are formed in the precision of `place`, which the state holds as two numbers of the module's dtype.
     """
     last_place = state.place.to(place.dtype) + state.place_low.to(place.dtype)
     moved = torch.where(is_first[..., None], 0.0, (place - last_place).to(state.place.dtype))

@@ -23,8 +23,8 @@ from tgdsl.tensors.link_products import LINK_PRODUCTS
 KERNEL = "kernel/"
 """Kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels."""
 NEGLIGIBLE = 1e-14
-"""Share of a taxel's signal that counts as none: a millionth of float32's last digit. Much smaller ones would be subnormal
-numbers, with which processors multiply ten times slower."""
+"""Share of a taxel's signal below which it is set to 0: a millionth of float32's last digit. Products with subnormal numbers
+are ten times slower."""
 
 
 class Crosstalk(Stage):
@@ -114,7 +114,7 @@ def _reference_operator(call: ReferenceCall) -> Float[np.ndarray, "row row"]:
 
 
 def _reference_column(layout: Layout | None, i: int, sigma: float) -> Float[np.ndarray, " row"]:
-    """Return what share of taxel i's signal each taxel gets."""
+    """Return the share of taxel i's signal that each taxel gets."""
     assert layout is not None
     kernel = np.zeros(layout.num_taxels)
     for j in range(layout.num_taxels):

@@ -2,7 +2,7 @@
 
 A stage that no taxel has is left out. A sensor with a rate holds its reading between its samples.
 
-Shapes: `env` environments, `row` rows of a reading, `channel` its channels, `end` lowest and highest value of what is drawn.
+Shapes: `env` environments, `row` rows of a reading, `channel` its channels, `end` lowest and highest value of a range.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def register(stage: StageType) -> None:
 
 
 def more_stages() -> tuple[StageType, ...]:
-    """Return the stages of installed packages, and those that were registered.
+    """Return the stages of installed packages and the registered ones.
 
     Raises:
         TgdslError: If two stages share a knob, a number or its draw.
@@ -61,8 +61,8 @@ def more_stages() -> tuple[StageType, ...]:
 def _wrong(stage: object) -> str:
     if isinstance(stage, type) and issubclass(stage, Stage):
         return ""
-    shown = stage.__name__ if isinstance(stage, type) else type(stage).__name__
-    return f"found {shown}, expected a subclass of tgdsl.sensors.noise.stage.Stage"
+    type_name = stage.__name__ if isinstance(stage, type) else type(stage).__name__
+    return f"found {type_name}, expected a subclass of tgdsl.sensors.noise.stage.Stage"
 
 
 def more_knobs() -> tuple[type[Any], ...]:
@@ -71,7 +71,7 @@ def more_knobs() -> tuple[type[Any], ...]:
 
 
 def knobs_of(knobs: frozenset[str]) -> frozenset[str]:
-    """Return all knobs of a kind: its own, and those of `more_stages` if it has any."""
+    """Return the knobs of a kind with those of `more_stages`; none if it has none."""
     return knobs.union(*(model.model_fields for model in more_knobs())) if knobs else knobs
 
 
@@ -103,12 +103,12 @@ class LoweredNoise:
     """Noise, ready to be planned.
 
     Attributes:
-        terms: Names of the stages there are.
+        terms: Names of its stages.
         constants: Their constants: (channel or 1, row or 1), or (end, …) where an environment draws its own; and kernels.
-        memory: Names of what is carried from one call to the next, and for how long each call is held [s]; 0: the last alone.
+        memory: Names of its memory, and how long each call is held [s]; 0: the last call alone.
         radius: Largest disturbance of a radius [m].
-        streams: What random numbers are drawn for.
-        needs_dt: Whether the time since the last call is needed.
+        streams: Purposes of its random numbers.
+        needs_dt: Whether it needs the time since the last call.
     """
 
     terms: tuple[str, ...]
@@ -190,7 +190,7 @@ def draw(stages: Sequence[StageType], constants: Mapping[str, Tensor], now: Now)
 def disturb(
     signal: Signal, stages: Sequence[Stage], path: str, memory: Mapping[str, Tensor], now: Now
 ) -> tuple[Signal, dict[str, Tensor]]:
-    """Return what is read of a signal, and the new memory.
+    """Return the disturbed signal and the new memory.
 
     Args:
         signal: The signal.
@@ -243,12 +243,12 @@ class ReferenceNoise:
         return Radius.reference_radius(radius, self._call)
 
     def read(self, signal: ReferenceSignal, dt: float, is_sample: bool = True) -> ReferenceSignal:
-        """Return what is read of a signal, and go on to the next step.
+        """Return the disturbed signal, and go on to the next step.
 
         Args:
-            signal: The signal, of which `gain` is a factor already.
+            signal: The signal, already multiplied by `gain`.
             dt: Time since the last call [s].
-            is_sample: Whether the sensor takes a sample now; else it reads the last one.
+            is_sample: Whether the sensor takes a sample now, or reads the last one.
         """
         call = replace(self._call, dt=dt, is_sample=is_sample)
         for stage in self._stages:

@@ -56,7 +56,7 @@ def quantity(channel: str) -> str:
 
 
 def range_of(value: Range | Amplitude, channel: str) -> Range:
-    """Return a number's range for a channel; what an amplitude does not name is 0."""
+    """Return a number's range for a channel; 0 of quantities that an amplitude lacks."""
     return value if isinstance(value, tuple) else value.get(quantity(channel), value.get(ALL, ZERO))
 
 
@@ -117,7 +117,7 @@ class Knobs(SpecModel):
         return self
 
     def over(self, base: Knobs) -> Knobs:
-        """Return the knobs of another with those of this one that were written."""
+        """Return other knobs, overridden by the fields that were set here."""
         model = max(self.plain, base.plain, key=lambda model: len(model.model_fields))
         values = {
             name: getattr(knobs, name)
@@ -169,7 +169,7 @@ def noise_model(more: tuple[type[SpecModel], ...]) -> type[NoiseSpec]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a knob's value without what makes no difference: a mapping that is zero throughout."""
+    """Return a knob's value without the zeros of mappings."""
     if isinstance(value, Mapping):
         return {name: part for name, part in value.items() if part != ZERO}
     return tuple(_plain(part) for part in value) if isinstance(value, tuple) else value
@@ -180,7 +180,7 @@ BASE = frozenset({"read_delay", "jitter", "bias", "white_noise", "drift", "quant
 PROBE = BASE | {"radius_noise"}
 """Knobs of a kind that reads distances."""
 TAXEL = PROBE | {"gain", "dead_probability", "dead_range", "hysteresis"}
-"""Knobs of a kind that feels contact."""
+"""Knobs of a kind that reads contact."""
 FORCE = TAXEL | {"crosstalk"}
 """Knobs of a kind whose taxels read forces."""
 
@@ -206,14 +206,14 @@ PROFILES: dict[str, dict[str, Knobs]] = {
     },
 }
 """Built-in profiles: knobs by sensor kind, none for a kind not named. `noisy` is the paper's noisy condition (Chung et al.,
-*Tactile Genesis*, appendix, table of sensor imperfection parameters). `force_taxel`, which the paper has not, takes the values
-of its forces, but for the radius noise: its sum is the solver's at any radius."""
+*Tactile Genesis*, appendix, table of sensor imperfection parameters). `force_taxel`, which is not in the paper, takes the
+values of its forces, without radius noise: its sum is the solver's at any radius."""
 
 
 def resolve_noise(
     noise: str | NoiseSpec, kind: str, named: Mapping[str, NoiseSpec], seen: tuple[str, ...] = ()
 ) -> tuple[Knobs, tuple[tuple[str, Knobs], ...]]:
-    """Return the knobs of one sensor, and those of some links by pattern, in the order in which they count.
+    """Return the knobs of a sensor, and of some links by pattern; of several that match a link, the last one counts.
 
     Args:
         noise: A profile of the document, a built-in one, or knobs in line.
@@ -222,7 +222,7 @@ def resolve_noise(
         seen: Profiles that led here.
 
     Raises:
-        KeyError: If there is no profile of that name, or profiles lead to one another in a circle.
+        KeyError: If there is no profile of that name, or profiles refer to one another in a circle.
     """
     if isinstance(noise, str):
         if noise in seen:
@@ -235,7 +235,7 @@ def resolve_noise(
 
 
 def built_in(noise: str | NoiseSpec, named: Mapping[str, NoiseSpec]) -> str:
-    """Return the built-in profile that a sensor's noise starts from in the end; profiles that lead in a circle have none."""
+    """Return the built-in profile at the end of the chain of `like`, which must not be a circle."""
     while not isinstance(noise, str) or noise in named:
         noise = named[noise] if isinstance(noise, str) else noise.like
     return noise

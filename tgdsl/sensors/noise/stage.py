@@ -26,11 +26,11 @@ from tgdsl.sensors.noise.reference import Signal as ReferenceSignal
 from tgdsl.sensors.noise.spec import ZERO, Amplitude
 
 Signal = Float[Tensor, "env channel row"]
-"""What noise disturbs."""
+"""The signal that noise disturbs."""
 
 
 class Now(NamedTuple):
-    """When a reading is made.
+    """Time and random numbers of a reading.
 
     Attributes:
         dt: Time since the last call [s].
@@ -38,7 +38,7 @@ class Now(NamedTuple):
         age: Calls since each environment's reset, (env, 1); 0 at the first one.
         ages: Time since each of the calls before this one, the last one first (env, call) [s]; None without a delay.
         is_sample: Whether each environment's sensor takes a sample now, (env, 1); None: always.
-        period: Time between samples [s], a scalar; None: one is taken at every call.
+        period: Time between samples [s], a scalar; None: each call takes one.
         streams: The sensor's random numbers, by purpose.
     """
 
@@ -52,7 +52,7 @@ class Now(NamedTuple):
 
 
 NO_CLOCK = Now(*[None] * 6, {})  # type: ignore[arg-type]
-"""What a sensor gets whose noise depends neither on time nor on chance."""
+"""Of a sensor whose noise has neither time nor random numbers."""
 
 
 def uniform(now: Now, purpose: int, row: int, like: Tensor) -> Tensor:
@@ -68,12 +68,12 @@ class Number:
 
     Attributes:
         draw: Which random number of an episode says where in its range it is, unique to it; None: it is not drawn.
-        label: What precedes its value in an account of a module; None: it is not shown.
-        unit: Its unit; None: that of the reading.
+        label: Text before its value in `explain`; None: it is not shown.
+        unit: Its unit; None: the unit of the reading.
         knob: The path of its range in the knobs, `gain.0`; "": its name; None: it is of no knob.
         absent: Its range where such a knob is None.
         neutral: The value that has no effect: a stage is left out where all rows have it. None: it does not decide.
-        stream: What random numbers are drawn for where it is there, see `random`.
+        stream: Purpose of the random numbers that it needs, see `random`.
     """
 
     draw: int | None
@@ -86,7 +86,7 @@ class Number:
 
 
 class NoMemory(NamedTuple):
-    """A stage that remembers nothing."""
+    """Memory of a stage without any."""
 
 
 Table = Mapping[str, Float[np.ndarray, "end channel row"]]
@@ -103,11 +103,11 @@ class Stage:
     Attributes:
         name: Its name in a plan.
         Knobs: Fields that it adds to the knobs of a sensor, with neutral defaults.
-        Memory: What it carries from one call to the next: a NamedTuple of (env, channel, row). Its content before the first
-            call is arbitrary: it starts where `Now.age` is 0.
+        Memory: Its memory: a NamedTuple of (env, channel, row). The content before the first call, where `Now.age` is 0, is
+            arbitrary.
         needs_dt: Whether it needs the time since the last call.
         after: Name of the stage that it follows; "": the one before it in `STAGES`, or the last one.
-        is_split: Whether a plan names its numbers that are not neutral, in place of the stage.
+        is_split: Whether a plan names its active numbers instead of the stage.
         numbers: Its numbers by name, from the fields.
     """
 
@@ -168,7 +168,7 @@ class Stage:
 
     @classmethod
     def of(cls, values: Mapping[str, Tensor]) -> Self:
-        """Return the stage with its numbers among those of all stages."""
+        """Return the stage with its numbers, from the values of all stages."""
         return cls(**{name: values.get(name) for name in cls.numbers})
 
     def forward(self, signal: Signal, memory: Any, now: Now) -> tuple[Signal, Any]:

@@ -1,6 +1,6 @@
 """The stages that act on each taxel alone, in their order; `crosstalk` has the one between taxels.
 
-    radius          R̃_j = max(0, R_j + ε_j), ε_j ~ U[−ρ, ρ] at each reading, before objects are felt [m]
+    radius          R̃_j = max(0, R_j + ε_j), ε_j ~ U[−ρ, ρ] at each reading, before the distance query [m]
     gain            x ← γ_j x, γ_j ~ U[γ_low, γ_high] at reset; of an elastomer the depth at each taxel
     hysteresis      ξ ← e^(−r) ξ + (1 − e^(−r))/r (x_t − x_(t−1)), r = Δt/τ; x ← x + β ξ; ξ = 0 at reset
     delay           x ← x(t − Δ), Δ = Δ_read + U[0, J] at each reading, the same for all taxels
@@ -37,14 +37,14 @@ from tgdsl.tensors.fusion import materialised
 
 
 class Radius(Stage):
-    """Disturbs radii by `shift`, and leaves the signal that follows from them as it is."""
+    """Disturbs radii by `shift`; the signal stays as it is."""
 
     name = "radius_noise"
     radius_noise: Annotated[Tensor, Number(0, unit=" m", stream=random.RADIUS)]
     """ρ [m]."""
 
     def shift(self, now: Now, like: Tensor) -> Tensor:
-        """Return by how much each probe's radius is off (env, taxel) [m]."""
+        """Return the disturbance of each probe's radius (env, taxel) [m]."""
         share = materialised(uniform(now, random.RADIUS, 0, like))
         return self.radius_noise[:, 0] * (2 * share - 1)
 
@@ -147,9 +147,9 @@ class Delay(Stage):
         start = torch.where(newer > 0, ages.gather(1, (newer - 1).clamp(min=0)), 0.0)
         rest = (late - start) / (ages.gather(1, newer.clamp(max=length - 1)) - start)
         rest, newer = materialised(torch.where(is_oldest, 0.0, rest)), materialised(newer)
-        after, before = (_entry(ring, materialised((now.step - newer - k) % length)) for k in (0, 1))
+        after, older = (_entry(ring, materialised((now.step - newer - k) % length)) for k in (0, 1))
         after = torch.where(newer[:, None] == 0, signal, after)
-        return torch.where(rest[:, None] > 0, after + rest[:, None] * (before - after), after), DelayMemory(signal)
+        return torch.where(rest[:, None] > 0, after + rest[:, None] * (older - after), after), DelayMemory(signal)
 
     @staticmethod
     def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
@@ -164,7 +164,7 @@ class Delay(Stage):
 
 
 def _entry(ring: Tensor, slot: Tensor) -> Signal:
-    """Return what a ring (env, call, channel, row) holds at a place, (env, 1) or (env, row)."""
+    """Return the entries of a ring (env, call, channel, row) at slots (env, 1) or (env, row)."""
     env = torch.arange(len(ring), device=ring.device)
     if slot.shape[1] == 1:  # whole signals, which are contiguous
         return ring[env, slot[:, 0]]
@@ -276,7 +276,7 @@ class Dead(Stage):
 
 
 class Release(Stage):
-    """Release threshold of bits [m]: `decide` of the kind reads it in place of its own; the signal stays as it is."""
+    """Release threshold of bits [m]. It replaces the constant that `decide` of the kind reads; the signal stays as it is."""
 
     name = "release_threshold"
     release_threshold: Annotated[Tensor, Number(16, unit=" m", absent=(-1.0, -1.0))]
