@@ -21,7 +21,7 @@ import numpy as np
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError
 from tgdsl.fields.materials import Material
-from tgdsl.modal.modes import Modes, ModeShapes, SurfaceGains
+from tgdsl.modal.modes import Modes, ModeShapes
 from tgdsl.modal.spec import ShapeModes
 from tgdsl.modal.spectrum import Spectrum, spectrum
 from tgdsl.surfaces.surface import Surface
@@ -75,7 +75,6 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progr
         frequency=omega[is_used] / (2 * np.pi),
         decay=decay[is_used],
         gain=shape.gain[is_used] / mass,
-        at=SurfaceGains(shape.pos * size + middle, shape.share[:, is_used]),
         shapes=_shapes(shape, size, middle).of(is_used),
     )
 

@@ -25,8 +25,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from tgdsl.modal.cells import Crossings
-
 INAUDIBLE = 1e-3
 """Gain below which a group is left out, over the largest gain."""
 MERGE_TOLERANCE = 1e-3
@@ -50,10 +48,6 @@ class Loudness:
     gain: Float[np.ndarray, " group"]
     mixture: Float[np.ndarray, "mode field"]
     owner: Int[np.ndarray, " field"]
-
-    def share(self, normal: Float[np.ndarray, "x mode"]) -> Float[np.ndarray, "x group"]:
-        """Return how much more each group is struck at points than in the mean, of the mode shapes along a direction there."""
-        return of_groups(normal @ self.mixture, self.owner, len(self.gain))
 
 
 def of_groups(
@@ -113,16 +107,3 @@ def sign_of(shape: Float[np.ndarray, " x"]) -> float:
     size = np.abs(shape)
     first = int(np.argmax(size > (1 - 1e-6) * size.max(initial=0.0)))
     return 1.0 if not len(shape) or shape[first] >= 0 else -1.0
-
-
-def picked(crossings: Crossings) -> Int[np.ndarray, " x"]:
-    """Return one point for each cell and side that its surface faces: the one nearest to the middle of these points."""
-    axis = np.abs(crossings.normal).argmax(axis=1)
-    faces_up = crossings.normal[np.arange(len(axis)), axis] > 0
-    _, which = np.unique(6 * crossings.cell + 2 * axis + faces_up, return_inverse=True)
-    which = which.reshape(-1)
-    count = np.bincount(which)
-    middle = np.stack([np.bincount(which, part) / count for part in crossings.pos.T], axis=1)
-    off = np.linalg.norm(crossings.pos - middle[which], axis=1)
-    order = np.lexsort((off, which))
-    return order[np.concatenate([[0], np.cumsum(count)[:-1]])]

@@ -9,7 +9,7 @@ with the frequency f_i [Hz], the decay rate d_i of the amplitude [1/s], and the 
 normal, and s the pseudo-velocity ω q of the surface: its displacement q times ω = 2πf, which has the amplitude of its velocity
 and no jump at the impulse.
 
-Shapes: `mode` modes of one body, `point` points of its surface, `node` nodes of a grid, z running fastest, `field` fields of
+Shapes: `mode` modes of one body, `point` points of it, `node` nodes of a grid, z running fastest, `field` fields of
 its modes, one of each, and as many as there are mode shapes where symmetry makes these one mode, see `loudness.py`.
 """
 
@@ -19,19 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceGains:
-    """By how much more or less a mode is struck at a point of the surface than by its gain.
-
-    Attributes:
-        pos: The points, in the body's frame [m].
-        share: φ_i at each point along the normal, over its root mean square over the surface; with its sign [1].
-    """
-
-    pos: Float[np.ndarray, "point 3"]
-    share: Float[np.ndarray, "point mode"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +71,10 @@ class Modes:
         frequency: f, of the undamped mode's ringing [Hz].
         decay: Rate d at which its amplitude decays [1/s].
         gain: Amplitude of s per impulse, g [1/kg].
-        at: How strongly each is struck at points of the surface; None: alike everywhere.
-        shapes: The same anywhere, and along any direction; None: alike everywhere.
+        shapes: How strongly each is struck where and along what; None: alike everywhere.
     """
 
     frequency: Float[np.ndarray, " mode"]
     decay: Float[np.ndarray, " mode"]
     gain: Float[np.ndarray, " mode"]
-    at: SurfaceGains | None = None
     shapes: ModeShapes | None = None

@@ -3,7 +3,7 @@
 Frequencies of similar bodies are as √(E/ρ)/L, and mode shapes of unit modal mass as 1/√m. So all that follows from the shape is
 computed in units of the body's size L, with E = 1 and ρ = 1, and scaled exactly.
 
-Shapes: `group` modes of distinct frequency, `point` points of the surface, `field` fields of mode shapes.
+Shapes: `group` modes of distinct frequency, `field` fields of mode shapes.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from tgdsl.files import cache
 from tgdsl.modal import cells, grid
 from tgdsl.modal.closed import closed, enclosed, refused
 from tgdsl.modal.elasticity import Elements
-from tgdsl.modal.loudness import loudness, picked
+from tgdsl.modal.loudness import loudness
 from tgdsl.modal.shapes import ShapeGrid, on_grid
 from tgdsl.modal.vibration import vibration
 from tgdsl.surfaces.surface import Surface
 
-FORMAT = b"tgdsl modes 3"
+FORMAT = b"tgdsl modes 4"
 """Version of cached results; change it with any change of the computation."""
 UNKNOWNS = 25_000
 """Target number of unknowns, which sets the size of cells."""
@@ -58,8 +58,6 @@ class Spectrum:
         multiplicity: Number of modes that are one.
         gain: Gain times the body's mass: see `loudness.py`.
         volume: The body's, over L³.
-        pos: Points of the surface, from the middle of the bounding box and over L.
-        share: How strongly each mode is struck at them, over its root mean square over the surface.
         unknowns: Size of the eigenproblem.
         axes: The grid's axes, as rows, of the body's.
         owner: The group that each field of the mode shapes belongs to, see `loudness.py`.
@@ -70,8 +68,6 @@ class Spectrum:
     multiplicity: Int[np.ndarray, " group"]
     gain: Float[np.ndarray, " group"]
     volume: float
-    pos: Float[np.ndarray, "point 3"]
-    share: Float[np.ndarray, "point group"]
     unknowns: int
     axes: Float[np.ndarray, "3 3"]
     owner: Int[np.ndarray, " field"]
@@ -125,15 +121,13 @@ def _computed(
     normal = np.einsum("xim,xi->xm", displacement, crossings.normal)
     volume = float(elements.filled.volume.sum())
     heard = loudness(result.wave_number, normal, crossings.area, volume)
-    first, at = slice(None, count), picked(crossings)
+    first = slice(None, count)
     in_count = heard.owner < count
     return Spectrum(
         wave_number=_rounded(heard.wave_number[first]),
         multiplicity=heard.multiplicity[first],
         gain=_rounded(heard.gain[first]),
         volume=volume,
-        pos=crossings.pos[at] @ turned,
-        share=np.round(heard.share(normal[at])[:, first], 6),
         unknowns=3 * len(elements.pos),
         axes=turned,
         owner=heard.owner[in_count],
