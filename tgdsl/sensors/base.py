@@ -23,6 +23,7 @@ from tgdsl.fields.accuracy import AccuracyField
 from tgdsl.fields.history import History
 from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
 from tgdsl.fields.regions import RegionPart
+from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered, Quantity, Request
 from tgdsl.sensors.noise import BASE, NoiseField
@@ -121,6 +122,16 @@ class Channel:
 
     name: str
     unit: str
+
+
+def vector(name: str, unit: str) -> tuple[Channel, ...]:
+    """Return the channels of a vector's components."""
+    return tuple(Channel(f"{name}_{axis}", unit) for axis in "xyz")
+
+
+def components(name: str, planes: Vec) -> dict[str, Tensor]:
+    """Return a vector's planes by its channels."""
+    return {f"{name}_{axis}": plane for axis, plane in zip("xyz", planes, strict=True)}
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,6 @@ from tgdsl.quantities.contacts import ContactPoints, Contacts, ReferenceContacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Array,
-    Channel,
     ContactProbeSpec,
     Context,
     Kind,
@@ -66,7 +65,9 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    components,
     scalar,
+    vector,
 )
 from tgdsl.sensors.noise import FORCE
 
@@ -140,7 +141,8 @@ def reference(
         torques[j] = spin[j] * m
         if spec.torque_about == "link":
             torques[j] += np.cross(x, forces[j])
-    return np.concatenate([{"force": forces, "torque": torques}[name] for name in _ordered(spec)], axis=1), {}
+    parts = {"force": forces, "torque": torques}
+    return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
 
 
 def reference_balance(pressed: np.ndarray, body_id: np.ndarray, contacts: ReferenceContacts) -> tuple[np.ndarray, np.ndarray]:
@@ -175,17 +177,10 @@ class KinematicTaxelConstants(Generic[Array]):
     """Radius of each probe [m]."""
 
 
-def _ordered(spec: KinematicTaxelSpec) -> tuple[str, ...]:
-    return tuple(name for name in ("force", "torque") if name in spec.outputs)
-
-
 def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Fold the sign of the model into the damping constants; leave out what no output needs."""
-    channels: list[Channel] = []
-    if "force" in spec.outputs:
-        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
-    if "torque" in spec.outputs:
-        channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
+    parts = {"force": vector("force", "N"), "torque": vector("torque", "N·m")}
+    channels = tuple(channel for name, part in parts.items() if name in spec.outputs for channel in part)
     has_torque, is_balanced = "torque" in spec.outputs, spec.balance == "solver"
     member = layout.body_id[:, None] == np.arange(len(layout.bodies))
     constants = KinematicTaxelConstants(
@@ -203,7 +198,7 @@ def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
     motion = bool(spec.normal_damping or spec.shear_damping or (has_torque and spec.spin_damping))
     depth = ContactDepth(spec.objects, spec.is_gated, normal=True, motion=motion)
     requests = (depth, Contacts(spec.objects, slots=spec.slots)) if is_balanced else (depth,)
-    return Lowered(tuple(channels), constants, requests=requests)
+    return Lowered(channels, constants, requests=requests)
 
 
 def forward(
@@ -228,7 +223,7 @@ def forward(
     force = planes.scale(pressed, touch.normal)
     if shear is not None:
         force = planes.add(force, shear if limit is None else _within(limit, shear))
-    readings = {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
+    readings = components("force", force)
     if constants.spin_damping is not None:
         none = touch.depth * 0.0  # not-a-number where the pose is
         torque = planes.cross(touch.pos, force) if constants.about_link is not None else (none, none, none)
@@ -238,7 +233,7 @@ def forward(
                 largest = constants.patch * limit
                 spin = torch.minimum(torch.maximum(spin, -largest), largest)
             torque = planes.add(torque, planes.scale(spin, touch.normal))
-        readings |= {f"torque_{axis}": plane for axis, plane in zip("xyz", torque, strict=True)}
+        readings |= components("torque", torque)
     return readings, {}
 
 

@@ -46,7 +46,9 @@ from tgdsl.sensors.base import (
     State,
     SurfaceOf,
     body_axis,
+    components,
     scalar,
+    vector,
 )
 
 
@@ -94,7 +96,7 @@ class LinkContactConstants(Generic[Array]):
 
 def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The net force alone is wanted, without slots, unless normal forces are; and no probe."""
-    force = tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
+    force = vector("force", "N")
     parts = {"contact": (Channel("contact", "1"),), "force": force, "normal_force": (Channel("normal_force", "N"),)}
     channels = tuple(channel for name, part in parts.items() if name in spec.outputs for channel in part)
     signal, slots = (force + parts["normal_force"], spec.slots) if "normal_force" in spec.outputs else (force, 0)
@@ -108,7 +110,7 @@ def forward(
     """Return the force planes and the normal force [N], by body, which are what noise acts on."""
     contacts = gathered[Contacts]
     pressed = planes.dot(contacts.force, contacts.normal).clamp(min=0.0).sum(dim=-1)
-    return {**{f"force_{axis}": plane for axis, plane in zip("xyz", contacts.net, strict=True)}, "normal_force": pressed}, {}
+    return {**components("force", contacts.net), "normal_force": pressed}, {}
 
 
 def decide(

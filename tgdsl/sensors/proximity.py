@@ -40,7 +40,6 @@ from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Alternative,
     Array,
-    Channel,
     Context,
     Kind,
     Lowered,
@@ -49,7 +48,9 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    components,
     scalar,
+    vector,
 )
 from tgdsl.sensors.noise import FORCE
 
@@ -150,11 +151,8 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         area=None if spec.reference_area is None else scalar(spec.reference_area),
         about_link=scalar(1.0) if is_about_link else None,
     )
-    channels: list[Channel] = []
-    if "force" in spec.outputs:
-        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
-    if "torque" in spec.outputs:
-        channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
+    parts = {"force": vector("force", "N"), "torque": vector("torque", "N·m")}
+    channels = tuple(channel for name, part in parts.items() if name in spec.outputs for channel in part)
     request = MomentsRequest(
         objects=spec.objects,
         radius=spec.radius,
@@ -166,7 +164,7 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         with_area=spec.reference_area is None,
         motion=bool(spec.shear_damping and ("force" in spec.outputs or is_about_link)),
     )
-    return Lowered(tuple(channels), constants, requests=(request,))
+    return Lowered(channels, constants, requests=(request,))
 
 
 def forward(
@@ -190,7 +188,7 @@ def forward(
     torque = planes.scale(stiffness, planes.cross(first, normal))
     if constants.about_link is not None:
         torque = planes.add(torque, planes.cross(surfaces.pos, force))
-    return {f"{n}_{axis}": p for n, v in (("force", force), ("torque", torque)) for axis, p in zip("xyz", v, strict=True)}, {}
+    return components("force", force) | components("torque", torque), {}
 
 
 def _slip(surfaces: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:

@@ -40,7 +40,9 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    components,
     scalar,
+    vector,
 )
 from tgdsl.sensors.noise import PROBE
 
@@ -80,7 +82,7 @@ def lower(spec: SurfaceDistanceSpec, layout: Layout, surface_of: SurfaceOf) -> L
     """One channel per object, and three more where the vector is wanted."""
     channels = [Channel(f"distance_{name}", "m") for name in spec.feels]
     if spec.nearest:
-        channels += [Channel(f"nearest_{name}_{axis}", "m") for name in spec.feels for axis in "xyz"]
+        channels += [channel for name in spec.feels for channel in vector(f"nearest_{name}", "m")]
     constants = SurfaceDistanceConstants(scalar(spec.max_range))
     request = ContactDepth(spec.objects, spec.is_gated, range=spec.max_range, distance=True)
     return Lowered(tuple(channels), constants, requests=(request,))
@@ -96,8 +98,8 @@ def forward(
         capped = torch.minimum(distance, max_range)
         readings[f"distance_{name}"] = capped
         reach = torch.where(distance > max_range, 0.0, -capped)
-        vector = planes.scale(reach, gradient)
-        readings |= {f"nearest_{name}_{axis}": part for axis, part in zip("xyz", vector, strict=True)}
+        to_surface = planes.scale(reach, gradient)
+        readings |= components(f"nearest_{name}", to_surface)
     return readings, {}
 
 

@@ -5,6 +5,7 @@ Shapes: `env` environments, `row` taxels, `channel` channels.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,10 @@ from torch import Tensor
 
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.sensors.noise import Knobs, random
-from tgdsl.sensors.noise.pipeline import ReferenceNoise, disturb, draw, lower_noise, stages_of
+from tgdsl.sensors.noise.pipeline import disturb, draw, draws_of, known_stages, lower_noise, stages_of
+from tgdsl.sensors.noise.reference import ReferenceCall
 from tgdsl.sensors.noise.stage import Now
+from tgdsl.sensors.noise.stages import Gain, Radius
 
 MM = 1e-3
 """A millimetre [m]."""
@@ -41,6 +44,58 @@ def make_layout(pos: np.ndarray, normal: Any = (0, 0, 1), link_id: Any = 0, radi
 def line(count: int) -> Layout:
     """Taxels 1 mm apart."""
     return make_layout(np.arange(count)[:, None] * np.array([MM, 0, 0]))
+
+
+class ReferenceNoise:
+    """The definition of the noise: one sensor in one environment, fed call by call, in float64."""
+
+    def __init__(
+        self, knobs: Sequence[Knobs], channels: Sequence[str], key: tuple[int, int], env: int = 0, layout: Layout | None = None
+    ):
+        """Begin the first episode.
+
+        Args:
+            knobs: The knobs of each row.
+            channels: Names of the signal's channels.
+            key: The sensor's key, see `random.sensor_key`.
+            env: Number of the environment.
+            layout: The taxels, if there is crosstalk.
+        """
+        self._stages = known_stages()
+        ranges = [{name: v for stage in self._stages for name, v in stage.ranges(row).items()} for row in knobs]
+        self._call = ReferenceCall(ranges, draws_of(self._stages), channels, key, env, layout, episode=-1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        self._call = replace(self._call, episode=self._call.episode + 1)
+        self._memory: dict[str, dict[str, Any]] = {stage.name: {} for stage in self._stages}
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Each taxel's gain (row, channel)."""
+        return Gain.reference(np.ones((len(self._call.ranges), len(self._call.channels))), self._call, {})
+
+    def radius(self, radius: np.ndarray) -> np.ndarray:
+        """Return this step's radii of probes with these radii [m]."""
+        return Radius.reference_radius(radius, self._call)
+
+    def read(self, signal: np.ndarray, dt: float, is_sample: bool = True) -> np.ndarray:
+        """Return the disturbed signal, and go on to the next step.
+
+        Args:
+            signal: The signal, already multiplied by `gain`.
+            dt: Time since the last call [s].
+            is_sample: Whether the sensor takes a sample now, or reads the last one.
+        """
+        call = replace(self._call, dt=dt, is_sample=is_sample)
+        for stage in self._stages:
+            if stage is not Gain:
+                signal = stage.reference(signal, call, self._memory[stage.name])
+        if is_sample:
+            self._sample = signal
+        self._call = replace(self._call, step=self._call.step + 1)
+        return self._sample
 
 
 class Noise:

@@ -50,7 +50,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.points import Points
-from tgdsl.sensors.base import Alternative, Array, Channel, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
+from tgdsl.sensors.base import Alternative, Array, Context, Kind, Lowered, Memory, State, SurfaceOf, components, scalar, vector
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links
 from tgdsl.sensors.elastomer.operators import Operator, operator_of
@@ -58,9 +58,6 @@ from tgdsl.sensors.elastomer.point_anchors import Markers
 from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.sensors.noise import TAXEL
-
-CHANNELS = tuple(Channel(f"displacement_{axis}", "m") for axis in "xyz")
-
 
 Operators: TypeAlias = tuple[Operator[Array], ...] | None
 """An operator of each link; None if the skin does not need it."""
@@ -147,7 +144,7 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         state = {name: Memory(shape=Points, overwritten=True) for name in point_anchors.PLANES}
         depth = replace(depth, range=max_distance)
         points = (Points(spec.objects, spec.is_gated, num_points=spec.points, range=max_distance),)
-    return Lowered(CHANNELS, constants, state, requests=(depth, *points), notes=spec.notes)
+    return Lowered(vector("displacement", "m"), constants, state, requests=(depth, *points), notes=spec.notes)
 
 
 def _flat_links(layout: Layout) -> list[int]:
@@ -178,7 +175,7 @@ def forward(
         markers = Markers(touch.pos, normal, constants.shear_falloff, constants.reference_area, flat)
         dragged = point_anchors.drag(loads, markers, touch.depth.shape[0])
         result = planes.add(result, planes.scale(constants.shear_strength * constants.is_active, dragged))
-    return {channel.name: plane for channel, plane in zip(CHANNELS, result, strict=True)}, after
+    return components("displacement", result), after
 
 
 def _gaussian(depth: Tensor, shear: Vec | None, normal: Vec, constants: ElastomerConstants[Tensor]) -> Vec:

@@ -34,15 +34,17 @@ frame of the body.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Generic, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
+from tgdsl.sensors.base import Array
 from tgdsl.sensors.force_taxel.constants import damping, no_force, unreached, wholly
 from tgdsl.tensors.operations import Operation
 
@@ -111,27 +113,28 @@ def footprint(
     return Footprint(captured[..., None] * share, left)
 
 
-class Bodies(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Bodies(Generic[Array]):
     """Which taxels each body has: they stand one body after the other.
 
     Attributes:
-        taxel: Taxels of each body; a body with fewer than another repeats its first.
-        inverse_radius: 1/R of each [1/m], 0 for inactive ones and those repeated.
-        row: Place of each taxel in these, flattened.
-        first: First taxel of each body, and the number of all.
-        box: Least and largest coordinates of its active taxels [m].
-        place: Position of each taxel [m], with inactive ones beyond all contacts' reach, for a kernel that knows of none; and
-            −2 times its outward normal.
-        padded: Position and −2 times the normal of each of `taxel`.
+        taxel: Taxels of each body (body, padded); a body with fewer than another repeats its first.
+        inverse_radius: 1/R of each (body, padded) [1/m], 0 for inactive and repeated ones.
+        row: Index of each taxel in these, flattened (taxel,).
+        first: First taxel of each body, and the number of all (body + 1,).
+        box: Least and largest coordinates of each body's active taxels (body, 6) [m].
+        place: Position of each taxel [m], of inactive ones beyond all contacts' reach, and −2 times its outward normal
+            (taxel, 6).
+        padded: Position and −2 times the normal of each of `taxel` (6, body, padded).
     """
 
-    taxel: Int[Tensor, "body padded"]
-    inverse_radius: Float[Tensor, "body padded"]
-    row: Int[Tensor, " taxel"]
-    first: Int[Tensor, " bodies_and_one"]
-    box: Float[Tensor, "body 6"]
-    place: Float[Tensor, "taxel 6"]
-    padded: Float[Tensor, "6 body padded"]
+    taxel: Array
+    inverse_radius: Array
+    row: Array
+    first: Array
+    box: Array
+    place: Array
+    padded: Array
 
 
 def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, " 6"]:
@@ -161,7 +164,7 @@ class Shared(NamedTuple):
 
 
 def shared_forces(
-    bodies: Bodies,
+    bodies: Bodies[Tensor],
     depth: Float[Tensor, "env taxel"],
     point: Vec,
     force: Vec,
@@ -203,7 +206,7 @@ def shared_forces(
 
 
 def _shared_by_kernel(
-    bodies: Bodies, depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+    bodies: Bodies[Tensor], depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
 ) -> Shared:
     from tgdsl.sensors.force_taxel import footprint_kernel
 
@@ -215,7 +218,7 @@ def _shared_by_kernel(
 
 
 def _inputs(
-    bodies: Bodies, depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+    bodies: Bodies[Tensor], depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
 ) -> list[Tensor]:
     return [depth, *point, *force, *torque, *normal]
 

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Generic, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -57,6 +57,8 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    components,
+    vector,
 )
 from tgdsl.sensors.force_taxel import footprint
 from tgdsl.sensors.noise import FORCE
@@ -121,16 +123,9 @@ def reference_reports(spec: ForceTaxelSpec, layout: Layout, gathered: References
 
 
 @dataclass(frozen=True, eq=False)
-class ForceTaxelConstants(Generic[Array]):
-    """Fields of `footprint.Bodies`; r_f of each body [m]; least curvature of each step [1]."""
+class ForceTaxelConstants(footprint.Bodies[Array]):
+    """The bodies; r_f of each [m]; least curvature of each step [1]."""
 
-    taxel: Array
-    inverse_radius: Array
-    row: Array
-    first: Array
-    box: Array
-    place: Array
-    padded: Array
     footprint: Array
     levenberg: Array
     inward: Array | None = None
@@ -142,7 +137,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
     is_active = layout.radius > 0
     channels: list[Channel] = []
     if "force" in spec.outputs:
-        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
+        channels += vector("force", "N")
     if "pressure" in spec.outputs:
         if (layout.area[is_active] <= 0).any():
             raise LowerError("a taxel of no area has no pressure", field="outputs", hint="leave pressure out, or give its area")
@@ -166,10 +161,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         levenberg=np.array(spec.levenberg),
         inward=-layout.normal.T / np.where(is_active, layout.area, np.inf) if "pressure" in spec.outputs else None,
     )
-    reports = {
-        "missed": tuple(Channel(f"missed_{axis}", "N") for axis in "xyz"),
-        "residual": tuple(Channel(f"residual_{axis}", "N·m") for axis in "xyz"),
-    }
+    reports = {"missed": vector("missed", "N"), "residual": vector("residual", "N·m")}
     requests = (ContactDepth(spec.objects, spec.is_gated), Contacts(spec.objects, slots=spec.slots))
     return Lowered(tuple(channels), constants, requests=requests, reports=reports)
 
@@ -179,9 +171,8 @@ def forward(
 ) -> tuple[dict[str, Tensor], State]:
     """Return the force [N], the pressure [Pa] if wanted, and by body the missed force [N] and the residual moment [N·m]."""
     contacts, touch = gathered[Contacts], gathered[ContactDepth]
-    bodies = footprint.Bodies(*(getattr(constants, name) for name in footprint.Bodies._fields))
     shared = footprint.SHARED_FORCES(
-        bodies,
+        constants,
         touch.depth,
         contacts.pos,
         contacts.force,
@@ -195,7 +186,7 @@ def forward(
     if constants.inward is None:
         return {"signal": shared.force, **readings}, {}
     force = planes.vec(shared.force.unbind(1))
-    readings |= {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
+    readings |= components("force", force)
     readings["pressure"] = planes.dot(force, planes.vec(constants.inward)).clamp(min=0)
     return readings, {}
 

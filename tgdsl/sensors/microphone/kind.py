@@ -36,7 +36,6 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, did_you_mean
 from tgdsl.geometry import planes
-from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.kinematics import Places
@@ -168,7 +167,8 @@ def forward(
     history = torch.where(is_first[..., None], 0.0, state.history)
     sound = torch.cat([history, emitted], dim=2)
     path = _path(place, state, is_first)
-    listener = gathered[Places] if constants.pos is None else _fixed(constants.pos, place)
+    fixed = None if constants.pos is None else constants.pos.to(place.dtype).expand(len(place), 1, 3)
+    listener = gathered[Places] if fixed is None else planes.split(fixed)
     here = planes.vec((m - place[:, i]).to(emitted.dtype) for i, m in enumerate(listener))
     age = age_of_sound(planes.vec(here[i][:, None] - path[:, i] for i in range(3)), constants.speed * context.dt)
     last_age = torch.where(is_first, age, state.age)
@@ -197,11 +197,6 @@ def _path(place: Tensor, state: MicrophoneState, is_first: Tensor) -> Tensor:
     moved = torch.where(is_first[..., None], 0.0, (place - last_place).to(state.place.dtype))
     path = torch.where(is_first[..., None, None], 0.0, state.path - moved[:, :, None])
     return torch.cat([torch.zeros_like(path[:, :, :1]), path], dim=2)
-
-
-def _fixed(pos: Tensor, place: Tensor) -> Vec:
-    """Return a place in the world, planes (env, 1) [m]."""
-    return planes.split(pos.to(place.dtype).expand(len(place), 1, 3))
 
 
 def _level(steps: Tensor, num_nodes: int, constants: MicrophoneConstants[Tensor], dt: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ Shapes: `env` environments, `row` rows of a reading, `channel` its channels, `en
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,6 @@ from tgdsl.files.plugins import installed
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.crosstalk import Crosstalk
-from tgdsl.sensors.noise.reference import ReferenceCall
-from tgdsl.sensors.noise.reference import Signal as ReferenceSignal
 from tgdsl.sensors.noise.spec import ALL, Knobs, quantity, range_of
 from tgdsl.sensors.noise.stage import Now, Signal, Stage
 from tgdsl.sensors.noise.stages import Dead, Delay, Gain, Hysteresis, Offset, Quantization, Radius, Release
@@ -206,55 +204,3 @@ def disturb(
         named = zip(stage.Memory._fields, state, strict=True)
         new |= {path + name: value for name, value in named if value is not None}
     return signal, new
-
-
-class ReferenceNoise:
-    """The definition of the noise: one sensor in one environment, fed call by call, in float64."""
-
-    def __init__(
-        self, knobs: Sequence[Knobs], channels: Sequence[str], key: tuple[int, int], env: int = 0, layout: Layout | None = None
-    ):
-        """Begin the first episode.
-
-        Args:
-            knobs: The knobs of each row.
-            channels: Names of the signal's channels.
-            key: The sensor's key, see `random.sensor_key`.
-            env: Number of the environment.
-            layout: The taxels, if there is crosstalk.
-        """
-        self._stages = known_stages()
-        ranges = [{name: v for stage in self._stages for name, v in stage.ranges(row).items()} for row in knobs]
-        self._call = ReferenceCall(ranges, draws_of(self._stages), channels, key, env, layout, episode=-1)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin a new episode."""
-        self._call = replace(self._call, episode=self._call.episode + 1)
-        self._memory: dict[str, dict[str, Any]] = {stage.name: {} for stage in self._stages}
-
-    @property
-    def gain(self) -> ReferenceSignal:
-        """Each taxel's gain (row, channel)."""
-        return Gain.reference(np.ones((len(self._call.ranges), len(self._call.channels))), self._call, {})
-
-    def radius(self, radius: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
-        """Return this step's radii of probes with these radii [m]."""
-        return Radius.reference_radius(radius, self._call)
-
-    def read(self, signal: ReferenceSignal, dt: float, is_sample: bool = True) -> ReferenceSignal:
-        """Return the disturbed signal, and go on to the next step.
-
-        Args:
-            signal: The signal, already multiplied by `gain`.
-            dt: Time since the last call [s].
-            is_sample: Whether the sensor takes a sample now, or reads the last one.
-        """
-        call = replace(self._call, dt=dt, is_sample=is_sample)
-        for stage in self._stages:
-            if stage is not Gain:
-                signal = stage.reference(signal, call, self._memory[stage.name])
-        if is_sample:
-            self._sample = signal
-        self._call = replace(self._call, step=self._call.step + 1)
-        return self._sample
