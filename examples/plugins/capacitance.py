@@ -37,7 +37,6 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
-    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import BASE
@@ -95,7 +94,7 @@ def lower(spec: CapacitanceSpec, layout: Layout, surface_of: SurfaceOf) -> Lower
     parameters = (spec.thickness, spec.least_thickness, spec.permittivity, spec.range)
     constants = CapacitanceConstants(EPSILON * layout.area, *map(scalar, parameters))
     request = ContactDepth(spec.objects, spec.is_gated, range=spec.range, distance=True)
-    return Lowered((Channel("capacitance", "F"),), by_name(constants), requests=(request,))
+    return Lowered((Channel("capacitance", "F"),), constants, requests=(request,))
 
 
 def forward(

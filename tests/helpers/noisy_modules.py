@@ -10,8 +10,8 @@ from torch import Tensor
 
 import tgdsl
 from tgdsl.module.module import TactileModule
+from tgdsl.sensors.noise.pipeline import draw, stages_of
 from tgdsl.sensors.noise.stage import NO_CLOCK
-from tgdsl.sensors.noise.stages import draw, stages_of
 from tgdsl.testing import only
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "every_sensor.yaml"
@@ -111,8 +111,8 @@ def read_of_rank(rank: int, file: str, made: dict, folder: str) -> None:
 
 
 def circumstances(touch: TactileModule, memory: Mapping[str, Tensor], dt: Tensor | None = None):
-    """Return when each sensor is read next, and the values of its noise's stages then, by sensor."""
+    """Return when each sensor is read next, and the stages of its noise then, by sensor."""
     nows = touch.memory.clock.nows(memory, dt)
-    terms = {sensor.name: sensor.noise.terms for sensor in touch.plan.sensors if sensor.noise is not None}
+    stages = {sensor.name: stages_of(sensor.noise.terms) for sensor in touch.plan.sensors if sensor.noise is not None}
     tree = touch.constants.tree["noise"]
-    return nows, {name: draw(stages_of(terms[name]), own, nows.get(name, NO_CLOCK)) for name, own in tree.items()}
+    return nows, {name: draw(stages[name], own, nows.get(name, NO_CLOCK)) for name, own in tree.items()}

@@ -11,8 +11,8 @@ import torch
 
 from oracles.comparison import Values, field
 from oracles.setups.signals import KOLMOGOROV, MM, Noise, normal_distance, standard_errors, uniform_distance
-from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.radius import RADIUS
+from tgdsl.sensors.noise.pipeline import draw
+from tgdsl.sensors.noise.stages import Radius
 
 NUM, SIDE = 10**6, 1000
 """Samples: of 1000 environments with 1000 rows."""
@@ -125,8 +125,9 @@ def radii(width: float = 0.3 * MM):
     noise, like, errors = million({"radius_noise": width}), torch.zeros(SIDE, SIDE), []
     for _ in range(2):
         now = noise.now()
-        values = stages.draw(noise.stages, noise.constants, now)[RADIUS.name]
-        shift = RADIUS.shift(values, now, like).double().numpy()
+        (disturbed,) = draw(noise.stages, noise.constants, now)
+        assert isinstance(disturbed, Radius)
+        shift = disturbed.shift(now, like).double().numpy()
         errors.append(_distance(uniform_distance(shift, -width, width)) if np.abs(shift).max() <= width else np.inf)
         noise.read(0.0)
     return 0.0, errors

@@ -16,7 +16,7 @@ from tgdsl.quantities.base import Request
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import Contacts
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Axis, Channel, ContactProbeSpec, LinkSpec, Lowered, Memory, by_name
+from tgdsl.sensors.base import Axis, Channel, ContactProbeSpec, LinkSpec, Lowered, Memory
 
 SCENE = """
 <mujoco><worldbody>
@@ -101,7 +101,7 @@ def test_constants_of_a_dataclass(build, tmp_path):
 
     def lower_typed(spec, layout, surface_of):
         lowered = lower(spec, layout, surface_of)
-        return dataclasses.replace(lowered, constants=by_name(Areas(lowered.constants["area"])))
+        return dataclasses.replace(lowered, constants=Areas(lowered.constants["area"]))
 
     def forward_typed(gathered, context, constants, state):
         seen.append(constants)

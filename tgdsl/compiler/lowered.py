@@ -23,8 +23,8 @@ from tgdsl.sensors import Kind
 from tgdsl.sensors.base import AnySensorSpec, Axis, Fitting, Lowered, ReadSensor, body_axis, taxel_axis
 from tgdsl.sensors.known import check_lowered
 from tgdsl.sensors.noise import Knobs, NoiseSpec, built_in, resolve_noise
-from tgdsl.sensors.noise.fields import quantity
-from tgdsl.sensors.noise.lower import LoweredNoise, lower_noise
+from tgdsl.sensors.noise.pipeline import LoweredNoise, lower_noise
+from tgdsl.sensors.noise.spec import quantity
 from tgdsl.surfaces.surface import Surface
 
 

@@ -1,4 +1,4 @@
-"""Modal analysis: from the triangles around a solid, and what it is made of, to its modes.
+"""Modal analysis: from the triangles around a solid, and its material, to its modes.
 
     f = κ √(E/ρ) / 2πL,   d = (α + β ω²)/2,   g = γ/m
 
@@ -10,20 +10,18 @@ damping α [1/s] and β [s] of the material. In mass-normalised modal coordinate
 and g is φ_n(x) φ_n(y) with root mean squares over the surface for both: an impulse J at some point of it makes the surface move
 with the velocity g J e^(−dt) cos ωt, in the mean. `loudness.py` says what g is where symmetry makes modes equal.
 
-The body is free and homogeneous. Its modes are not those of a body that is held, filled or glued, and what air takes from them
-is in the damping only as far as it is in its source.
+The body is free and homogeneous: held, filled or glued, it has other modes. Damping by air counts as far as the source of the
+material's damping has it.
 """
 
 from __future__ import annotations
-
-from functools import partial
 
 import numpy as np
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError
 from tgdsl.fields.materials import Material
-from tgdsl.modal.modes import Modes, ModeShapes, SurfaceGains
+from tgdsl.modal.modes import Modes, ModeShapes
 from tgdsl.modal.spec import ShapeModes
 from tgdsl.modal.spectrum import Spectrum, spectrum
 from tgdsl.surfaces.surface import Surface
@@ -34,13 +32,13 @@ WANTED = {
     "mass_damping": "damping",
     "stiffness_damping": "damping",
 }
-"""What must be known of a material for its modes, besides its density."""
+"""Properties of a material that modal analysis needs, with its density."""
 MAX_POISSON = 0.4999
-"""Poisson's ratio from which on the elements no longer follow what is incompressible."""
+"""Largest Poisson's ratio: elements lock in nearly incompressible solids."""
 
 
 def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progress: Progress = silent) -> Modes:
-    """Return the modes of a solid: those that ring and are wanted, or else the lowest one.
+    """Return the modes of a solid that ring, up to a frequency; at least the lowest one.
 
     Args:
         name: What the body is called in messages.
@@ -54,10 +52,11 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progr
             modes rings.
     """
     material = given.material
-    youngs_modulus, poissons_ratio, mass_damping, stiffness_damping = _known(name, material)
+    youngs_modulus, poissons_ratio, mass_damping, stiffness_damping = _properties(name, material)
     try:
-        tell = partial(_told, progress, name)
-        shape, size, middle = spectrum(surface, poissons_ratio, given.count, progress=tell)
+        shape, size, middle = spectrum(
+            surface, poissons_ratio, given.count, progress=lambda text: progress(f"modes of {name}: {text}")
+        )
     except LowerError as error:
         raise LowerError(f'modes of "{name}": {error.what}', field="modes", hint=error.hint) from error
     omega = shape.wave_number * np.sqrt(youngs_modulus / material.density) / size
@@ -68,40 +67,34 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progr
             f'none of the modes of "{name}" rings: {material.name} damps the lowest one, at {omega[0] / (2 * np.pi):.4g} Hz'
         )
         raise LowerError(problem, field="modes", hint="give another material, or list its modes")
-    kept = rings & (omega <= 2 * np.pi * below * (1 + 1e-12))
-    if not kept.any():
-        kept = np.arange(len(omega)) == int(np.argmax(rings))
+    is_used = rings & (omega <= 2 * np.pi * below * (1 + 1e-12))
+    if not is_used.any():
+        is_used = np.arange(len(omega)) == int(np.argmax(rings))
     mass = material.density * shape.volume * size**3
     return Modes(
-        frequency=omega[kept] / (2 * np.pi),
-        decay=decay[kept],
-        gain=shape.gain[kept] / mass,
-        at=SurfaceGains(shape.pos * size + middle, shape.share[:, kept]),
-        shapes=_shapes(shape, size, middle).of(kept),
+        frequency=omega[is_used] / (2 * np.pi),
+        decay=decay[is_used],
+        gain=shape.gain[is_used] / mass,
+        shapes=_shapes(shape, size, middle).of(is_used),
     )
 
 
-def _told(progress: Progress, name: str, what: str) -> None:
-    """Say what is done, and of which body."""
-    progress(f"modes of {name}: {what}")
-
-
-def _shapes(found: Spectrum, size: float, middle: np.ndarray) -> ModeShapes:
+def _shapes(shape: Spectrum, size: float, middle: np.ndarray) -> ModeShapes:
     """Return mode shapes in metres of the body's frame."""
-    low = found.grid.low * size + found.axes @ middle
-    return ModeShapes(found.axes, low, found.grid.step * size, found.grid.num, found.grid.value, found.owner, found.grid.error)
+    low = shape.grid.low * size + shape.axes @ middle
+    return ModeShapes(shape.axes, low, shape.grid.step * size, shape.grid.num, shape.grid.value, shape.owner, shape.grid.error)
 
 
-def _known(name: str, material: Material) -> tuple[float, float, float, float]:
+def _properties(name: str, material: Material) -> tuple[float, float, float, float]:
     """Return stiffness, Poisson's ratio and damping of a material."""
     values = [getattr(material, field) for field in WANTED]
     if missing := [quantity for quantity, value in zip(WANTED.values(), values, strict=True) if value is None]:
-        shown = " and no ".join(dict.fromkeys(missing))
+        listing = " and no ".join(dict.fromkeys(missing))
         hint = (
             f"give {', '.join(field for field, value in zip(WANTED, values, strict=True) if value is None)}, or list its modes"
         )
-        raise LowerError(f'modes of "{name}": {material.name} has no {shown}', field="modes", hint=hint)
+        raise LowerError(f'modes of "{name}": {material.name} has no {listing}', field="modes", hint=hint)
     if values[1] > MAX_POISSON:
         problem = f'modes of "{name}": Poisson\'s ratio of {material.name} is {values[1]:g}, expected at most {MAX_POISSON:g}'
-        raise LowerError(problem, field="modes", hint="what is incompressible has no modes by this method")
+        raise LowerError(problem, field="modes", hint="this method has no modes of incompressible solids")
     return values[0], values[1], values[2], values[3]

@@ -1,6 +1,6 @@
 """How much of each cell of a grid a body fills, as weights of points to integrate over it, and points of the body's surface.
 
-Along lines of sight through the cells, in all three directions, the pieces inside the body are found exactly, from where the
+Along lines of sight through the cells, in all three directions, the pieces inside the body follow exactly from where the
 lines cross its triangles. On the grid's points, Gauss' along each axis, weights are chosen such that all polynomials of up to
 degree four along each axis are integrated over the body in a cell as these lines integrate them; each of the three directions
 counts as the square of the surface that it sees in the cell. A full cell has Gauss' own weights. The crossings themselves, each
@@ -192,7 +192,7 @@ def _crossings(
     first_u, last_u = np.searchsorted(u, flat[:, :, 0].min(axis=1)), np.searchsorted(u, flat[:, :, 0].max(axis=1))
     first_v, last_v = np.searchsorted(v, flat[:, :, 1].min(axis=1)), np.searchsorted(v, flat[:, :, 1].max(axis=1))
     count = (last_u - first_u) * (last_v - first_v)
-    found: list[tuple[np.ndarray, ...]] = []
+    chunks: list[tuple[np.ndarray, ...]] = []
     for chunk in np.array_split(np.flatnonzero(count), max(1, int(count.sum()) // CHUNK)):
         face = np.repeat(chunk, count[chunk])
         nth = np.arange(len(face)) - np.repeat(np.cumsum(count[chunk]) - count[chunk], count[chunk])
@@ -200,8 +200,8 @@ def _crossings(
         i, j = first_u[face] + nth // width, first_v[face] + nth % width
         sense, depth = _pierced(vertices, faces, face, u[i], v[j])
         hit = sense != 0
-        found.append((i[hit] * len(v) + j[hit], depth[hit], face[hit], sense[hit]))
-    ray, w, face, sense = (np.concatenate(part) for part in zip(*found, strict=True))
+        chunks.append((i[hit] * len(v) + j[hit], depth[hit], face[hit], sense[hit]))
+    ray, w, face, sense = (np.concatenate(part) for part in zip(*chunks, strict=True))
     order = np.lexsort((face, w, ray))
     ray, w, face, sense = ray[order], w[order], face[order], sense[order]
     winding = np.cumsum(sense)
@@ -213,8 +213,8 @@ def _crossings(
     first = np.flatnonzero((np.diff(ray, prepend=-1) != 0) | (np.diff(w, prepend=-np.inf) > TOUCHING * size))
     last = np.append(first[1:], len(ray)) - 1
     turn = (winding[last] != 0).astype(int) - (winding[first] != sense[first])
-    kept = first[turn != 0]
-    return ray[kept], w[kept], face[kept], turn[turn != 0]
+    crossing_ids = first[turn != 0]
+    return ray[crossing_ids], w[crossing_ids], face[crossing_ids], turn[turn != 0]
 
 
 def _pierced(

@@ -6,7 +6,7 @@ makes a body thin-walled.
 
 Repaired, geom by geom: vertices that coincide are one; triangles without area and repeated ones are dropped; neighbours that
 are wound against each other are turned, by connected part, to what most of its area has; a geom that is inside out is turned;
-small holes are closed. What is open beyond that has no inside, and is an error.
+small holes are closed. A geom with larger holes has no inside, which is an error.
 
 Shapes: `v` vertices, `f` faces.
 """
@@ -32,12 +32,12 @@ FLAT = 1e-9
 
 
 def refused(what: str, hint: str = "") -> LowerError:
-    """Return the error of a body that has no modal analysis: what was found, and what would be right."""
+    """Return the error of a body that has no modal analysis."""
     return LowerError(what, field="modes", hint=hint)
 
 
 def closed(surface: Surface) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Return vertices [m] and faces that wind around the inside of a body, once or more, and not around what is outside.
+    """Return vertices [m] and faces that wind around the inside of a body, once or more, and not around the outside.
 
     Raises:
         LowerError: If there are no triangles, a coordinate is no number, or a geom is open or flat.
@@ -47,8 +47,8 @@ def closed(surface: Surface) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
         faces = surface.faces[surface.face_geom == geom]
         if len(faces):
             names = [name for name in surface.geoms[geom] if name]
-            shown = f'geom "{names[0]}"' if names else f"geom {geom}"
-            vertices, faces = _closed_geom(surface.vertices, faces, shown)
+            geom_name = f'geom "{names[0]}"' if names else f"geom {geom}"
+            vertices, faces = _closed_geom(surface.vertices, faces, geom_name)
             parts.append((vertices, faces + count))
             count += len(vertices)
     if not parts:
@@ -86,7 +86,7 @@ def enclosed(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) 
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a geom's vertices, those that coincide as one, and its distinct faces that have an area."""
+    """Return a geom's welded vertices, and its distinct faces with an area."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used] + 0.0, faces.reshape(-1, 3)
     if not np.isfinite(vertices).all():
@@ -122,6 +122,6 @@ def _coherent(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     pairs = np.bincount(which, minlength=len(edges)) == 2
     if not (pairs & (np.bincount(which, sense, len(edges)) != 0)).any():
         return faces
-    turned, part = (np.asarray(found).astype(np.int64) for found in igl.bfs_orient(faces))
-    kept = np.where((turned == faces).all(axis=1), 1.0, -1.0) * np.asarray(igl.doublearea(vertices, faces))
-    return np.where((np.bincount(part, kept) < 0)[part][:, None], turned[:, ::-1], turned)
+    turned, part = (np.asarray(array).astype(np.int64) for array in igl.bfs_orient(faces))
+    signed_area = np.where((turned == faces).all(axis=1), 1.0, -1.0) * np.asarray(igl.doublearea(vertices, faces))
+    return np.where((np.bincount(part, signed_area) < 0)[part][:, None], turned[:, ::-1], turned)

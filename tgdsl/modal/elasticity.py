@@ -90,16 +90,16 @@ class Elements:
         stiffness = np.zeros((num, NODES, 3, NODES, 3))
         for i in range(3):
             for j in range(i, 3):
-                found = integrals(gradient[:, i], gradient[:, j]) / (size[:, i] * size[:, j])[:, None, None]
-                stiffness[:, :, i, :, j] += first * found
-                stiffness[:, :, j, :, i] += shear * found
+                integral = integrals(gradient[:, i], gradient[:, j]) / (size[:, i] * size[:, j])[:, None, None]
+                stiffness[:, :, i, :, j] += first * integral
+                stiffness[:, :, j, :, i] += shear * integral
                 if i != j:
-                    back = found.swapaxes(1, 2)
+                    back = integral.swapaxes(1, 2)
                     stiffness[:, :, j, :, i] += first * back
                     stiffness[:, :, i, :, j] += shear * back
                 else:
                     for k in range(3):
-                        stiffness[:, :, k, :, k] += shear * found
+                        stiffness[:, :, k, :, k] += shear * integral
         mass = np.zeros_like(stiffness)
         for i in range(3):
             mass[:, :, i, :, i] = integrals(value, value)

@@ -1,6 +1,6 @@
 """The grid of cells that a body is cut by: along the body's own flat faces, and on planes where most of these lie.
 
-Walls between parallel planes so get layers of cells of their own, however thin they are; elsewhere the body's surface passes
+So walls between parallel planes get separate layers of cells, however thin they are; elsewhere the body's surface passes
 through the cells (`cells.py`).
 
 Shapes: `v` vertices, `f` faces, `line` planes across an axis.
@@ -23,7 +23,7 @@ MAX_PLANES = 24
 LEAST_LAYER = 0.1
 """Of planes nearer than this to each other, in cell sizes, those with less than a third of another one's area are left out."""
 MERGE_TOLERANCE = 1e-2
-"""Relative difference below which two principal moments are equal, and their axes those of the body's frame."""
+"""Relative difference below which two principal moments are equal; the axes are then the body frame's."""
 ROUNDING = 1e-5
 """Difference of places along an axis up to which they are one, over the size of the body: meshes are float32."""
 
@@ -82,7 +82,7 @@ def _main(normal: np.ndarray, area: np.ndarray, whole: float | None = None) -> n
 
 
 def _principal(moments: np.ndarray) -> np.ndarray:
-    """Return the long principal axis; where several are as long, what is nearest to an axis of the frame among them."""
+    """Return the long principal axis; of several, the nearest one to an axis of the frame."""
     value, vector = np.linalg.eigh(moments)
     long = vector[:, value > (1 - MERGE_TOLERANCE) * value[-1]]
     onto = long @ long.T
@@ -91,35 +91,35 @@ def _principal(moments: np.ndarray) -> np.ndarray:
 
 
 def planes(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], axis: int) -> Planes:
-    """Return the planes across an axis that hold some of a surface: those of most area, at most `MAX_PLANES`."""
+    """Return the planes across an axis that contain most of a surface's area, at most `MAX_PLANES`."""
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     area = np.linalg.norm(cross, axis=1)
     size = float(np.ptp(vertices, axis=0).max())
     is_flat = (np.ptp(corners[:, :, axis], axis=1) < ROUNDING * size) & (area > 0)
-    at, own = corners[is_flat, :, axis].mean(axis=1), area[is_flat]
+    at, areas = corners[is_flat, :, axis].mean(axis=1), area[is_flat]
     order = np.argsort(at, kind="stable")
-    at, own = at[order], own[order]
+    at, areas = at[order], areas[order]
     group = np.cumsum(np.diff(at, prepend=-np.inf) > ROUNDING * size) - 1
-    sums = np.bincount(group, own, group.max(initial=-1) + 1).astype(float)
-    middle = np.bincount(group, own * at, len(sums)) / np.maximum(sums, np.finfo(float).tiny)
+    sums = np.bincount(group, areas, group.max(initial=-1) + 1).astype(float)
+    middle = np.bincount(group, areas * at, len(sums)) / np.maximum(sums, np.finfo(float).tiny)
     largest = np.sort(np.argsort(-sums, kind="stable")[:MAX_PLANES])
     largest = largest[sums[largest] > PLANE_SHARE * area.sum()]
     return Planes(middle[largest], sums[largest])
 
 
-def lines(found: Planes, low: float, high: float, cell: float) -> Float[np.ndarray, " line"]:
+def lines(flat: Planes, low: float, high: float, cell: float) -> Float[np.ndarray, " line"]:
     """Return the planes of the grid across an axis, from one end of the body to the other, about a cell apart or nearer."""
     near = ROUNDING * (high - low)
-    at = np.where(found.at < low + near, low, np.where(found.at > high - near, high, found.at))
+    at = np.where(flat.at < low + near, low, np.where(flat.at > high - near, high, flat.at))
     ends = np.array([end for end in (low, high) if end not in at])
-    at, area = np.concatenate([at, ends]), np.concatenate([found.area, np.zeros(len(ends))])
+    at, area = np.concatenate([at, ends]), np.concatenate([flat.area, np.zeros(len(ends))])
     area, at = area[np.argsort(at)], np.sort(at)
-    kept = np.ones(len(at), bool)
+    is_kept = np.ones(len(at), bool)
     for plane in np.argsort(area[1:-1], kind="stable") + 1:
-        is_near = kept & (np.abs(at - at[plane]) < LEAST_LAYER * cell)
-        kept[plane] = not (area[is_near] > 3 * area[plane]).any()
-    at = at[kept]
+        is_near = is_kept & (np.abs(at - at[plane]) < LEAST_LAYER * cell)
+        is_kept[plane] = not (area[is_near] > 3 * area[plane]).any()
+    at = at[is_kept]
     parts = [np.zeros(1) + at[0]]
     for start, end in pairwise(at):
         count = max(1, int(np.ceil((end - start) / cell - 1e-6)))

@@ -25,8 +25,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from tgdsl.modal.cells import Crossings
-
 INAUDIBLE = 1e-3
 """Gain below which a group is left out, over the largest gain."""
 MERGE_TOLERANCE = 1e-3
@@ -51,17 +49,13 @@ class Loudness:
     mixture: Float[np.ndarray, "mode field"]
     owner: Int[np.ndarray, " field"]
 
-    def share(self, normal: Float[np.ndarray, "x mode"]) -> Float[np.ndarray, "x group"]:
-        """Return how much more each group is struck at points than in the mean, of the mode shapes along a direction there."""
-        return of_groups(normal @ self.mixture, self.owner, len(self.gain))
-
 
 def of_groups(
     fields: Float[np.ndarray, "*point field"], owner: Int[np.ndarray, " field"], count: int
 ) -> Float[np.ndarray, "*point group"]:
     """Return the share of each of so many groups: its field, or of several the root of the sum of their squares."""
-    own = [fields[..., owner == group] for group in range(count)]
-    results = [part[..., 0] if part.shape[-1] == 1 else np.sqrt((part**2).sum(axis=-1)) for part in own]
+    by_group = [fields[..., owner == group] for group in range(count)]
+    results = [part[..., 0] if part.shape[-1] == 1 else np.sqrt((part**2).sum(axis=-1)) for part in by_group]
     return np.stack(results, axis=-1) if results else fields[..., :0]
 
 
@@ -86,23 +80,23 @@ def loudness(
         area: Surface that each point stands for.
         mass: The body's.
     """
-    found = groups(wave_number)[:-1]
-    gain, mixtures = np.zeros(len(found)), []
-    for i, own in enumerate(found):
-        shape, mixture = normal[:, own] * np.sqrt(mass), np.zeros((len(wave_number), own.stop - own.start))
+    mode_groups = groups(wave_number)[:-1]
+    gain, mixtures = np.zeros(len(mode_groups)), []
+    for i, group in enumerate(mode_groups):
+        shape, mixture = normal[:, group] * np.sqrt(mass), np.zeros((len(wave_number), group.stop - group.start))
         products = (shape * area[:, None]).T @ shape / area.sum()
         gain[i] = np.linalg.norm(products)
         if gain[i] > 0 and mixture.shape[1] == 1:
-            mixture[own] = sign_of(shape[:, 0]) / np.sqrt(gain[i])
+            mixture[group] = sign_of(shape[:, 0]) / np.sqrt(gain[i])
         elif gain[i] > 0:
             square, vector = np.linalg.eigh(products)
-            mixture[own] = vector * np.sqrt(np.maximum(square, 0.0)) / gain[i]
+            mixture[group] = vector * np.sqrt(np.maximum(square, 0.0)) / gain[i]
         mixtures.append(np.sqrt(mass) * mixture)
-    square = np.array([np.mean(wave_number[own] ** 2) for own in found])
-    multiplicity = np.array([own.stop - own.start for own in found], np.int64)
+    square = np.array([np.mean(wave_number[group] ** 2) for group in mode_groups])
+    multiplicity = np.array([group.stop - group.start for group in mode_groups], np.int64)
     heard = gain > INAUDIBLE * gain.max(initial=0.0)
     mixture = np.concatenate(
-        [np.zeros((len(wave_number), 0)), *(own for own, is_own in zip(mixtures, heard, strict=True) if is_own)], axis=1
+        [np.zeros((len(wave_number), 0)), *(part for part, is_heard in zip(mixtures, heard, strict=True) if is_heard)], axis=1
     )
     owner = np.repeat(np.arange(int(heard.sum())), multiplicity[heard])
     return Loudness(np.sqrt(square)[heard], multiplicity[heard], gain[heard], mixture, owner)
@@ -113,16 +107,3 @@ def sign_of(shape: Float[np.ndarray, " x"]) -> float:
     size = np.abs(shape)
     first = int(np.argmax(size > (1 - 1e-6) * size.max(initial=0.0)))
     return 1.0 if not len(shape) or shape[first] >= 0 else -1.0
-
-
-def picked(crossings: Crossings) -> Int[np.ndarray, " x"]:
-    """Return one point for each cell and side that its surface faces: the one nearest to the middle of these points."""
-    axis = np.abs(crossings.normal).argmax(axis=1)
-    faces_up = crossings.normal[np.arange(len(axis)), axis] > 0
-    _, which = np.unique(6 * crossings.cell + 2 * axis + faces_up, return_inverse=True)
-    which = which.reshape(-1)
-    count = np.bincount(which)
-    middle = np.stack([np.bincount(which, part) / count for part in crossings.pos.T], axis=1)
-    off = np.linalg.norm(crossings.pos - middle[which], axis=1)
-    order = np.lexsort((off, which))
-    return order[np.concatenate([[0], np.cumsum(count)[:-1]])]

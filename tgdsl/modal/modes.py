@@ -9,7 +9,7 @@ with the frequency f_i [Hz], the decay rate d_i of the amplitude [1/s], and the 
 normal, and s the pseudo-velocity ω q of the surface: its displacement q times ω = 2πf, which has the amplitude of its velocity
 and no jump at the impulse.
 
-Shapes: `mode` modes of one body, `point` points of its surface, `node` nodes of a grid, z running fastest, `field` fields of
+Shapes: `mode` modes of one body, `point` points of it, `node` nodes of a grid, z running fastest, `field` fields of
 its modes, one of each, and as many as there are mode shapes where symmetry makes these one mode, see `loudness.py`.
 """
 
@@ -22,21 +22,8 @@ from jaxtyping import Bool, Float, Int
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceGains:
-    """By how much more or less a mode is struck at a point of the surface than by its gain.
-
-    Attributes:
-        pos: The points, in the body's frame [m].
-        share: φ_i at each point along the normal, over its root mean square over the surface; with its sign [1].
-    """
-
-    pos: Float[np.ndarray, "point 3"]
-    share: Float[np.ndarray, "point mode"]
-
-
-@dataclass(frozen=True, eq=False)
 class ModeShapes:
-    """Mode shapes on a grid through the body, as vectors, over the root mean square of what is normal to the surface.
+    """Mode shapes on a grid through the body, as vectors, over the root mean square of their normal component on the surface.
 
     Attributes:
         axes: The grid's axes, as rows, of the body's frame.
@@ -70,7 +57,7 @@ class ModeShapes:
         return of_groups(np.einsum("xif,xi->xf", result, along @ self.axes.T), self.owner, int(self.owner.max()) + 1)
 
     def of(self, kept: Bool[np.ndarray, " mode"]) -> ModeShapes:
-        """Return those of some modes."""
+        """Return the shapes of some modes."""
         mine = kept[self.owner]
         number = np.cumsum(kept) - 1
         return replace(self, value=self.value[:, :, mine], owner=number[self.owner[mine]], error=self.error[mine])
@@ -84,12 +71,10 @@ class Modes:
         frequency: f, of the undamped mode's ringing [Hz].
         decay: Rate d at which its amplitude decays [1/s].
         gain: Amplitude of s per impulse, g [1/kg].
-        at: How strongly each is struck at points of the surface; None: alike everywhere.
-        shapes: The same anywhere, and along any direction; None: alike everywhere.
+        shapes: How strongly each is struck where and along what; None: alike everywhere.
     """
 
     frequency: Float[np.ndarray, " mode"]
     decay: Float[np.ndarray, " mode"]
     gain: Float[np.ndarray, " mode"]
-    at: SurfaceGains | None = None
     shapes: ModeShapes | None = None

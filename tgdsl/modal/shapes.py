@@ -55,7 +55,7 @@ class ShapeGrid:
 def interpolated(
     low: np.ndarray, step: np.ndarray, num: np.ndarray, value: np.ndarray, pos: Float[np.ndarray, "x 3"]
 ) -> Float[np.ndarray, "x 3 field"]:
-    """Return what is between the nodes of a grid, linear along each axis; beyond it what is at the nearest point of its box."""
+    """Return values between the nodes of a grid, trilinear; outside its box the value at the nearest point of the box."""
     at = np.clip((pos - low) / step, 0.0, num - 1)
     first = np.minimum(at.astype(np.int64), num - 2)
     share = at - first
@@ -100,11 +100,11 @@ def on_grid(elements: Elements, crossings: Crossings, lines: Lines, fields: Floa
 def _at(
     elements: Elements, crossings: Crossings, near: KDTree, lines: Lines, pos: Float[np.ndarray, "node 3"], fields: np.ndarray
 ) -> Float[np.ndarray, "node 3 field"]:
-    """Return fields at points: within the body's cells those of the elements, elsewhere those of the nearest surface."""
-    own = elements.filled
+    """Return fields at points: of the elements within the body's cells, elsewhere of the nearest surface point."""
+    filled = elements.filled
     row = np.full([len(line) - 1 for line in lines], -1)
-    is_trusted = own.weight.sum(axis=1) > TRUSTED
-    row[tuple(own.index[is_trusted].T)] = np.flatnonzero(is_trusted)
+    is_trusted = filled.weight.sum(axis=1) > TRUSTED
+    row[tuple(filled.index[is_trusted].T)] = np.flatnonzero(is_trusted)
     index = [
         np.clip(np.searchsorted(line, part, side="right") - 1, 0, len(line) - 2)
         for line, part in zip(lines, pos.T, strict=True)

@@ -3,7 +3,7 @@
 Frequencies of similar bodies are as √(E/ρ)/L, and mode shapes of unit modal mass as 1/√m. So all that follows from the shape is
 computed in units of the body's size L, with E = 1 and ρ = 1, and scaled exactly.
 
-Shapes: `group` modes of distinct frequency, `point` points of the surface, `field` fields of mode shapes.
+Shapes: `group` modes of distinct frequency, `field` fields of mode shapes.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from tgdsl.files import cache
 from tgdsl.modal import cells, grid
 from tgdsl.modal.closed import closed, enclosed, refused
 from tgdsl.modal.elasticity import Elements
-from tgdsl.modal.loudness import loudness, picked
+from tgdsl.modal.loudness import loudness
 from tgdsl.modal.shapes import ShapeGrid, on_grid
 from tgdsl.modal.vibration import vibration
 from tgdsl.surfaces.surface import Surface
 
-FORMAT = b"tgdsl modes 3"
-"""To be changed with anything that changes what is computed."""
+FORMAT = b"tgdsl modes 4"
+"""Version of cached results; change it with any change of the computation."""
 UNKNOWNS = 25_000
-"""Number of unknowns that the cells are made small for."""
+"""Target number of unknowns, which sets the size of cells."""
 MAX_UNKNOWNS = 60_000
 """Bound on it: a body whose flat walls alone ask for more cells is refused."""
 FINEST = 1 / 48
@@ -44,22 +44,20 @@ SIGHT, GLANCE = 12, 3
 SLIVER = 2e-3
 """Share of a cell that is filled below which it is left out: too few lines of sight pass through the body there."""
 WHOLE = 0.9
-"""Share of the volume that one connected part has at least; smaller parts beside it are left out."""
+"""Share of the volume that one connected part has at least; smaller parts are left out."""
 DIGITS = 9
 """Decimals of coordinates, over the size of the body: so that similar bodies are equal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Modes of a shape by ascending frequency; those of one frequency are one.
+    """Modes of a shape by ascending frequency; modes of equal frequency are one.
 
     Attributes:
         wave_number: ω L/c with c = √(E/ρ) and the length L of the longest side of the bounding box.
         multiplicity: Number of modes that are one.
         gain: Gain times the body's mass: see `loudness.py`.
         volume: The body's, over L³.
-        pos: Points of the surface, from the middle of the bounding box and over L.
-        share: How strongly each mode is struck at them, over its root mean square over the surface.
         unknowns: Size of the eigenproblem.
         axes: The grid's axes, as rows, of the body's.
         owner: The group that each field of the mode shapes belongs to, see `loudness.py`.
@@ -70,8 +68,6 @@ class Spectrum:
     multiplicity: Int[np.ndarray, " group"]
     gain: Float[np.ndarray, " group"]
     volume: float
-    pos: Float[np.ndarray, "point 3"]
-    share: Float[np.ndarray, "point group"]
     unknowns: int
     axes: Float[np.ndarray, "3 3"]
     owner: Int[np.ndarray, " field"]
@@ -87,7 +83,7 @@ def spectrum(
         surface: Triangles around the body [m].
         poissons_ratio: Less than 1/2.
         count: Most modes of distinct frequency.
-        unknowns: Number of unknowns that the cells are made small for; default: `UNKNOWNS`.
+        unknowns: Target number of unknowns; default: `UNKNOWNS`.
         progress: Called with a line of text for each long job.
 
     Raises:
@@ -125,19 +121,17 @@ def _computed(
     normal = np.einsum("xim,xi->xm", displacement, crossings.normal)
     volume = float(elements.filled.volume.sum())
     heard = loudness(result.wave_number, normal, crossings.area, volume)
-    kept, at = slice(None, count), picked(crossings)
-    wanted = heard.owner < count
+    first = slice(None, count)
+    in_count = heard.owner < count
     return Spectrum(
-        wave_number=_rounded(heard.wave_number[kept]),
-        multiplicity=heard.multiplicity[kept],
-        gain=_rounded(heard.gain[kept]),
+        wave_number=_rounded(heard.wave_number[first]),
+        multiplicity=heard.multiplicity[first],
+        gain=_rounded(heard.gain[first]),
         volume=volume,
-        pos=crossings.pos[at] @ turned,
-        share=np.round(heard.share(normal[at])[:, kept], 6),
         unknowns=3 * len(elements.pos),
         axes=turned,
-        owner=heard.owner[wanted],
-        grid=on_grid(elements, crossings, lines, result.shape @ heard.mixture[:, wanted]),
+        owner=heard.owner[in_count],
+        grid=on_grid(elements, crossings, lines, result.shape @ heard.mixture[:, in_count]),
     )
 
 
@@ -183,20 +177,20 @@ def _whole(elements: Elements, crossings: cells.Crossings) -> tuple[Elements, ce
         return elements, crossings
     volume = np.bincount(part, elements.filled.volume)
     if volume[0] < WHOLE * volume.sum():
-        shown = ", ".join(f"{share:.1%}" for share in volume[:4] / volume.sum())
-        raise refused(f"it is {len(volume)} parts that do not touch, of {shown} of its volume", "join its geoms")
-    kept = part == 0
-    row = np.cumsum(kept) - 1
-    own = elements.filled
-    filled = cells.Filled(own.index[kept], own.low[kept], own.size[kept], own.weight[kept])
-    on = kept[crossings.cell]
+        shares = ", ".join(f"{share:.1%}" for share in volume[:4] / volume.sum())
+        raise refused(f"it is {len(volume)} parts that do not touch, of {shares} of its volume", "join its geoms")
+    is_largest = part == 0
+    row = np.cumsum(is_largest) - 1
+    everything = elements.filled
+    filled = cells.Filled(*(getattr(everything, name)[is_largest] for name in ("index", "low", "size", "weight")))
+    on = is_largest[crossings.cell]
     one = cells.Crossings(row[crossings.cell[on]], crossings.pos[on], crossings.normal[on], crossings.area[on])
     return Elements.of(filled), one
 
 
-def _packed(found: Spectrum) -> Mapping[str, np.ndarray]:
-    own = {name: np.asarray(getattr(found, name)) for name in Spectrum.__dataclass_fields__ if name != "grid"}
-    return own | {f"grid_{name}": getattr(found.grid, name) for name in ShapeGrid.__dataclass_fields__}
+def _packed(result: Spectrum) -> Mapping[str, np.ndarray]:
+    arrays = {name: np.asarray(getattr(result, name)) for name in Spectrum.__dataclass_fields__ if name != "grid"}
+    return arrays | {f"grid_{name}": getattr(result.grid, name) for name in ShapeGrid.__dataclass_fields__}
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray]) -> Spectrum:

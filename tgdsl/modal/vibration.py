@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from tgdsl.modal.closed import refused
 
 SHIFT = -1e-3
-"""Shift of the eigenvalues: below all of them, so that what is factorised is positive definite."""
+"""Shift of the eigenvalues: below all of them, so that the factorised matrix is positive definite."""
 RIGID = 1e-7
 """Eigenvalue below which a mode is a rigid motion: rounding makes it 1e-11 to 1e-9, bending of a rod 1 : 1,000 is at 4e-5."""
 NUM_RIGID = 6
@@ -59,7 +59,7 @@ def vibration(stiffness: csc_array, mass: csc_array, count: int) -> Vibration:
     """
     diagonal = mass.diagonal()
     held = diagonal > FAINT * diagonal.max()
-    # Unit diagonal of what is factorised: unknowns of cells that are hardly filled then do not spoil the condition.
+    # Scaled to a unit diagonal, so that unknowns of hardly filled cells do not spoil the condition.
     scale = diags_array(1 / np.sqrt((stiffness.diagonal() - SHIFT * diagonal)[held]))
     inner_stiffness, inner_mass = (csc_array(scale @ matrix[held][:, held] @ scale) for matrix in (stiffness, mass))
     factor = splu(
@@ -90,18 +90,18 @@ def _lowest(mass: csc_array, solve: Solve, count: int) -> tuple[Float[np.ndarray
     block, _ = _orthonormal(np.random.default_rng(0).standard_normal((size, min(BLOCK, size))), mass)
     dim = 0
     while block.shape[1] and dim + block.shape[1] <= most:
-        own = slice(dim, dim + block.shape[1])
-        basis[:, own] = block
-        dim = own.stop
+        columns = slice(dim, dim + block.shape[1])
+        basis[:, columns] = block
+        dim = columns.stop
         new = solve(mass @ block)
         for _ in range(2):
             along = basis[:, :dim].T @ (mass @ new)
-            projected[:dim, own] += along
+            projected[:dim, columns] += along
             new -= basis[:, :dim] @ along
         block, rest = _orthonormal(new, mass)
         inverse, vector = np.linalg.eigh(projected[:dim, :dim], UPLO="U")
         inverse, vector = inverse[::-1][:count], vector[:, ::-1][:, :count]
-        error = np.linalg.norm(rest @ vector[own], axis=0)
+        error = np.linalg.norm(rest @ vector[columns], axis=0)
         if dim >= count and (error <= TOLERANCE * inverse).all():
             return SHIFT + 1 / inverse, basis[:, :dim] @ vector
     raise refused("the iteration for its modes does not converge", "repair the mesh")
@@ -110,6 +110,6 @@ def _lowest(mass: csc_array, solve: Solve, count: int) -> tuple[Float[np.ndarray
 def _orthonormal(vectors: np.ndarray, mass: csc_array) -> tuple[np.ndarray, np.ndarray]:
     """Return an orthonormal basis of some vectors, and them in it; what depends on the others is left out."""
     square, rotation = np.linalg.eigh(vectors.T @ (mass @ vectors))
-    kept = square > DEPENDENT * square.max(initial=0.0)
-    scale = np.sqrt(square[kept])
-    return vectors @ (rotation[:, kept] / scale), scale[:, None] * rotation[:, kept].T
+    is_independent = square > DEPENDENT * square.max(initial=0.0)
+    scale = np.sqrt(square[is_independent])
+    return vectors @ (rotation[:, is_independent] / scale), scale[:, None] * rotation[:, is_independent].T

@@ -19,8 +19,8 @@ from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Quantity
-from tgdsl.sensors.noise.fields import quantity
-from tgdsl.sensors.noise.stages import stages_of
+from tgdsl.sensors.noise.pipeline import stages_of
+from tgdsl.sensors.noise.spec import quantity
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.torch_internals import TorchDispatchMode
 
@@ -219,7 +219,7 @@ def _noise(touch: Explained, sensor: PlannedSensor) -> list[str]:
                 label = "stuck at " if name == "dead_low" and "dead_high" not in constants else number.label
                 amount = _amplitudes(sensor, value) if number.unit is None else _value(value[..., 0, :]) + number.unit
                 stage_lines[name] = label + amount
-        parts = stage_lines.items() if len(stage.terms) > 1 else [(stage.name, ", ".join(stage_lines.values()))]
+        parts = stage_lines.items() if stage.is_split else [(stage.name, ", ".join(stage_lines.values()))]
         lines += [f"{term} {part}" for term, part in parts]
     return lines
 

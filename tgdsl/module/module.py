@@ -31,7 +31,7 @@ from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.known import kinds_by_sensor, quantities_of
-from tgdsl.sensors.noise.stages import stages_of
+from tgdsl.sensors.noise.pipeline import stages_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype
 from tgdsl.tensors.env_ids import EnvIds, env_mask

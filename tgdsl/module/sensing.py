@@ -25,12 +25,10 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity, Scene
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
-from tgdsl.sensors.base import UNTIMED, Context, Kind
-from tgdsl.sensors.noise.gain import GAIN
-from tgdsl.sensors.noise.radius import RADIUS
-from tgdsl.sensors.noise.release import RELEASE
-from tgdsl.sensors.noise.stage import NO_CLOCK, Now
-from tgdsl.sensors.noise.stages import AnyStage, Drawn, disturb, draw
+from tgdsl.sensors.base import UNTIMED, Context, Kind, state_by_name
+from tgdsl.sensors.noise.pipeline import StageType, disturb, draw
+from tgdsl.sensors.noise.stage import NO_CLOCK, Now, Stage
+from tgdsl.sensors.noise.stages import Gain, Radius, Release
 from tgdsl.sensors.upstream import Upstream
 from tgdsl.tensors.fusion import materialised
 
@@ -78,16 +76,16 @@ def scene_of(
     own: Tree,
     tensors: Mapping[str, Tensor],
     nows: Mapping[str, Now],
-    drawn: Mapping[str, Drawn],
+    noise: Mapping[str, Sequence[Stage]],
     dtype: torch.dtype,
 ) -> Scene:
-    """Return what quantities are gathered from; drawn values of noise may disturb the taxels' radii."""
+    """Return what quantities are gathered from; stages of noise may disturb the taxels' radii."""
     shifts = {}
     for sensor in plan.sensors:
-        if sensor.noise is not None and RADIUS.name in sensor.noise.terms:
-            values = drawn[sensor.name][RADIUS.name]
-            probes = values.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
-            shifts[sensor.name] = RADIUS.shift(values, nows[sensor.name], probes)
+        for stage in noise.get(sensor.name, ()):
+            if isinstance(stage, Radius):
+                probes = stage.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
+                shifts[sensor.name] = stage.shift(nows[sensor.name], probes)
     return Scene(tensors, plan.objects, _pairs(own["pairs"], tensors, dtype) if plan.objects else None, shifts, dtype)
 
 
@@ -142,8 +140,7 @@ def read(
     gathered: Gathered,
     context: Context,
     constants: Any,
-    stages: Sequence[AnyStage],
-    drawn: Drawn,
+    stages: Sequence[Stage],
     memory: Mapping[str, Tensor],
     now: Now,
     joined: Float[Tensor, "env channel row"] | None = None,
@@ -153,15 +150,17 @@ def read(
     Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
     fuses then has the equation write all channels side by side, and would else form them again for each number of the noise.
     """
-    if GAIN in stages and kind.gains_depth:
-        felt, gains = gathered[ContactDepth], drawn[GAIN.name]
-        gathered = gathered.replaced(ContactDepth, felt._replace(depth=GAIN.of_taxels(gains, now, felt.depth) * felt.depth))
-        stages = [stage for stage in stages if stage is not GAIN]
+    gain = next((stage for stage in stages if isinstance(stage, Gain)), None)
+    if gain is not None and kind.gains_depth:
+        felt = gathered[ContactDepth]
+        gathered = gathered.replaced(ContactDepth, felt._replace(depth=gain.of_taxels(now, felt.depth) * felt.depth))
+        stages = [stage for stage in stages if stage is not gain]
+    released = {stage.name: stage.release_threshold[:, 0] for stage in stages if isinstance(stage, Release)}
     state, path = _kind_state(sensor, memory), f"{sensor.name}:"
     result, new = ({}, {}) if joined is not None else _answer(sensor, kind, gathered, context, constants, state)
     new = {path + name: value for name, value in new.items()}
     signal = clean = _stacked(result, "signal", sensor.signal) if joined is None else joined
-    signal, noted = disturb(signal, stages, drawn, f"{path}noise/", memory, now)
+    signal, noted = disturb(signal, stages, f"{path}noise/", memory, now)
     new |= noted
     signal_readings = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
     readings: Tensors = {} if sensor.noise is None else {f"{sensor.name}/signal": clean}
@@ -170,12 +169,11 @@ def read(
             planes_now = torch.where(now.is_sample[..., None], planes_now, memory[f"{path}sample/{which}"])
             new[f"{path}sample/{which}"] = planes_now
         if kind.decide is not None:
-            released = {"release_threshold": drawn[RELEASE.name].release_threshold[:, 0]} if RELEASE in stages else {}
             planes = dict(zip(sensor.signal, planes_now.unbind(1), strict=True))
             own_constants = {**constants, **released} if kind.constants is None else replace(constants, **released)
-            planes, decided = kind.decide(planes, own_constants, state)
+            planes, decided = kind.decide(planes, own_constants, kind.typed_state(state))
             planes_now = torch.stack([planes[name] for name in reading.channels], dim=1)
-            new |= {path + name: value for name, value in decided.items()}
+            new |= {path + name: value for name, value in state_by_name(decided).items()}
         readings[reading.name] = planes_now.transpose(1, 2)
     for reading in sensor.readings[len(signal_readings) :]:
         report = reading.name.rpartition("/")[2]
@@ -217,18 +215,19 @@ def _answer(
     Raises:
         TgdslError: If it is not what the kind said when it was lowered.
     """
-    answer = kind.forward(gathered, context, constants, state)
+    answer = kind.forward(gathered, context, constants, kind.typed_state(state))
     if not torch.compiler.is_compiling():
-        _check_answer(sensor, answer, state)
+        _check_answer(sensor, kind, answer, state)
     result, new = answer
-    return dict(result), dict(new)
+    return dict(result), state_by_name(new)
 
 
-def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None:
+def _check_answer(sensor: PlannedSensor, kind: Kind, answer: Any, state: Tensors) -> None:
     where = f'sensor "{sensor.name}": `forward` of the kind "{sensor.kind}" returns'
-    if not (isinstance(answer, tuple) and len(answer) == 2 and all(isinstance(part, Mapping) for part in answer)):
+    is_pair = isinstance(answer, tuple) and len(answer) == 2
+    if not (is_pair and isinstance(answer[0], Mapping) and isinstance(answer[1], kind.state or Mapping)):
         raise TgdslError(f"{where} {type(answer).__name__}, expected planes by channel, and the new state by name")
-    outputs, new = answer
+    outputs, new = answer[0], state_by_name(answer[1])
     if missing := [name for name in sensor.provides if name not in outputs]:
         raise TgdslError(f"{where} {listed(list(outputs)) or 'nothing'}, without {missing[0]}, which the kind provides")
     if missing := [name for name in sensor.signal if name not in outputs and "signal" not in outputs]:
@@ -278,7 +277,7 @@ class Sensing(NamedTuple):
     plan: Plan
     kinds: Mapping[str, Kind]
     quantities: tuple[Quantity, ...]
-    stages: Mapping[str, Sequence[AnyStage]]
+    stages: Mapping[str, Sequence[StageType]]
     clock: Clock
     order: tuple[PlannedSensor, ...]
 
@@ -312,9 +311,9 @@ def sense(
     """
     plan, dt = sensing.plan, tensors.get("dt")
     nows = sensing.clock.nows(memory, dt)
-    drawn = {name: draw(sensing.stages[name], constants, nows.get(name, NO_CLOCK)) for name, constants in own["noise"].items()}
-    gathered = _gathered(sensing, own, tensors, nows, drawn, dtype)
-    earlier = [_gathered(sensing, own, part, nows, drawn, dtype) for part in _substeps(plan, tensors)]
+    noise = {name: draw(sensing.stages[name], constants, nows.get(name, NO_CLOCK)) for name, constants in own["noise"].items()}
+    gathered = _gathered(sensing, own, tensors, nows, noise, dtype)
+    earlier = [_gathered(sensing, own, part, nows, noise, dtype) for part in _substeps(plan, tensors)]
     readings: Tensors = {}
     joined: dict[tuple[str, ...], Tensor] = {}
     answers: dict[str, list[Tensors]] = {}
@@ -333,9 +332,8 @@ def sense(
                     joined[sensor.joined] = _joined(sensing, own, sensor, gathered[sensor.name])
                 signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
             context = sensing.clock.context(sensor, memory, dt)
-            noise = sensing.stages[sensor.name], drawn.get(sensor.name, {})
-            now = nows.get(sensor.name, NO_CLOCK)
-            outputs, new, answer = read(sensor, kind, inputs, context, constants, *noise, memory, now, signal)
+            now, stages = nows.get(sensor.name, NO_CLOCK), noise.get(sensor.name, ())
+            outputs, new, answer = read(sensor, kind, inputs, context, constants, stages, memory, now, signal)
             answered = [answer]
         if sensor.provides:
             answers[sensor.name] = answered
@@ -357,10 +355,10 @@ def _gathered(
     own: Tree,
     tensors: Mapping[str, Tensor],
     nows: Mapping[str, Now],
-    drawn: Mapping[str, Drawn],
+    noise: Mapping[str, Sequence[Stage]],
     dtype: torch.dtype,
 ) -> dict[str, Gathered]:
-    scene = scene_of(sensing.plan, own, tensors, nows, drawn, dtype)
+    scene = scene_of(sensing.plan, own, tensors, nows, noise, dtype)
     values = gather(sensing.quantities, own, scene)
     return {sensor.name: gathered_of(sensor, sensing.quantities, values) for sensor in sensing.plan.sensors}
 

@@ -68,8 +68,8 @@ class PlannedNoise(Generic[Array]):
     """The imperfections of a sensor.
 
     Attributes:
-        terms: The stages there are, in their order, see `sensors.noise.stages`.
-        constants: Values that they read, ([end,] channel, row), see `sensors.noise.lower`.
+        terms: The stages there are, in their order, see `sensors.noise.pipeline`.
+        constants: Values that they read, ([end,] channel, row), see `sensors.noise.pipeline`.
         streams: What random numbers are drawn for, see `sensors.noise.random`.
     """
 

@@ -16,8 +16,8 @@ from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.base import AnySensorSpec, ProbeSpec
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise import NoiseSpec
+from tgdsl.sensors.noise.pipeline import more_knobs
 from tgdsl.sensors.noise.spec import noise_model
-from tgdsl.sensors.noise.stages import AnyStage, more_stages
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 
@@ -66,14 +66,14 @@ class Spec(SpecModel):
 
 def document_model(kinds: tuple[Kind, ...] = KINDS, needs_sensors: bool = True) -> type[Spec]:
     """Return the document model whose sensors are of the given kinds, with the knobs of all known stages of noise."""
-    return _document_model(kinds, needs_sensors, more_stages())
+    return _document_model(kinds, needs_sensors, more_knobs())
 
 
 @cache
-def _document_model(kinds: tuple[Kind, ...], needs_sensors: bool, stages: tuple[AnyStage, ...]) -> type[Spec]:
-    noise: Any = noise_model(stages)
+def _document_model(kinds: tuple[Kind, ...], needs_sensors: bool, knobs: tuple[type[SpecModel], ...]) -> type[Spec]:
+    noise: Any = noise_model(knobs)
     specs = tuple(kind.spec for kind in kinds)
-    if stages:
+    if knobs:
         field: Any = Annotated[Text | Annotated[noise, Tag("other")], TEXT_OR_OTHER]
         about = AnySensorSpec.model_fields["noise"]
         described = Field(default=about.default, description=about.description)

@@ -8,7 +8,7 @@ from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
-from tgdsl.sensors.noise.stages import knobs_of
+from tgdsl.sensors.noise.pipeline import knobs_of
 
 
 def reference_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:

@@ -10,25 +10,26 @@ friction has the spectral density (β_fric ω)² [Pa²/Hz] whatever that rate, a
 slides ω is in m/s and τ in N.
 
 - Within a step ω and ℓ are linear between the values at its ends, so that nothing jumps; φ is the exact integral of ω and goes
-  on from step to step, backwards where the joint turns back: the pitch is that of |ω|.
+  on from step to step, backwards where the joint turns back, so the pitch follows |ω|.
 - w fades a multiple out between 0.40 and 0.45 of the sample rate, so that none is aliased, and in up to 20 Hz: a joint that
   stands under load makes no steady pressure.
-- At the first call after a reset φ = 0, and velocity and load have been what they are.
+- At the first call after a reset φ = 0, and velocity and load are taken as constant before it.
 
 A sample k = 1 … K is at the time t + kΔt/K of a step that begins at t; the last one is at its end.
 
 Source: the paper, appendix on audio, "Actuation audio". Departures: φ is integrated and levels are linear within a step; the
-paper says neither, nor what becomes of multiples that the rate does not hold. It makes all three of two-pole resonators, whose
-phase is lost as they are retuned.
+paper specifies neither, nor multiples above the sample rate. It makes all three of two-pole resonators, which lose their phase
+when they are retuned.
 
-Limits: strengths are no motor's: they are to be measured. Harmonics alone are modelled, neither side bands nor resonances of
-the housing, and sound comes from the joint's anchor.
+Limits: the default strengths are of no real motor; measure them. Harmonics are modelled, side bands and resonances of the
+housing are not. Sound comes from the joint's anchor.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -43,9 +44,9 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.kinematics import Joints
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
+    Array,
     Axis,
     Channel,
-    Constants,
     Context,
     Kind,
     Lowered,
@@ -53,7 +54,6 @@ from tgdsl.sensors.base import (
     OnJointsSpec,
     ReferenceContext,
     ReferenceState,
-    State,
     SurfaceOf,
     scalar,
 )
@@ -111,46 +111,73 @@ class ActuationAudioSpec(OnJointsSpec):
 def reference(
     spec: ActuationAudioSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return s (sample, joint, 1) [Pa], what is remembered, and what is heard of it elsewhere."""
+    """Return s (sample, joint, 1) [Pa], the new state, and the planes for microphones."""
     drive, num = gathered[Joints], spec.samples
     now = np.array([drive.velocity, spec.load * np.abs(drive.effort) + spec.power * np.abs(drive.effort * drive.velocity)])
-    before = now if context.is_first else np.array([state["velocity"], state["level"]])
+    start = now if context.is_first else np.array([state["velocity"], state["level"]])
     phase, hum = (0.0 * now[0], np.zeros(1)) if context.is_first else (state["phase"], state["hum"])
     noise, rate, (whole, none) = noise_of(context, num, len(layout.links)), num / context.dt, fade_band()
-    made = np.zeros((num, len(layout.links)))
+    sound = np.zeros((num, len(layout.links)))
     for k in range(1, num + 1):
         time = k / num * context.dt
-        velocity, level = before + k / num * (now - before)
-        angle = phase + 2 * np.pi * spec.pitch * (before[0] * time + (now[0] - before[0]) / context.dt * time**2 / 2)
+        velocity, level = start + k / num * (now - start)
+        angle = phase + 2 * np.pi * spec.pitch * (start[0] * time + (now[0] - start[0]) / context.dt * time**2 / 2)
         for h, strength in enumerate(spec.partials, start=1):
             pitch = h * spec.pitch * np.abs(velocity)
             fade = np.clip((none - pitch / rate) / (none - whole), 0, 1) * np.clip(pitch / audible(), 0, 1)
-            made[k - 1] += level * strength * fade * np.sin(h * angle)
-        made[k - 1] += spec.friction * np.abs(velocity) * math.sqrt(rate / 2) * noise[k - 1]
-        made[k - 1] += spec.hum * np.sin(hum + 2 * np.pi * spec.hum_frequency * time)
-    turned = phase + 2 * np.pi * spec.pitch * context.dt * (now[0] + before[0]) / 2
+            sound[k - 1] += level * strength * fade * np.sin(h * angle)
+        sound[k - 1] += spec.friction * np.abs(velocity) * math.sqrt(rate / 2) * noise[k - 1]
+        sound[k - 1] += spec.hum * np.sin(hum + 2 * np.pi * spec.hum_frequency * time)
+    turned = phase + 2 * np.pi * spec.pitch * context.dt * (now[0] + start[0]) / 2
     hummed = hum + 2 * np.pi * spec.hum_frequency * context.dt
     after = {"velocity": now[0], "level": now[1], "phase": turned, "hum": hummed}
-    return made[:, :, None], after, {SAMPLES: made, PLACE: drive.place.T}
+    return sound[:, :, None], after, {SAMPLES: sound, PLACE: drive.place.T}
 
 
 def noise_of(context: ReferenceContext, num_samples: int, num_rows: int) -> Float[np.ndarray, "sample row"]:
-    """Return n: of each word two numbers, for a sample and the one after it."""
+    """Return n: two numbers per random word, for a sample and the next one."""
     count = (num_samples + 1) // 2
     pairs = normal_pair(context.words(np.arange(count * num_rows, dtype=np.uint64)))
     return np.stack([part.reshape(count, num_rows) for part in pairs], axis=1).reshape(-1, num_rows)[:num_samples]
 
 
+@dataclass(frozen=True, eq=False)
+class ActuationAudioConstants(Generic[Array]):
+    """Parameters; None of parts that make no sound. `share` is k/K of each sample."""
+
+    share: Array
+    pitch: Array
+    load: Array | None = None
+    power: Array | None = None
+    partials: Array | None = None
+    friction: Array | None = None
+    hum: Array | None = None
+    hum_frequency: Array | None = None
+
+
+class ActuationAudioState(NamedTuple):
+    """ω and ℓ at the end of the last step; φ; and φ_hum, (env, 1)."""
+
+    velocity: Tensor
+    level: Tensor
+    phase: Tensor
+    hum: Tensor
+
+
 def lower(spec: ActuationAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """A row for each joint; parts that make no sound are left out."""
     joints, num = [link.name for link in layout.links], spec.samples
-    constants = {"share": np.arange(1, num + 1) / num, "pitch": scalar(spec.pitch)}
-    if spec.load or spec.power:
-        constants |= {"load": scalar(spec.load), "power": scalar(spec.power), "partials": np.array(spec.partials)}
-    if spec.friction:
-        constants["friction"] = scalar(spec.friction)
-    if spec.hum:
-        constants |= {"hum": scalar(spec.hum), "hum_frequency": scalar(spec.hum_frequency)}
+    has_whine = bool(spec.load or spec.power)
+    constants = ActuationAudioConstants(
+        share=np.arange(1, num + 1) / num,
+        pitch=scalar(spec.pitch),
+        load=scalar(spec.load) if has_whine else None,
+        power=scalar(spec.power) if has_whine else None,
+        partials=np.array(spec.partials) if has_whine else None,
+        friction=scalar(spec.friction) if spec.friction else None,
+        hum=scalar(spec.hum) if spec.hum else None,
+        hum_frequency=scalar(spec.hum_frequency) if spec.hum else None,
+    )
     rows = Axis("joint", len(joints), {"joint": joints, "body": [link.body for link in layout.links]}, np.arange(len(joints)))
     return Lowered(
         channels=(Channel("sound", "Pa"),),
@@ -165,44 +192,49 @@ def lower(spec: ActuationAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
     )
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return s (env, sample, 1, joint) [Pa], and what others hear of it."""
+def forward(
+    gathered: Gathered, context: Context, constants: ActuationAudioConstants[Tensor], state: ActuationAudioState
+) -> tuple[dict[str, Tensor], ActuationAudioState]:
+    """Return s (env, sample, 1, joint) [Pa] with the planes for microphones, and the new state."""
     drive, is_first = gathered[Joints], context.is_first
-    share, dt = constants["share"][:, None], context.dt
-    velocity, begun = drive.velocity, torch.where(is_first, drive.velocity, state["velocity"])
+    share, dt = constants.share[:, None], context.dt
+    velocity, begun = drive.velocity, torch.where(is_first, drive.velocity, state.velocity)
     swept = begun[:, None] * share + 0.5 * (velocity - begun)[:, None] * share * share
-    phase = torch.where(is_first, 0.0, state["phase"])
-    angle = phase[:, None] + 2 * pi() * constants["pitch"] * dt * swept
+    phase = torch.where(is_first, 0.0, state.phase)
+    angle = phase[:, None] + 2 * pi() * constants.pitch * dt * swept
     speed = (begun[:, None] + share * (velocity - begun)[:, None]).abs()
     rate = share.shape[0] / dt
-    made, level = torch.zeros_like(speed), torch.zeros_like(velocity)
-    if "load" in constants:
-        level = constants["load"] * drive.effort.abs() + constants["power"] * (drive.effort * velocity).abs()
-        before = torch.where(is_first, level, state["level"])[:, None]
-        made = (before + share * (level[:, None] - before)) * _partials(angle, speed, rate, constants)
-    if "friction" in constants:
-        made = made + constants["friction"] * speed * torch.sqrt(0.5 * rate) * _noise(context, speed)
-    hum = torch.where(is_first, 0.0, state["hum"])
-    if "hum" in constants:
-        step = 2 * pi() * constants["hum_frequency"] * dt
-        made = made + constants["hum"] * torch.sin(hum[:, None] + step * share)
+    sound, level = torch.zeros_like(speed), torch.zeros_like(velocity)
+    if constants.load is not None and constants.power is not None and constants.partials is not None:
+        level = constants.load * drive.effort.abs() + constants.power * (drive.effort * velocity).abs()
+        start = torch.where(is_first, level, state.level)[:, None]
+        whine = _whine(angle, speed, rate, constants.pitch, constants.partials)
+        sound = (start + share * (level[:, None] - start)) * whine
+    if constants.friction is not None:
+        sound = sound + constants.friction * speed * torch.sqrt(0.5 * rate) * _noise(context, speed)
+    hum = torch.where(is_first, 0.0, state.hum)
+    if constants.hum is not None and constants.hum_frequency is not None:
+        step = 2 * pi() * constants.hum_frequency * dt
+        sound = sound + constants.hum * torch.sin(hum[:, None] + step * share)
         hum = _wrapped(hum + step)
-    after = {"velocity": velocity, "level": level, "phase": _wrapped(angle[:, -1]), "hum": hum}
-    return {"signal": made[:, :, None], SAMPLES: made, PLACE: torch.stack(drive.place, dim=1)}, after
+    new = ActuationAudioState(velocity, level, _wrapped(angle[:, -1]), hum)
+    return {"signal": sound[:, :, None], SAMPLES: sound, PLACE: torch.stack(drive.place, dim=1)}, new
 
 
-def _partials(angle: Tensor, speed: Tensor, rate: Tensor, constants: Constants) -> Float[Tensor, "env sample joint"]:
+def _whine(
+    angle: Tensor, speed: Tensor, rate: Tensor, pitch_ratio: Tensor, partials: Tensor
+) -> Float[Tensor, "env sample joint"]:
     """Return the sum of the whine's multiples, for a level of 1."""
     whine, (whole, none) = torch.zeros_like(angle), fade_band()
-    for h, strength in enumerate(constants["partials"].unbind(), start=1):
-        pitch = h * constants["pitch"] * speed
+    for h, strength in enumerate(partials.unbind(), start=1):
+        pitch = h * pitch_ratio * speed
         fade = ((none - pitch / rate) / (none - whole)).clamp(0.0, 1.0) * (pitch / audible()).clamp(0.0, 1.0)
         whine = whine + strength * fade * torch.sin(h * angle)
     return whine
 
 
 def _noise(context: Context, like: Float[Tensor, "env sample joint"]) -> Float[Tensor, "env sample joint"]:
-    """Return normal numbers, of each word two, for a sample and the one after it."""
+    """Return normal numbers, two per random word, for a sample and the next one."""
     _, num_samples, num_rows = like.shape
     count = (num_samples + 1) // 2
     assert context.stream is not None
@@ -212,7 +244,7 @@ def _noise(context: Context, like: Float[Tensor, "env sample joint"]) -> Float[T
 
 
 def _wrapped(angle: Tensor) -> Tensor:
-    """Return an angle within a turn, so that single precision does not lose it."""
+    """Return an angle within a turn, so that it keeps its precision in float32."""
     return angle - 2 * pi() * torch.round(angle / (2 * pi()))
 
 
@@ -225,4 +257,6 @@ ACTUATION_AUDIO = Kind(
     is_timed=True,
     is_random=True,
     provides=SOUND,
+    constants=ActuationAudioConstants,
+    state=ActuationAudioState,
 )

@@ -23,6 +23,7 @@ from tgdsl.fields.accuracy import AccuracyField
 from tgdsl.fields.history import History
 from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
 from tgdsl.fields.regions import RegionPart
+from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered, Quantity, Request
 from tgdsl.sensors.noise import BASE, NoiseField
@@ -32,7 +33,7 @@ from tgdsl.surfaces.surface import Surface
 
 
 class AnySensorSpec(SpecModel):
-    """What every kind of sensor has, wherever it is. A kind's own spec adds `kind: Literal["its_name"]` and its parameters."""
+    """Fields of every kind. A kind's spec adds `kind: Literal["its_name"]` and its parameters."""
 
     noise: NoiseField = "clean"
     """A noise profile's name, or the knobs in line."""
@@ -49,7 +50,7 @@ class AnySensorSpec(SpecModel):
     is_on_taxels: ClassVar[bool] = True
     """Whether `links` chooses among the links that the layout gives taxels; else among all bodies of the robot."""
     needs_taxels: ClassVar[bool] = True
-    """Whether it reads its taxels. One that does not may be in a document without a layout, on any of the robot's bodies."""
+    """Whether it reads its taxels. A kind that does not works without a layout, on any body of the robot."""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -75,7 +76,7 @@ class SensorSpec(AnySensorSpec):
 
 
 class OnJointsSpec(AnySensorSpec):
-    """A sensor that has a place on each of some joints; its layout's links are called as these are, on the bodies they move."""
+    """A sensor on joints: its layout has a link for each joint, with the joint's name, on the body that the joint moves."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Names or shell wildcards of hinges and slides; default: the robot's actuated joints, in the order of the actuators."""
@@ -84,7 +85,7 @@ class OnJointsSpec(AnySensorSpec):
 
 
 class LinkSpec(SensorSpec):
-    """A sensor that has a place on each link, whether the link has taxels or not."""
+    """A sensor on links, with or without taxels."""
 
     is_on_taxels: ClassVar[bool] = False
     needs_taxels: ClassVar[bool] = False
@@ -103,7 +104,7 @@ class ProbeSpec(SensorSpec):
 
 
 class ContactProbeSpec(ProbeSpec):
-    """Probes that feel what their link touches."""
+    """Probes that feel objects in contact with their link."""
 
     gate: Literal["contact_pair", "geometric"] = "contact_pair"
     """When an object is felt: `contact_pair` only while the simulator has it in contact with the taxel's link (the paper);
@@ -117,10 +118,20 @@ class ContactProbeSpec(ProbeSpec):
 
 @dataclass(frozen=True)
 class Channel:
-    """One number per taxel: its name and unit."""
+    """A number per row of a reading: its name and unit."""
 
     name: str
     unit: str
+
+
+def vector(name: str, unit: str) -> tuple[Channel, ...]:
+    """Return the channels of a vector's components."""
+    return tuple(Channel(f"{name}_{axis}", unit) for axis in "xyz")
+
+
+def components(name: str, planes: Vec) -> dict[str, Tensor]:
+    """Return a vector's planes by its channels."""
+    return {f"{name}_{axis}": plane for axis, plane in zip("xyz", planes, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -128,9 +139,9 @@ class Memory:
     """A tensor (env, *shape) that is carried from one call to the next.
 
     Attributes:
-        rest: Its value at rest.
-        shape: Its shape; None: (row,) of the kind's own reading; a type of request: as many rows as its value has.
-        overwritten: Whether a kernel may write the new state over the old; it is then left out of what `forward` returns.
+        rest: Its value after a reset.
+        shape: Its shape; None: (row,) of the reading; a type of request: the rows of that quantity's value.
+        overwritten: Whether a kernel may overwrite it in place; `forward` then returns no new value.
     """
 
     rest: float = 0.0
@@ -140,13 +151,13 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """What the rows of a reading are.
+    """The rows of a reading.
 
     Attributes:
-        name: What one is called: "taxel", "body", "voxel", "sample", …
-        size: How many there are.
-        table: Columns of a table for users, a row for each: texts, or arrays (row, …).
-        link_id: Which of the layout's links each row is on, for noise that differs between links; None: they are on none.
+        name: Noun for a row: "taxel", "body", "voxel", "sample", …
+        size: Number of rows.
+        table: Columns of a table for users: texts, or arrays (row, …).
+        link_id: The layout's link of each row, for noise that differs between links; None: rows are on no link.
     """
 
     name: str
@@ -166,32 +177,43 @@ def body_axis(layout: Layout) -> Axis:
     return Axis("body", len(layout.bodies), {"body": layout.bodies}, np.array(first, dtype=np.int64))
 
 
+def _named(constants: Any, path: str = "") -> dict[str, Any]:
+    """Return the arrays of dataclasses, mappings and tuples by their paths, without those that are None."""
+    if dataclasses.is_dataclass(constants):
+        constants = {part.name: getattr(constants, part.name) for part in dataclasses.fields(constants)}
+    elif isinstance(constants, tuple):
+        constants = {str(i): part for i, part in enumerate(constants)}
+    if not isinstance(constants, Mapping):
+        return {} if constants is None else {path: constants}
+    parts = [_named(part, f"{path}/{name}" if path else name) for name, part in constants.items()]
+    return {name: array for part in parts for name, array in part.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Lowered:
     """A sensor, ready to be planned.
 
     Attributes:
-        channels: What the sensor's own reading holds, in order.
-        constants: Arrays that `forward` gets as tensors.
-        state: What is carried from one call to the next.
-        requests: What is asked of the scene, at most one of each type.
-        rows: What the reading has one row of; None: of each taxel, or of each body if the kind is not on taxels.
-        reports: Further readings: `<sensor>/<name>` holds these channels, with a row per body.
-        report_rows: What the rows of a report are, where they are not bodies.
-        notes: What an account of the sensor says of its parameters, line by line.
-        signal: What `forward` returns, if the kind decides: what noise acts on.
-        substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
-            or of so many times `samples`. 0: it is called once per call, with the state of the last one.
-        samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
-        provides: Planes that `forward` returns for other sensors to read, of those of `Kind.provides`.
-        sound: Samples of sound that it provides at each call of `forward`; 0: none, see `sensors.upstream`.
-        upstream: What it asks of other sensors: `forward` gets it as `gathered[Upstream]`, see `sensors.upstream`.
-        timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
-            between calls is another one, a warning says so.
+        channels: Channels of the sensor's reading, in order.
+        constants: Arrays that `forward` gets as tensors: a mapping, or a dataclass, which becomes a mapping by path.
+        state: Tensors carried from one call to the next.
+        requests: Requests to the scene, at most one of each type.
+        rows: Rows of the reading; None: taxels, or bodies if the kind is not on taxels.
+        reports: Further readings `<sensor>/<name>` with these channels and a row per body.
+        report_rows: Rows of a report, where they are not bodies.
+        notes: Lines about its parameters for `explain`.
+        signal: Channels that `forward` returns and noise disturbs, if the kind has `decide`.
+        substeps: Number of physics steps per call. `forward` is called at each, and the reading is a block of this many
+            samples, times `samples`. 0: `forward` is called once per call, with the state of the last physics step.
+        samples: Samples that `forward` returns at once, as "signal" (env, sample, channel, row); 0: a single reading.
+        provides: Planes that `forward` returns for other sensors, among `Kind.provides`.
+        sound: Samples of sound per call of `forward`, see `sensors.upstream`; 0: none.
+        upstream: Request to other sensors: `forward` gets `gathered[Upstream]`, see `sensors.upstream`.
+        timestep: Time between calls of `forward` that the constants are for [s]; another one is warned of. 0: any.
     """
 
     channels: tuple[Channel, ...]
-    constants: Mapping[str, np.ndarray] = field(default_factory=dict)
+    constants: Any = field(default_factory=dict)
     state: Mapping[str, Memory] = field(default_factory=dict)
     requests: tuple[Request, ...] = ()
     rows: Axis | None = None
@@ -206,20 +228,24 @@ class Lowered:
     sound: int = 0
     upstream: Upstream | None = None
 
+    def __post_init__(self) -> None:
+        """Name the constants."""
+        object.__setattr__(self, "constants", _named(self.constants))
+
 
 class ReadSensor(NamedTuple):
-    """A sensor that another one reads: what its kind made of it, and what it has rows of."""
+    """A sensor that another one reads, lowered, and its rows."""
 
     lowered: Lowered
     rows: Axis
 
 
 class Fitting(NamedTuple):
-    """What is known once all that a sensor reads is lowered.
+    """What `Kind.fit` gets, after the sensors that a sensor reads were lowered.
 
     Attributes:
-        timestep: Time of a physics step of the scene [s].
-        upstream: The sensors that it reads, by their names, in order.
+        timestep: Physics time step of the scene [s].
+        upstream: The sensors that it reads by name, in order.
     """
 
     timestep: float
@@ -227,15 +253,15 @@ class Fitting(NamedTuple):
 
 
 class Context(NamedTuple):
-    """When a kind is called. Only a kind that `is_timed` may look: to others it is `UNTIMED`, which holds nothing.
+    """When `forward` is called. A kind without `is_timed` gets `UNTIMED`, whose fields are None.
 
     Attributes:
-        dt: Time since the last call, or the last substep [s], a scalar.
+        dt: Time since the last call or substep [s], a scalar.
         step: Number of this call of each environment, (env, 1).
-        substep: Which substep of the call this is, from 0.
+        substep: Index of the substep within the call.
         time: Time since each environment's reset [s], (env, 1); 0 at the first call after it.
-        is_first: Whether it is the first call after each environment's reset, (env, 1).
-        stream: Random words of this call, or this substep, of a kind that `is_random`: see `noise.random`.
+        is_first: Whether this is the first call after each environment's reset, (env, 1).
+        stream: Random words of this call or substep, for a kind with `is_random`: see `noise.random`.
     """
 
     dt: Tensor
@@ -247,7 +273,7 @@ class Context(NamedTuple):
 
 
 UNTIMED = Context(*[None] * 5)  # type: ignore[arg-type]
-"""What a kind gets that does not want to know the time."""
+"""The context of a kind without `is_timed`."""
 
 
 class ReferenceContext(NamedTuple):
@@ -259,7 +285,7 @@ class ReferenceContext(NamedTuple):
     time: float
     is_first: bool
     words: Callable[[UInt64[np.ndarray, "*word"]], UInt64[np.ndarray, "*word"]]
-    """Returns the random words of this call, or this substep, by their numbers: those of `Context.stream`."""
+    """Returns random words of `Context.stream` by their numbers."""
 
 
 @runtime_checkable
@@ -276,7 +302,7 @@ class SurfaceOf(Protocol):
 
     @property
     def progress(self) -> Progress:
-        """Is told what is done with them, where that takes long."""
+        """Receives messages during long jobs."""
         ...
 
 
@@ -287,21 +313,19 @@ Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
 Planes = Mapping[str, Tensor]
-Kept = dict[str, np.ndarray]
-ReferenceAnswer = tuple[np.ndarray, Kept] | tuple[np.ndarray, Kept, Mapping[str, np.ndarray]]
-"""A reading (row, channel), or (sample, row, channel) of a block, and what is kept; and planes, where a kind provides them."""
+ReferenceAnswer = tuple[np.ndarray, dict[str, np.ndarray]] | tuple[np.ndarray, dict[str, np.ndarray], Mapping[str, np.ndarray]]
+"""A reading (row, channel), or (sample, row, channel) of a block; the new state; and the planes that the kind provides."""
 
 
 class Alternative(NamedTuple):
-    """Another choice of a sensor's or an object's fields that reads the same thing, at another error and another cost.
+    """Other values of a sensor's or an object's fields, with another error and cost.
 
     Attributes:
-        label: What to call it: `svd, 0.1 %`.
-        changes: Fields and what they are then, as a document has them; None: left out.
-        unused: Fields that mean nothing then: who wrote one of them does not want this choice.
-        is_exact: Whether it is exact but for rounding, so that errors of others may be measured against it and it may be chosen
-            without one.
-        is_other: Whether what is read then has another shape, or other times: `accuracy` never chooses it.
+        label: Name for users: `svd, 0.1 %`.
+        changes: New values of fields, as a document has them; None: left out.
+        unused: Fields that have no effect then. A document that sets one of them excludes this alternative.
+        is_exact: Whether it is exact up to rounding. Errors of others may be measured against it, and it needs no measurement.
+        is_other: Whether its reading has another shape or other times. `accuracy` never chooses it.
     """
 
     label: str
@@ -315,7 +339,7 @@ Warn = Callable[[str, Mapping[str, np.ndarray], Sequence[str], np.ndarray], Sequ
 
 
 def no_alternatives(spec: Any) -> Sequence[Alternative]:
-    """Return no alternatives: nothing in a spec trades speed for error."""
+    """Return no alternatives."""
     return ()
 
 
@@ -325,35 +349,37 @@ class Kind:
 
     Attributes:
         spec: Its pydantic model; `kind` is a `Literal` with the kind's name.
-        lower: `(spec, layout, surface_of) → Lowered`; the layout holds the sensor's own taxels, or no taxels and its links. May
+        lower: `(spec, layout, surface_of) → Lowered`. The layout has the sensor's taxels, or its links without taxels. May
             raise `LowerError`.
-        forward: `(gathered, context, constants, state) → (planes by channel name, new state)`: planes (env, row), at least
-            those of the channels; pure, traceable; the new state is like the old. Where all channels are one tensor
-            (env, channel, row) already it stands for them, as "signal", or of a report as "<report>/signal".
+        forward: `(gathered, context, constants, state) → (planes, new state)`: planes (env, row) by name, at least of all
+            channels; pure and traceable. One tensor (env, channel, row) of all channels may be returned as "signal", or
+            for a report as "<report>/signal".
         reference: `(spec, layout, gathered, context, state) → (reading (row, channel), new state)` for one environment, in
-            NumPy: what was asked for is what the quantities' references return; of a block it is called once per substep.
-        decide: `(planes, constants, state) → (planes, new state)`, if the reading is made of the signal by a threshold: what
-            `forward` returns is then the signal, which noise disturbs first.
-        knobs: Names of the noise knobs that it has.
-        gains_depth: Whether a taxel's gain is of the depth that `forward` gets rather than of the reading.
-        idle_knobs: Those of its knobs that change nothing in what it reads.
-        is_pointwise: Whether each row of what `forward` returns is of one taxel alone. Sensors on different taxels may then be
-            computed as one, where they have no state, and parameters that are scalars are given as (taxel,).
-        is_timed: Whether it wants to know when it is called: a clock is kept, and the state's `dt` is wanted.
-        is_random: Whether it draws random numbers of its own, from `Context.stream`.
-        retimed: `(constants, dt) → constants`: those of its constants that depend on the time between calls of `forward` [s],
-            again. The module calls it whenever that time is another one than `Lowered.timestep`, or was at the last call.
-        quantities: Quantities of its own that it asks for, which no installed package brings.
-        alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
-            measured against the last that can be had. One that the spec does not allow, or its links do not, is left out.
-        provides: Planes that `forward` can return beside its channels for other sensors to read, see `sensors.upstream`:
-            it does so for those of `Lowered.provides`, and `reference` returns them too, by name, as a third value.
-        reads: The field of its spec that names sensors that it reads, if it does so.
-        warns: Names of its state, and `(sensor's name, constants, rows of the sensors that it reads, largest numbers of all
-            environments) → messages`: what users are to be warned of, each once.
-        fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from sensors that it reads.
-        constants: A dataclass with a field for each constant, None where it may be left out: `forward` and `decide` get one,
-            and `lower` makes `Lowered.constants` of one by `by_name`. None: they get a mapping.
+            NumPy. `gathered` has the results of the quantities' references. Of a block it is called at each substep.
+        decide: `(planes, constants, state) → (planes, new state)`, if the reading is a threshold of a signal: `forward` then
+            returns the signal, and noise acts on that.
+        knobs: Names of its noise knobs.
+        gains_depth: Whether the noise stage `gain` scales the depth that `forward` gets, in place of the reading.
+        idle_knobs: Knobs that do not change its reading; a document that sets one gets a warning.
+        is_pointwise: Whether each row of its planes depends on one taxel alone. Sensors without state on different taxels are
+            then evaluated together, and scalar constants are passed as (taxel,).
+        is_timed: Whether `forward` uses the context. The module then keeps a clock and requires the state's `dt`.
+        is_random: Whether it draws random numbers from `Context.stream`.
+        retimed: `(constants, dt) → constants`: the constants that depend on the time between calls of `forward` [s]. The
+            module calls it when that time differs from the one of the constants.
+        quantities: Quantities that it requests and that no installed package provides.
+        alternatives: `(spec) → alternatives`, from coarse to fine. Errors are measured against the last one that can be
+            compiled; one that the spec or its links do not allow is left out.
+        provides: Planes that `forward` and `reference` (as a third value, by name) can return for other sensors, see
+            `sensors.upstream`. `Lowered.provides` has those of one sensor.
+        reads: The field of its spec that names the sensors it reads; "": none.
+        warns: Pairs of a state's name and `(sensor's name, constants, rows of the sensors that it reads, maxima over
+            environments) → messages`, each shown once.
+        fit: `(spec, lowered, fitting) → Lowered`, if sizes depend on the scene's time step or on the sensors that it reads.
+        constants: A dataclass with a field for each constant, None where optional, or a function that makes one from
+            constants by keyword: `forward` and `decide` get one, and `lower` passes one to `Lowered`. None: mappings.
+        state: A NamedTuple with a field for each state, None where optional: `forward` and `decide` get and return one.
+            None: mappings.
     """
 
     spec: type[AnySensorSpec]
@@ -374,11 +400,16 @@ class Kind:
     reads: str = ""
     warns: tuple[tuple[str, Warn], ...] = ()
     fit: Callable[[Any, Lowered, Fitting], Lowered] | None = None
-    constants: type[Any] | None = None
+    constants: Callable[..., Any] | None = None
+    state: type[Any] | None = None
 
     def typed(self, constants: Mapping[str, Tensor]) -> Any:
         """Return constants as `forward` gets them."""
         return constants if self.constants is None else self.constants(**constants)
+
+    def typed_state(self, state: Mapping[str, Tensor]) -> Any:
+        """Return state as `forward` gets it."""
+        return state if self.state is None else self.state(**state)
 
     @property
     def name(self) -> str:
@@ -387,10 +418,10 @@ class Kind:
         return name
 
 
-def by_name(constants: Any) -> dict[str, np.ndarray]:
-    """Return the fields of a dataclass of constants as `Lowered.constants` has them, without those that are None."""
-    fields = {part.name: getattr(constants, part.name) for part in dataclasses.fields(constants)}
-    return {name: value for name, value in fields.items() if value is not None}
+def state_by_name(state: Any) -> dict[str, Tensor]:
+    """Return a kind's state by name."""
+    fields = zip(state._fields, state, strict=True) if isinstance(state, tuple) else state.items()  # type: ignore[attr-defined]
+    return {name: value for name, value in fields if value is not None}
 
 
 def scalar(value: float) -> Float[np.ndarray, ""]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Generic, Literal
+from typing import Annotated, Generic, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -34,9 +34,7 @@ from tgdsl.sensors.base import (
     Memory,
     ReferenceContext,
     ReferenceState,
-    State,
     SurfaceOf,
-    by_name,
     scalar,
 )
 from tgdsl.sensors.noise import TAXEL
@@ -86,6 +84,12 @@ class ContactConstants(Generic[Array]):
     release_threshold: Array | None = None
 
 
+class ContactState(NamedTuple):
+    """The last bits; None where the two thresholds are one."""
+
+    bit: Tensor | None = None
+
+
 def lower(spec: ContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The bit is state only where the two thresholds differ."""
     has_memory = spec.release != spec.threshold
@@ -93,24 +97,35 @@ def lower(spec: ContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     channels, signal = (Channel("contact", "1"),), (Channel("depth", "m"),)
     requests = (ContactDepth(spec.objects, spec.is_gated),)
     state = {"bit": Memory()} if has_memory else {}
-    return Lowered(channels, by_name(constants), state, requests, signal=signal)
+    return Lowered(channels, constants, state, requests, signal=signal)
 
 
 def forward(
-    gathered: Gathered, context: Context, constants: ContactConstants[Tensor], state: State
-) -> tuple[dict[str, Tensor], State]:
+    gathered: Gathered, context: Context, constants: ContactConstants[Tensor], state: ContactState
+) -> tuple[dict[str, Tensor], ContactState]:
     """Return the depth plane [m], which is what noise acts on."""
-    return {"depth": gathered[ContactDepth].depth}, {}
+    return {"depth": gathered[ContactDepth].depth}, ContactState()
 
 
-def decide(signal: Mapping[str, Tensor], constants: ContactConstants[Tensor], state: State) -> tuple[dict[str, Tensor], State]:
+def decide(
+    signal: Mapping[str, Tensor], constants: ContactConstants[Tensor], state: ContactState
+) -> tuple[dict[str, Tensor], ContactState]:
     """Return the bit plane, 0 or 1 in the module's dtype."""
     depth, threshold = signal["depth"], constants.threshold
-    if constants.release_threshold is not None and "bit" in state:
-        threshold = torch.where(state["bit"] > 0.5, constants.release_threshold, threshold)
+    if constants.release_threshold is not None and state.bit is not None:
+        threshold = torch.where(state.bit > 0.5, constants.release_threshold, threshold)
     bit = (depth > threshold).to(depth.dtype)
     bit = torch.where(depth.isnan(), depth, bit)  # a broken pose must not look like no contact
-    return {"contact": bit}, ({"bit": bit} if "bit" in state else {})
+    return {"contact": bit}, ContactState() if state.bit is None else ContactState(bit)
 
 
-CONTACT = Kind(ContactSpec, lower, forward, reference, decide, TAXEL | {"release_threshold"}, constants=ContactConstants)
+CONTACT = Kind(
+    ContactSpec,
+    lower,
+    forward,
+    reference,
+    decide,
+    TAXEL | {"release_threshold"},
+    constants=ContactConstants,
+    state=ContactState,
+)

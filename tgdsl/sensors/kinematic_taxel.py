@@ -23,7 +23,7 @@ solver's contacts on that body with all objects of the sensor, f_c their forces 
 probe's radius [m].
 
 With `balance: solver` the magnitudes of a body's normal forces, each along its own m_j, sum to the solver's W, in the
-proportions of the law above: where normals diverge, under a ball or beside an edge, their vector sum is smaller. Friction
+proportions of the law above: where normals diverge, under a ball or near an edge, their vector sum is smaller. Friction
 follows the law up to a limit, the cone of `friction_cone` or else the solver's total tangential force; with the latter a
 frictionless contact has none. The spin torque is limited to l_j R_j: a contact patch is no larger than its probe. Forces stay
 bounded as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. A negative (tensile) f_n,j has no share of W. ε is the normal force
@@ -57,7 +57,6 @@ from tgdsl.quantities.contacts import ContactPoints, Contacts, ReferenceContacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Array,
-    Channel,
     ContactProbeSpec,
     Context,
     Kind,
@@ -66,8 +65,9 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
-    by_name,
+    components,
     scalar,
+    vector,
 )
 from tgdsl.sensors.noise import FORCE
 
@@ -141,19 +141,20 @@ def reference(
         torques[j] = spin[j] * m
         if spec.torque_about == "link":
             torques[j] += np.cross(x, forces[j])
-    return np.concatenate([{"force": forces, "torque": torques}[name] for name in _ordered(spec)], axis=1), {}
+    parts = {"force": forces, "torque": torques}
+    return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
 
 
 def reference_balance(pressed: np.ndarray, body_id: np.ndarray, contacts: ReferenceContacts) -> tuple[np.ndarray, np.ndarray]:
     """Return normal forces f_n that sum to the solver's on each body [N], and the limits l of friction [N]: (taxel,)."""
     normal, limit = np.zeros_like(pressed), np.zeros_like(pressed)
     for b in np.unique(body_id):
-        own, at = body_id == b, contacts.body == b
+        on_body, at = body_id == b, contacts.body == b
         along = np.sum(contacts.force[at] * contacts.normal[at], axis=1)
         across = np.linalg.norm(contacts.force[at] - along[:, None] * contacts.normal[at], axis=1)
-        part = np.maximum(0.0, pressed[own])
+        part = np.maximum(0.0, pressed[on_body])
         share = part * part.sum() / (part.sum() ** 2 + unloaded() ** 2)
-        normal[own], limit[own] = share * along.sum(), share * across.sum()
+        normal[on_body], limit[on_body] = share * along.sum(), share * across.sum()
     return normal, limit
 
 
@@ -176,17 +177,10 @@ class KinematicTaxelConstants(Generic[Array]):
     """Radius of each probe [m]."""
 
 
-def _ordered(spec: KinematicTaxelSpec) -> tuple[str, ...]:
-    return tuple(name for name in ("force", "torque") if name in spec.outputs)
-
-
 def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Fold the sign of the model into the damping constants; leave out what no output needs."""
-    channels: list[Channel] = []
-    if "force" in spec.outputs:
-        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
-    if "torque" in spec.outputs:
-        channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
+    parts = {"force": vector("force", "N"), "torque": vector("torque", "N·m")}
+    channels = tuple(channel for name, part in parts.items() if name in spec.outputs for channel in part)
     has_torque, is_balanced = "torque" in spec.outputs, spec.balance == "solver"
     member = layout.body_id[:, None] == np.arange(len(layout.bodies))
     constants = KinematicTaxelConstants(
@@ -204,7 +198,7 @@ def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
     motion = bool(spec.normal_damping or spec.shear_damping or (has_torque and spec.spin_damping))
     depth = ContactDepth(spec.objects, spec.is_gated, normal=True, motion=motion)
     requests = (depth, Contacts(spec.objects, slots=spec.slots)) if is_balanced else (depth,)
-    return Lowered(tuple(channels), by_name(constants), requests=requests)
+    return Lowered(channels, constants, requests=requests)
 
 
 def forward(
@@ -214,32 +208,32 @@ def forward(
 
     Where nothing is touched, depth, normal and motion are all zero, and so is every term.
     """
-    felt = gathered[ContactDepth]
-    assert felt.normal is not None
-    stiffness = planes.power(felt.depth, constants.depth_exponent)
+    touch = gathered[ContactDepth]
+    assert touch.normal is not None
+    stiffness = planes.power(touch.depth, constants.depth_exponent)
     pressed, shear, limit = constants.normal_stiffness * stiffness, None, None
-    if felt.velocity is not None:
-        approach = planes.dot(felt.velocity, felt.normal)
+    if touch.velocity is not None:
+        approach = planes.dot(touch.velocity, touch.normal)
         pressed = pressed + constants.normal_damping * stiffness * approach
-        shear = planes.scale(constants.shear_damping, planes.sub(felt.velocity, planes.scale(approach, felt.normal)))
+        shear = planes.scale(constants.shear_damping, planes.sub(touch.velocity, planes.scale(approach, touch.normal)))
     if constants.member is not None and constants.body is not None:
         pressed, limit = _balanced(pressed, gathered[Contacts], constants.member, constants.body)
     if constants.friction_cone is not None:
         limit = constants.friction_cone * pressed.clamp(min=0)
-    force = planes.scale(pressed, felt.normal)
+    force = planes.scale(pressed, touch.normal)
     if shear is not None:
         force = planes.add(force, shear if limit is None else _within(limit, shear))
-    readings = {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
+    readings = components("force", force)
     if constants.spin_damping is not None:
-        none = felt.depth * 0.0  # not-a-number where the pose is
-        torque = planes.cross(felt.pos, force) if constants.about_link is not None else (none, none, none)
-        if felt.angular is not None:
-            spin = constants.spin_damping * planes.dot(felt.angular, felt.normal)
+        none = touch.depth * 0.0  # not-a-number where the pose is
+        torque = planes.cross(touch.pos, force) if constants.about_link is not None else (none, none, none)
+        if touch.angular is not None:
+            spin = constants.spin_damping * planes.dot(touch.angular, touch.normal)
             if constants.patch is not None and limit is not None:
                 largest = constants.patch * limit
                 spin = torch.minimum(torch.maximum(spin, -largest), largest)
-            torque = planes.add(torque, planes.scale(spin, felt.normal))
-        readings |= {f"torque_{axis}": plane for axis, plane in zip("xyz", torque, strict=True)}
+            torque = planes.add(torque, planes.scale(spin, touch.normal))
+        readings |= components("torque", torque)
     return readings, {}
 
 

@@ -1,4 +1,4 @@
-"""The kinds that a document may use: tgdsl's, those of installed packages, and those a caller gives.
+"""The kinds that a document may use: of tgdsl, of installed packages, and of the caller.
 
 A package brings a kind by an entry point, in its pyproject.toml:
 
@@ -30,21 +30,21 @@ ARGUMENTS = {
     "reference": ("spec", "layout", "gathered", "context", "state"),
     "decide": ("planes", "constants", "state"),
 }
-"""What a kind's functions are called with, in this order."""
+"""Arguments of a kind's functions, in order."""
 FORMER = {"probes"}
-"""Names of arguments that there were before kinds made requests."""
+"""Names of arguments from before kinds made requests."""
 
 
 def known_kinds(given: Sequence[Kind] = ()) -> tuple[Kind, ...]:
-    """Return all kinds: those of tgdsl, of installed packages by package and name, and those that are given.
+    """Return all kinds: of tgdsl, of installed packages by package and name, and of the caller.
 
-    An installed kind that cannot be had is left out, with a warning, the first time.
+    An installed kind that cannot be imported is left out, with one warning.
 
     Args:
-        given: Kinds of the caller's own. One that an installed package brings too may be among them.
+        given: Kinds of the caller, which may repeat those of installed packages.
 
     Raises:
-        TgdslError: If two kinds have one name, or a kind that is given is none.
+        TgdslError: If two kinds have one name, or one of `given` is not a kind.
     """
     return known(GROUP, "sensor kind", "kinds", KINDS, given, _wrong)
 
@@ -53,36 +53,36 @@ def kinds_by_sensor(kinds: Sequence[Kind], wanted: Mapping[str, str]) -> dict[st
     """Return the kind of each sensor.
 
     Args:
-        kinds: The kinds that there are.
-        wanted: Names of the sensors' kinds, by those of the sensors.
+        kinds: All kinds.
+        wanted: Name of each sensor's kind, by the sensor's name.
 
     Raises:
         TgdslError: If there is no such kind.
     """
-    known = {kind.name: kind for kind in kinds}
+    by_name = {kind.name: kind for kind in kinds}
     for sensor, name in wanted.items():
-        if name not in known:
-            hint = did_you_mean(name, known, "kinds")
+        if name not in by_name:
+            hint = did_you_mean(name, by_name, "kinds")
             raise TgdslError(f'sensor "{sensor}" is of kind "{name}", which is neither installed nor given as `kinds`; {hint}')
-    return {sensor: known[name] for sensor, name in wanted.items()}
+    return {sensor: by_name[name] for sensor, name in wanted.items()}
 
 
 def quantities_of(kinds: Sequence[Kind]) -> tuple[Quantity, ...]:
-    """Return all quantities that kinds may ask for: those that are known, and those that kinds bring themselves.
+    """Return all quantities that kinds may request: the known ones, and those in `Kind.quantities`.
 
     Raises:
         TgdslError: If two quantities have one name.
     """
-    own = {id(quantity): quantity for kind in kinds for quantity in kind.quantities}
-    return known_quantities(tuple(own.values()))
+    quantities = {id(quantity): quantity for kind in kinds for quantity in kind.quantities}
+    return known_quantities(tuple(quantities.values()))
 
 
 def check_lowered(kind: Kind, lowered: Lowered, spec: AnySensorSpec) -> None:
-    """Refuse what a kind may not say of a sensor: names that readings need for something else, requests that contradict.
+    """Refuse a lowered sensor with reserved names, repeated requests, or options that a block does not have.
 
     Raises:
-        TgdslError: With the kind and what is wrong.
-        LowerError: If the document asks of a block what a block has not.
+        TgdslError: If it is a mistake of the kind.
+        LowerError: If it is a mistake of the document.
     """
     _check_parts(kind, lowered)
     channels = [*lowered.channels, *(lowered.signal or ()), *(c for report in lowered.reports.values() for c in report)]
@@ -113,15 +113,15 @@ def check_lowered(kind: Kind, lowered: Lowered, spec: AnySensorSpec) -> None:
 
 
 def _check_parts(kind: Kind, lowered: Any) -> None:
-    """Refuse parts of a lowered sensor that are not of their types.
+    """Refuse parts of a lowered sensor that have another type.
 
     Raises:
-        TgdslError: With the kind, what was found, and what would be right.
+        TgdslError: With the kind, the type found, and the type expected.
     """
 
     def refuse(what: str, found: object, expected: str) -> None:
-        shown = found.__name__ if isinstance(found, type) else repr(found) if isinstance(found, str) else type(found).__name__
-        raise TgdslError(f'kind "{kind.name}": {what}: found {shown}, expected {expected}')
+        text = found.__name__ if isinstance(found, type) else repr(found) if isinstance(found, str) else type(found).__name__
+        raise TgdslError(f'kind "{kind.name}": {what}: found {text}, expected {expected}')
 
     if not isinstance(lowered, Lowered):
         refuse("`lower` returns", lowered, "a tgdsl.sensors.base.Lowered")
@@ -172,18 +172,18 @@ def _wrong(kind: object) -> str:
 
 def _wrong_call(kind: str, name: str, call: Any) -> str:
     """Return why a kind's function cannot be called as kinds are, or nothing."""
-    wanted = ARGUMENTS[name]
+    arguments = ARGUMENTS[name]
     try:
         signature = inspect.signature(call)
-    except (TypeError, ValueError):  # of what is written in C there may be none
+    except (TypeError, ValueError):  # functions written in C may have none
         return "" if callable(call) else f'kind "{kind}": `{name}` is a {type(call).__name__}, expected a function'
     try:
-        signature.bind(*wanted)
+        signature.bind(*arguments)
         fits = True
     except TypeError:
         fits = False
-    if fits and not FORMER & set(list(signature.parameters)[: len(wanted)]):
+    if fits and not FORMER & set(list(signature.parameters)[: len(arguments)]):
         return ""
     result = ", ".join(signature.parameters)
     hint = "the CHANGELOG says what was renamed when kinds began to make requests"
-    return f'kind "{kind}": found `{name}({result})`, expected `{name}({", ".join(wanted)})`; {hint}'
+    return f'kind "{kind}": found `{name}({result})`, expected `{name}({", ".join(arguments)})`; {hint}'

@@ -9,9 +9,9 @@ normal out of the object. One row per body that carries the sensor, in the order
 summed before the threshold: a body squeezed between two objects with equal forces reads zero and no contact, and s_b twice that
 force; to separate objects, give each its own sensor. The bit is a step function and has no gradient.
 
-The normal force is how hard a body presses, whatever its direction: that of two contacts that oppose one another is their sum,
-and friction is no part of it. It reads contacts one by one, `slots` of each pair of body and object. What others carry is
-shared out over these, see `quantities.contacts`: exact where all normals are the same, as under a flat face.
+The normal force is a sum of magnitudes: two opposing contacts add up, and friction is not part of it. It reads contacts one by
+one, `slots` of each pair of body and object. What others carry is shared out over these, see `quantities.contacts`: exact where
+all normals are the same, as under a flat face.
 
 Source: MuJoCo's contact sensor, with the reduction `netforce` for f_b and contact by contact for s_b (XML reference,
 sensor/contact).
@@ -46,8 +46,9 @@ from tgdsl.sensors.base import (
     State,
     SurfaceOf,
     body_axis,
-    by_name,
+    components,
     scalar,
+    vector,
 )
 
 
@@ -95,11 +96,11 @@ class LinkContactConstants(Generic[Array]):
 
 def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The net force alone is wanted, without slots, unless normal forces are; and no probe."""
-    force = tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
+    force = vector("force", "N")
     parts = {"contact": (Channel("contact", "1"),), "force": force, "normal_force": (Channel("normal_force", "N"),)}
-    channels = tuple(channel for name, own in parts.items() if name in spec.outputs for channel in own)
+    channels = tuple(channel for name, part in parts.items() if name in spec.outputs for channel in part)
     signal, slots = (force + parts["normal_force"], spec.slots) if "normal_force" in spec.outputs else (force, 0)
-    constants = by_name(LinkContactConstants(scalar(spec.threshold)))
+    constants = LinkContactConstants(scalar(spec.threshold))
     return Lowered(channels, constants, requests=(Contacts(spec.objects, slots=slots),), rows=body_axis(layout), signal=signal)
 
 
@@ -109,7 +110,7 @@ def forward(
     """Return the force planes and the normal force [N], by body, which are what noise acts on."""
     contacts = gathered[Contacts]
     pressed = planes.dot(contacts.force, contacts.normal).clamp(min=0.0).sum(dim=-1)
-    return {**{f"force_{axis}": plane for axis, plane in zip("xyz", contacts.net, strict=True)}, "normal_force": pressed}, {}
+    return {**components("force", contacts.net), "normal_force": pressed}, {}
 
 
 def decide(

@@ -23,7 +23,8 @@ to the torque about the taxel.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Generic, Literal
 
 import numpy as np
 from pydantic import Field, StrictInt, model_validator
@@ -38,8 +39,7 @@ from tgdsl.quantities.moments import MomentsRequest, SurfaceMoments
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Alternative,
-    Channel,
-    Constants,
+    Array,
     Context,
     Kind,
     Lowered,
@@ -48,7 +48,9 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
+    components,
     scalar,
+    vector,
 )
 from tgdsl.sensors.noise import FORCE
 
@@ -125,22 +127,32 @@ def reference(
     return np.stack(rows), {}
 
 
+@dataclass(frozen=True, eq=False)
+class ProximityConstants(Generic[Array]):
+    """Coefficients times density, with the sign of the model; None: the objects' area, and torques about the taxel."""
+
+    normal: Array
+    stiffness: Array
+    damping: Array
+    is_absolute: Array
+    """Whether slip is of the object's absolute angular velocity."""
+    area: Array | None = None
+    about_link: Array | None = None
+
+
 def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Fold sign and density into the stiffness; leave out what no output needs."""
-    constants = {
-        "normal": layout.normal.T,
-        "stiffness": scalar(spec.normal_sign * spec.normal_stiffness * spec.density),
-        "damping": scalar(spec.shear_damping * spec.density),
-        "is_absolute": np.asarray(spec.model == "paper"),
-    }
-    if spec.reference_area is not None:
-        constants["area"] = scalar(spec.reference_area)
-    channels: list[Channel] = []
-    if "force" in spec.outputs:
-        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
-    if "torque" in spec.outputs:
-        channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
-        constants |= {"about_link": scalar(1.0)} if spec.torque_about == "link" else {}
+    is_about_link = "torque" in spec.outputs and spec.torque_about == "link"
+    constants = ProximityConstants(
+        normal=layout.normal.T,
+        stiffness=scalar(spec.normal_sign * spec.normal_stiffness * spec.density),
+        damping=scalar(spec.shear_damping * spec.density),
+        is_absolute=np.asarray(spec.model == "paper"),
+        area=None if spec.reference_area is None else scalar(spec.reference_area),
+        about_link=scalar(1.0) if is_about_link else None,
+    )
+    parts = {"force": vector("force", "N"), "torque": vector("torque", "N·m")}
+    channels = tuple(channel for name, part in parts.items() if name in spec.outputs for channel in part)
     request = MomentsRequest(
         objects=spec.objects,
         radius=spec.radius,
@@ -150,37 +162,39 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         gradient_tolerance=spec.gradient_tolerance,
         max_bytes=spec.max_bytes,
         with_area=spec.reference_area is None,
-        motion=bool(spec.shear_damping and ("force" in spec.outputs or "about_link" in constants)),
+        motion=bool(spec.shear_damping and ("force" in spec.outputs or is_about_link)),
     )
-    return Lowered(tuple(channels), constants, requests=(request,))
+    return Lowered(channels, constants, requests=(request,))
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return the force planes [N] and the torque planes [N·m]; what is not asked for is not used."""
-    normal = planes.split(constants["normal"].T)
-    felt = gathered[MomentsRequest]
-    zero = felt.none
+def forward(
+    gathered: Gathered, context: Context, constants: ProximityConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
+    """Return the force planes [N] and the torque planes [N·m]; the module drops those that are not read."""
+    normal = planes.split(constants.normal.T)
+    surfaces = gathered[MomentsRequest]
+    zero = surfaces.none
     mass, first, slip = zero, (zero, zero, zero), (zero, zero, zero)
-    for name, near in felt.moments.items():
+    for name, near in surfaces.moments.items():
         mass, first = mass + near.mass, planes.add(first, near.first)
-        if name in felt.motions:
-            slip = planes.add(slip, _slip(felt, name, constants["is_absolute"]))
-    area = constants["area"] if "area" in constants else sum(felt.area.values(), start=zero[:1, :1])
-    stiffness, damping = constants["stiffness"] / area, constants["damping"] / area
+        if name in surfaces.motions:
+            slip = planes.add(slip, _slip(surfaces, name, constants.is_absolute))
+    area = sum(surfaces.area.values(), start=zero[:1, :1]) if constants.area is None else constants.area
+    stiffness, damping = constants.stiffness / area, constants.damping / area
     # Less its part along the normal. Without the inner product, which all three components would share, a compiler that fuses
     # computes all channels in one pass; it would else compute each of them for every number of a reading.
     slip = planes.cross(planes.cross(normal, slip), normal)
     force = planes.add(planes.scale(stiffness * mass, normal), planes.scale(damping, slip))
     torque = planes.scale(stiffness, planes.cross(first, normal))
-    if "about_link" in constants:
-        torque = planes.add(torque, planes.cross(felt.pos, force))
-    return {f"{n}_{axis}": p for n, v in (("force", force), ("torque", torque)) for axis, p in zip("xyz", v, strict=True)}, {}
+    if constants.about_link is not None:
+        torque = planes.add(torque, planes.cross(surfaces.pos, force))
+    return components("force", force) | components("torque", torque), {}
 
 
-def _slip(felt: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:
+def _slip(surfaces: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:
     """Return Σ of an object [m⁴/s]."""
-    near, motion = felt.moments[name], felt.motions[name]
-    velocity = planes.add(motion.linear, planes.cross(motion.angular, felt.pos))
+    near, motion = surfaces.moments[name], surfaces.motions[name]
+    velocity = planes.add(motion.linear, planes.cross(motion.angular, surfaces.pos))
     omega = planes.add(motion.angular, planes.scale(is_absolute, motion.turn))
     return planes.add(planes.scale(near.mass, velocity), planes.cross(omega, near.first))
 
@@ -196,4 +210,4 @@ def alternatives(spec: ProximitySpec) -> list[Alternative]:
     return [*clouds, *fields, Alternative("field, 0.2 %", finest, of_points)]
 
 
-PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE, alternatives=alternatives)
+PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE, alternatives=alternatives, constants=ProximityConstants)

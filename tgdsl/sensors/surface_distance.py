@@ -11,7 +11,7 @@ the radius of active ones has no effect.
 Source: Chung et al., *Tactile Genesis*, appendix, "SurfaceDistanceProbe".
 
 Departures: the range, beyond which the reading is constant; the sign inside; the vector u. Inside a compound of overlapping
-geoms the magnitude is that of the deepest geom alone, which is at most the true one.
+geoms the magnitude is of the deepest geom alone, which is at most the true one.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
-    by_name,
+    components,
     scalar,
+    vector,
 )
 from tgdsl.sensors.noise import PROBE
 
@@ -61,12 +62,12 @@ def reference(
     spec: SurfaceDistanceSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return y of all objects, then u of all objects: (taxel, object) or (taxel, 4 object) [m]."""
-    met = gathered[ContactDepth]
-    distance = np.minimum(met.distance, spec.max_range)
+    touch = gathered[ContactDepth]
+    distance = np.minimum(touch.distance, spec.max_range)
     if not spec.nearest:
         return distance, {}
-    in_range = (met.distance <= spec.max_range)[..., None]
-    vector = np.where(in_range, -distance[..., None] * met.outward, 0.0)
+    in_range = (touch.distance <= spec.max_range)[..., None]
+    vector = np.where(in_range, -distance[..., None] * touch.outward, 0.0)
     return np.concatenate([distance, vector.reshape(len(vector), -1)], axis=1), {}
 
 
@@ -81,8 +82,8 @@ def lower(spec: SurfaceDistanceSpec, layout: Layout, surface_of: SurfaceOf) -> L
     """One channel per object, and three more where the vector is wanted."""
     channels = [Channel(f"distance_{name}", "m") for name in spec.feels]
     if spec.nearest:
-        channels += [Channel(f"nearest_{name}_{axis}", "m") for name in spec.feels for axis in "xyz"]
-    constants = by_name(SurfaceDistanceConstants(scalar(spec.max_range)))
+        channels += [channel for name in spec.feels for channel in vector(f"nearest_{name}", "m")]
+    constants = SurfaceDistanceConstants(scalar(spec.max_range))
     request = ContactDepth(spec.objects, spec.is_gated, range=spec.max_range, distance=True)
     return Lowered(tuple(channels), constants, requests=(request,))
 
@@ -97,8 +98,8 @@ def forward(
         capped = torch.minimum(distance, max_range)
         readings[f"distance_{name}"] = capped
         reach = torch.where(distance > max_range, 0.0, -capped)
-        vector = planes.scale(reach, gradient)
-        readings |= {f"nearest_{name}_{axis}": part for axis, part in zip("xyz", vector, strict=True)}
+        to_surface = planes.scale(reach, gradient)
+        readings |= components(f"nearest_{name}", to_surface)
     return readings, {}
 
 

@@ -27,7 +27,7 @@ from tgdsl.schema.load import load
 from tgdsl.schema.objects import ObjectSpec, query_alternatives
 from tgdsl.sensors.base import AnySensorSpec, Kind
 from tgdsl.sensors.known import known_kinds
-from tgdsl.sensors.noise.fields import quantity
+from tgdsl.sensors.noise.spec import quantity
 from tgdsl.tuning.recording import Recording
 
 

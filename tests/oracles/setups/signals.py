@@ -5,6 +5,7 @@ Shapes: `env` environments, `row` taxels, `channel` channels.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from tgdsl.layout.layout import Layout, Link
-from tgdsl.sensors.noise import Knobs, random, stages
-from tgdsl.sensors.noise.lower import lower_noise
+from tgdsl.sensors.noise import Knobs, random
+from tgdsl.sensors.noise.pipeline import disturb, draw, draws_of, known_stages, lower_noise, stages_of
+from tgdsl.sensors.noise.reference import ReferenceCall
 from tgdsl.sensors.noise.stage import Now
-from tgdsl.sensors.noise.stages import ReferenceNoise
+from tgdsl.sensors.noise.stages import Gain, Radius
 
 MM = 1e-3
 """A millimetre [m]."""
@@ -44,6 +46,58 @@ def line(count: int) -> Layout:
     return make_layout(np.arange(count)[:, None] * np.array([MM, 0, 0]))
 
 
+class ReferenceNoise:
+    """The definition of the noise: one sensor in one environment, fed call by call, in float64."""
+
+    def __init__(
+        self, knobs: Sequence[Knobs], channels: Sequence[str], key: tuple[int, int], env: int = 0, layout: Layout | None = None
+    ):
+        """Begin the first episode.
+
+        Args:
+            knobs: The knobs of each row.
+            channels: Names of the signal's channels.
+            key: The sensor's key, see `random.sensor_key`.
+            env: Number of the environment.
+            layout: The taxels, if there is crosstalk.
+        """
+        self._stages = known_stages()
+        ranges = [{name: v for stage in self._stages for name, v in stage.ranges(row).items()} for row in knobs]
+        self._call = ReferenceCall(ranges, draws_of(self._stages), channels, key, env, layout, episode=-1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        self._call = replace(self._call, episode=self._call.episode + 1)
+        self._memory: dict[str, dict[str, Any]] = {stage.name: {} for stage in self._stages}
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Each taxel's gain (row, channel)."""
+        return Gain.reference(np.ones((len(self._call.ranges), len(self._call.channels))), self._call, {})
+
+    def radius(self, radius: np.ndarray) -> np.ndarray:
+        """Return this step's radii of probes with these radii [m]."""
+        return Radius.reference_radius(radius, self._call)
+
+    def read(self, signal: np.ndarray, dt: float, is_sample: bool = True) -> np.ndarray:
+        """Return the disturbed signal, and go on to the next step.
+
+        Args:
+            signal: The signal, already multiplied by `gain`.
+            dt: Time since the last call [s].
+            is_sample: Whether the sensor takes a sample now, or reads the last one.
+        """
+        call = replace(self._call, dt=dt, is_sample=is_sample)
+        for stage in self._stages:
+            if stage is not Gain:
+                signal = stage.reference(signal, call, self._memory[stage.name])
+        if is_sample:
+            self._sample = signal
+        self._call = replace(self._call, step=self._call.step + 1)
+        return self._sample
+
+
 class Noise:
     """The batched noise of one sensor, as a module would run it; what it remembers is NaN at first, so that no use escapes."""
 
@@ -60,7 +114,7 @@ class Noise:
         self.channels, self.num_envs, self.dtype = tuple(channels), num_envs, dtype
         self._rows, self.key = [sets[i] for i in which], random.sensor_key(seed, name)
         self.lowered = lower_noise(sets, which, channels, self.layout)
-        self.stages = stages.stages_of(self.lowered.terms)
+        self.stages = stages_of(self.lowered.terms)
         self.constants = {key: torch.tensor(value, dtype=dtype) for key, value in self.lowered.constants.items()}
         self.memory = {key: torch.full((num_envs, len(channels), count), math.nan, dtype=dtype) for key in self.lowered.memory}
         if "ring" in self.memory:
@@ -87,8 +141,7 @@ class Noise:
         shape = (self.num_envs, self.layout.num_taxels, len(self.channels))
         signal = torch.as_tensor(signal, dtype=self.dtype).expand(shape).transpose(1, 2)
         now = self.now(dt, is_sample)
-        values = stages.draw(self.stages, self.constants, now)
-        signal, new = stages.disturb(signal, self.stages, values, "", self.memory, now)
+        signal, new = disturb(signal, draw(self.stages, self.constants, now), "", self.memory, now)
         for key, value in new.items():
             buffer = self.memory[key]
             place = buffer[:, self.step % buffer.shape[1]] if key == "ring" else buffer

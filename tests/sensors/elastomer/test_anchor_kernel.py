@@ -56,13 +56,13 @@ def nothing_held(meeting):
 def by_kernel(meeting, stick_slip, state):
     """Return the active points, and change the state in place, as `shear_loads` has the kernel do on a GPU."""
     from tgdsl.quantities.depth_kernel import grid_tables
-    from tgdsl.sensors.elastomer.anchor_kernel import anchor_kernel, launch
+    from tgdsl.sensors.elastomer.anchor_kernel import advance_anchors
 
     (rotation, offset, _, gate), source = meeting
     places, numbers = torch.stack(source.points)[:, :, 0], [part for part in stick_slip if part is not None]
     how = (*grid_tables(source.links, 0), source.links.shapes[0] == "tricubic")
     held = [state[name] for name in PLANES]
-    return launch(anchor_kernel, [*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
+    return advance_anchors([*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
 
 
 def first_ones(count, num_points):

@@ -1,5 +1,6 @@
 """A stage of noise that is not tgdsl's own: in documents, modules, artefacts and definitions like any other."""
 
+import dataclasses
 import importlib.util
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from oracles.setups.signals import Noise
 import tgdsl
 from tgdsl.errors import TgdslError
 from tgdsl.schema.document import json_schema
-from tgdsl.sensors.noise import NoiseSpec, register, stages
+from tgdsl.sensors.noise import NoiseSpec, pipeline, register
 from tgdsl.sensors.noise.spec import noise_model
 
 FILE = Path(__file__).parents[3] / "examples" / "plugins" / "saturation.py"
@@ -25,14 +26,14 @@ FILE = Path(__file__).parents[3] / "examples" / "plugins" / "saturation.py"
 @pytest.fixture
 def saturation(monkeypatch):
     """The stage of the example, registered for one test."""
-    monkeypatch.setattr(stages, "_registered", [])
+    monkeypatch.setattr(pipeline, "_registered", [])
     spec = importlib.util.spec_from_file_location("saturation", FILE)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "saturation", module)
     spec.loader.exec_module(module)
-    register(module.SATURATION)
-    return module.SATURATION
+    register(module.Saturation)
+    return module.Saturation
 
 
 KNOBS = {"bias": {"force": 0.3}, "saturation": {"force": [0.2, 0.4]}, "quantization": {"force": 1e-3}, "like": "clean"}
@@ -57,7 +58,7 @@ def test_a_module_clips_between_offset_and_quantiser(tmp_path, saturation, compi
 
 
 def test_the_batched_form_is_as_defined(saturation, monkeypatch):
-    monkeypatch.setattr("oracles.setups.signals.Knobs", noise_model((saturation,)).plain)
+    monkeypatch.setattr("oracles.setups.signals.Knobs", noise_model((saturation.Knobs,)).plain)
     noise = Noise({name: value for name, value in KNOBS.items() if name != "like"}, 5, ("force_x",), num_envs=3)
     signal = np.linspace(-1, 1, 5)[:, None]
     expected = [definition.read(signal, 0.0) for definition in noise.references()]
@@ -73,7 +74,7 @@ def test_profiles_links_and_artefacts_have_it(tmp_path, saturation, monkeypatch)
     tgdsl.save(touch, tmp_path / "touch.safetensors")
     state = touch.example_state(2)
     assert torch.equal(tgdsl.load(tmp_path / "touch.safetensors")(state)["s"], touch(state)["s"])
-    monkeypatch.setattr(stages, "_registered", [])
+    monkeypatch.setattr(pipeline, "_registered", [])
     with pytest.raises(TgdslError, match=r'the noise stage "saturation" is not known; install its package, or `tgdsl'):
         tgdsl.load(tmp_path / "touch.safetensors")
 
@@ -95,13 +96,14 @@ def test_without_it_the_knob_is_unknown(tmp_path):
 
 
 def test_a_stage_with_the_draw_of_another(saturation, tmp_path, monkeypatch):
-    monkeypatch.setattr(type(saturation), "numbers", {"saturation": saturation.numbers["saturation"]._replace(draw=12)})
+    number = dataclasses.replace(saturation.numbers["saturation"], draw=12)
+    monkeypatch.setattr(saturation, "numbers", {"saturation": number})
     with pytest.raises(TgdslError, match=r'the noise stages "quantization" and "saturation" both have the draw 12'):
         tgdsl.compile(document(tmp_path, "contact_depth", {}))
 
 
 def test_an_installed_stage_is_there_without_being_registered(tmp_path, monkeypatch):
-    with installing(tmp_path, monkeypatch, stages.GROUP, FILE.read_text()) as install:
-        install("clips", "1.0", saturation="clips:SATURATION")
+    with installing(tmp_path, monkeypatch, pipeline.GROUP, FILE.read_text()) as install:
+        install("clips", "1.0", saturation="clips:Saturation")
         touch = tgdsl.compile(document(tmp_path, "kinematic_taxel", {"saturation": 0.1}))
         assert touch.plan.sensors[0].noise.terms == ("saturation",)

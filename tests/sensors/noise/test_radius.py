@@ -9,7 +9,7 @@ from noisy_modules import SCENE, circumstances, document, felt_state, read
 
 import tgdsl
 from tgdsl.module.module import TactileModule
-from tgdsl.sensors.noise.radius import RADIUS, RadiusStage
+from tgdsl.sensors.noise.stages import Radius
 from tgdsl.testing import only
 from tgdsl.testing.reference import full_scale_error
 
@@ -21,8 +21,10 @@ def test_a_disturbed_radius_is_another_radius(build, tmp_path):
     for call in range(4):
         state = felt_state(touch, 2, call)
         memory = touch.memory.tensors(2, None, touch.dtype, touch.device)
-        nows, knobs = circumstances(touch, memory)
-        shift = RADIUS.shift(knobs["s"][RADIUS.name], nows["s"], torch.zeros(2, 17, dtype=torch.float64))
+        nows, noise = circumstances(touch, memory)
+        (radius,) = noise["s"]
+        assert isinstance(radius, Radius)
+        shift = radius.shift(nows["s"], torch.zeros(2, 17, dtype=torch.float64))
         readings = touch(state)["s"]
         drawn.append(shift)
         for env in range(2):
@@ -74,9 +76,7 @@ def test_radius_noise_of_proximity(tmp_path, monkeypatch, backend):
             moments = dataclasses.replace(exact.plan.quantities["moments"], tables=touch.plan.quantities["moments"].tables)
             plan = dataclasses.replace(exact.plan, quantities={**exact.plan.quantities, "moments": moments})
             exact = TactileModule(plan, dtype=torch.float64)
-        monkeypatch.setattr(
-            RadiusStage, "shift", lambda _, values, *__, sign=sign: (sign * values.radius_noise[:, 0]).expand(100, 17)
-        )
+        monkeypatch.setattr(Radius, "shift", lambda stage, *_, sign=sign: (sign * stage.radius_noise[:, 0]).expand(100, 17))
         error = full_scale_error(touch(state)["s"], exact(state)["s"].numpy())
         print(f"{backend}, R {sign:+d} ρ: largest error {error.max():.2g} of full scale, RMS {np.sqrt(np.mean(error**2)):.2g}")
         assert error.max() < RADIUS_ERRORS[backend]

@@ -45,7 +45,7 @@ def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
         dt = None if state.dt is None else torch.tensor(state.dt, dtype=torch.float64)
         stages = circumstances(touch, memory, dt)[1]["s"]
         touch(state)
-        values = {name: value for stage in stages.values() for name, value in stage._asdict().items()}
+        values = {name: value for stage in stages for name, value in vars(stage).items()}
         return {name: values[name][:, 0, 0] for name in expected}
 
     first, second = drawn(), drawn()

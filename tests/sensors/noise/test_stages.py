@@ -6,8 +6,8 @@ import torch
 from noise_stages import ALL_TOGETHER, ALONE, CHANNELS, DT, EXACT, NOISES, NORMAL, TWO_LINKS, errors, uneven
 from oracles.setups.signals import MM, Noise
 
-from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.radius import RADIUS
+from tgdsl.sensors.noise.pipeline import draw
+from tgdsl.sensors.noise.stages import Radius
 
 
 @pytest.mark.parametrize("case", [*ALONE, *NOISES])
@@ -105,8 +105,9 @@ def test_a_radius_is_as_defined_and_never_negative():
             for env in (1, 2):
                 definitions[env].reset()
         now = noise.now(DT)
-        values = stages.draw(noise.stages, noise.constants, now)[RADIUS.name]
-        shift = RADIUS.shift(values, now, torch.zeros(4, 3).double())
+        (disturbed,) = draw(noise.stages, noise.constants, now)
+        assert isinstance(disturbed, Radius)
+        shift = disturbed.shift(now, torch.zeros(4, 3).double())
         found = (torch.tensor(radius) + shift).clamp(min=0).numpy()
         expected = []
         for definition in definitions:

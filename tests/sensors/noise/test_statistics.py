@@ -10,9 +10,9 @@ from oracles.noise import NUM as N
 from oracles.setups.signals import KOLMOGOROV, MM, Noise, correlation, standard_errors, uniform_distance
 from torch import Tensor
 
-from tgdsl.sensors.noise import random, stages
-from tgdsl.sensors.noise.radius import RADIUS
+from tgdsl.sensors.noise import pipeline, random
 from tgdsl.sensors.noise.stage import Now
+from tgdsl.sensors.noise.stages import Radius
 
 
 def test_white_noise_is_white():
@@ -100,8 +100,9 @@ def test_radii_are_uniform_at_each_step():
     found = []
     for _ in range(2):
         now = noise.now()
-        values = stages.draw(noise.stages, noise.constants, now)[RADIUS.name]
-        found.append(RADIUS.shift(values, now, like).double().numpy())
+        (radius,) = pipeline.draw(noise.stages, noise.constants, now)
+        assert isinstance(radius, Radius)
+        found.append(radius.shift(now, like).double().numpy())
         noise.read(0.0)
     for shift in found:
         assert np.abs(shift).max() <= 0.3 * MM
@@ -142,13 +143,13 @@ def test_ranges_are_uniform_over_environments():
         "hysteresis": {"strength": [0, 1], "time_constant": [0.1, 0.2]}, "crosstalk": {"strength": [0, 0.5], "sigma": [1e-3, 2e-3]},
     }  # fmt: skip
     noise = Noise(knobs, 1, num_envs=N, dt=2.0)
-    numbers = stages.draws_of(noise.stages)
+    numbers = pipeline.draws_of(noise.stages)
     drawn = {name for name, value in noise.constants.items() if name in numbers and value.ndim == 3}
-    assert drawn == set(stages.draws_of(stages.STAGES)) - {"release_threshold"}
+    assert drawn == set(pipeline.draws_of(pipeline.STAGES)) - {"release_threshold"}
 
     def values() -> dict[str, Tensor]:
-        stages_ = stages.draw(noise.stages, noise.constants, noise.now()).values()
-        return {name: value for stage in stages_ for name, value in stage._asdict().items()}
+        stages = pipeline.draw(noise.stages, noise.constants, noise.now())
+        return {name: getattr(stage, name) for stage in stages for name in stage.numbers}
 
     before = values()
     noise.reset()
@@ -176,8 +177,8 @@ def advanced(
     ages = memory["ages"] + dt
     steps = step.expand(noise.num_envs)[:, None]
     now = Now(dt, steps, steps, ages, None, None, streams)
-    values, past = stages.draw(noise.stages, noise.constants, now), {key: memory[key] for key in noise.memory}
-    found, new = stages.disturb(signal[:, None], noise.stages, values, "", past, now)
+    stages, past = pipeline.draw(noise.stages, noise.constants, now), {key: memory[key] for key in noise.memory}
+    found, new = pipeline.disturb(signal[:, None], stages, "", past, now)
     place = (step % memory["ring"].shape[1])[None]
     ring = memory["ring"].index_copy(1, place, new["ring"][:, None])
     ages = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1]], dim=1)

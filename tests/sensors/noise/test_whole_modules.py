@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 from noise_stages import ALL_TOGETHER, DT, NORMAL
-from oracles.setups.signals import MM
+from oracles.setups.signals import MM, ReferenceNoise
 
 import tgdsl
 from tgdsl.module.module import TactileModule
 from tgdsl.sensors.noise import Knobs, random
-from tgdsl.sensors.noise.stages import ReferenceNoise
 
 PADS = """
 <mujoco><worldbody>

@@ -27,7 +27,7 @@ from tgdsl.plan.plan import Plan
 from tgdsl.report.bench.results import Measured, Subject, with_front
 from tgdsl.report.bench.timing import times_of
 from tgdsl.sensors.known import known_kinds
-from tgdsl.sensors.noise.fields import quantity
+from tgdsl.sensors.noise.spec import quantity
 from tgdsl.tuning.recording import Recording
 from tgdsl.tuning.trials import Exact, Sensor, cost_of, exact_of, finest_of
 

@@ -18,7 +18,6 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.geometry import planes
@@ -48,48 +47,23 @@ def advance_anchors(
     state: list[Tensor],
     first: int,
 ) -> tuple[Tensor, Tensor]:
-    """Advance anchors in place, and return the active points; see `launch`.
+    """Advance anchors in place, and return z_p [m] and (z_p − e_p) h_p [m²] of active points, and their number.
 
-    It is no `triton_op`: places that depend on what was read would make a compiler conclude that all arguments may change.
-    """
-    return launch(anchor_kernel, pose, gate, pair, points, frames, counts, values, is_cubic, stick_slip, state, first)
-
-
-@advance_anchors.register_fake
-def _(pose: list[Tensor], gate: Tensor | None, pair: Tensor, points: Tensor, *_rest: Any) -> tuple[Tensor, Tensor]:
-    return _empty(pose, pair, points)
-
-
-def launch(
-    run: Any,
-    pose: list[Float[Tensor, "env pair"]],
-    gate: Float[Tensor, "env pair"] | None,
-    pair: Int[Tensor, " link"],
-    points: Float[Tensor, "3 case point"],
-    frames: Float[Tensor, "link 16"],
-    counts: Int[Tensor, "link 4"],
-    values: Float[Tensor, " node"],
-    is_cubic: bool,
-    stick_slip: list[Float[Tensor, ""]],
-    state: list[Float[Tensor, "env all"]],
-    first: int,
-) -> tuple[Float[Tensor, "6 env link point"], Int[Tensor, "env link"]]:
-    """Run the kernel and return z_p [m] and (z_p − e_p) h_p [m²] of active points, and their number.
-
-    Those of a link come first, in their order; the numbers after them mean nothing.
+    The result is (6, env, link, point) and (env, link); active points of a link come first, in their order, and the numbers
+    after them mean nothing. It is not a `triton_op`, because addresses that depend on loaded values would make a compiler
+    conclude that all arguments may change.
 
     Args:
-        run: The kernel.
         pose: As for `depth_kernel.launch`, as the next six.
-        gate: Negative where a pair may not be felt.
+        gate: Negative where a pair's gate is closed.
         pair: Index of each link's pair.
         points: Places in the object's frame [m].
-        frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes [m].
-        counts: Index of each grid's first node, and the number of its nodes along each axis.
+        frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes [m], (link, 16).
+        counts: Index of each grid's first node, and the number of its nodes along each axis, (link, 4).
         values: `Grid.values`.
         is_cubic: Whether it is interpolated by cubes.
         stick_slip: Standoff, enter, exit, and slip if there is friction: see `anchors.StickSlip`.
-        state: The planes that `point_anchors.PLANES` names, changed in place.
+        state: The planes (env, all) that `point_anchors.PLANES` names, changed in place.
         first: Where the object's points begin in them, link after link.
     """
     result, num_active = _empty(pose, pair, points)
@@ -97,7 +71,7 @@ def launch(
     assert num_points < MOST
     points, gates = points.contiguous(), pose[0] if gate is None else gate
     standoff, enter, exit, *slip = stick_slip
-    run[(num_envs * num_links,)](
+    anchor_kernel[(num_envs * num_links,)](
         result, num_active, *state, standoff, enter, exit, slip[0] if slip else standoff, *pose, gates, pair, points,
         frames.contiguous(), counts.contiguous(), values, first, state[0].stride(0),
         num_links, num_points, *pose[0].stride(), *pose[9].stride(), *gates.stride(), points.stride(0),
@@ -106,6 +80,11 @@ def launch(
         CHUNK=min(max(triton.next_power_of_2(num_points), LANES), CHUNK), num_warps=1, maxnreg=REGISTERS,
     )  # fmt: skip
     return result, num_active
+
+
+@advance_anchors.register_fake
+def _(pose: list[Tensor], gate: Tensor | None, pair: Tensor, points: Tensor, *_rest: Any) -> tuple[Tensor, Tensor]:
+    return _empty(pose, pair, points)
 
 
 def _empty(pose: list[Tensor], pair: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -117,7 +96,7 @@ def _empty(pose: list[Tensor], pair: Tensor, points: Tensor) -> tuple[Tensor, Te
 
 @triton.jit
 def anchor_kernel(
-    found, num_active, anchor_x, anchor_y, anchor_z, held, standoff, enter, exit, slip,
+    result, num_active, anchor_x, anchor_y, anchor_z, held, standoff, enter, exit, slip,
     xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values, first, state_env,
     num_links, num_points, turn_env, turn_pair, offset_env, offset_pair, gate_env, gate_pair, point_axis, point_env,
     SLIDES: tl.constexpr, IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, LANES: tl.constexpr, CHUNK: tl.constexpr,
@@ -125,10 +104,10 @@ def anchor_kernel(
     """Advance all points on one link of one environment; see `launch`."""
     row = tl.program_id(0).to(tl.int64)
     env, link = row // num_links, tl.program_id(0) % num_links
-    own = env * state_env + first + link * num_points
-    state = (anchor_x + own, anchor_y + own, anchor_z + own, held + own)
+    first_state = env * state_env + first + link * num_points
+    state = (anchor_x + first_state, anchor_y + first_state, anchor_z + first_state, held + first_state)
     points += env * point_env
-    found += row * num_points
+    result += row * num_points
     plane = tl.num_programs(0).to(tl.int64) * num_points
     pair = tl.load(pairs + link)
     planes = xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz
@@ -136,11 +115,11 @@ def anchor_kernel(
     is_open = is_felt(gates, env * gate_env + pair * gate_pair, IS_GATED)
     lost = _lost(pose)
 
-    num_found = tl.full((), 0, tl.int32)
+    num_written = tl.full((), 0, tl.int32)
     for start in range(0, num_points, CHUNK):
         point = start + tl.arange(0, CHUNK)
         is_point = point < num_points
-        # A pose that is not a number comes out of all points, whatever the gate says.
+        # A pose with a NaN makes all points NaN, whatever the gate says.
         candidates = ((tl.load(state[3] + point, is_point, 0.0) + lost <= 0) == 0) & is_point
         if is_open:
             skin = surface(frames, counts, values, link)
@@ -152,7 +131,7 @@ def anchor_kernel(
             skin = surface(frames, counts, values, link)
             stick_slip = (tl.load(standoff), tl.load(enter), tl.load(exit), tl.load(slip))
             # The compacted indices occupy the output's memory: never more is written than has been read of them.
-            compacted = found + start
+            compacted = result + start
             tl.store(compacted + _rank(candidates), point.to(tl.float32), candidates)
             tl.debug_barrier()
             for low in range(0, num_candidates, LANES):
@@ -165,15 +144,15 @@ def anchor_kernel(
                     distance, gradient = measured(skin, here, is_candidate, IS_CUBIC)
                 strength = _advanced(chosen_points, is_candidate, here, distance, gradient, stick_slip, state, SLIDES)
                 is_active = ((strength[0] + lost != 0) | (strength[1] != 0) | (strength[2] != 0)) & is_candidate
-                to = found + (num_found + _rank(is_active))
+                to = result + (num_written + _rank(is_active))
                 tl.store(to, here[0], is_active)
                 tl.store(to + plane, here[1], is_active)
                 tl.store(to + 2 * plane, here[2], is_active)
                 tl.store(to + 3 * plane, strength[0], is_active)
                 tl.store(to + 4 * plane, strength[1], is_active)
                 tl.store(to + 5 * plane, strength[2], is_active)
-                num_found += tl.sum(is_active.to(tl.int32), axis=0)
-    tl.store(num_active + row, num_found)
+                num_written += tl.sum(is_active.to(tl.int32), axis=0)
+    tl.store(num_active + row, num_written)
 
 
 @triton.jit
@@ -192,7 +171,7 @@ def _advanced(point, is_point, here, distance, gradient, stick_slip, state, SLID
         tl.load(anchor_x + point, held_before, 0.0), tl.load(anchor_y + point, held_before, 0.0),
         tl.load(anchor_z + point, held_before, 0.0),
     )  # fmt: skip
-    # What is not a number is no less than anything.
+    # Written so that NaN keeps its anchor.
     is_held = held_before & ((distance > standoff + exit) == 0)
     depth = tl.maximum(standoff - distance, 0.0, propagate_nan=tl.PropagateNan.ALL)
     none = tl.zeros_like(depth)
@@ -201,18 +180,18 @@ def _advanced(point, is_point, here, distance, gradient, stick_slip, state, SLID
     if SLIDES:
         moved, anchor = _slid(moved, anchor, gradient, slip * depth)
     is_taken = (is_held == 0) & (standoff - distance > enter) & is_point
-    kept = chosen(is_held, anchor, chosen(is_taken, here, (none, none, none)))
+    new_anchor = chosen(is_held, anchor, chosen(is_taken, here, (none, none, none)))
     is_changed = held_before | is_taken
-    tl.store(anchor_x + point, kept[0], is_changed)
-    tl.store(anchor_y + point, kept[1], is_changed)
-    tl.store(anchor_z + point, kept[2], is_changed)
+    tl.store(anchor_x + point, new_anchor[0], is_changed)
+    tl.store(anchor_y + point, new_anchor[1], is_changed)
+    tl.store(anchor_z + point, new_anchor[2], is_changed)
     tl.store(held + point, (is_held | is_taken).to(tl.float32), is_changed)
     return depth * moved[0], depth * moved[1], depth * moved[2]
 
 
 @triton.jit
 def _lost(pose):
-    """Return 0, or what is not a number if a pose is not one."""
+    """Return 0, or NaN if a pose has a NaN."""
     turn = pose[0] + pose[1] + pose[2] + pose[3] + pose[4] + pose[5] + pose[6] + pose[7] + pose[8]
     return 0.0 * (turn + pose[9] + pose[10] + pose[11])
 

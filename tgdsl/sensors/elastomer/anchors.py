@@ -1,8 +1,8 @@
 """Anchors: the material point of an object that each taxel sticks to, and its tangential displacement since.
 
 A taxel i takes an anchor e_i, the object's material point at the taxel, in the object's frame, when the deepest object is
-deeper than `enter`; it is released when that object is farther than `exit` above the skin, or may no longer be felt. One object
-at a time holds an anchor: the deepest when it was taken, the first among equals. In the link's frame the displacement is
+deeper than `enter`; it is released when that object is farther than `exit` above the skin, or its gate closes. One object
+at a time holds an anchor: the deepest one at that instant, the first among equals. In the link's frame the displacement is
 
     s_i = R_oᵀ (e_i − c_o) − x_i,        t_i = Π_ni(s_i)                                      [m]
 
@@ -27,14 +27,14 @@ from tgdsl.geometry.reference import TIE
 from tgdsl.quantities.contact_depth import Penetration, ReferencePenetration
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")
-"""What is carried from call to call: e_i [m], and the number of its object from 1, 0 for none."""
+"""State: e_i [m], and the number of its object from 1, 0 for none."""
 
 
 class StickSlip(NamedTuple):
     """Stick and slip of a contact: when it gets an anchor, loses it, and slides; numbers, or scalar tensors.
 
     Attributes:
-        standoff: s, height of the undeformed skin, up to which objects are felt [m].
+        standoff: s, height of the undeformed skin above the taxels [m].
         enter: Depth from which a contact sticks [m].
         exit: Distance above the skin at which the anchor is released [m].
         slip: Largest tangential displacement per depth [1]; None: it never slides.
@@ -47,24 +47,24 @@ class StickSlip(NamedTuple):
 
 
 def advance(
-    felt: Penetration, pos: Vec, normal: Vec, stick_slip: StickSlip, state: Mapping[str, Tensor]
+    touch: Penetration, pos: Vec, normal: Vec, stick_slip: StickSlip, state: Mapping[str, Tensor]
 ) -> tuple[Vec, dict[str, Tensor]]:
     """Return the tangential displacements t [m] and the new anchors."""
     anchor, held_by = (state["anchor_x"], state["anchor_y"], state["anchor_z"]), state["object"]
-    zero = torch.zeros_like(felt.depth)
+    zero = torch.zeros_like(touch.depth)
     moved, holds = (zero, zero, zero), []
-    for k, (name, distance) in enumerate(felt.distances.items(), start=1):
-        frame = felt.frames[name]
+    for k, (name, distance) in enumerate(touch.distances.items(), start=1):
+        frame = touch.frames[name]
         holds.append((held_by == k) & ~(distance.value > stick_slip.standoff + stick_slip.exit))
         here = planes.rotate_back(frame.rotation, planes.sub(anchor, frame.offset))
         moved = planes.where(holds[-1], planes.sub(here, pos), moved)
     stretch = planes.sub(moved, planes.scale(planes.dot(moved, normal), normal))
-    kept, slides = (stretch, None) if stick_slip.slip is None else capped(stretch, stick_slip.slip * felt.depth)
-    slid = planes.sub(kept, stretch)
+    tangential, slides = (stretch, None) if stick_slip.slip is None else capped(stretch, stick_slip.slip * touch.depth)
+    slid = planes.sub(tangential, stretch)
     is_free = ~torch.stack(holds).any(dim=0)
     taken, holder, deepest = (zero, zero, zero), zero, zero + stick_slip.enter
-    for k, ((name, distance), is_held) in enumerate(zip(felt.distances.items(), holds, strict=True), start=1):
-        rotation, offset = felt.frames[name]
+    for k, ((name, distance), is_held) in enumerate(zip(touch.distances.items(), holds, strict=True), start=1):
+        rotation, offset = touch.frames[name]
         dragged = anchor
         if slides is not None:
             dragged = planes.where(slides, planes.add(anchor, planes.rotate(rotation, slid)), anchor)
@@ -73,7 +73,7 @@ def advance(
         taken = planes.where(is_held, dragged, planes.where(is_taken, planes.add(planes.rotate(rotation, pos), offset), taken))
         holder = torch.where(is_held | is_taken, float(k), holder)
         deepest = torch.maximum(deepest, depth)
-    return kept, dict(zip(PLANES, (*taken, holder), strict=True))
+    return tangential, dict(zip(PLANES, (*taken, holder), strict=True))
 
 
 def capped(stretch: Vec, limit: Tensor) -> tuple[Vec, Tensor]:
@@ -111,9 +111,9 @@ def advance_reference(
 
 def _deepest(depth: np.ndarray, enter: float) -> int:
     """Return the deepest object, the first among equals; −1 if none is deeper than `enter`."""
-    chosen, most = -1, enter
+    best, most = -1, enter
     for k, d in enumerate(depth):
-        if d > (most + TIE if chosen >= 0 else most):
-            chosen = k
+        if d > (most + TIE if best >= 0 else most):
+            best = k
         most = max(most, d)
-    return chosen
+    return best

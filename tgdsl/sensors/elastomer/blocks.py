@@ -13,7 +13,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.sensors.base import SurfaceOf
 from tgdsl.sensors.elastomer.bonded_layer import Layer
 from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, LinkTaxels
-from tgdsl.sensors.elastomer.operators import OperatorForm, Response, fold
+from tgdsl.sensors.elastomer.operators import Operator, OperatorForm, Response, fold
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -23,10 +23,10 @@ PLANES = {"spread": (3, 1), "bulge": (1, 1), "drag": (1, 1), "traction": (3, 3),
 
 def link_taxels(layout: Layout, link: int) -> LinkTaxels:
     """Return the taxels of one link; inactive ones, whose area may be nothing, get the others' mean."""
-    own = layout.link_id == link
-    is_active, area = layout.radius[own] > 0, layout.area[own]
+    at = layout.link_id == link
+    is_active, area = layout.radius[at] > 0, layout.area[at]
     mean = area[is_active].mean() if is_active.any() else 1.0
-    return LinkTaxels(layout.pos[own], layout.normal[own], np.where(is_active, area, mean), layout.cell[own], is_active)
+    return LinkTaxels(layout.pos[at], layout.normal[at], np.where(is_active, area, mean), layout.cell[at], is_active)
 
 
 def gaussian(spec: ElastomerSpec, part: LinkTaxels) -> Gaussian:
@@ -49,32 +49,30 @@ def weights(spec: ElastomerSpec, part: LinkTaxels) -> Float[np.ndarray, " taxel"
     return np.where(part.is_active, area, 0.0)
 
 
-def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
-    """Return the constants of all operators of all links, `<operator>/<link>/<constant>`.
+def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> dict[str, tuple[Operator[np.ndarray], ...]]:
+    """Return the operators of all links by name.
 
     Raises:
         LowerError: If a convolution is asked for where it cannot be, or the pad's edge cannot be clamped.
     """
-    constants = {}
+    of_links = []
     for i, link in enumerate(layout.links):
         try:
-            constants |= _fold_link(spec, layout, i, surface_of)
+            of_links.append(_fold_link(spec, layout, i, surface_of))
         except LowerError as error:
             field = error.field or "boundary"  # what a surface says knows no field
             raise LowerError(f'link "{link.name}": {error.what}', field, error.hint) from error
-    return constants
+    return {name: tuple(operators[name] for operators in of_links) for name in of_links[0]}
 
 
-def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
-    """Return the constants of one link's operators, `<operator>/<link>/<constant>`."""
+def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, Operator[np.ndarray]]:
     part = link_taxels(layout, link)
     pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
-    wanted, constants = OperatorForm(spec.operator, spec.tolerance), {}
-    for name, response in responses(spec, part, pad).items():
-        is_alike = not (name == "spread" and pad is not None)
-        folded = fold(response, PLANES[name], part, wanted, is_alike)
-        constants |= {f"{name}/{link}/{key}": value for key, value in folded.items()}
-    return constants
+    form = OperatorForm(spec.operator, spec.tolerance)
+    return {
+        name: fold(response, PLANES[name], part, form, is_alike=pad is None or name != "spread")
+        for name, response in responses(spec, part, pad).items()
+    }
 
 
 def responses(spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None) -> dict[str, Response]:
@@ -88,8 +86,8 @@ def responses(spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None) -> dic
         clamped = kernel.spread(part.pos, part.normal, part.pos) + clamping(spec, part, pad)
 
     def spread(source: np.ndarray) -> np.ndarray:
-        own = kernel.spread(part.pos, part.normal, part.pos[source]) if clamped is None else clamped[..., source]
-        return is_active * own * weight[source]
+        response = kernel.spread(part.pos, part.normal, part.pos[source]) if clamped is None else clamped[..., source]
+        return is_active * response * weight[source]
 
     def bulge(source: np.ndarray) -> np.ndarray:
         return is_active * kernel.bulge(part, source) * weight[source]
@@ -122,11 +120,11 @@ def clamping(spec: ElastomerSpec, part: LinkTaxels, pad: Surface) -> Float[np.nd
     added = np.zeros((3, 1, len(part.pos), len(part.pos)))
     if not part.is_active.any():
         return added
-    own, drag = np.flatnonzero(part.is_active), spec.boundary.drag
+    active, drag = np.flatnonzero(part.is_active), spec.boundary.drag
     extent = float(np.ptp(pad.corners.reshape(-1, 3), axis=0).max())
-    sheet = unroll(pad, part.pos[own], part.normal[own], element_size(spec.thickness, drag, extent))
+    sheet = unroll(pad, part.pos[active], part.normal[active], element_size(spec.thickness, drag, extent))
     free = gaussian(spec, part).spread(sheet.edge_pos, sheet.edge_normal, part.pos)[:, 0]
     back = -np.einsum("eak,kei->aei", sheet.edge_axes, free).reshape(-1, len(part.pos))
-    inside = (correction(sheet, spec.thickness, drag, spec.boundary.bulk) @ back).reshape(2, len(own), -1)
-    added[:, 0, own] = np.einsum("jak,aji->kji", sheet.taxel_axes, inside)
+    inside = (correction(sheet, spec.thickness, drag, spec.boundary.bulk) @ back).reshape(2, len(active), -1)
+    added[:, 0, active] = np.einsum("jak,aji->kji", sheet.taxel_axes, inside)
     return added

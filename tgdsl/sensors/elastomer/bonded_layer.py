@@ -10,7 +10,7 @@ in which ν = 1/2 is no exception, because λ div u = −4 G ν B e^(−kz) stay
 part is τ sinh(k(t − z)) / (G k cosh kt). Hankel integrals of order 0, 1 and 2 take both to the plane, the load spread over
 the same patch as in `half_space`, whose transform cuts the integrals off; they are tabulated once and interpolated.
 
-Source: the method is that of Burmister's layered elastic systems (1945); see also Johnson, *Contact Mechanics*, section 5.8.
+Source: Burmister's method for layered elastic systems (1945); see also Johnson, *Contact Mechanics*, section 5.8.
 
 Shapes: `k` wavenumbers, `r` distances.
 """
@@ -82,15 +82,15 @@ def response(k: np.ndarray, layer: Layer) -> Response:
 def profiles(r: np.ndarray, layer: Layer, patch: float) -> Profiles:
     """Return the layer's profiles at distances r [m] from a patch of radius a [m], by Hankel quadrature."""
     k, weight = _quadrature(float(np.max(r, initial=0.0)), layer, patch)
-    found = response(k, layer)
+    layer_response = response(k, layer)
     weight = weight * k * patch_transform(k, patch) / (4.0 * np.pi)
     factors = np.stack(
         [
-            2.0 * found.w_normal * weight,
-            (found.v_tangential + found.transverse) * weight,
-            2.0 * found.v_normal * weight,
-            -2.0 * found.w_tangential * weight,
-            (found.transverse - found.v_tangential) * weight,
+            2.0 * layer_response.w_normal * weight,
+            (layer_response.v_tangential + layer_response.transverse) * weight,
+            2.0 * layer_response.v_normal * weight,
+            -2.0 * layer_response.w_tangential * weight,
+            (layer_response.transverse - layer_response.v_tangential) * weight,
         ],
         axis=1,
     )

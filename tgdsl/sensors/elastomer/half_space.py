@@ -6,7 +6,7 @@ area A = π a². Its pressure is that whose Hankel transform is
 
     φ(k) = (1 + k b + c k² b²) exp(−k b),        b = (c + 1) a,        c = cos 20° − 1/2 = 0.4397
 
-Of this family only one member has, besides the total load, both the second moment of a uniform disc of radius a (⟨s²⟩ = a²/2,
+Only one member of this family has the total load, the second moment of a uniform disc of radius a (⟨s²⟩ = a²/2,
 so the field away from the patch is the disc's to second order) and the disc's normal and tangential surface displacement at
 its own centre (so that a sum over patches that tile a surface gives what a smooth load gives): (2 − 4c)(1 + c)² = 1/2.
 Every integral over k is then elementary, finite at z = 0, r = 0, and the field obeys equilibrium exactly, since it is a

@@ -1,9 +1,9 @@
 """The fixed matrices of an elastomer: what each source taxel of a link does to each target, per unit of its input.
 
-On a curved link, source i and target j meet in the target's tangent plane: their distance is that of the tangential offset
+On a curved link, the offset of source i and target j is projected to the target's tangent plane,
 r_ij = Π_nj(x_j − x_i), exact for every pair, and tangential loads are projected there. The Gaussian kernel is so by
-definition. For the elastic kernels it is an approximation, good as long as the normals of taxels that matter to each other
-differ by little: the surface is taken as flat between them, and its curvature and a link's far side are not seen.
+definition. For the elastic kernels it is an approximation that takes the surface between two taxels as flat: it is good where
+the normals of interacting taxels differ by little, and it neglects curvature and the far side of a link.
 
 Shapes: `source`, `target` taxels; a matrix is (out, in, target, source), `out` and `in` planes of a vector or scalar.
 """
@@ -110,16 +110,16 @@ class Elastic:
         r = offset(taxels.pos, n, taxels.pos[source])
         length = np.sqrt(np.einsum("kji,kji->ji", r, r))
         e = r / np.where(length > 0, length, 1.0)
-        found = Profiles(*(part * area for part in self.profiles(length, area, float(taxels.spacing**2))))
+        profiles = Profiles(*(part * area for part in self.profiles(length, area, float(taxels.spacing**2))))
         flat = np.eye(3)[:, :, None] - np.einsum("jk,jl->klj", n, n)
-        own = np.eye(3)[:, :, None] - np.einsum("ik,il->kli", m, m)
-        twist = found.along - found.bend
+        source_plane = np.eye(3)[:, :, None] - np.einsum("ik,il->kli", m, m)
+        twist = profiles.along - profiles.bend
         # A tangential traction stays as much as it lies in the target's plane; e lies in it already.
-        tangential = np.einsum("kpj,pli,ji->klji", flat, own, twist)
-        seen = np.einsum("pji,pli->lji", e, own)
-        tangential += np.einsum("kji,lji,ji->klji", e, seen, 2.0 * found.bend)
-        tangential -= np.einsum("jk,lji,ji->klji", n, seen, found.lift)
-        pressed = np.einsum("jk,ji->kji", n, found.normal) - e * found.spread
+        tangential = np.einsum("kpj,pli,ji->klji", flat, source_plane, twist)
+        seen = np.einsum("pji,pli->lji", e, source_plane)
+        tangential += np.einsum("kji,lji,ji->klji", e, seen, 2.0 * profiles.bend)
+        tangential -= np.einsum("jk,lji,ji->klji", n, seen, profiles.lift)
+        pressed = np.einsum("jk,ji->kji", n, profiles.normal) - e * profiles.spread
         return tangential + np.einsum("kji,il->klji", pressed, m)
 
 

@@ -1,6 +1,6 @@
 """Elastomer: displacement of the markers in a soft skin that is pressed and dragged, as a vision-based sensor sees them.
 
-Taxels are markers and sources alike; those of one link act on each other. With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
+Taxels are both markers and sources; taxels of one link act on each other. With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
 r_ij = Π_nj(x_j − x_i), depth h_i = max(0, s − min_o φ_o(x_i)) of the felt objects o under the skin's height s [m], and t_i
 the tangential displacement of the object's material since the taxel stuck to it [m] (`anchors`), the Gaussian kernel gives
 
@@ -36,6 +36,10 @@ own outline. Without friction an elastic skin sticks to what it touches until th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, TypeAlias
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -46,54 +50,101 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.points import Points
-from tgdsl.sensors.base import Alternative, Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
+from tgdsl.sensors.base import Alternative, Array, Context, Kind, Lowered, Memory, State, SurfaceOf, components, scalar, vector
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links
+from tgdsl.sensors.elastomer.operators import Operator, operator_of
 from tgdsl.sensors.elastomer.point_anchors import Markers
 from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.sensors.noise import TAXEL
 
-FLAT = "flat/"
-"""Constants `flat/<first taxel>`: links whose taxels have one normal. That they are there is all they say."""
-CHANNELS = tuple(Channel(f"displacement_{axis}", "m") for axis in "xyz")
+Operators: TypeAlias = tuple[Operator[Array], ...] | None
+"""An operator of each link; None if the skin does not need it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ElastomerConstants(Generic[Array]):
+    """Operators, strengths and stiffnesses, see `ElastomerSpec`; None if the skin does not need them.
+
+    Attributes:
+        normal: Normals (3, taxel).
+        slip: Largest tangential displacement per depth [1].
+        shear_stiffness: K_t [Pa/m].
+        is_active: 1 of taxels that are moved by points, else 0.
+        flat: Links whose taxels have one normal, by the first taxel; the values are unused.
+    """
+
+    normal: Array
+    spread: Operators[Array] = None
+    bulge: Operators[Array] = None
+    drag: Operators[Array] = None
+    traction: Operators[Array] = None
+    pressure: Operators[Array] = None
+    dilation_strength: Array | None = None
+    depth_exponent: Array | None = None
+    normal_stiffness: Array | None = None
+    standoff: Array | None = None
+    enter: Array | None = None
+    exit: Array | None = None
+    slip: Array | None = None
+    shear_strength: Array | None = None
+    shear_stiffness: Array | None = None
+    shear_falloff: Array | None = None
+    is_active: Array | None = None
+    reference_area: Array | None = None
+    flat: Mapping[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, **constants: Array) -> ElastomerConstants[Array]:
+        """Return constants by their names: `<operator>/<link>/<constant>`, `flat/<first taxel>`, or a field's."""
+        fields: dict[str, Any] = {}
+        for path, value in constants.items():
+            *parents, name = path.split("/")
+            of_parent = fields
+            for parent in parents:
+                of_parent = of_parent.setdefault(parent, {})
+            of_parent[name] = value
+        operators = {name: value for name, value in fields.items() if isinstance(value, dict) and name != "flat"}
+        links = {name: tuple(operator_of(each[str(i)]) for i in range(len(each))) for name, each in operators.items()}
+        return cls(**{**fields, **links})
 
 
 def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Fold geometry and material into one operator per link; strengths and stiffnesses stay numbers.
 
     Raises:
-        LowerError: If the operator or the clamped boundary cannot be had on these links.
+        LowerError: If these links do not allow the operator or the clamped boundary.
     """
-    constants = {**fold_links(spec, layout, surface_of), "normal": layout.normal.T}
-    if spec.normal_stiffness is not None:
-        constants["normal_stiffness"] = scalar(spec.normal_stiffness)
-    else:
-        constants |= {"dilation_strength": scalar(spec.dilation_strength), "depth_exponent": scalar(spec.depth_exponent)}
-    standoff = np.full(layout.num_taxels, spec.standoff)
-    if spec.anchored is None:
-        depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff)
-        return Lowered(CHANNELS, constants, requests=(depth,), notes=spec.notes)
-    constants |= {"standoff": scalar(spec.standoff), "enter": scalar(spec.enter), "exit": scalar(spec.exit)}
-    if spec.slip is not None:
-        constants["slip"] = scalar(spec.slip)
-    if spec.normal_stiffness is not None:
-        constants["shear_stiffness"] = scalar(spec.normal_stiffness * spec.stiffness_ratio)
-    else:
-        constants["shear_strength"] = scalar(spec.shear_strength)
-    max_distance = spec.standoff + spec.exit
+    has_shear, on_points, is_elastic = spec.has_shear, spec.anchored == "points", spec.kernel != "gaussian"
+    constants = ElastomerConstants(
+        normal=layout.normal.T,
+        **fold_links(spec, layout, surface_of),
+        dilation_strength=None if is_elastic else scalar(spec.dilation_strength),
+        depth_exponent=None if is_elastic else scalar(spec.depth_exponent),
+        normal_stiffness=None if spec.normal_stiffness is None else scalar(spec.normal_stiffness),
+        standoff=scalar(spec.standoff) if has_shear else None,
+        enter=scalar(spec.enter) if has_shear else None,
+        exit=scalar(spec.exit) if has_shear else None,
+        slip=scalar(spec.slip) if has_shear and spec.slip is not None else None,
+        shear_strength=scalar(spec.shear_strength) if has_shear and not is_elastic else None,
+        shear_stiffness=scalar(spec.shear_stiffness) if has_shear and is_elastic else None,
+        shear_falloff=scalar(spec.shear_falloff) if on_points else None,
+        is_active=(layout.radius > 0).astype(np.float64) if on_points else None,
+        reference_area=scalar(spec.reference_area) if on_points and spec.model != "paper" else None,
+        flat={str(first): np.asarray(1) for first in _flat_links(layout)} if on_points else {},
+    )
+    standoff, max_distance = np.full(layout.num_taxels, spec.standoff), spec.standoff + spec.exit
+    depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff)
+    state, points = {}, ()
     if spec.anchored == "taxels":
         state = {name: Memory() for name in anchors.PLANES}
-        depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff, range=max_distance, distance=True, frame=True)
-        return Lowered(CHANNELS, constants, state, requests=(depth,), notes=spec.notes)
-    constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (layout.radius > 0).astype(np.float64)}
-    constants |= {f"{FLAT}{first}": np.asarray(1) for first in _flat_links(layout)}
-    if spec.model != "paper":
-        constants["reference_area"] = scalar(spec.reference_area)
-    state = {name: Memory(shape=Points, overwritten=True) for name in point_anchors.PLANES}
-    depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff, range=max_distance)
-    points = Points(spec.objects, spec.is_gated, num_points=spec.points, range=max_distance)
-    return Lowered(CHANNELS, constants, state, requests=(depth, points), notes=spec.notes)
+        depth = replace(depth, range=max_distance, distance=True, frame=True)
+    elif on_points:
+        state = {name: Memory(shape=Points, overwritten=True) for name in point_anchors.PLANES}
+        depth = replace(depth, range=max_distance)
+        points = (Points(spec.objects, spec.is_gated, num_points=spec.points, range=max_distance),)
+    return Lowered(vector("displacement", "m"), constants, state, requests=(depth, *points), notes=spec.notes)
 
 
 def _flat_links(layout: Layout) -> list[int]:
@@ -103,47 +154,55 @@ def _flat_links(layout: Layout) -> list[int]:
     return [first for first, end in zip(starts, ends, strict=True) if (layout.normal[first:end] == layout.normal[first]).all()]
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: ElastomerConstants[Tensor], state: State
+) -> tuple[dict[str, Tensor], State]:
     """Return the displacement planes [m] and the new anchors."""
-    normal = planes.split(constants["normal"].T)
-    felt = gathered[ContactDepth]
+    normal = planes.split(constants.normal.T)
+    touch = gathered[ContactDepth]
     shear, loads, after = None, None, {}
-    if "enter" in constants:
-        stick_slip = anchors.StickSlip(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
-        if "shear_falloff" in constants:
+    if constants.standoff is not None and constants.enter is not None and constants.exit is not None:
+        stick_slip = anchors.StickSlip(constants.standoff, constants.enter, constants.exit, constants.slip)
+        if constants.shear_falloff is not None:
             loads, after = point_anchors.SHEAR_LOADS(list(gathered[Points].values()), stick_slip, state)
         else:
-            shear, after = anchors.advance(felt, felt.pos, normal, stick_slip, state)
-    move = _elastic if "normal_stiffness" in constants else _gaussian
-    result = move(felt.depth, shear, normal, constants)
-    if loads is not None:
-        flat = frozenset(int(name.removeprefix(FLAT)) for name in constants if name.startswith(FLAT))
-        markers = Markers(felt.pos, normal, constants["shear_falloff"], constants.get("reference_area"), flat)
-        dragged = point_anchors.drag(loads, markers, felt.depth.shape[0])
-        result = planes.add(result, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
-    return {channel.name: plane for channel, plane in zip(CHANNELS, result, strict=True)}, after
+            shear, after = anchors.advance(touch, touch.pos, normal, stick_slip, state)
+    move = _gaussian if constants.normal_stiffness is None else _elastic
+    result = move(touch.depth, shear, normal, constants)
+    if loads is not None and constants.shear_falloff is not None:
+        assert constants.shear_strength is not None
+        flat = frozenset(int(first) for first in constants.flat)
+        markers = Markers(touch.pos, normal, constants.shear_falloff, constants.reference_area, flat)
+        dragged = point_anchors.drag(loads, markers, touch.depth.shape[0])
+        result = planes.add(result, planes.scale(constants.shear_strength * constants.is_active, dragged))
+    return components("displacement", result), after
 
 
-def _gaussian(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants) -> Vec:
-    strength = constants["dilation_strength"]
-    in_plane = planes.vec(operators.apply(constants, "spread", [strength * depth]))
-    (bulge,) = operators.apply(constants, "bulge", [strength * planes.power(depth, constants["depth_exponent"])])
+def _gaussian(depth: Tensor, shear: Vec | None, normal: Vec, constants: ElastomerConstants[Tensor]) -> Vec:
+    strength = constants.dilation_strength
+    assert strength is not None and constants.depth_exponent is not None
+    assert constants.spread is not None and constants.bulge is not None
+    in_plane = planes.vec(operators.apply(constants.spread, [strength * depth]))
+    (bulge,) = operators.apply(constants.bulge, [strength * planes.power(depth, constants.depth_exponent)])
     result = planes.add(in_plane, planes.scale(bulge, normal))
     if shear is None:
         return result
-    pulled = torch.stack(planes.scale(constants["shear_strength"] * depth, shear))
-    (dragged,) = operators.apply(constants, "drag", [pulled])
+    assert constants.shear_strength is not None and constants.drag is not None
+    pulled = torch.stack(planes.scale(constants.shear_strength * depth, shear))
+    (dragged,) = operators.apply(constants.drag, [pulled])
     along = planes.vec(dragged)
     return planes.add(result, planes.sub(along, planes.scale(planes.dot(along, normal), normal)))
 
 
-def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants) -> Vec:
-    pressure = constants["normal_stiffness"] * depth
-    if shear is None:
-        return planes.vec(operators.apply(constants, "pressure", [pressure]))
-    stiffness = torch.where(depth > 0, constants["shear_stiffness"], 0.0)
+def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: ElastomerConstants[Tensor]) -> Vec:
+    assert constants.normal_stiffness is not None
+    pressure = constants.normal_stiffness * depth
+    if constants.pressure is not None:
+        return planes.vec(operators.apply(constants.pressure, [pressure]))
+    assert shear is not None and constants.shear_stiffness is not None and constants.traction is not None
+    stiffness = torch.where(depth > 0, constants.shear_stiffness, 0.0)
     traction = planes.sub(planes.scale(stiffness, shear), planes.scale(pressure, normal))
-    return planes.vec(operators.apply(constants, "traction", traction))
+    return planes.vec(operators.apply(constants.traction, traction))
 
 
 def alternatives(spec: ElastomerSpec) -> list[Alternative]:
@@ -164,4 +223,5 @@ ELASTOMER = Kind(
     knobs=TAXEL,
     gains_depth=True,
     alternatives=alternatives,
+    constants=ElastomerConstants.of,
 )

@@ -1,6 +1,6 @@
 """Applying a fixed matrix per link to planes (…, taxel): as it is, cut to its rank, or as a convolution on a regular grid.
 
-Every form is made at compile time and is known by its constants:
+Every form is built at compile time:
 
 | form | constants, per link | what it costs per environment, in multiply-adds |
 |---|---|---|
@@ -15,8 +15,9 @@ error is within a tolerance of the matrix, by Frobenius' norm. The choice is by 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -24,20 +25,95 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import LowerError
+from tgdsl.sensors.base import Array
 from tgdsl.sensors.elastomer.kernels import LinkTaxels
 from tgdsl.tensors.link_products import LINK_PRODUCTS
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
-"""Time per multiply-add of each form, over that of a large matrix product (one CPU core, float32, 512 environments)."""
+"""Time per multiply-add, relative to a large matrix product (one CPU core, float32, 512 environments)."""
 SAME = 1e-6
 """Relative difference up to which spacings, areas and normals of a grid count as equal."""
 
 Response = Callable[[Int[np.ndarray, " source"]], Float[np.ndarray, "out in target source"]]
-"""Returns what some source taxels do to all taxels of the link."""
+"""Returns the responses of all taxels of the link to some source taxels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dense(Generic[Array]):
+    """The matrix (in, source, out, target)."""
+
+    matrix: Array
+
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels of the link."""
+        return self.matrix.shape[1]
+
+    def __call__(self: Dense[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
+        """Return the output planes (…, taxel)."""
+        sources, targets = self.matrix.shape[1], self.matrix.shape[3]
+        return (_joined(planes) @ self.matrix.reshape(len(planes) * sources, -1)).split(targets, dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Truncated(Generic[Array]):
+    """Factors of the matrix, (in, source, rank) and (rank, out, target)."""
+
+    left: Array
+    right: Array
+
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels of the link."""
+        return self.left.shape[1]
+
+    def __call__(self: Truncated[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
+        """Return the output planes (…, taxel)."""
+        left, right = self.left, self.right
+        out = (_joined(planes) @ left.reshape(-1, left.shape[2])) @ right.reshape(right.shape[0], -1)
+        return out.split(right.shape[2], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Convolution(Generic[Array]):
+    """The transform of the response, (out, in, row, column, 2); the taxel of each cell; and the cell of each taxel."""
+
+    spectrum: Array
+    cells: Array
+    places: Array
+
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels of the link."""
+        return self.places.shape[0]
+
+    def __call__(self: Convolution[Tensor], planes: list[Tensor]) -> tuple[Tensor, ...]:
+        """Return the output planes (…, taxel)."""
+        spectrum = torch.view_as_complex(self.spectrum)
+        rows, columns = self.cells.shape
+        size = spectrum.shape[2], 2 * (spectrum.shape[3] - 1)
+        order = self.cells.reshape(-1)
+        waves = [torch.fft.rfft2(plane[..., order].unflatten(-1, (rows, columns)), s=size) for plane in planes]
+        results = []
+        for response in spectrum:
+            total = sum((wave * factor for wave, factor in zip(waves, response, strict=True)), start=torch.zeros_like(waves[0]))
+            plane = torch.fft.irfft2(total, s=size)[..., :rows, :columns]
+            results.append(plane.flatten(-2)[..., self.places])
+        return tuple(results)
+
+
+Operator: TypeAlias = Dense[Array] | Truncated[Array] | Convolution[Array]
+
+
+def operator_of(constants: Mapping[str, Array]) -> Operator[Array]:
+    """Return the operator of one link with these constants."""
+    return next(
+        form(**constants) for form in (Dense, Truncated, Convolution) if form.__dataclass_fields__.keys() == constants.keys()
+    )
 
 
 class OperatorForm(NamedTuple):
-    """What the user asked for: a form or "auto", and the relative error that is allowed; None: none, if there is a choice."""
+    """The user's form or "auto", and the allowed relative error; None: exact forms, if there is a choice."""
 
     form: str
     tolerance: float | None
@@ -50,15 +126,15 @@ class OperatorForm(NamedTuple):
 
 def fold(
     response: Response, planes: tuple[int, int], taxels: LinkTaxels, wanted: OperatorForm, is_alike: bool = True
-) -> dict[str, np.ndarray]:
-    """Return the constants of one link's operator.
+) -> Operator[np.ndarray]:
+    """Return one link's operator.
 
     Args:
         response: Its matrix.
-        planes: Numbers of planes that go out and in.
+        planes: Numbers of output and input planes.
         taxels: The link's taxels.
         wanted: The form and its error.
-        is_alike: Whether the response depends on nothing but the way from source to target where the taxels are alike.
+        is_alike: Whether, between equal taxels, the response depends only on the offset from source to target.
 
     Raises:
         LowerError: If a convolution is asked for where the taxels are no regular grid.
@@ -75,12 +151,12 @@ def fold(
     if wanted.form == "svd" or (wanted.form == "auto" and wanted.tolerance is not None):
         left, right = _truncated(matrix, wanted.error)
         if wanted.form == "svd" or COST["svd"] * (left.size + right.size) < dense:
-            return {"left": left, "right": right}
-    return {"matrix": matrix}
+            return Truncated(left, right)
+    return Dense(matrix)
 
 
 def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
-    """Return the taxel in each cell of a full, regular, planar grid, or else say what it lacks."""
+    """Return the taxel in each cell of a full, regular, planar grid, or the reason why it is not one."""
     if (taxels.cell < 0).any():
         return f"{int((taxels.cell < 0).any(axis=1).sum())} taxels have no row and column"
     cell = taxels.cell - taxels.cell.min(axis=0)
@@ -94,7 +170,7 @@ def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
     off = np.linalg.norm(taxels.pos - first - cell @ np.stack(steps), axis=1).max()
     pitch = min((float(np.linalg.norm(step)) for step in steps if step.any()), default=1.0)
     if off > SAME * pitch:
-        return f"a taxel is {off:.2g} m beside its place, the spacing is {pitch:.2g} m"
+        return f"a taxel is {off:.2g} m off its place, the spacing is {pitch:.2g} m"
     if np.linalg.norm(taxels.normal - taxels.normal[0], axis=1).max() > SAME:
         return "the normals differ"
     if np.ptp(taxels.area) > SAME * taxels.area.max():
@@ -102,78 +178,23 @@ def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
     return cells
 
 
-def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Tensor, "*env taxel"]]) -> tuple[Tensor, ...]:
-    """Return the planes (…, taxel) that come out of an operator, link after link.
+def apply(operators: Sequence[Operator[Tensor]], planes: Sequence[Float[Tensor, "*env taxel"]]) -> tuple[Tensor, ...]:
+    """Return the output planes (…, taxel) of the operators of all links, link after link.
 
     Args:
-        constants: Holds the operator's constants as `<name>/<link>/<constant>`.
-        name: The operator's name.
-        planes: What goes in: any number of leading axes, taxels last.
+        operators: Of each link.
+        planes: Input planes, taxels last.
     """
-    if (matrices := _matrices(constants, name)) and LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
-        lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
-        result = reduce(torch.add, [LINK_PRODUCTS(own, each) for own, each in zip(lines, matrices, strict=True)])
-        return tuple(result.unflatten(1, planes[0].shape[:-1]).unbind())
-    parts: list[tuple[Tensor, ...]] = []
-    start = 0
-    while (form := _form(constants, f"{name}/{len(parts)}")) is not None:
-        constant, num, use = form
-        parts.append(use(constant, [plane[..., start : start + num] for plane in planes]))
-        start += num
+    dense = [operator.matrix for operator in operators if isinstance(operator, Dense)]
+    if len(dense) == len(operators):
+        matrices = [[matrix[i] for matrix in dense] for i in range(len(planes))]
+        if LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
+            lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
+            result = reduce(torch.add, [LINK_PRODUCTS(line, each) for line, each in zip(lines, matrices, strict=True)])
+            return tuple(result.unflatten(1, planes[0].shape[:-1]).unbind())
+    of_links = zip(*(plane.split([operator.num_taxels for operator in operators], dim=-1) for plane in planes), strict=True)
+    parts = [operator(list(sources)) for operator, sources in zip(operators, of_links, strict=True)]
     return tuple(part[0] if len(part) == 1 else torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
-
-
-def _matrices(constants: Mapping[str, Tensor], name: str) -> list[list[Float[Tensor, "_source out _target"]]]:
-    """Return the matrices of all links, for each plane that goes in; nothing if there are other forms."""
-    results: list[Tensor] = []
-    while (form := _form(constants, f"{name}/{len(results)}")) is not None:
-        if "matrix" not in form[0]:
-            return []
-        results.append(form[0]["matrix"])
-    return [[matrix[i] for matrix in results] for i in range(len(results[0]))] if results else []
-
-
-Block = Mapping[str, Tensor]
-Use = Callable[[Block, list[Tensor]], tuple[Tensor, ...]]
-
-
-def _form(constants: Mapping[str, Tensor], prefix: str) -> tuple[Block, int, Use] | None:
-    """Return the constants of one link, its number of taxels, and how to apply them; None if there is no such link."""
-    if (matrix := constants.get(f"{prefix}/matrix")) is not None:
-        return {"matrix": matrix}, matrix.shape[1], _use_matrix
-    if (left := constants.get(f"{prefix}/left")) is not None:
-        return {"left": left, "right": constants[f"{prefix}/right"]}, left.shape[1], _use_factors
-    if (places := constants.get(f"{prefix}/places")) is not None:
-        names = ("spectrum", "cells", "places")
-        return {name: constants[f"{prefix}/{name}"] for name in names}, places.shape[0], _use_spectrum
-    return None
-
-
-def _use_matrix(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
-    matrix = block["matrix"]
-    sources, targets = matrix.shape[1], matrix.shape[3]
-    out = _joined(planes) @ matrix.reshape(len(planes) * sources, -1)
-    return out.split(targets, dim=-1)
-
-
-def _use_factors(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
-    left, right = block["left"], block["right"]
-    out = (_joined(planes) @ left.reshape(-1, left.shape[2])) @ right.reshape(right.shape[0], -1)
-    return out.split(right.shape[2], dim=-1)
-
-
-def _use_spectrum(block: Block, planes: list[Tensor]) -> tuple[Tensor, ...]:
-    cells, spectrum = block["cells"], torch.view_as_complex(block["spectrum"])
-    rows, columns = cells.shape
-    size = spectrum.shape[2], 2 * (spectrum.shape[3] - 1)
-    order = cells.reshape(-1)
-    waves = [torch.fft.rfft2(plane[..., order].unflatten(-1, (rows, columns)), s=size) for plane in planes]
-    results = []
-    for response in spectrum:
-        total = sum((wave * factor for wave, factor in zip(waves, response, strict=True)), start=torch.zeros_like(waves[0]))
-        plane = torch.fft.irfft2(total, s=size)[..., :rows, :columns]
-        results.append(plane.flatten(-2)[..., block["places"]])
-    return tuple(results)
 
 
 def _joined(planes: list[Tensor]) -> Tensor:
@@ -192,7 +213,7 @@ def _fft_cost(planes: tuple[int, int], shape: tuple[int, ...]) -> float:
     return COST["fft"] * points * (sum(planes) * np.log2(points) + np.prod(planes))
 
 
-def _spectrum(response: Response, cells: Int[np.ndarray, "row column"]) -> dict[str, np.ndarray]:
+def _spectrum(response: Response, cells: Int[np.ndarray, "row column"]) -> Convolution[np.ndarray]:
     """Return the transform of the response to one cell: seen from the four corners it shows every offset there is."""
     size = np.array([_padded(num) for num in cells.shape])
     kernel = None
@@ -205,7 +226,7 @@ def _spectrum(response: Response, cells: Int[np.ndarray, "row column"]) -> dict[
     assert kernel is not None
     wave = np.fft.rfft2(kernel)
     spectrum = np.stack([wave.real, wave.imag], axis=-1)
-    return {"spectrum": spectrum, "cells": cells, "places": np.argsort(cells.reshape(-1), kind="stable")}
+    return Convolution(spectrum, cells, np.argsort(cells.reshape(-1), kind="stable"))
 
 
 def _truncated(matrix: Float[np.ndarray, "in source out target"], tolerance: float) -> tuple[np.ndarray, np.ndarray]:

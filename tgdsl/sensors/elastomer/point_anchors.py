@@ -1,8 +1,8 @@
 """Anchors on points of the objects, as in the paper: where each point was when it sank into the skin, and how far it came.
 
 A point p of an object, z_p its place in the link's frame and φ the signed distance to the link's own surface, takes the anchor
-e_p = z_p when it is deeper than `enter` in the skin, and is released when it is farther than `exit` above it, or may no longer
-be felt. With h_p = max(0, s − φ(z_p)) its depth [m], s the skin's height, and m_p = ∇φ(z_p), it moves the markers j by
+e_p = z_p when it is deeper than `enter` in the skin, and is released when it is farther than `exit` above it, or its gate
+closes. With h_p = max(0, s − φ(z_p)) its depth [m], s the skin's height, and m_p = ∇φ(z_p), it moves the markers j by
 
     u_j = s_s Π_nj Σ_p w_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²)                     [m]
 
@@ -33,11 +33,11 @@ from tgdsl.tensors.torch_internals import expect_size
 
 Row = tuple[Float[Tensor, "6 row slot"], Int[Tensor, " row"]]
 LARGEST_BLOCK = 16
-"""Points of a block at most; a number that divides that of the points."""
+"""Largest number of points of a block, which divides the number of points."""
 OVERHEAD = 24
-"""Cost of a row beside that of its slots, in slots."""
+"""Fixed cost of a row, in slots."""
 WORTHWHILE = 0.75
-"""Largest share of the dense sum's cost at which compaction pays."""
+"""Largest cost over the dense sum's at which points are compacted."""
 MIN_ACTIVE = 2
 """Rows of a link at least: torch.compile treats sizes 0 and 1 apart."""
 EXPECTED = (1000, 100)
@@ -89,13 +89,13 @@ def compacted(planes: list[Tensor], is_active: Tensor) -> tuple[list[Tensor], li
     env = torch.repeat_interleave(torch.arange(num_envs).repeat(num_links), num_rows.reshape(-1)).split(sizes)
     index = _index(is_active, count, num_rows, length).split([length * num for num in sizes])
     rows, envs = [], []
-    for own, of_env in zip(index, env, strict=True):
+    for block_ids, of_env in zip(index, env, strict=True):
         lacking = max(MIN_ACTIVE - len(of_env), 0)
         row = planes[0].new_zeros((6, length * (len(of_env) + lacking), size))
-        at = own.clamp(min=0)
+        at = block_ids.clamp(min=0)
         for of_plane, to in zip(blocks, row, strict=True):
-            torch.index_select(of_plane, 0, at, out=to[: len(own)])
-        row[3:, : len(own)].masked_fill_((own < 0)[:, None], 0)
+            torch.index_select(of_plane, 0, at, out=to[: len(block_ids)])
+        row[3:, : len(block_ids)].masked_fill_((block_ids < 0)[:, None], 0)
         rows.append(row.view(6, -1, length * size))
         envs.append(torch.cat([of_env, of_env.new_zeros(lacking)]))
     return rows, envs
@@ -131,13 +131,13 @@ def _index(
 ) -> Int[Tensor, " place"]:
     """Return the block at each place of the rows, counted through (env, link, block), link after link; −1: none."""
     num_envs, num_links, num_blocks = is_active.shape
-    found = is_active.transpose(0, 1).reshape(-1).nonzero()[:, 0]
+    active = is_active.transpose(0, 1).reshape(-1).nonzero()[:, 0]
     pair = torch.arange(num_links * num_envs).view(num_links, num_envs)
     there = torch.arange(num_envs) * num_links + torch.arange(num_links)[:, None]
     count, num_rows = count.reshape(-1), num_rows.reshape(-1)
     place = length * (num_rows.cumsum(0) - num_rows) - (count.cumsum(0) - count)
     index = torch.full((int(num_rows.sum()) * length,), -1)
-    index[torch.arange(len(found)) + torch.repeat_interleave(place, count)] = found + torch.repeat_interleave(
+    index[torch.arange(len(active)) + torch.repeat_interleave(place, count)] = active + torch.repeat_interleave(
         num_blocks * (there - pair).reshape(-1), count
     )
     return index
@@ -191,7 +191,7 @@ def shear_loads(
     objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
 ) -> tuple[list[ShearLoad], dict[str, Tensor]]:
     """Return the shear loads of each object's points, and the new anchors: none if a kernel has written them in place."""
-    return advance([LINK_POINTS(own) for own in objects], stick_slip, state)
+    return advance([LINK_POINTS(points) for points in objects], stick_slip, state)
 
 
 def _shear_loads_by_kernel(
@@ -206,30 +206,30 @@ def _shear_loads_by_kernel(
         places, tables = torch.stack(source.points)[:, :, 0], grid_tables(source.links, 0)
         is_cubic, pose = source.links.shapes[0] == "tricubic", [*pairs.rotation, *pairs.offset]
         planes_of = [state[name] for name in PLANES]
-        found, count = advance_anchors(pose, pairs.gate, source.pair, places, *tables, is_cubic, numbers, planes_of, first)
-        x, y, z, *strength = found.unbind()
+        active, count = advance_anchors(pose, pairs.gate, source.pair, places, *tables, is_cubic, numbers, planes_of, first)
+        x, y, z, *strength = active.unbind()
         loads.append(ShearLoad(source.taxels, source.tiles, source.area, (x, y, z), planes.vec(strength), count))
         first += source.pair.shape[0] * places.shape[2]
     return loads, {}
 
 
 def _anchor_inputs(objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]) -> list[Tensor]:
-    return [tensor for own in objects for tensor in LINK_POINTS.inputs(own)]
+    return [tensor for source in objects for tensor in LINK_POINTS.inputs(source)]
 
 
 def _have_one_grid(objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]) -> bool:
-    return all(len(own.source.links.shapes) == 1 and are_grids(own) for own in objects)
+    return all(len(points.source.links.shapes) == 1 and are_grids(points) for points in objects)
 
 
 SHEAR_LOADS = Operation("advance_anchors", shear_loads, _shear_loads_by_kernel, _anchor_inputs, _have_one_grid)
 
 
 def advance(
-    met: Sequence[LinkPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
+    of_objects: Sequence[LinkPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
 ) -> tuple[list[ShearLoad], dict[str, Tensor]]:
     """Return what the points of each object load with, and the new anchors."""
     loads, after, start = [], {name: [] for name in PLANES}, 0
-    for points in met:
+    for points in of_objects:
         # Flat as the state is: a compiler then reads and writes that in one loop.
         distance = points.distance.flatten(1)
         pos, gradient = (planes.vec(part.flatten(1) for part in vector) for vector in (points.pos, points.gradient))
@@ -242,8 +242,8 @@ def advance(
         moved = planes.where(is_held, planes.sub(pos, anchor), (zero, zero, zero))
         if stick_slip.slip is not None:
             stretch = planes.sub(moved, planes.scale(planes.dot(moved, gradient), gradient))
-            kept, slides = capped(stretch, stick_slip.slip * depth)
-            slid = planes.sub(stretch, kept)
+            within_cap, slides = capped(stretch, stick_slip.slip * depth)
+            slid = planes.sub(stretch, within_cap)
             moved, anchor = planes.sub(moved, slid), planes.where(slides, planes.add(anchor, slid), anchor)
         is_taken = ~is_held & (stick_slip.standoff - distance > stick_slip.enter)
         taken = planes.where(is_held, anchor, planes.where(is_taken, pos, (zero, zero, zero)))
@@ -260,10 +260,10 @@ def drag(loads: Sequence[ShearLoad], markers: Markers, num_envs: int) -> Vec:
     zero = markers.pos[0].new_zeros((num_envs, markers.pos[0].shape[0]))
     total = (zero, zero, zero)
     for load in loads:
-        found = POINT_SUM(load, markers)
+        on_link = POINT_SUM(load, markers)
         if markers.reference_area is not None:
-            found = planes.scale(load.area / markers.reference_area, found)
-        total = planes.add(total, found)
+            on_link = planes.scale(load.area / markers.reference_area, on_link)
+        total = planes.add(total, on_link)
     return planes.sub(total, planes.scale(planes.dot(total, markers.normal), markers.normal))
 
 
@@ -278,13 +278,13 @@ def point_sum(load: ShearLoad, markers: Markers) -> Vec:
         normal = planes.vec(part[first : first + 1 if first in markers.flat else last] for part in markers.normal)
         if rows is None:
             z, strength = (planes.vec(part[:, link] for part in vector) for vector in (load.pos, load.strength))
-            found = _summed_on_link(z, strength, pos, normal, markers.falloff)
+            on_link = _summed_on_link(z, strength, pos, normal, markers.falloff)
         else:
             points, env = next(rows)
-            found = _summed_on_link(planes.vec(points[:3]), planes.vec(points[3:]), pos, normal, markers.falloff)
-            found = planes.vec(zero[:, first:last].index_add(0, env, part) for part in found)
+            on_link = _summed_on_link(planes.vec(points[:3]), planes.vec(points[3:]), pos, normal, markers.falloff)
+            on_link = planes.vec(zero[:, first:last].index_add(0, env, part) for part in on_link)
         around = (first, num_taxels - last)
-        total = planes.add(total, planes.vec(torch.nn.functional.pad(part, around) for part in found))
+        total = planes.add(total, planes.vec(torch.nn.functional.pad(part, around) for part in on_link))
     return total
 
 
@@ -315,22 +315,22 @@ def _summed_on_link(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: Tensor) -> Vec:
     """Return the sum for one link's markers, of one block of points.
 
-    The in-plane offset is found along two tangents of each marker, scaled so that its square is the exponent of 2. Where all
-    markers share one normal, so do their tangents, and what there is of each point is found once per point.
+    The in-plane offset is taken along two tangents of each marker, scaled so that its square is the exponent of 2. If all
+    markers share one normal, they share the tangents, and terms of points alone are computed once per point.
     """
     scale = torch.sqrt(falloff / math.log(2.0))
-    z, own = (planes.vec(part[:, None] for part in vector) for vector in (pos, strength))
+    z, strengths = (planes.vec(part[:, None] for part in vector) for vector in (pos, strength))
     offset_u, offset_v = (
         materialised(planes.dot(tangent, marker))[:, None]
         - _along(planes.vec(materialised(part)[:, None] for part in tangent), z)
         for tangent in (planes.scale(scale, tangent) for tangent in _tangents(normal))
     )
     fall = torch.exp2(-offset_u * offset_u - offset_v * offset_v)
-    return planes.vec((fall * part).sum(dim=-1) for part in own)
+    return planes.vec((fall * part).sum(dim=-1) for part in strengths)
 
 
 def _along(tangent: Vec, point: Vec) -> Tensor:
-    """Return points along tangents, (env, taxel or 1, point): of one tangent it is kept, not formed again for each marker."""
+    """Return points along tangents, (env, taxel or 1, point); for a single tangent it is materialised."""
     result = planes.dot(tangent, point)
     return materialised(result) if tangent[0].shape[0] == 1 else result
 
@@ -348,7 +348,7 @@ def _tangents(normal: Vec) -> tuple[Vec, Vec]:
 
 
 def reference_drag(
-    met: Sequence[ReferencePoints],
+    of_objects: Sequence[ReferencePoints],
     pos: Float[np.ndarray, "taxel 3"],
     normal: Float[np.ndarray, "taxel 3"],
     stick_slip: StickSlip,
@@ -359,7 +359,7 @@ def reference_drag(
     """Return u_j / s_s (taxel, 3) [m²] and the new anchors of one environment, point by point."""
     result, row = np.zeros((len(pos), 3)), 0
     after = {name: np.zeros_like(state[name]) for name in PLANES}
-    for points in met:
+    for points in of_objects:
         weight = 1.0 if reference_area is None else points.area / reference_area
         for z, phi, m in zip(points.pos, points.distance, points.gradient, strict=True):
             e, holds = np.array([state[name][row] for name in PLANES[:3]]), state["held"][row] > 0

@@ -3,7 +3,7 @@
 A program takes one environment and some tiles of markers, each of one link: a thread per marker, a loop over the points. Few
 points are in contact. With `count` they come first and the loop ends after them; without it the loop skips groups of points
 that all have strength 0, so points that are near on the object should be near among all. The in-plane offset Π_n(x − z) is
-found along two tangents of each marker, scaled so that its square is the exponent of 2.
+taken along two tangents of each marker, scaled so that its square is the exponent of 2.
 
 Shapes: `env` environments, `link` links that may meet an object, `point` points, `marker` markers of all links, `tile`
 tiles.
@@ -14,11 +14,8 @@ tiles.
 
 from __future__ import annotations
 
-from typing import Any
-
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
@@ -41,31 +38,15 @@ def point_sum(
     normal: list[Tensor],
     falloff: Tensor,
 ) -> Tensor:
-    """Return Σ_p s_p exp(−λ |Π_nj(x_j − z_p)|²), (3, env, marker) [m²]; see `launch`."""
-    return launch(wrap_triton(point_sum_kernel), pos, strength, count, tiles, block, marker, normal, falloff)
-
-
-def launch(
-    run: Any,
-    pos: list[Float[Tensor, "env link point"]],
-    strength: list[Float[Tensor, "env link point"]],
-    count: Int[Tensor, "env link"] | None,
-    tiles: Int[Tensor, "tile 3"],
-    block: int,
-    marker: list[Float[Tensor, " marker"]],
-    normal: list[Float[Tensor, " marker"]],
-    falloff: Float[Tensor, ""],
-) -> Float[Tensor, "3 env marker"]:
-    """Run the kernel, plain or wrapped.
+    """Return Σ_p s_p exp(−λ |Π_nj(x_j − z_p)|²), (3, env, marker) [m²].
 
     Args:
-        run: The kernel.
-        pos: z_p, three planes in each link's frame [m].
+        pos: z_p, three planes (env, link, point) in each link's frame [m].
         strength: s_p, in the same way [m²]; all six lie in memory alike.
-        count: Number of active points of each link; they come first. None: inactive ones have strength 0.
-        tiles: What `points.point_tiles` returns; markers of no link read 0.
+        count: Number of active points of each link, (env, link); they come first. None: inactive ones have strength 0.
+        tiles: What `points.point_tiles` returns, (tile, 3); markers of no link read 0.
         block: `points.tile_size`.
-        marker: x_j, three planes [m].
+        marker: x_j, three planes (marker,) [m].
         normal: Unit normals n_j, in the same way.
         falloff: λ [1/m²].
     """
@@ -73,7 +54,7 @@ def launch(
     result = pos[0].new_empty((3, num_envs, marker[0].shape[0]))
     of_program = 1 if count is None else TILES
     planes = (*pos, *strength, *(part.contiguous() for part in (*marker, *normal)))
-    run[(num_envs, triton.cdiv(tiles.shape[0], of_program))](
+    wrap_triton(point_sum_kernel)[(num_envs, triton.cdiv(tiles.shape[0], of_program))](
         *planes, falloff, result, tiles if count is None else count, tiles,
         tiles.shape[0], num_links, num_points, pos[0].stride(0), pos[0].stride(1), marker[0].shape[0],
         HAS_COUNT=count is not None, TILES=of_program, BLOCK=block, num_warps=1,
@@ -83,14 +64,14 @@ def launch(
 
 @triton.jit
 def point_sum_kernel(
-    z_x, z_y, z_z, s_x, s_y, s_z, x_x, x_y, x_z, n_x, n_y, n_z, falloff, found, count, tiles,
+    z_x, z_y, z_z, s_x, s_y, s_z, x_x, x_y, x_z, n_x, n_y, n_z, falloff, result, count, tiles,
     num_tiles, num_links, num_points, stride_env, stride_link, num_markers,
     HAS_COUNT: tl.constexpr, TILES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sum over the points of one environment for some tiles of markers."""
     env, first_tile = tl.program_id(0).to(tl.int64), tl.program_id(1) * TILES
-    own = first_tile + tl.arange(0, TILES)
-    links = tl.load(tiles + 3 * own, own < num_tiles, -1)
+    tile_ids = first_tile + tl.arange(0, TILES)
+    links = tl.load(tiles + 3 * tile_ids, tile_ids < num_tiles, -1)
     count += env * num_links
     are_links = links >= 0
     num_active = tl.where(are_links, num_points, 0)
@@ -98,7 +79,7 @@ def point_sum_kernel(
         num_active = tl.load(count + links, are_links, 0)
     busy = tl.sum((num_active > 0).to(tl.int32) << tl.arange(0, TILES), axis=0)
     plane = tl.num_programs(0).to(tl.int64) * num_markers
-    found += env * num_markers
+    result += env * num_markers
     for i in range(tl.minimum(TILES, num_tiles - first_tile)):
         tile = tiles + 3 * (first_tile + i)
         link, first, last = tl.load(tile), tl.load(tile + 1), tl.load(tile + 2)
@@ -115,7 +96,7 @@ def point_sum_kernel(
                     total = _added(total, frame, pos, strength, p)
             else:
                 total = _sum_of_all(total, frame, pos, strength, num_points)
-        place = found + marker
+        place = result + marker
         tl.store(place, total[0], is_marker)
         tl.store(place + plane, total[1], is_marker)
         tl.store(place + 2 * plane, total[2], is_marker)
@@ -123,7 +104,7 @@ def point_sum_kernel(
 
 @triton.jit
 def _frame(pos, normal, marker, is_marker, falloff):
-    """Return where markers are along two tangents of their own, and these tangents, scaled by √(λ log₂ e)."""
+    """Return where markers are along two tangents of their tile_ids, and these tangents, scaled by √(λ log₂ e)."""
     nx, ny = tl.load(normal[0] + marker, is_marker, 0.0), tl.load(normal[1] + marker, is_marker, 0.0)
     nz = tl.load(normal[2] + marker, is_marker, 1.0)
     # Two tangents without a branch that loses digits: Duff et al., "Building an orthonormal basis, revisited", 2017.

@@ -45,9 +45,9 @@ def reference(
         drag, after = reference_drag(gathered[Points], *args)
         result = np.where(layout.radius[:, None] > 0, spec.shear_strength * drag, 0.0)
     for link in range(len(layout.links)):
-        own = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
-        for j in own:
-            sources = _Sources(layout.pos[own], layout.normal[own], layout.area[own], touch.depth[own], shear[own])
+        at = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
+        for j in at:
+            sources = _Sources(layout.pos[at], layout.normal[at], layout.area[at], touch.depth[at], shear[at])
             move = _gaussian if spec.kernel == "gaussian" else _elastic
             result[j] += move(spec, layout.pos[j], layout.normal[j], sources)
     return result, after

@@ -11,7 +11,7 @@ relation,
 Shore A and 40 % more at 50. `soft_gel` is a silicone of 10 Shore A, as soft as those for skins and gel pads; `firm_rubber` is
 one of 50 Shore A. Assumed are ν = 0.48 and a thickness of 2 mm: give your pad's own.
 
-The normal stiffness, unless it is given, is that of a layer that cannot spread sideways (Johnson, *Contact Mechanics*, 5.8),
+The normal stiffness, unless given, is of a layer that cannot spread sideways (Johnson, *Contact Mechanics*, 5.8),
 
     K_n = E (1 − ν)/((1 + ν)(1 − 2 ν) t)      [Pa/m]
 
@@ -58,7 +58,7 @@ OF_SHEAR = frozenset({"shear_falloff", "enter", "exit"})
 """Fields of a skin that are not used where a document turns shear off."""
 
 
-def known(name: str | None) -> str | None:
+def checked_skin(name: str | None) -> str | None:
     """Return a skin's name.
 
     Raises:
@@ -69,27 +69,27 @@ def known(name: str | None) -> str | None:
     return name
 
 
-def with_skin(found: Mapping[str, Any], unused: Mapping[str, set[str]]) -> dict[str, Any]:
-    """Return an elastomer as found, with the fields of the skin that it is like where it has none itself.
+def with_skin(fields: Mapping[str, Any], unused: Mapping[str, set[str]]) -> dict[str, Any]:
+    """Return the fields of an elastomer, filled in from its skin.
 
     Args:
-        found: What a document says; its `like` names a skin.
-        unused: Fields that each kernel does not use: of the skin's they are left out.
+        fields: What a document says; its `like` names a skin.
+        unused: Fields that each kernel does not use, which are left out of the skin's.
 
     Raises:
         ValueError: If the document asks for a kernel that the skin has no values for.
     """
-    skin = SKINS[found["like"]]
-    kernel = found.get("kernel", skin["kernel"])
+    skin = SKINS[fields["like"]]
+    kernel = fields.get("kernel", skin["kernel"])
     if not isinstance(kernel, str) or kernel not in unused:
-        return dict(found)  # which is reported where it stands
+        return dict(fields)  # which is reported where it stands
     if (kernel == "gaussian") != (skin["kernel"] == "gaussian"):
-        others = " or ".join(name for name in unused if (name == "gaussian") == (skin["kernel"] == "gaussian"))
-        raise ValueError(f'the skin "{found["like"]}" has no values for the kernel {kernel}, expected {others}')
-    left_out = unused[kernel] | (OF_SHEAR if found.get("shear_strength") == 0 else set())
-    merged = {name: value for name, value in skin.items() if name not in left_out} | dict(found)
+        fitting = " or ".join(name for name in unused if (name == "gaussian") == (skin["kernel"] == "gaussian"))
+        raise ValueError(f'the skin "{fields["like"]}" has no values for the kernel {kernel}, expected {fitting}')
+    left_out = unused[kernel] | (OF_SHEAR if fields.get("shear_strength") == 0 else set())
+    merged = {name: value for name, value in skin.items() if name not in left_out} | dict(fields)
     if kernel != "gaussian" and "normal_stiffness" not in merged:
-        stiffness = _layer_stiffness({**skin, **found})
+        stiffness = _layer_stiffness({**skin, **fields})
         merged |= {} if stiffness is None else {"normal_stiffness": stiffness}
     return merged
 

@@ -6,12 +6,12 @@ Functions, not a module's floats: torch.compile for dynamic shapes makes graph i
 
 
 def unreached() -> float:
-    """Return the weight of a taxel that the object does not reach [probe's radius of depth]: someone must carry the load."""
+    """Return the weight of a taxel that the object does not reach [probe's radius of depth], for loads without depth."""
     return 1e-3
 
 
 def damping() -> float:
-    """Return what a step of β counts beside its effect on the shares [1].
+    """Return the weight of a step's length against its effect on the shares [1].
 
     It bounds steps where taxels of hardly any share decide.
     """

@@ -14,8 +14,8 @@ distance r_f/2 from an active taxel with b_cj = 1, 0 from r_f on. Both are conti
 
 β [1] is one vector per body. It selects the weights with Σ_c γ_c Σ_j λ_cj (x_j − x_c) × f_c = Σ_c γ_c τ_c of minimum relative
 entropy to λ⁰, contacts weighted by γ_c |f_c|: they are never negative, and splitting a contact into two at the same point with
-the same direction changes nothing. To first order β is the λ⁰-weighted least-norm correction. It is found by a fixed number of
-Newton steps on the convex dual: with H the mean covariance of g and e the excess moment, both over Σ_c γ_c |f_c| (and e over
+the same direction changes nothing. To first order β is the λ⁰-weighted least-norm correction. It is computed by a fixed number
+of Newton steps on the convex dual: with H the mean covariance of g and e the excess moment, both over Σ_c γ_c |f_c| (and e over
 r_f),
 
     s = (H + ε)⁻¹ H (H + ε)⁻¹ e,   β ← β − s / √(1 + s · H s + s · s / 10)
@@ -34,15 +34,17 @@ frame of the body.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Generic, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
+from tgdsl.sensors.base import Array
 from tgdsl.sensors.force_taxel.constants import damping, no_force, unreached, wholly
 from tgdsl.tensors.operations import Operation
 
@@ -83,7 +85,7 @@ def footprint(
         pos: Taxel positions [m], planes (taxel,) or (body, taxel).
         is_active: Which taxels can carry.
         depth: Depth of each probe over its radius [1].
-        inward: −2 n of each taxel, planes like those of `pos` [1].
+        inward: −2 n of each taxel, planes shaped as `pos` [1].
         point: Contact points [m], planes (*body, contact).
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
@@ -102,8 +104,8 @@ def footprint(
     lever = planes.cross(arm, planes.vec((part / strength)[..., None] for part in force))
     load = captured * strength
     total = load.sum(dim=-1) + no_force()
-    wanted = planes.vec((captured * part).sum(dim=-1) / (radius * total) for part in torque)
-    share = _tilted(weight, lever, _tilt(weight, lever, load / total[..., None], wanted, levenberg))
+    moment = planes.vec((captured * part).sum(dim=-1) / (radius * total) for part in torque)
+    share = _tilted(weight, lever, _tilt(weight, lever, load / total[..., None], moment, levenberg))
     left = planes.vec(
         (captured * part).sum(dim=-1) - radius * (load * (share * g).sum(dim=-1)).sum(dim=-1)
         for part, g in zip(torque, lever, strict=True)
@@ -111,27 +113,28 @@ def footprint(
     return Footprint(captured[..., None] * share, left)
 
 
-class Bodies(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Bodies(Generic[Array]):
     """Which taxels each body has: they stand one body after the other.
 
     Attributes:
-        taxel: Taxels of each body; a body with fewer than another repeats its first.
-        inverse_radius: 1/R of each [1/m], 0 for inactive ones and those repeated.
-        row: Place of each taxel in these, flattened.
-        first: First taxel of each body, and the number of all.
-        box: Least and largest coordinates of its active taxels [m].
-        place: Position of each taxel [m], with inactive ones beyond all contacts' reach, for a kernel that knows of none; and
-            −2 times its outward normal.
-        padded: Position and −2 times the normal of those of `taxel`.
+        taxel: Taxels of each body (body, padded); a body with fewer than another repeats its first.
+        inverse_radius: 1/R of each (body, padded) [1/m], 0 for inactive and repeated ones.
+        row: Index of each taxel in these, flattened (taxel,).
+        first: First taxel of each body, and the number of all (body + 1,).
+        box: Least and largest coordinates of each body's active taxels (body, 6) [m].
+        place: Position of each taxel [m], of inactive ones beyond all contacts' reach, and −2 times its outward normal
+            (taxel, 6).
+        padded: Position and −2 times the normal of each of `taxel` (6, body, padded).
     """
 
-    taxel: Int[Tensor, "body padded"]
-    inverse_radius: Float[Tensor, "body padded"]
-    row: Int[Tensor, " taxel"]
-    first: Int[Tensor, " bodies_and_one"]
-    box: Float[Tensor, "body 6"]
-    place: Float[Tensor, "taxel 6"]
-    padded: Float[Tensor, "6 body padded"]
+    taxel: Array
+    inverse_radius: Array
+    row: Array
+    first: Array
+    box: Array
+    place: Array
+    padded: Array
 
 
 def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, " 6"]:
@@ -161,7 +164,7 @@ class Shared(NamedTuple):
 
 
 def shared_forces(
-    bodies: Bodies,
+    bodies: Bodies[Tensor],
     depth: Float[Tensor, "env taxel"],
     point: Vec,
     force: Vec,
@@ -184,11 +187,11 @@ def shared_forces(
     """
     taxel, inverse_radius = bodies.taxel, bodies.inverse_radius
     # Of torch's operations on a CPU `index` and `exp` wake other threads for a few thousand numbers, these do not.
-    own = depth.index_select(1, taxel.flatten()).unflatten(1, taxel.shape)
+    depths = depth.index_select(1, taxel.flatten()).unflatten(1, taxel.shape)
     share, residual = footprint(
         planes.vec(bodies.padded[:3]),
         inverse_radius > 0,
-        own * inverse_radius,
+        depths * inverse_radius,
         planes.vec(bodies.padded[3:]),
         point,
         force,
@@ -203,19 +206,19 @@ def shared_forces(
 
 
 def _shared_by_kernel(
-    bodies: Bodies, depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+    bodies: Bodies[Tensor], depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
 ) -> Shared:
     from tgdsl.sensors.force_taxel import footprint_kernel
 
-    own = bodies.inverse_radius.flatten()[bodies.row]
-    weight = torch.log2(depth * own + unreached())
+    inverse_radius = bodies.inverse_radius.flatten()[bodies.row]
+    weight = torch.log2(depth * inverse_radius + unreached())
     args = radius, levenberg, bodies.first, bodies.box
     shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
     return Shared(shared, sums[:, :3], sums[:, 3:])
 
 
 def _inputs(
-    bodies: Bodies, depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+    bodies: Bodies[Tensor], depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
 ) -> list[Tensor]:
     return [depth, *point, *force, *torque, *normal]
 
@@ -286,7 +289,7 @@ def reference(
 ) -> tuple[Float[np.ndarray, "contact taxel"], Float[np.ndarray, " 3"]]:
     """Return what `footprint` does, for one environment: shares γ_c λ_cj, and the moment that is left [N·m].
 
-    `outward` are the taxels' own normals n, `normal` those of the contacts.
+    `outward` are the taxels' normals n, `normal` the contacts'.
     """
     num = len(point)
     weight, captured = np.zeros((num, len(pos))), np.zeros(num)

@@ -5,8 +5,8 @@ need no communication between threads. A pass over the taxels accumulates the mo
 covariance of g follow from those, as g is linear in the arm. Groups of contacts that are all empty are skipped.
 
 Covariances are differences of moments, and float32 would suffer cancellation where few taxels are in the footprint, all of them
-on one side of the contact. So for contacts beside the bounding box of the body's taxels the moments are taken about the nearest
-point of that box.
+on one side of the contact. So for contacts outside the bounding box of the body's taxels, moments are about the nearest point
+of that box.
 
 Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel` taxels of all bodies, one body after the other.
 """
@@ -17,7 +17,6 @@ Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel`
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import triton
 import triton.language as tl
@@ -39,7 +38,7 @@ FEW_STEPS = 12
 UNROLL = tl.constexpr(4)
 """Taxels of a pass that are worked on at a time."""
 BESIDE = tl.constexpr(0.25)
-"""How far a contact stands beside the box of the taxels where moments are about that [footprints]."""
+"""Distance of a contact from the box of the taxels from which on moments are about that box [footprints]."""
 LIMIT = tl.constexpr(64.0)
 """More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
 NO_FORCE = tl.constexpr(no_force())
@@ -76,29 +75,12 @@ def shared_forces(
         first: First taxel of each body, and the number of all: (body + 1,).
         box: Least and largest coordinates of each body's active taxels, (body, 6) [m].
     """
-    return launch(wrap_triton(footprint_kernel), pos, weight, point, force, torque, normal, radius, levenberg, first, box)
-
-
-def launch(
-    run: Any,
-    pos: Tensor,
-    weight: Tensor,
-    point: Sequence[Tensor],
-    force: Sequence[Tensor],
-    torque: Sequence[Tensor],
-    normal: Sequence[Tensor],
-    radius: Tensor,
-    levenberg: Tensor,
-    first: Tensor,
-    box: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Run the kernel, plain or wrapped, on the arguments of `shared_forces`."""
     num_envs, num_bodies, num_contacts = point[0].shape
     num_taxels = weight.shape[1]
     shared = weight.new_empty((num_envs, 3, num_taxels))
     sums = weight.new_empty((num_envs, 6, num_bodies))
     planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque, *normal)]
-    run[(triton.cdiv(num_envs, ENVS), num_bodies)](
+    wrap_triton(footprint_kernel)[(triton.cdiv(num_envs, ENVS), num_bodies)](
         *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
         STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, num_warps=1,
     )  # fmt: skip
@@ -117,7 +99,7 @@ def footprint_kernel(
     is_env = env < num_envs
     row = env * num_bodies + body
     first_taxel = tl.load(first + body)
-    num_own = tl.load(first + body + 1) - first_taxel
+    num_here = tl.load(first + body + 1) - first_taxel
     pos += 6 * first_taxel
     weights = weight + first_taxel + tl.where(is_env, env, 0) * num_taxels
     planes = (point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z)
@@ -138,7 +120,7 @@ def footprint_kernel(
                 strength, way = _direction(force)
                 slope = _slope(way, tilt, inverse)
                 captured, norm, top, mean, covariance = _moments(
-                    pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG
+                    pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG
                 )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
@@ -158,7 +140,7 @@ def footprint_kernel(
             strength, way = _direction(force)
             slope = _slope(way, tilt, inverse)
             captured, norm, top, mean, covariance = _moments(
-                pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG
+                pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG
             )
             unmet = add3(unmet, _unmet(captured, mean, force, torque))
             each = scale3(tl.where(norm == 0, 0.0, captured / norm), force)
@@ -168,11 +150,11 @@ def footprint_kernel(
             u, v, w = _each3(slope)
             fx, fy, fz = _each3(each)
             tops = _each(top)
-            for taxel in range(0, num_own, TILE):
-                own = taxel + tl.arange(0, TILE)
-                is_own = is_env[:, None] & (own < num_own)[None, :]
-                place, inward = _tile(pos + 6 * own, own < num_own), _tile(pos + 6 * own + 3, own < num_own)
-                pull = _load(weights[:, None] + own[None, :], is_own)
+            for taxel in range(0, num_here, TILE):
+                taxels = taxel + tl.arange(0, TILE)
+                is_taxel = is_env[:, None] & (taxels < num_here)[None, :]
+                place, inward = _tile(pos + 6 * taxels, taxels < num_here), _tile(pos + 6 * taxels + 3, taxels < num_here)
+                pull = _load(weights[:, None] + taxels[None, :], is_taxel)
                 p0 = _pulled(
                     place, inward, pull, (x[0], y[0], z[0]), (nx[0], ny[0], nz[0]), (u[0], v[0], w[0]), tops[0], inverse
                 )
@@ -185,10 +167,10 @@ def footprint_kernel(
                 p3 = _pulled(
                     place, inward, pull, (x[3], y[3], z[3]), (nx[3], ny[3], nz[3]), (u[3], v[3], w[3]), tops[3], inverse
                 )
-                out = shared + first_taxel + env[:, None] * (3 * num_taxels) + own[None, :]
-                _accumulate(out, _weighted(p0, p1, p2, p3, fx), is_own, start)
-                _accumulate(out + num_taxels, _weighted(p0, p1, p2, p3, fy), is_own, start)
-                _accumulate(out + 2 * num_taxels, _weighted(p0, p1, p2, p3, fz), is_own, start)
+                out = shared + first_taxel + env[:, None] * (3 * num_taxels) + taxels[None, :]
+                _accumulate(out, _weighted(p0, p1, p2, p3, fx), is_taxel, start)
+                _accumulate(out + num_taxels, _weighted(p0, p1, p2, p3, fy), is_taxel, start)
+                _accumulate(out + 2 * num_taxels, _weighted(p0, p1, p2, p3, fz), is_taxel, start)
             tl.debug_barrier()
     out = sums + 6 * env * num_bodies + body
     tl.store(out, carried[0], is_env)
@@ -217,7 +199,7 @@ def _contacts(planes, normals, row, is_env, start, num_contacts, GROUP: tl.const
 
 @triton.jit
 def _load(at, is_there):
-    """Return what is there, else 0."""
+    """Return the values under a mask, else 0."""
     return tl.load(at, is_there, 0.0)
 
 
@@ -269,16 +251,16 @@ def _arm(place, point):
 def _pull(arm, facing, weight, slope, top, inverse):
     """Return κ, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels; `facing` is −2 n · m, `weight` a logarithm."""
     near = 1.0 - inverse * inverse * dot(arm, arm)
-    near = tl.minimum(near, near * facing, propagate_nan=tl.PropagateNan.ALL)  # what is negative remains so
+    near = tl.minimum(near, near * facing, propagate_nan=tl.PropagateNan.ALL)  # keeps the sign
     near = tl.maximum(near, 0.0, propagate_nan=tl.PropagateNan.ALL)
     exponent = weight + slope[0] * arm[0] + slope[1] * arm[1] + slope[2] * arm[2] - top
-    exponent = tl.minimum(exponent, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # what is larger is out of reach
+    exponent = tl.minimum(exponent, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # larger exponents are out of reach
     return near, near * near * tl.exp2(exponent)
 
 
 @triton.jit
 def _away(box, point, force, inverse):
-    """Return the way from contacts to the box of the taxels, (env, contact) [m], and whether one that acts stands beside it."""
+    """Return the way from contacts to the box of the taxels, (env, contact) [m], and whether one with a force is outside it."""
     x = tl.clamp(point[0], tl.load(box), tl.load(box + 3)) - point[0]
     y = tl.clamp(point[1], tl.load(box + 1), tl.load(box + 4)) - point[1]
     z = tl.clamp(point[2], tl.load(box + 2), tl.load(box + 5)) - point[2]
@@ -288,26 +270,26 @@ def _away(box, point, force, inverse):
 
 
 @triton.jit
-def _moments(pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG: tl.constexpr):
+def _moments(pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
     away, is_beside = _away(box, point, force, inverse)
     if is_beside:
-        result = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, True)
+        result = _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG, True)
     else:
-        result = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, False)
+        result = _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG, False)
     return result
 
 
 @triton.jit
-def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
-    """Return what `_moments` does; sums are about the contacts, or beside the box about what is `away` from them."""
+def _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
+    """Return `_moments` with sums about the contacts, or about the points `away` from them."""
     zero = tl.zeros_like(point[0])
     top = zero
     if IS_LONG:
-        top += _highest(pos, num_own, point, normal, slope, inverse)
+        top += _highest(pos, num_here, point, normal, slope, inverse)
     nearest, total = zero, zero
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):
+    for taxel in tl.range(0, num_here, loop_unroll_factor=UNROLL):
         place, inward = _taxel(pos, taxel)
         arm, facing = _arm(place, point), dot(inward, normal)
         weight = tl.load(weights + taxel)[:, None]
@@ -364,10 +346,10 @@ def _weighted(p0, p1, p2, p3, force):
 
 
 @triton.jit
-def _highest(pos, num_own, point, normal, slope, inverse):
+def _highest(pos, num_here, point, normal, slope, inverse):
     """Return the largest exponent of 2 among the taxels in reach on the contact's side, (env, contact)."""
     top = tl.full(point[0].shape, float("-inf"), tl.float32)
-    for taxel in range(num_own):
+    for taxel in range(num_here):
         place, inward = _taxel(pos, taxel)
         arm, facing = _arm(place, point), dot(inward, normal)
         is_reached = (inverse * inverse * dot(arm, arm) < 1.0) & (facing > 0.0)
@@ -390,7 +372,7 @@ def _unmet(captured, mean, force, torque):
 
 @triton.jit
 def _of_levers(load, spread, way):
-    """Return Σ_c load_c [f̂]ₓ C [f̂]ₓᵀ, (env,): the covariance of x × f̂, from that of x."""
+    """Return Σ_c load_c [f̂]ₓ C [f̂]ₓᵀ, (env,): the covariance of x × f̂ from the covariance of x."""
     xx, xy, xz, yy, yz, zz = spread
     x, y, z = way
     # Row by row the columns of A = C [f̂]ₓᵀ: covariances of x and x × f̂.
@@ -409,5 +391,5 @@ def _of_levers(load, spread, way):
 
 @triton.jit
 def _accumulate(out, value, is_there, start):
-    """Store the first contacts' part, and add that of further ones."""
+    """Store the part of the first contacts, and add further parts."""
     tl.store(out, value + tl.load(out, is_there & (start > 0), 0.0), is_there)

@@ -7,7 +7,7 @@
 
 with c over the solver's contacts of the sensor's objects on one body: contact points x_c [m], forces f_c [N] and torques τ_c
 [N·m] on the link, net force f_net; j over that body's taxels: positions x_j [m], outward normals n_j, areas A_j [m²]; all in
-the link's frame. The captured fraction γ_c [1] and the weights λ_cj ≥ 0 with Σ_j λ_cj = 1 are those of `footprint`: they favour
+the link's frame. `footprint` defines the captured fraction γ_c [1] and the weights λ_cj ≥ 0 with Σ_j λ_cj = 1: they favour
 taxels near the contact, on its side of the body and with large depth, and are chosen such that the moment of the taxel forces
 is that of the contacts, as far as non-negative weights can match it.
 
@@ -21,15 +21,15 @@ body. The residual is a pure couple, since the distributed forces sum to the cap
 Source: a solver's contacts are points on rigid bodies; this distributes their resultant as on a Winkler foundation, whose
 pressure is proportional to depth (Johnson, *Contact Mechanics*, §4.3), with the moment corrected.
 
-Limits: depth is that of the object that a probe is deepest in, so two objects within one footprint share their taxels. Weights
-follow depth and distance per taxel, not per area. With the gate `contact_pair` depth jumps where a contact begins; the forces
-still sum to the solver's.
+Limits: a probe has one depth, of the object that it is deepest in, so two objects within one footprint share their taxels.
+Weights follow depth and distance per taxel, not per area. With the gate `contact_pair` depth jumps where a contact begins; the
+forces still sum to the solver's.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Generic, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -56,7 +56,8 @@ from tgdsl.sensors.base import (
     ReferenceState,
     State,
     SurfaceOf,
-    by_name,
+    components,
+    vector,
 )
 from tgdsl.sensors.force_taxel import footprint
 from tgdsl.sensors.noise import FORCE
@@ -82,8 +83,8 @@ class ForceTaxelSpec(ContactProbeSpec):
 
     def radii(self, layout: Layout) -> np.ndarray:
         """Return r_f of each body [m]."""
-        own = [layout.area[(layout.body_id == b) & (layout.radius > 0)] for b in range(len(layout.bodies))]
-        spacing = [float(np.sqrt(area.mean())) if len(area) else 1.0 for area in own]
+        areas = [layout.area[(layout.body_id == b) & (layout.radius > 0)] for b in range(len(layout.bodies))]
+        spacing = [float(np.sqrt(area.mean())) if len(area) else 1.0 for area in areas]
         return np.array([self.footprint or SPACINGS * each for each in spacing])
 
     @property
@@ -109,28 +110,21 @@ def reference_reports(spec: ForceTaxelSpec, layout: Layout, gathered: References
     is_active = layout.radius > 0
     depth = np.where(is_active, touch.depth / np.where(is_active, layout.radius, 1.0), 0.0)
     for b in range(len(layout.bodies)):
-        own, at = layout.body_id == b, contacts.body == b
+        on_body, at = layout.body_id == b, contacts.body == b
         share, residual[b] = footprint.reference(
-            layout.pos[own], is_active[own], depth[own], layout.normal[own],
+            layout.pos[on_body], is_active[on_body], depth[on_body], layout.normal[on_body],
             contacts.pos[at], contacts.force[at], contacts.torque[at], contacts.normal[at],
             spec.radii(layout)[b], spec.levenberg,
         )  # fmt: skip
-        force[own] = share.T @ contacts.force[at]
-        missed[b] -= force[own].sum(axis=0)
+        force[on_body] = share.T @ contacts.force[at]
+        missed[b] -= force[on_body].sum(axis=0)
     return force, missed, residual
 
 
 @dataclass(frozen=True, eq=False)
-class ForceTaxelConstants(Generic[Array]):
-    """Fields of `footprint.Bodies`; r_f of each body [m]; least curvature of each step [1]."""
+class ForceTaxelConstants(footprint.Bodies[Array]):
+    """The bodies; r_f of each [m]; least curvature of each step [1]."""
 
-    taxel: Array
-    inverse_radius: Array
-    row: Array
-    first: Array
-    box: Array
-    place: Array
-    padded: Array
     footprint: Array
     levenberg: Array
     inward: Array | None = None
@@ -142,7 +136,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
     is_active = layout.radius > 0
     channels: list[Channel] = []
     if "force" in spec.outputs:
-        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
+        channels += vector("force", "N")
     if "pressure" in spec.outputs:
         if (layout.area[is_active] <= 0).any():
             raise LowerError("a taxel of no area has no pressure", field="outputs", hint="leave pressure out, or give its area")
@@ -166,23 +160,19 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         levenberg=np.array(spec.levenberg),
         inward=-layout.normal.T / np.where(is_active, layout.area, np.inf) if "pressure" in spec.outputs else None,
     )
-    reports = {
-        "missed": tuple(Channel(f"missed_{axis}", "N") for axis in "xyz"),
-        "residual": tuple(Channel(f"residual_{axis}", "N·m") for axis in "xyz"),
-    }
+    reports = {"missed": vector("missed", "N"), "residual": vector("residual", "N·m")}
     requests = (ContactDepth(spec.objects, spec.is_gated), Contacts(spec.objects, slots=spec.slots))
-    return Lowered(tuple(channels), by_name(constants), requests=requests, reports=reports)
+    return Lowered(tuple(channels), constants, requests=requests, reports=reports)
 
 
 def forward(
     gathered: Gathered, context: Context, constants: ForceTaxelConstants[Tensor], state: State
 ) -> tuple[dict[str, Tensor], State]:
-    """Return the force [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
-    contacts, felt = gathered[Contacts], gathered[ContactDepth]
-    bodies = footprint.Bodies(*(getattr(constants, name) for name in footprint.Bodies._fields))
+    """Return the force [N], the pressure [Pa] if wanted, and by body the missed force [N] and the residual moment [N·m]."""
+    contacts, touch = gathered[Contacts], gathered[ContactDepth]
     shared = footprint.SHARED_FORCES(
-        bodies,
-        felt.depth,
+        constants,
+        touch.depth,
         contacts.pos,
         contacts.force,
         contacts.torque,
@@ -195,7 +185,7 @@ def forward(
     if constants.inward is None:
         return {"signal": shared.force, **readings}, {}
     force = planes.vec(shared.force.unbind(1))
-    readings |= {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
+    readings |= components("force", force)
     readings["pressure"] = planes.dot(force, planes.vec(constants.inward)).clamp(min=0)
     return readings, {}
 

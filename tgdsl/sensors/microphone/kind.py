@@ -27,7 +27,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Generic, NamedTuple
 
 import numpy as np
 import torch
@@ -35,20 +36,18 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, did_you_mean
 from tgdsl.geometry import planes
-from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.kinematics import Places
 from tgdsl.sensors.base import (
+    Array,
     Axis,
     Channel,
-    Constants,
     Context,
     Fitting,
     Kind,
     Lowered,
     Memory,
-    State,
     SurfaceOf,
     scalar,
 )
@@ -59,22 +58,47 @@ from tgdsl.sensors.microphone.spec import MicrophoneSpec
 from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND, Upstream
 
 
+@dataclass(frozen=True, eq=False)
+class MicrophoneConstants(Generic[Array]):
+    """Parameters; C of `interpolation`; l of each source's row; the samples' numbers from 1; and m [m], None on a body."""
+
+    falloff: Array
+    nearest: Array
+    speed: Array
+    reach: Array
+    coefficients: Array
+    levels: Array
+    num_samples: Array
+    pos: Array | None = None
+
+
+class MicrophoneState(NamedTuple):
+    """State of the sources; see `fit` for shapes.
+
+    Attributes:
+        history: Samples that have not yet arrived from the largest distance [Pa].
+        path: Where sources were at earlier steps, from where they are now [m].
+        place: Where they are in the world [m].
+        place_low: What `place` rounds off [m].
+        age: Age of the sound that arrives now, in steps.
+        beyond: Distance at which a source was not heard [m]; 0: none.
+    """
+
+    history: Tensor
+    path: Tensor
+    place: Tensor
+    place_low: Tensor
+    age: Tensor
+    beyond: Tensor
+
+
 def lower(spec: MicrophoneSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
-    """A single row; sizes are those of the sources, see `fit`."""
+    """A single row; sizes follow from the sources, see `fit`."""
     pos = (0.0, 0.0, 0.0) if spec.pos is None else spec.pos
-    constants = {
-        "falloff": scalar(spec.falloff),
-        "nearest": scalar(spec.nearest),
-        "speed": scalar(spec.speed),
-        "reach": scalar(spec.reach),
-        "coefficients": coefficients(),
-    }
-    if spec.body is None:
-        constants["pos"] = np.array(pos)
     requests = () if spec.body is None else (Places(bodies=(spec.body,), offset=np.array([pos])),)
     rows = Axis("microphone", 1, {"body": ["world" if spec.body is None else spec.body], "pos": np.array([pos])})
-    asked = Upstream(sensors=spec.hears or (), planes=SOUND, what="sound")
-    return Lowered((Channel("pressure", "Pa"),), constants, requests=requests, rows=rows, upstream=asked)
+    upstream = Upstream(sensors=spec.hears or (), planes=SOUND, what="sound")
+    return Lowered((Channel("pressure", "Pa"),), requests=requests, rows=rows, upstream=upstream)
 
 
 def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
@@ -84,7 +108,7 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
         LowerError: If sources make different numbers of samples, or a level is of none of them.
     """
     first = next(iter(fitting.upstream))
-    blocks = {name: own.lowered.sound for name, own in fitting.upstream.items()}
+    blocks = {name: source.lowered.sound for name, source in fitting.upstream.items()}
     for name, count in blocks.items():
         if count != blocks[first]:
             problem = f'"{name}" makes {count} samples per physics step, "{first}" {blocks[first]}'
@@ -93,9 +117,9 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
         if name not in fitting.upstream:
             raise LowerError(f'it does not hear "{name}"', "levels", did_you_mean(name, fitting.upstream, "sources"))
     levels, timestep = [], fitting.timestep
-    for name, own in fitting.upstream.items():
-        timestep = own.lowered.timestep or timestep
-        levels += [spec.levels.get(name, 1.0)] * own.rows.size
+    for name, source in fitting.upstream.items():
+        timestep = source.lowered.timestep or timestep
+        levels += [spec.levels.get(name, 1.0)] * source.rows.size
     samples, substeps = blocks[first], fitting.upstream[first].lowered.substeps
     num_nodes = math.ceil(spec.reach / (spec.speed * timestep)) + 1
     room, num_rows = (num_nodes + 1) * samples + TAPS, len(levels)
@@ -104,9 +128,19 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
         f"hears {', '.join(fitting.upstream)} up to {spec.reach:g} m at {rate:g} Hz",
         f"no sound sooner than {1e3 * least:.3g} ms after it was made: all within {spec.speed * least:.3g} m",
     )
+    constants = MicrophoneConstants(
+        falloff=scalar(spec.falloff),
+        nearest=scalar(spec.nearest),
+        speed=scalar(spec.speed),
+        reach=scalar(spec.reach),
+        coefficients=coefficients(),
+        levels=np.array(levels),
+        num_samples=np.arange(1.0, samples + 1.0),
+        pos=np.array(spec.pos) if spec.body is None else None,
+    )
     return replace(
         lowered,
-        constants={**lowered.constants, "levels": np.array(levels), "num_samples": np.arange(1.0, samples + 1.0)},
+        constants=constants,
         state={
             "history": Memory(shape=(num_rows, room)),
             "path": Memory(shape=(3, num_nodes, num_rows)),
@@ -122,60 +156,55 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
     )
 
 
-def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(
+    gathered: Gathered, context: Context, constants: MicrophoneConstants[Tensor], state: MicrophoneState
+) -> tuple[dict[str, Tensor], MicrophoneState]:
     """Return the samples of a step, (env, sample, 1, 1) [Pa]."""
-    found = gathered[Upstream].values()
-    made = torch.cat([planes_of[SAMPLES].transpose(1, 2) for planes_of in found], dim=1)
-    place = torch.cat([planes_of[PLACE] for planes_of in found], dim=2)
+    sources = gathered[Upstream].values()
+    emitted = torch.cat([source[SAMPLES].transpose(1, 2) for source in sources], dim=1)
+    place = torch.cat([source[PLACE] for source in sources], dim=2)
     is_first = context.is_first
-    history = torch.where(is_first[..., None], 0.0, state["history"])
-    sound = torch.cat([history, made], dim=2)
-    path, kept = _path(place, state, is_first)
-    listener = _listener(gathered, constants, place)
-    here = planes.vec((m - place[:, i]).to(made.dtype) for i, m in enumerate(listener))
-    age = age_of_sound(planes.vec(here[i][:, None] - path[:, i] for i in range(3)), constants["speed"] * context.dt)
-    before = torch.where(is_first, age, state["age"])
-    num, room = made.shape[-1], history.shape[-1]
-    share = constants["num_samples"] / num
-    delay = num * (before[..., None] + share * (age - before)[..., None])
-    end = torch.arange(num, device=made.device) + room
-    heard = delayed(sound, end, delay.nan_to_num().clamp(LEAST_DELAY, room - TAPS // 2), constants["coefficients"])
+    history = torch.where(is_first[..., None], 0.0, state.history)
+    sound = torch.cat([history, emitted], dim=2)
+    path = _path(place, state, is_first)
+    fixed = None if constants.pos is None else constants.pos.to(place.dtype).expand(len(place), 1, 3)
+    listener = gathered[Places] if fixed is None else planes.split(fixed)
+    here = planes.vec((m - place[:, i]).to(emitted.dtype) for i, m in enumerate(listener))
+    age = age_of_sound(planes.vec(here[i][:, None] - path[:, i] for i in range(3)), constants.speed * context.dt)
+    last_age = torch.where(is_first, age, state.age)
+    num, room = emitted.shape[-1], history.shape[-1]
+    share = constants.num_samples / num
+    delay = num * (last_age[..., None] + share * (age - last_age)[..., None])
+    end = torch.arange(num, device=emitted.device) + room
+    delay = delay.nan_to_num().clamp(LEAST_DELAY, room - TAPS // 2)
+    arrived = delayed(sound, end, delay, constants.coefficients)
     num_nodes = path.shape[2] - 1
-    level, level_before = (_level(steps, num_nodes, constants, context.dt) for steps in (age, before))
-    gain = level_before[..., None] + share * (level - level_before)[..., None]
-    pressure = (gain * heard).sum(dim=1)
-    beyond = torch.maximum(state["beyond"], torch.where(level > 0, 0.0, constants["speed"] * context.dt * age))
-    new = {"history": sound[:, :, num:], "path": path[:, :, :-1], "age": age, "beyond": beyond, **kept}
-    return {"signal": pressure[..., None, None]}, new
+    level, last_level = (_level(steps, num_nodes, constants, context.dt) for steps in (age, last_age))
+    gain = last_level[..., None] + share * (level - last_level)[..., None]
+    pressure = (gain * arrived).sum(dim=1)
+    beyond = torch.maximum(state.beyond, torch.where(level > 0, 0.0, constants.speed * context.dt * age))
+    high = place.to(state.place.dtype)
+    low = (place - high.to(place.dtype)).to(high.dtype)
+    return {"signal": pressure[..., None, None]}, MicrophoneState(sound[:, :, num:], path[:, :, :-1], high, low, age, beyond)
 
 
-def _path(place: Tensor, state: State, is_first: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return where sources were at each node, from where they are now (env, 3, node, row) [m], and what is kept of now.
+def _path(place: Tensor, state: MicrophoneState, is_first: Tensor) -> Tensor:
+    """Return where sources were at each node, from where they are now (env, 3, node, row) [m].
 
-    Differences are formed as precisely as the state knows places: what is kept of them is two numbers of the module's dtype.
+    Differences are formed in the precision of `place`, which the state holds as two numbers of the module's dtype.
     """
-    dtype = state["place"].dtype
-    before = state["place"].to(place.dtype) + state["place_low"].to(place.dtype)
-    moved = torch.where(is_first[..., None], 0.0, (place - before).to(dtype))
-    path = torch.where(is_first[..., None, None], 0.0, state["path"] - moved[:, :, None])
-    path = torch.cat([torch.zeros_like(path[:, :, :1]), path], dim=2)
-    high = place.to(dtype)
-    return path, {"place": high, "place_low": (place - high.to(place.dtype)).to(dtype)}
+    last_place = state.place.to(place.dtype) + state.place_low.to(place.dtype)
+    moved = torch.where(is_first[..., None], 0.0, (place - last_place).to(state.place.dtype))
+    path = torch.where(is_first[..., None, None], 0.0, state.path - moved[:, :, None])
+    return torch.cat([torch.zeros_like(path[:, :, :1]), path], dim=2)
 
 
-def _listener(gathered: Gathered, constants: Constants, place: Tensor) -> Vec:
-    """Return where the microphone is in the world, planes (env, 1) [m]."""
-    if "pos" in constants:
-        return planes.split(constants["pos"].to(place.dtype).expand(len(place), 1, 3))
-    return gathered[Places]
-
-
-def _level(steps: Tensor, num_nodes: int, constants: Constants, dt: Tensor) -> Tensor:
-    """Return by what samples are multiplied that were emitted some steps ago (env, row)."""
-    distance = constants["speed"] * dt * steps
-    near = torch.maximum(distance, constants["nearest"])
-    level = constants["levels"] * torch.exp(-constants["falloff"] * torch.log(near))
-    return torch.where((distance > constants["reach"]) | (steps >= num_nodes), 0.0, level)
+def _level(steps: Tensor, num_nodes: int, constants: MicrophoneConstants[Tensor], dt: Tensor) -> Tensor:
+    """Return the factor of samples that were emitted some steps ago (env, row)."""
+    distance = constants.speed * dt * steps
+    near = torch.maximum(distance, constants.nearest)
+    level = constants.levels * torch.exp(-constants.falloff * torch.log(near))
+    return torch.where((distance > constants.reach) | (steps >= num_nodes), 0.0, level)
 
 
 def not_heard(name: str, constants: Mapping[str, np.ndarray], rows: Sequence[str], beyond: np.ndarray) -> list[str]:
@@ -195,4 +224,6 @@ MICROPHONE = Kind(
     reads="hears",
     warns=(("beyond", not_heard),),
     fit=fit,
+    constants=MicrophoneConstants,
+    state=MicrophoneState,
 )

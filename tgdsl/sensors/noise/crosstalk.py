@@ -8,15 +8,13 @@ is a range, G mixes the kernels of its ends with a share that is drawn uniformly
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.fields.models import Range, RangeOf, SpecModel, Usual
 from tgdsl.layout.layout import Layout
-from tgdsl.sensors.noise.fields import ZERO, Share
 from tgdsl.sensors.noise.reference import ReferenceCall
 from tgdsl.sensors.noise.reference import Signal as ReferenceSignal
 from tgdsl.sensors.noise.stage import NoMemory, Now, Number, Signal, Stage, Table, compact
@@ -25,62 +23,35 @@ from tgdsl.tensors.link_products import LINK_PRODUCTS
 KERNEL = "kernel/"
 """Kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels."""
 NEGLIGIBLE = 1e-14
-"""Share of a taxel's signal that counts as none: a millionth of float32's last digit. Much smaller ones would be subnormal
-numbers, with which processors multiply ten times slower."""
+"""Share of a taxel's signal below which it is set to 0: a millionth of float32's last digit. Products with subnormal numbers
+are ten times slower."""
 
 
-class Crosstalk(SpecModel):
-    """Mixing of neighbouring taxels of a link; the sum over its taxels stays what it is."""
-
-    strength: Share
-    """χ, share of each taxel's signal that goes to its neighbourhood."""
-    sigma: Annotated[Range, RangeOf("length", gt=0.0), Usual("length", high=0.1)]
-    """Standard deviation of the Gaussian neighbourhood [m]."""
-
-
-class CrosstalkKnobs(SpecModel):
-    """Knob of the crosstalk."""
-
-    crosstalk: Crosstalk | None = None
-    """Mixing of neighbouring taxels."""
-
-
-class CrosstalkValues(NamedTuple):
-    """χ and the mixture of kernels, where they are not part of the kernels; and these, see `KERNEL`."""
-
-    crosstalk_strength: Tensor | None
-    crosstalk_mixture: Tensor | None
-    kernels: Sequence[Tensor]
-
-
-class CrosstalkStage(Stage[CrosstalkValues, NoMemory]):
+class Crosstalk(Stage):
     """Spreads each taxel's signal over its link, a product for each: with W, or with G where χ or σ differ between episodes."""
 
     name = "crosstalk"
-    Knobs = CrosstalkKnobs
-    numbers = {
-        "crosstalk_strength": Number(5, "strength "),
-        "crosstalk_sigma": Number(None),
-        "crosstalk_mixture": Number(6, None),
-    }
-    Values = CrosstalkValues
+    crosstalk_strength: Annotated[Tensor | None, Number(5, "strength ", knob="crosstalk.strength")]
+    """χ; None where it is part of the kernels."""
+    crosstalk_sigma: Annotated[None, Number(None, knob="crosstalk.sigma", absent=(1.0, 1.0), neutral=None)]
+    """σ, part of the kernels."""
+    crosstalk_mixture: Annotated[Tensor | None, Number(6, None, knob=None, neutral=None)]
+    """Share of the upper σ's kernel; None where σ is no range."""
+    kernels: Sequence[Tensor]
+    """Of each link, see `KERNEL`."""
 
-    def values_of(self, knobs: Any) -> Mapping[str, Range]:
-        own = knobs.crosstalk
-        strength, sigma = (own.strength, own.sigma) if own else (ZERO, (1.0, 1.0))
-        return {"crosstalk_strength": strength, "crosstalk_sigma": sigma, "crosstalk_mixture": (0.0, 1.0)}
-
-    def constants(self, values: Table, layout: Layout) -> dict[str, np.ndarray]:
+    @classmethod
+    def constants(cls, values: Table, layout: Layout) -> dict[str, np.ndarray]:
         """Return each link's W, (σ, from, to); where χ or σ is a range, G of the lower σ, and what the upper one adds."""
         result: dict[str, np.ndarray] = {}
         strength, (low, high) = values["crosstalk_strength"][:, 0], values["crosstalk_sigma"][:, 0]
         is_wider = bool((low != high).any())
         is_drawn = is_wider or bool((strength[0] != strength[1]).any())
         for i in range(len(layout.links)):
-            own = np.flatnonzero(layout.link_id == i)
-            kernel, wider = (crosstalk_kernel(layout.take(own), sigma[own]) for sigma in (low, high))
+            taxels = np.flatnonzero(layout.link_id == i)
+            kernel, wider = (crosstalk_kernel(layout.take(taxels), sigma[taxels]) for sigma in (low, high))
             if not is_drawn:
-                kernel = np.diag(1 - strength[0, own]) + strength[0, own] * kernel
+                kernel = np.diag(1 - strength[0, taxels]) + strength[0, taxels] * kernel
             kernels = [kernel, wider - kernel] if is_wider else [kernel]
             result[f"{KERNEL}{i:04d}"] = np.stack(kernels).transpose(0, 2, 1)
         if is_drawn:
@@ -89,19 +60,21 @@ class CrosstalkStage(Stage[CrosstalkValues, NoMemory]):
             result["crosstalk_mixture"] = np.array([0.0, 1.0])[:, None, None]
         return result
 
-    def typed(self, values: Mapping[str, Tensor]) -> CrosstalkValues:
+    @classmethod
+    def of(cls, values: Mapping[str, Tensor]) -> Crosstalk:
         kernels = [values[name] for name in sorted(name for name in values if name.startswith(KERNEL))]
-        return CrosstalkValues(values.get("crosstalk_strength"), values.get("crosstalk_mixture"), kernels)
+        return cls(values.get("crosstalk_strength"), None, values.get("crosstalk_mixture"), kernels)
 
-    def forward(self, signal: Signal, values: CrosstalkValues, memory: NoMemory, now: Now) -> tuple[Signal, NoMemory]:
-        strength, mixture, kernels = values
+    def forward(self, signal: Signal, memory: NoMemory, now: Now) -> tuple[Signal, NoMemory]:
+        strength, mixture, kernels = self.crosstalk_strength, self.crosstalk_mixture, self.kernels
         spread = signal if strength is None else signal * strength
         mixed = _product(spread, [kernel[0] for kernel in kernels])
         if mixture is not None:
             mixed = mixed + mixture * _product(spread, [kernel[1] for kernel in kernels])
         return mixed if strength is None else signal - spread + mixed, memory
 
-    def reference(self, signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
         if "operator" not in memory:
             memory["operator"] = _reference_operator(call)
         return memory["operator"] @ signal
@@ -141,7 +114,7 @@ def _reference_operator(call: ReferenceCall) -> Float[np.ndarray, "row row"]:
 
 
 def _reference_column(layout: Layout | None, i: int, sigma: float) -> Float[np.ndarray, " row"]:
-    """Return what share of taxel i's signal each taxel gets."""
+    """Return the share of taxel i's signal that each taxel gets."""
     assert layout is not None
     kernel = np.zeros(layout.num_taxels)
     for j in range(layout.num_taxels):
@@ -149,6 +122,3 @@ def _reference_column(layout: Layout | None, i: int, sigma: float) -> Float[np.n
         if i == j or (are_active and layout.link_id[i] == layout.link_id[j] and layout.normal[i] @ layout.normal[j] > 0):
             kernel[j] = np.exp(-sum((layout.pos[i] - layout.pos[j]) ** 2) / (2 * sigma**2))
     return kernel / kernel.sum()
-
-
-CROSSTALK = CrosstalkStage()

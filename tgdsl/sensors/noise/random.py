@@ -1,18 +1,17 @@
-"""Random numbers by counting: each is a hash of what it is for, so it depends on nothing else.
+"""Counter-based random numbers: each is a hash of its purpose and its number.
 
     word(k, i) = mix(i ⊕ k₀) ⊕ k₁                                  i-th 32-bit word of a stream (k₀, k₁)
     k_h = mix(mix(mix(environment ⊕ s_h) ⊕ counter) ⊕ c_h),   h = 0, 1
 
 with mix a bijection of 32-bit words by shifts and products, (s₀, s₁) the sensor's key, and c_h the purpose with what the
 counter has beyond 32 bits. The sensor's key comes from the seed and the sensor's name alone, the environment counts over all
-processes, and the counter is the step for what is drawn at each reading, the episode for what is drawn at reset. So no sensor,
-environment, batch size, device or process changes the numbers of another, and nothing has to be stored or drawn in order.
+processes. The counter is the step for numbers drawn at each reading, and the episode for numbers drawn at reset. So numbers do
+not depend on other sensors, environments, batch size, device or process, and are neither stored nor drawn in order.
 
 Uniform numbers have 23 bits, the same in float32 and float64. Normal ones come in pairs, each of one word (Box and Muller
 1958): 20 bits for the radius, so that none is beyond √(2 ln 2²¹) = 5.40, and 12 for the angle.
 
-Products are formed in int64 and cut to 32 bits: that of two int32 may overflow, which C++ does not define, and compilers make
-use of that.
+Products are formed in int64 and cut to 32 bits, as overflow of int32 is undefined in C++.
 
 Source of the constants of `mix`: the search for bijections of little bias that C. Wellons began ("Hash Prospector", 2018 on).
 
@@ -34,8 +33,7 @@ from tgdsl.geometry.planes import pi
 from tgdsl.tensors.fusion import materialised
 
 READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER, KIND = range(7)
-"""What numbers are for: the first three are drawn at each step, the next three at each reset; the last are those that a kind
-draws itself, at each of its calls."""
+"""Purposes of numbers: the first three are drawn at each step, the next three at reset, the last by a kind at each call."""
 
 PER_STEP = (READING, RADIUS, JITTER)
 UNIFORM_BITS, RADIUS_BITS, ANGLE_BITS = 23, 20, 10
@@ -68,7 +66,7 @@ def streams(
 ) -> list[Mapping[int, Stream]]:
     """Return the streams of each sensor, by purpose.
 
-    They are found together, of a few operations, whatever number of sensors there is.
+    The number of operations does not grow with the number of sensors.
 
     Args:
         keys: The sensors' keys, int32.
@@ -81,8 +79,8 @@ def streams(
     begun = mix(mix(env.to(torch.int32)[:, None, None] ^ keys)[:, :, None] ^ low)  # (env, sensor, counter, half)
     purposes = torch.arange(2 * KIND, device=env.device) * PURPOSE_STEP + FIRST_PURPOSE
     purposes = purposes.to(torch.int32).view(2, len(PER_STEP), 2)  # (counter, purpose, half)
-    found = materialised(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
-    halves = [own.unbind(-1) for own in found.flatten(2, 3).unbind(1)]
+    keys_by_purpose = materialised(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
+    halves = [half.unbind(-1) for half in keys_by_purpose.flatten(2, 3).unbind(1)]
     return [{p: Stream(a[:, p, None], b[:, p, None]) for p in range(a.shape[1])} for a, b in halves]
 
 
@@ -92,7 +90,7 @@ def kind_stream(key: Int[Tensor, " half"], env: Int[Tensor, " env"], count: Int[
     Args:
         key: The sensor's key, int32.
         env: Numbers of the environments, int64, counted over all processes.
-        count: Number of the call of each environment, int64; of a block that of the physics step.
+        count: Number of the call of each environment, int64; of the physics step for a block.
     """
     low, high = count[:, None].to(torch.int32), mix((count[:, None] >> 32).to(torch.int32))
     begun = mix(mix(env.to(torch.int32)[:, None] ^ key) ^ low) ^ high
@@ -101,7 +99,7 @@ def kind_stream(key: Int[Tensor, " half"], env: Int[Tensor, " env"], count: Int[
 
 
 def words(stream: Stream, index: Int[Tensor, "*row"]) -> Int[Tensor, "*both"]:
-    """Return the words of these numbers, int32; the keys of the stream broadcast with them."""
+    """Return the words with these numbers, int32; the stream's keys broadcast with them."""
     return mix(index ^ stream.first) ^ stream.second
 
 

@@ -1,6 +1,6 @@
-"""Random numbers of the noise in NumPy, and what the float64 definition of a stage gets, for one environment.
+"""Random numbers of the noise in NumPy, and the inputs of a stage's float64 definition, for one environment.
 
-The batched form shares nothing with it but constants: hashes are of unsigned words, normal numbers are by cosine and sine.
+It shares only constants with the batched form: hashes are of unsigned words, normal numbers are by cosine and sine.
 
 Shapes: `row` taxels (or bodies) of the reading, `channel` its channels, `word` random words.
 """
@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt64
 from tgdsl.fields.models import Range
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.fields import ALL, Amplitude, range_of
+from tgdsl.sensors.noise.spec import ALL, Amplitude, range_of
 
 Signal = Float[np.ndarray, "row channel"]
 Words = UInt64[np.ndarray, "*word"]
@@ -32,11 +32,11 @@ def mix(word: Words) -> Words:
 
 
 def words(key: tuple[int, int], env: int, counter: int, purpose: int, index: Words) -> Words:
-    """Return words of a stream, by a sensor's key, the environment's number, that of the step or episode, and their purpose."""
+    """Return words of a stream, by sensor, environment, step or episode, and purpose."""
     low, high = (np.array([part & WORD], dtype=np.uint64) for part in (counter, counter >> 32))
     halves = []
-    for half, own in enumerate(key):
-        word = mix(mix(np.array([(env ^ own) & WORD], dtype=np.uint64)) ^ low)
+    for half, key_half in enumerate(key):
+        word = mix(mix(np.array([(env ^ key_half) & WORD], dtype=np.uint64)) ^ low)
         halves.append(mix(word ^ mix(high) ^ np.uint64(random.PURPOSES[2 * purpose + half])))
     return mix(index ^ halves[0]) ^ halves[1]
 

@@ -1,7 +1,7 @@
-"""A stage of a sensor's noise: one class with its knobs, its batched form, and its definition in float64.
+"""A stage of a sensor's noise: a class with its numbers, its batched form, and its definition in float64.
 
-A stage of one's own is a subclass in one file. `stages.register` makes it known, or the entry point `tgdsl.noise_stages`; every
-kind that has noise then has its knobs.
+A stage of a user is a subclass in one file with its `Knobs`. `pipeline.register` makes it known, or the entry point
+`tgdsl.noise_stages`; every kind that has noise then has its knobs.
 
 Shapes: `env` environments, `channel` numbers of a signal, `row` its rows, `end` lowest and highest value of a range.
 """
@@ -9,7 +9,8 @@ Shapes: `env` environments, `channel` numbers of a signal, `row` its rows, `end`
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, NamedTuple, Self, dataclass_transform, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -19,17 +20,17 @@ from torch import Tensor
 from tgdsl.fields.models import Range, SpecModel
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.fields import Amplitude
 from tgdsl.sensors.noise.random import Stream
 from tgdsl.sensors.noise.reference import ReferenceCall
 from tgdsl.sensors.noise.reference import Signal as ReferenceSignal
+from tgdsl.sensors.noise.spec import ZERO, Amplitude
 
 Signal = Float[Tensor, "env channel row"]
-"""What noise disturbs."""
+"""The signal that noise disturbs."""
 
 
 class Now(NamedTuple):
-    """When a reading is made.
+    """Time and random numbers of a reading.
 
     Attributes:
         dt: Time since the last call [s].
@@ -37,7 +38,7 @@ class Now(NamedTuple):
         age: Calls since each environment's reset, (env, 1); 0 at the first one.
         ages: Time since each of the calls before this one, the last one first (env, call) [s]; None without a delay.
         is_sample: Whether each environment's sensor takes a sample now, (env, 1); None: always.
-        period: Time between samples [s], a scalar; None: one is taken at every call.
+        period: Time between samples [s], a scalar; None: each call takes one.
         streams: The sensor's random numbers, by purpose.
     """
 
@@ -51,108 +52,137 @@ class Now(NamedTuple):
 
 
 NO_CLOCK = Now(*[None] * 6, {})  # type: ignore[arg-type]
-"""What a sensor gets whose noise depends neither on time nor on chance."""
+"""Of a sensor whose noise has neither time nor random numbers."""
 
 
 def uniform(now: Now, purpose: int, row: int, like: Tensor) -> Tensor:
-    """Return a uniform number between 0 and 1 for each of the last axis of `like`: those of a row of a purpose, (env, …)."""
+    """Return a uniform number between 0 and 1 for each of the last axis of `like`: one row of a purpose, (env, …)."""
     count = like.shape[-1]
     index = torch.arange(count, dtype=torch.int32, device=like.device) + row * count
     return random.uniform(random.words(now.streams[purpose], index), like.dtype)
 
 
-class Number(NamedTuple):
-    """A number of a stage's knobs.
+@dataclass(frozen=True)
+class Number:
+    """Marks a field of a stage as a number of the knobs.
 
     Attributes:
-        draw: Which random number of an episode says where in its range it is, one for each number; None: it is not drawn.
-        label: What precedes its value in an account of a module; None: it is not shown.
-        unit: Its unit; None: that of the reading.
-        knob: The knob that it is of, if that has another name.
+        draw: Which random number of an episode says where in its range it is, unique to it; None: it is not drawn.
+        label: Text before its value in `explain`; None: it is not shown.
+        unit: Its unit; None: the unit of the reading.
+        knob: The path of its range in the knobs, `gain.0`; "": its name; None: it is of no knob.
+        absent: Its range where such a knob is None.
+        neutral: The value that has no effect: a stage is left out where all rows have it. None: it does not decide.
+        stream: Purpose of the random numbers that it needs, see `random`.
     """
 
     draw: int | None
     label: str | None = ""
     unit: str | None = ""
-    knob: str = ""
+    knob: str | None = ""
+    absent: Range = ZERO
+    neutral: float | None = 0.0
+    stream: int | None = None
 
 
 class NoMemory(NamedTuple):
-    """A stage that remembers nothing."""
+    """Memory of a stage without any."""
 
 
-Values = TypeVar("Values")
-Memory = TypeVar("Memory")
 Table = Mapping[str, Float[np.ndarray, "end channel row"]]
 """Values of a stage's numbers."""
 
 
-class Stage(Generic[Values, Memory]):
-    """A stage of noise.
+@dataclass_transform(frozen_default=True, eq_default=False)
+class Stage:
+    """A stage of noise; an instance holds its numbers at one call.
+
+    A field is `name: Annotated[Tensor, Number(…)]`, (env or 1, channel or 1, row or 1); of `Tensor | None` it is None where it
+    is neutral in all rows. Subclasses are frozen dataclasses without being marked as such.
 
     Attributes:
         name: Its name in a plan.
         Knobs: Fields that it adds to the knobs of a sensor, with neutral defaults.
-        numbers: The numbers that `values_of` reads of the knobs, by the names of constants.
-        Values: What `forward` gets: a NamedTuple of constants, (env or 1, channel or 1, row or 1); None where one is left out.
-        Memory: What it carries from one call to the next: a NamedTuple of (env, channel, row). What there was before the first
-            call is of no use: it starts where `Now.age` is 0.
+        Memory: Its memory: a NamedTuple of (env, channel, row). The content before the first call, where `Now.age` is 0, is
+            arbitrary.
         needs_dt: Whether it needs the time since the last call.
-        after: Name of the stage that it follows; "": that before it in `STAGES`, or the last one.
+        after: Name of the stage that it follows; "": the one before it in `STAGES`, or the last one.
+        is_split: Whether a plan names its active numbers instead of the stage.
+        numbers: Its numbers by name, from the fields.
     """
 
     name: ClassVar[str]
-    Knobs: ClassVar[type[SpecModel]]
-    numbers: ClassVar[Mapping[str, Number]]
-    Values: ClassVar[type[Any]]
+    Knobs: ClassVar[type[SpecModel]] = SpecModel
     Memory: ClassVar[type[Any]] = NoMemory
     needs_dt: ClassVar[bool] = False
     after: ClassVar[str] = ""
+    is_split: ClassVar[bool] = False
+    numbers: ClassVar[Mapping[str, Number]]
+    _optional: ClassVar[frozenset[str]]
 
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """Its names in a plan: several if parts of it can be off by themselves."""
-        return (self.name,)
+    def __init_subclass__(cls) -> None:
+        """Collect the numbers."""
+        dataclass(frozen=True, eq=False)(cls)
+        hints = get_type_hints(cls, include_extras=True)
+        marked = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Annotated}
+        cls.numbers = {name: args[1] for name, args in marked.items()}
+        cls._optional = frozenset(name for name, args in marked.items() if type(None) in get_args(args[0]))
 
-    def values_of(self, knobs: Any) -> Mapping[str, Range | Amplitude]:
-        """Return its numbers of some knobs, neutral where it is off; default: knobs of the same names."""
-        return {name: getattr(knobs, name) for name in self.numbers}
+    @classmethod
+    def terms(cls) -> tuple[str, ...]:
+        """Return its names in plans."""
+        return tuple(cls.numbers) if cls.is_split else (cls.name,)
 
-    def active(self, values: Table) -> tuple[str, ...]:
-        """Return which of its terms some row has; default: its only one, where the first number is not 0."""
-        return self.terms if values[next(iter(self.numbers))].any() else ()
+    @classmethod
+    def ranges(cls, knobs: Any) -> dict[str, Range | Amplitude]:
+        """Return its numbers of some knobs."""
+        result = {}
+        for name, number in cls.numbers.items():
+            value = knobs
+            for part in () if number.knob is None else (number.knob or name).split("."):
+                value = value[int(part)] if part.isdigit() else getattr(value, part, None)
+            result |= {} if number.knob is None else {name: number.absent if value is None else value}
+        return result
 
-    def constants(self, values: Table, layout: Layout) -> dict[str, np.ndarray]:
-        """Return what `forward` reads of the values of a sensor whose layout has its taxels; default: all of them."""
-        return {name: compact(values[name]) for name in self.numbers}
+    @classmethod
+    def active(cls, values: Table) -> tuple[str, ...]:
+        """Return which of its terms some row has."""
+        names = tuple(name for name, n in cls.numbers.items() if n.neutral is not None and (values[name] != n.neutral).any())
+        return names if cls.is_split or not names else (cls.name,)
 
-    def remembers(self, terms: Sequence[str]) -> tuple[str, ...]:
-        """Return which fields of its memory there are, of a sensor with these terms; default: all."""
-        return self.Memory._fields
+    @classmethod
+    def constants(cls, values: Table, layout: Layout) -> dict[str, np.ndarray]:
+        """Return the constants of a sensor with these values, whose layout has its taxels."""
+        left_out = {name for name in cls._optional if (values[name] == cls.numbers[name].neutral).all()}
+        return {name: compact(values[name]) for name in cls.numbers if name not in left_out}
 
-    def purposes(self, constants: Mapping[str, np.ndarray]) -> tuple[int, ...]:
-        """Return what it draws random numbers for, see `random`."""
-        return ()
+    @classmethod
+    def remembered(cls, terms: Sequence[str]) -> tuple[str, ...]:
+        """Return which fields of its memory a sensor with these terms has; default: all."""
+        return cls.Memory._fields
 
-    def past(self, values: Table) -> float:
+    @classmethod
+    def past(cls, values: Table) -> float:
         """Return for how long its memory holds each call [s]; 0: it holds the last one alone."""
         return 0.0
 
-    def typed(self, values: Mapping[str, Tensor]) -> Values:
-        """Return its values of those of all stages."""
-        return self.Values(*[values.get(name) for name in self.Values._fields])
+    @classmethod
+    def of(cls, values: Mapping[str, Tensor]) -> Self:
+        """Return the stage with its numbers, from the values of all stages."""
+        return cls(**{name: values.get(name) for name in cls.numbers})
 
-    def forward(self, signal: Signal, values: Values, memory: Memory, now: Now) -> tuple[Signal, Memory]:
+    def forward(self, signal: Signal, memory: Any, now: Now) -> tuple[Signal, Any]:
         """Return the disturbed signal, here the same, and the new memory; where that is a ring, the entry of this call."""
         return signal, memory
 
-    def reference(self, signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
         """Return the disturbed signal (row, channel) of one environment; `memory` is empty at the first call of an episode."""
         return signal
 
 
 def compact(value: Float[np.ndarray, "end channel row"]) -> np.ndarray:
-    """Return values without the axes along which nothing changes; those of channels and rows become 1."""
+    """Return values without the axes along which nothing changes; channels and rows become axes of length 1."""
     for axis in (1, 2):
         first = value.take([0], axis)
         value = first if (value == first).all() else value

@@ -1,199 +1,286 @@
-"""Noise of a sensor: what lies between the true signal and the reading, stage by stage in the order of `STAGES`.
+"""The stages that act on each taxel alone, in their order; `crosstalk` has the one between taxels.
 
-Each stage acts on each channel alone. Where a kind makes bits of its signal (`contact`, `link_contact`), noise acts on the
-signal, before the threshold. A sensor with a rate holds its reading between its samples; its noise is drawn once per sample.
+    radius          R̃_j = max(0, R_j + ε_j), ε_j ~ U[−ρ, ρ] at each reading, before the distance query [m]
+    gain            x ← γ_j x, γ_j ~ U[γ_low, γ_high] at reset; of an elastomer the depth at each taxel
+    hysteresis      ξ ← e^(−r) ξ + (1 − e^(−r))/r (x_t − x_(t−1)), r = Δt/τ; x ← x + β ξ; ξ = 0 at reset
+    delay           x ← x(t − Δ), Δ = Δ_read + U[0, J] at each reading, the same for all taxels
+    offset          y = x + b + n_t + d_t, n_t ~ N(0, σ²), d_t = d_(t−1) + w_t, w_t ~ N(0, σ_rw²); d = 0 at reset
+    quantization    y ← q round(y/q); gradients pass as if it were not there
+    dead            y ← z_j where M_j, M_j ~ Bernoulli(p), z_j = low + s_j (high − low), s_j ~ U[0, 1], both at reset
 
-Source: Chung et al., *Tactile Genesis*, appendix, "Sensor Noise Model"; departures are in the files of the stages.
+Each acts on each channel alone. Where a kind makes bits of its signal (`contact`, `link_contact`), noise acts on the signal,
+before the threshold. Noise is drawn once per sample of a sensor with a rate; n and w are both from one random word. M_j and s_j
+are the same in all channels of a taxel.
 
-Shapes: `env` environments, `channel` numbers of the signal, `row` its rows.
+Hysteresis is a Maxwell branch, exact for signals that are linear between calls, so it is the same at any step; the paper's
+ξ ← e^(−r) ξ + x_t − x_(t−1) depends on the step. For the delay too the signal is linear between calls, and before the first
+call equal to the first one.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "Sensor Noise Model".
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.errors import TgdslError
-from tgdsl.files.plugins import installed
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.crosstalk import CROSSTALK
-from tgdsl.sensors.noise.dead import DEAD
-from tgdsl.sensors.noise.delay import DELAY
-from tgdsl.sensors.noise.gain import GAIN
-from tgdsl.sensors.noise.hysteresis import HYSTERESIS
-from tgdsl.sensors.noise.offset import OFFSET
-from tgdsl.sensors.noise.quantization import QUANTIZATION
-from tgdsl.sensors.noise.radius import RADIUS
-from tgdsl.sensors.noise.reference import ReferenceCall
+from tgdsl.sensors.noise.reference import ReferenceCall, normal_pair
 from tgdsl.sensors.noise.reference import Signal as ReferenceSignal
-from tgdsl.sensors.noise.release import RELEASE
-from tgdsl.sensors.noise.spec import Knobs
-from tgdsl.sensors.noise.stage import Now, Signal, Stage
+from tgdsl.sensors.noise.stage import NoMemory, Now, Number, Signal, Stage, Table, uniform
 from tgdsl.tensors.fusion import materialised
 
-AnyStage = Stage[Any, Any]
-STAGES: tuple[AnyStage, ...] = (
-    RADIUS, GAIN, HYSTERESIS, CROSSTALK, DELAY, OFFSET, QUANTIZATION, DEAD, RELEASE,
-)  # fmt: skip
-"""The stages of tgdsl, in their order."""
-GROUP = "tgdsl.noise_stages"
-"""Group of the entry points by which packages bring stages."""
-_registered: list[AnyStage] = []
+
+class Radius(Stage):
+    """Disturbs radii by `shift`; the signal stays as it is."""
+
+    name = "radius_noise"
+    radius_noise: Annotated[Tensor, Number(0, unit=" m", stream=random.RADIUS)]
+    """ρ [m]."""
+
+    def shift(self, now: Now, like: Tensor) -> Tensor:
+        """Return the disturbance of each probe's radius (env, taxel) [m]."""
+        share = materialised(uniform(now, random.RADIUS, 0, like))
+        return self.radius_noise[:, 0] * (2 * share - 1)
+
+    @staticmethod
+    def reference_radius(radius: np.ndarray, call: ReferenceCall) -> np.ndarray:
+        """Return this step's radii (row,) of probes with these radii [m]."""
+        disturbed = radius[:, None] + call.number("radius_noise") * (2 * call.uniform(random.RADIUS) - 1)
+        return np.maximum(0, disturbed[:, 0])
 
 
-def register(stage: AnyStage) -> None:
-    """Make a stage known to all documents and artefacts that are read from now on."""
-    _registered.append(stage)
+class Gain(Stage):
+    """x ← γ_j x."""
+
+    name = "gain"
+    gain_low: Annotated[Tensor, Number(1, "from ", knob="gain.0", neutral=1.0, stream=random.GAIN)]
+    gain_high: Annotated[Tensor, Number(2, "to ", knob="gain.1", neutral=1.0, stream=random.GAIN)]
+
+    def of_taxels(self, now: Now, like: Tensor) -> Tensor:
+        """Return each taxel's gain (env, taxel)."""
+        low, high = self.gain_low[:, 0], self.gain_high[:, 0]
+        return low + uniform(now, random.GAIN, 0, like) * (high - low)
+
+    def forward(self, signal: Signal, memory: NoMemory, now: Now) -> tuple[Signal, NoMemory]:
+        return self.of_taxels(now, signal[:, 0])[:, None] * signal, memory
+
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+        low, high = call.number("gain_low"), call.number("gain_high")
+        return (low + call.uniform(random.GAIN)[:, :1] * (high - low)) * signal
 
 
-def more_stages() -> tuple[AnyStage, ...]:
-    """Return the stages of installed packages, and those that were registered.
+class HysteresisMemory(NamedTuple):
+    """ξ, and the signal of the last call."""
 
-    Raises:
-        TgdslError: If two stages share a knob, a number or its draw.
-    """
-    more = (*(stage for stage, _ in installed(GROUP, "noise stage", _wrong)), *_registered)
-    names: dict[object, str] = {}
-    for stage in (*STAGES, *more):
-        draws = [number.draw for number in stage.numbers.values() if number.draw is not None]
-        for name in (*stage.Knobs.model_fields, *(f"number {name}" for name in stage.numbers), *draws):
-            if (other := names.setdefault(name, stage.name)) != stage.name:
-                problem = f"the draw {name}" if isinstance(name, int) else f'"{name}"'
-                raise TgdslError(f'the noise stages "{other}" and "{stage.name}" both have {problem}; expected another one')
-    return more
+    lag: Tensor
+    last: Tensor
 
 
-def knobs_of(knobs: frozenset[str]) -> frozenset[str]:
-    """Return all knobs of a kind: its own, and those of `more_stages` if it has any."""
-    return knobs.union(*(stage.Knobs.model_fields for stage in more_stages())) if knobs else knobs
+class Hysteresis(Stage):
+    """x ← x + β ξ."""
+
+    name = "hysteresis"
+    Memory = HysteresisMemory
+    needs_dt = True
+    hysteresis_strength: Annotated[Tensor, Number(3, "strength ", knob="hysteresis.strength")]
+    """β [1]."""
+    hysteresis_time: Annotated[Tensor, Number(4, "time constant ", " s", "hysteresis.time_constant", (1.0, 1.0), None)]
+    """τ [s]."""
+
+    def forward(self, signal: Signal, memory: HysteresisMemory, now: Now) -> tuple[Signal, HysteresisMemory]:
+        assert now.dt is not None
+        ratio = now.dt / self.hysteresis_time
+        ramp = torch.where(ratio > 0, -torch.expm1(-ratio) / torch.where(ratio > 0, ratio, 1.0), 1.0)
+        decay, ramp = materialised(torch.exp(-ratio)), materialised(ramp)
+        lag = torch.where(now.age[..., None] == 0, 0.0, decay * memory.lag + ramp * (signal - memory.last))
+        return signal + self.hysteresis_strength * lag, HysteresisMemory(lag, signal)
+
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+        lag = memory.get("lag", 0.0)
+        if "last" in memory:
+            r = call.dt / call.number("hysteresis_time")
+            lag = np.exp(-r) * lag - np.expm1(-r) / r * (signal - memory["last"])
+        memory.update(lag=lag, last=signal)
+        return signal + call.number("hysteresis_strength") * lag
 
 
-def known_stages() -> tuple[AnyStage, ...]:
-    """Return all stages in their order."""
-    result = list(STAGES)
-    for stage in more_stages():
-        names = [other.name for other in result]
-        result.insert(names.index(stage.after) + 1 if stage.after in names else len(result), stage)
-    return tuple(result)
+class DelayMemory(NamedTuple):
+    """The signals of the last calls, (env, call, channel, row); the new one is this call's, (env, channel, row)."""
+
+    ring: Tensor
 
 
-def _wrong(stage: object) -> str:
-    return "" if isinstance(stage, Stage) else f"found {type(stage).__name__}, expected a tgdsl.sensors.noise.stage.Stage"
+class Delay(Stage):
+    """x ← x(t − Δ)."""
+
+    name = "delay"
+    Memory = DelayMemory
+    needs_dt = True
+    read_delay: Annotated[Tensor, Number(7, unit=" s")]
+    """Δ_read [s]."""
+    jitter: Annotated[Tensor | None, Number(8, "jitter ", " s", stream=random.JITTER)]
+    """J [s]."""
+
+    @classmethod
+    def past(cls, values: Table) -> float:
+        return float((values["read_delay"][1] + values["jitter"][1]).max())
+
+    def forward(self, signal: Signal, memory: DelayMemory, now: Now) -> tuple[Signal, DelayMemory]:
+        assert now.ages is not None
+        late, ring = self.read_delay[:, 0], memory.ring
+        if self.jitter is not None:
+            index = torch.zeros_like(now.streams[random.JITTER].first[:1, 0])
+            word = random.words(now.streams[random.JITTER], index)
+            late = late + self.jitter[:, 0] * random.uniform(word, late.dtype)
+        length = ring.shape[1]
+        ages = now.ages[:, :length]
+        newer = torch.minimum((ages[:, None] <= late[..., None]).sum(dim=-1), torch.clamp(now.age, max=length))
+        is_oldest = newer >= torch.clamp(now.age, max=length)
+        start = torch.where(newer > 0, ages.gather(1, (newer - 1).clamp(min=0)), 0.0)
+        rest = (late - start) / (ages.gather(1, newer.clamp(max=length - 1)) - start)
+        rest, newer = materialised(torch.where(is_oldest, 0.0, rest)), materialised(newer)
+        after, older = (_entry(ring, materialised((now.step - newer - k) % length)) for k in (0, 1))
+        after = torch.where(newer[:, None] == 0, signal, after)
+        return torch.where(rest[:, None] > 0, after + rest[:, None] * (older - after), after), DelayMemory(signal)
+
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+        times, signals = memory.setdefault("times", []), memory.setdefault("signals", [])
+        times.append(times[-1] + call.dt if times else 0.0)
+        signals.append(signal)
+        late = call.number("read_delay") + call.uniform(random.JITTER)[0, 0] * call.number("jitter")
+        past, result = np.array(signals), np.empty(signal.shape)
+        for place in np.ndindex(signal.shape):
+            result[place] = np.interp(times[-1] - late[place], times, past[:, *place])
+        return result
 
 
-def stages_of(terms: Sequence[str]) -> tuple[AnyStage, ...]:
-    """Return the stages that a plan names.
-
-    Raises:
-        TgdslError: If one of them is not known.
-    """
-    known = known_stages()
-    if missing := set(terms).difference(*(stage.terms for stage in known)):
-        problem = f'the noise stage "{min(missing)}" is not known'
-        raise TgdslError(f"{problem}; install its package, or `tgdsl.sensors.noise.register` it")
-    return tuple(stage for stage in known if set(stage.terms) & set(terms))
+def _entry(ring: Tensor, slot: Tensor) -> Signal:
+    """Return the entries of a ring (env, call, channel, row) at slots (env, 1) or (env, row)."""
+    env = torch.arange(len(ring), device=ring.device)
+    if slot.shape[1] == 1:  # whole signals, which are contiguous
+        return ring[env, slot[:, 0]]
+    place = slot[:, None, None].expand(-1, 1, *ring.shape[2:])
+    return ring.gather(1, place)[:, 0]
 
 
-Drawn = Mapping[str, Any]
-"""What each stage of a sensor gets as `values`, by the stage's name."""
+class OffsetMemory(NamedTuple):
+    """d; None without drift."""
+
+    walk: Tensor | None = None
 
 
-def draws_of(stages: Sequence[AnyStage]) -> dict[str, int]:
-    """Return which random number of an episode says where in its range each number is."""
-    numbers = {name: number.draw for stage in stages for name, number in stage.numbers.items()}
-    return {name: draw for name, draw in numbers.items() if draw is not None}
+class Offset(Stage):
+    """y = x + b + n + d."""
+
+    name = "offset"
+    Memory = OffsetMemory
+    is_split = True
+    bias: Annotated[Tensor | None, Number(9, unit=None)]
+    """b."""
+    white_noise: Annotated[Tensor | None, Number(10, unit=None, stream=random.READING)]
+    """σ."""
+    drift: Annotated[Tensor | None, Number(11, unit=None, stream=random.READING)]
+    """σ_rw."""
+
+    @classmethod
+    def remembered(cls, terms: Sequence[str]) -> tuple[str, ...]:
+        return ("walk",) if "drift" in terms else ()
+
+    def forward(self, signal: Signal, memory: OffsetMemory, now: Now) -> tuple[Signal, OffsetMemory]:
+        if self.bias is not None:
+            signal = signal + self.bias
+        if self.white_noise is None and self.drift is None:
+            return signal, memory
+        channels, rows = signal.shape[1:]
+        index = torch.arange(channels * rows, dtype=torch.int32, device=signal.device).view(channels, rows)
+        first, second = now.streams[random.READING]
+        word = random.words(random.Stream(first[..., None], second[..., None]), index)
+        noise, step = random.normal_pair(word, signal.dtype)
+        if self.white_noise is not None:
+            signal = signal + self.white_noise * noise
+        if self.drift is None or memory.walk is None:
+            return signal, memory
+        step = self.drift * step
+        step = step if now.is_sample is None else torch.where(now.is_sample[..., None], step, 0.0)
+        walk = torch.where(now.age[..., None] == 0, 0.0, memory.walk) + step
+        return signal + walk, OffsetMemory(walk)
+
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+        noise, step = normal_pair(call.words(random.READING, signal.shape[1]))
+        if call.is_sample:
+            memory["walk"] = memory.get("walk", 0.0) + call.number("drift") * step
+        return signal + call.number("bias") + (call.number("white_noise") * noise + memory["walk"])
 
 
-def draw(stages: Sequence[AnyStage], constants: Mapping[str, Tensor], now: Now) -> Drawn:
-    """Return the values of stages; of a range, (end, channel, row), each environment draws its own at reset."""
-    draws, values = draws_of(stages), {}
-    for name, value in constants.items():
-        if name in draws and value.ndim == 3:
-            index = torch.full((1,), draws[name], dtype=torch.int32, device=value.device)
-            share = materialised(random.uniform(random.words(now.streams[random.PARAMETER], index), value.dtype))
-            low, high = value
-            values[name] = low + share[..., None] * (high - low)
-        else:
-            values[name] = value[None] if name in draws else value
-    return {stage.name: stage.typed(values) for stage in stages}
+class Quantization(Stage):
+    """y ← q round(y/q)."""
+
+    name = "quantization"
+    quantization: Annotated[Tensor, Number(12, unit=None)]
+    """q."""
+
+    def forward(self, signal: Signal, memory: NoMemory, now: Now) -> tuple[Signal, NoMemory]:
+        step = self.quantization
+        per_step = materialised(torch.where(step > 0, 1 / torch.where(step > 0, step, 1.0), 0.0))
+        level = torch.where(step > 0, step * torch.round(signal * per_step), signal)
+        return level.detach() + (signal - signal.detach()) if signal.requires_grad else level, memory
+
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+        q = call.number("quantization")
+        return np.where(q > 0, q * np.round(signal / np.where(q > 0, q, 1.0)), signal)
 
 
-def disturb(
-    signal: Signal, stages: Sequence[AnyStage], values: Drawn, path: str, memory: Mapping[str, Tensor], now: Now
-) -> tuple[Signal, dict[str, Tensor]]:
-    """Return what is read of a signal, and the new memory.
+class Dead(Stage):
+    """y ← z_j where M_j."""
 
-    Args:
-        signal: The signal.
-        stages: The stages.
-        values: Their values.
-        path: Start of the names of this sensor's part of the memory.
-        memory: By name (env, channel, row); of a ring, (env, call, channel, row), the new one holds this call alone.
-        now: When.
-    """
-    new: dict[str, Tensor] = {}
-    for stage in stages:
-        past = stage.Memory(*[memory.get(path + name) for name in stage.Memory._fields])
-        signal, state = stage.forward(signal, values[stage.name], past, now)
-        named = zip(stage.Memory._fields, state, strict=True)
-        new |= {path + name: value for name, value in named if value is not None}
-    return signal, new
+    name = "dead"
+    dead_probability: Annotated[Tensor, Number(13, "probability ", stream=random.DEAD)]
+    """p."""
+    dead_low: Annotated[Tensor, Number(14, "stuck from ", None, "dead_range.0", neutral=None)]
+    dead_high: Annotated[Tensor | None, Number(15, "to ", None, "dead_range.1", neutral=None)]
+    """None where it is the same as the lower end, for all."""
+
+    @classmethod
+    def constants(cls, values: Table, layout: Layout) -> dict[str, np.ndarray]:
+        constants = super().constants(values, layout)
+        if (np.ptp([*values["dead_low"], *values["dead_high"]], axis=0) == 0).all():
+            del constants["dead_high"]
+        return constants
+
+    def forward(self, signal: Signal, memory: NoMemory, now: Now) -> tuple[Signal, NoMemory]:
+        one = signal[:, 0]
+        share = torch.zeros_like(one) if self.dead_high is None else uniform(now, random.DEAD, 1, one)
+        is_dead = uniform(now, random.DEAD, 0, one) < self.dead_probability[:, 0]
+        share = materialised(torch.where(is_dead, share, -1.0))
+        share, stuck = share[:, None], self.dead_low
+        if self.dead_high is not None:
+            stuck = stuck + share * (self.dead_high - stuck)
+        return torch.where(share < 0, signal, stuck), memory
+
+    @staticmethod
+    def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
+        share = call.uniform(random.DEAD, 2)
+        low, high = call.number("dead_low"), call.number("dead_high")
+        return np.where(share[:, :1] < call.number("dead_probability"), low + share[:, 1:] * (high - low), signal)
 
 
-class ReferenceNoise:
-    """The definition of the noise: one sensor in one environment, fed call by call, in float64."""
+class Release(Stage):
+    """Release threshold of bits [m]. It replaces the constant that `decide` of the kind reads; the signal stays as it is."""
 
-    def __init__(
-        self, knobs: Sequence[Knobs], channels: Sequence[str], key: tuple[int, int], env: int = 0, layout: Layout | None = None
-    ):
-        """Begin the first episode.
+    name = "release_threshold"
+    release_threshold: Annotated[Tensor, Number(16, unit=" m", absent=(-1.0, -1.0))]
 
-        Args:
-            knobs: The knobs of each row.
-            channels: Names of the signal's channels.
-            key: The sensor's key, see `random.sensor_key`.
-            env: Number of the environment.
-            layout: The taxels, if there is crosstalk.
-        """
-        self._stages = known_stages()
-        ranges = [{name: v for stage in self._stages for name, v in stage.values_of(own).items()} for own in knobs]
-        self._call = ReferenceCall(ranges, draws_of(self._stages), channels, key, env, layout, episode=-1)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin a new episode."""
-        self._call = replace(self._call, episode=self._call.episode + 1)
-        self._memory: dict[str, dict[str, Any]] = {stage.name: {} for stage in self._stages}
-
-    @property
-    def gain(self) -> ReferenceSignal:
-        """Each taxel's gain (row, channel)."""
-        return GAIN.reference(np.ones((len(self._call.ranges), len(self._call.channels))), self._call, {})
-
-    def radius(self, radius: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
-        """Return this step's radii of probes whose own are given [m]."""
-        return RADIUS.reference_radius(radius, self._call)
-
-    def read(self, signal: ReferenceSignal, dt: float, is_sample: bool = True) -> ReferenceSignal:
-        """Return what is read of a signal, and go on to the next step.
-
-        Args:
-            signal: The signal, of which `gain` is a factor already.
-            dt: Time since the last call [s].
-            is_sample: Whether the sensor takes a sample now; else it reads the last one.
-        """
-        call = replace(self._call, dt=dt, is_sample=is_sample)
-        for stage in self._stages:
-            if stage is not GAIN:
-                signal = stage.reference(signal, call, self._memory[stage.name])
-        if is_sample:
-            self._sample = signal
-        self._call = replace(self._call, step=self._call.step + 1)
-        return self._sample
+    @classmethod
+    def active(cls, values: Table) -> tuple[str, ...]:
+        return (cls.name,) if (values["release_threshold"] >= 0).all() else ()

@@ -92,13 +92,13 @@ def _angles(faces: Int[np.ndarray, "f 3"], laid: Complex[np.ndarray, "f 3"]) -> 
     step = direction[side] - (direction[twin] + np.pi)
     step = np.concatenate([step, -step])
     graph = csr_matrix((np.ones(len(start)), (start, end)), shape=(count, count))
-    order, before = breadth_first_order(graph, 0, directed=False)
+    order, parent = breadth_first_order(graph, 0, directed=False)
     key = start * count + end
     sorting = np.argsort(key, kind="stable")
-    found = sorting[np.searchsorted(key, before[order[1:]] * count + order[1:], sorter=sorting)]
+    side_ids = sorting[np.searchsorted(key, parent[order[1:]] * count + order[1:], sorter=sorting)]
     angle = np.zeros(count)
-    for face, way in zip(order[1:].tolist(), found.tolist(), strict=True):
-        angle[face] = angle[before[face]] + step[way]
+    for face, way in zip(order[1:].tolist(), side_ids.tolist(), strict=True):
+        angle[face] = angle[parent[face]] + step[way]
     left = angle[end] - angle[start] - step
     left = (left + np.pi) % (2 * np.pi) - np.pi
     if np.abs(left).max(initial=0.0) < 1e-12:
@@ -134,13 +134,13 @@ def _unrolled(sheet: Sheet) -> Complex[np.ndarray, " v"]:
     angle = _angles(faces, laid)
     place, misfit = np.zeros(count, dtype=np.complex128), np.inf
     for _ in range(ROUNDS):
-        wanted = np.repeat(np.exp(1j * angle), 3) * edge
-        force = _at(end, weight * wanted, count) - _at(start, weight * wanted, count)
+        target = np.repeat(np.exp(1j * angle), 3) * edge
+        force = _at(end, weight * target, count) - _at(start, weight * target, count)
         solution = solver.solve(np.stack([np.real(force), np.imag(force)], axis=1)[1:])
         place[1:] = solution[:, 0] + 1j * solution[:, 1]
         got = place[end] - place[start]
-        before, misfit = misfit, float((weight * np.abs(got - wanted) ** 2).sum())
-        if misfit > (1 - SETTLED) * before or misfit < EXACT * float((weight * length**2).sum()):
+        last_misfit, misfit = misfit, float((weight * np.abs(got - target) ** 2).sum())
+        if misfit > (1 - SETTLED) * last_misfit or misfit < EXACT * float((weight * length**2).sum()):
             break
         angle = np.angle((weight * got * edge.conj()).reshape(-1, 3).sum(axis=1))
     return place
@@ -185,7 +185,7 @@ def _check(sheet: Sheet, plane: Float[np.ndarray, "v 2"]) -> None:
 
 
 def _crossings(plane: Float[np.ndarray, "v 2"], chains: list[list[int]]) -> int | None:
-    """Return a vertex beside a place where the edge of the pad crosses itself, or None."""
+    """Return a vertex near a crossing of the pad's edge with itself, or None."""
     first = np.concatenate(chains)
     last = np.concatenate([np.roll(chain, -1) for chain in chains])
     a, b = plane[first], plane[last]

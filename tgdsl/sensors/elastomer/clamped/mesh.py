@@ -1,10 +1,9 @@
 """Remeshing a region of the plane: triangles that are fine along the edge, where a clamped field varies, and coarser inside.
 
 The edge is thinned to the vertices that give it its shape and cut into pieces no longer than the element size; inside stand the
-points of nested triangular lattices, of which those with spacing 2^k sizes are used where the edge is at least 2^k / `GRADE`
-sizes away; Delaunay's triangulation joins them, pieces of the edge that it misses are bisected, and what lies outside is
-removed.
-Neither scikit-fem nor libigl meshes an outline, and the meshers that do are not under a free licence.
+points of nested triangular lattices: those with a spacing of 2^k sizes where the edge is at least 2^k / `GRADE` sizes away;
+Delaunay's triangulation joins them, pieces of the edge that it misses are bisected, and what lies outside is removed. Neither
+scikit-fem nor libigl meshes an outline, and the meshers that do are not under a free licence.
 
 Shapes: `n` vertices of a loop, `p` points, `m` triangles, `seg` pieces of the edge.
 """
@@ -55,16 +54,16 @@ def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> MeshTri:
         everything = np.concatenate([points, inner])
         triangles = Delaunay(everything).simplices.astype(np.int64)
         triangles = triangles[np.abs(igl.doublearea(everything, triangles)) > 1e-7]
-        found = MeshTri(np.ascontiguousarray(everything.T), np.ascontiguousarray(triangles.T), sort_t=False)
-        missing = ~np.isin(_sides(pieces), _sides(np.asarray(found.facets).T))
+        triangulation = MeshTri(np.ascontiguousarray(everything.T), np.ascontiguousarray(triangles.T), sort_t=False)
+        missing = ~np.isin(_sides(pieces), _sides(np.asarray(triangulation.facets).T))
         if not missing.any():
             break
         points, pieces = _bisected(points, pieces, missing)
     within = np.flatnonzero(_is_within(everything[triangles].mean(axis=1), points, pieces))
-    _check(found, within, pieces)
-    kept = found.restrict(within)
-    assert isinstance(kept, MeshTri)
-    return kept.scaled(size)
+    _check(triangulation, within, pieces)
+    inside = triangulation.restrict(within)
+    assert isinstance(inside, MeshTri)
+    return inside.scaled(size)
 
 
 def _sides(ends: Int[np.ndarray, "seg 2"]) -> Int[np.ndarray, " seg"]:
@@ -80,9 +79,9 @@ def _edge(outline: list[Float[np.ndarray, "n 2"]]) -> tuple[Float[np.ndarray, "p
     same = np.arange(len(points))
     for first, second in sorted(KDTree(points).query_pairs(1e-6)):
         same[second] = same[first]
-    kept, index = np.unique(same, return_inverse=True)
+    distinct, index = np.unique(same, return_inverse=True)
     pieces = np.stack([index, index[after]], axis=1)
-    return points[kept], pieces[pieces[:, 0] != pieces[:, 1]].astype(np.int64)
+    return points[distinct], pieces[pieces[:, 0] != pieces[:, 1]].astype(np.int64)
 
 
 def _starts(parts: list[np.ndarray]) -> Int[np.ndarray, " part"]:
@@ -99,9 +98,9 @@ def _sampled(loop: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "p 2"]:
     far = int(np.argmax(np.linalg.norm(loop - loop[0], axis=1)))
     # Douglas and Peucker, 1973
     halves = (igl.ramer_douglas_peucker(np.ascontiguousarray(half), SHAPE)[1] for half in (closed[: far + 1], closed[far:]))
-    kept = np.unique(np.concatenate([at + np.asarray(half) for at, half in zip((0, far), halves, strict=True)]))
+    corners = np.unique(np.concatenate([at + np.asarray(half) for at, half in zip((0, far), halves, strict=True)]))
     places = [
-        np.linspace(way[a], way[b], max(1, int(np.ceil(way[b] - way[a] - 1e-6))), endpoint=False) for a, b in pairwise(kept)
+        np.linspace(way[a], way[b], max(1, int(np.ceil(way[b] - way[a] - 1e-6))), endpoint=False) for a, b in pairwise(corners)
     ]
     place = np.concatenate(places)
     return np.stack([np.interp(place, way, closed[:, k]) for k in range(2)], axis=1)
@@ -124,8 +123,8 @@ def _inside(points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]) 
     i, j, lattice = i[boxed], j[boxed], lattice[boxed]
     distance = KDTree(_dense(points, pieces)).query(lattice, distance_upper_bound=2**COARSEST / GRADE)[0]  # beyond: inf
     level = np.clip(np.floor(np.log2(np.maximum(GRADE * distance, 1.0))), 0, COARSEST).astype(np.int64)
-    kept = ((i | j) % (1 << level) == 0) & (distance > CLEARANCE)
-    lattice = lattice[kept]
+    is_used = ((i | j) % (1 << level) == 0) & (distance > CLEARANCE)
+    lattice = lattice[is_used]
     return lattice[_is_within(lattice, points, pieces)]
 
 
@@ -152,10 +151,10 @@ def _bisected(
     return np.concatenate([points, points[cut].mean(axis=1)]), np.concatenate([pieces[~which], *halves])
 
 
-def _check(found: MeshTri, within: Int[np.ndarray, " m"], pieces: Int[np.ndarray, "seg 2"]) -> None:
+def _check(mesh: MeshTri, within: Int[np.ndarray, " m"], pieces: Int[np.ndarray, "seg 2"]) -> None:
     """Refuse triangles of a mesh whose edge is not the region's."""
-    facet, count = np.unique(np.asarray(found.t2f)[:, within], return_counts=True)
-    wrong = np.setxor1d(_sides(np.asarray(found.facets).T[facet[count == 1]]), _sides(pieces))
+    facet, count = np.unique(np.asarray(mesh.t2f)[:, within], return_counts=True)
+    wrong = np.setxor1d(_sides(np.asarray(mesh.facets).T[facet[count == 1]]), _sides(pieces))
     if not len(within) or len(wrong):
         raise refused(
             f"no triangles fill the pad: {len(wrong)} pieces of its edge do not bound the mesh",

@@ -28,7 +28,7 @@ MAX_OFFSET = 1e-3
 BESIDE = 1e-4
 """Largest distance of a taxel from the pad's edge, measured outwards along the surface [m]."""
 FACING = 0.5
-"""Least cosine between a taxel's normal and that of the surface it sits on."""
+"""Least cosine between a taxel's normal and the surface normal under it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +81,10 @@ def unroll(
             f"taxel 0 is on one, taxel {other} on another",
             "give each part its own link in the layout, or a region that joins them",
         )
-    chosen = np.flatnonzero(part == held[0])
-    sheet = opened(Sheet(soup.vertices, soup.faces[chosen]))
+    part_faces = np.flatnonzero(part == held[0])
+    sheet = opened(Sheet(soup.vertices, soup.faces[part_faces]))
     plane = flatten(sheet)
-    face = np.searchsorted(chosen, face)
+    face = np.searchsorted(part_faces, face)
     taxel_plane = np.einsum("tk,tkx->tx", weights, plane[sheet.faces[face]])
     return _assembled(sheet, plane, taxel_plane, _axes(jacobians(sheet, plane)[face], normal), element_size)
 
@@ -127,9 +127,9 @@ def _located(
 ) -> tuple[Int[np.ndarray, " q"], Float[np.ndarray, "q 3"]]:
     """Return the triangle of the plane that is nearest to each point, and the point's barycentric coordinates in it."""
     index = np.flatnonzero(has_area(points, faces))
-    lifted, wanted = (np.pad(part, ((0, 0), (0, 1))) for part in (points, where))
-    face = index[np.asarray(igl.point_mesh_squared_distance(wanted, lifted, faces[index].astype(np.int64))[1])]
-    return face, np.asarray(igl.barycentric_coordinates(wanted, *(lifted[faces[face, k]] for k in range(3))))
+    lifted, queries = (np.pad(part, ((0, 0), (0, 1))) for part in (points, where))
+    face = index[np.asarray(igl.point_mesh_squared_distance(queries, lifted, faces[index].astype(np.int64))[1])]
+    return face, np.asarray(igl.barycentric_coordinates(queries, *(lifted[faces[face, k]] for k in range(3))))
 
 
 def _axes(jacobian: Float[np.ndarray, "q 3 2"], normal: Float[np.ndarray, "q 3"]) -> Float[np.ndarray, "q 2 3"]:
@@ -145,7 +145,7 @@ def _seated(
     """Return the triangle that each taxel sits on, and the barycentric coordinates of the place.
 
     Raises:
-        LowerError: A taxel is farther than `MAX_OFFSET` from the surface or lies beside its edge.
+        LowerError: A taxel is farther than `MAX_OFFSET` from the surface or outside its edge.
     """
     corners = sheet.vertices[sheet.faces]
     is_open = np.zeros(3 * len(corners), dtype=bool)

@@ -41,7 +41,7 @@ class Sheet:
 
 
 def refused(what: str, hint: str = "") -> LowerError:
-    """Return the error of a pad that has no clamped boundary: what was found, and what would be right."""
+    """Return the error of a pad that cannot have a clamped boundary."""
     return LowerError(what, field="boundary", hint=hint)
 
 
@@ -71,7 +71,7 @@ def open_sides(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " seg"]:
 
 
 def welded(corners: Float[np.ndarray, "f 3 3"]) -> Sheet:
-    """Return triangles with shared vertices; those that vanish or repeat are dropped, T-junctions are closed."""
+    """Return triangles with shared vertices, without degenerate and repeated ones, and with T-junctions closed."""
     points = corners.reshape(-1, 3)
     near = COINCIDENT * float(np.ptp(points, axis=0).max())
     first, second = KDTree(points).query_pairs(near, output_type="ndarray").T
