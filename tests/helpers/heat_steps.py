@@ -14,8 +14,9 @@ NUM_ENVS = 7
 
 
 class Case(NamedTuple):
-    """What there is: cells of each link along each axis, objects, terms, whether materials differ by environment, Δt,
-    and whether the last object keeps its temperature.
+    """What there is: cells of each link along each axis, objects, terms, whether materials differ by environment, Δt [s].
+
+    `keeps`: whether the last object keeps its temperature.
     """
 
     count: tuple[tuple[int, int, int], ...]

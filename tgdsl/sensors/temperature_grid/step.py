@@ -53,6 +53,8 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
     """
     inverse = _of_nodes(patches, _inverse(patches))
     gained, nodes_gained = torch.zeros_like(cells), torch.zeros_like(nodes)
+    # Sums, and no views of what the module overwrites: derivatives are taken of them later.
+    cells, nodes = cells + gained, nodes + nodes_gained
     blown = radiated = source = touched = torch.zeros_like(cells[:, :, 0, 0, 0])
     blown_nodes = radiated_nodes = touched_nodes = torch.zeros_like(nodes)
     cooling, of_nodes = _surfaces(rows, patches, inverse, constants)

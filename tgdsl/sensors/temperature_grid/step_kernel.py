@@ -176,9 +176,10 @@ def step_kernel(
         width = tl.exp(tl.log(tl.where(inverse > 0, own_volume, 1.0)) * (1.0 / 3.0))
         own_lost, own_share = _lost_by_one(phi, (own_exposed, width / (6.0 * own_k), 0.0), own_glow, blowing, around, step)
     # Without contact: conduction, with linear losses and a source; and what modes show of contact, see `response`.
-    made = tl.zeros((CELLS, ROWS), tl.float32)
+    made = tl.zeros((CELLS, ENVS, ROWS), tl.float32)
     if HAS_SOURCE:
-        made = tl.load(source + at, is_at, 0.0) * (step / capacity)[None, :]
+        made = tl.load(source + (at_cell - env[None, :, None] * (num_rows * NX * NY * NZ)), is_at_cell, 0.0)
+        made *= (step / capacity)[None, None, :]
     weight = there.to(tl.float32)
     weight = tl.where(is_row[None, :], weight / tl.sum(weight, axis=0)[None, :], 0.0)
     now = before + lost
@@ -209,7 +210,7 @@ def step_kernel(
         met > 0,
     )
     heat_of, rate_of, own_touched = _touched(
-        now + (average + 0.5 * made[:, None, :]), now + (end + made[:, None, :]), phi + own_lost, capacity, inverse, flow,
+        now + (average + 0.5 * made), now + (end + made), phi + own_lost, capacity, inverse, flow,
         shares, by_cell, by_side, sigma,
     )  # fmt: skip
     spread, through = tl.zeros((CELLS, ENVS, ROWS), tl.float32), tl.zeros((ENVS, ROWS), tl.float32)
@@ -226,7 +227,7 @@ def step_kernel(
     spread, entered = spread + end, entered + through
     excess = tl.sum(spread, axis=0) - entered
     spread -= excess[None, :, :] * weight[:, None, :]
-    tl.store(gained + at_cell, (lost + heat_of) + (spread + made[:, None, :]), is_at_cell)
+    tl.store(gained + at_cell, (lost + heat_of) + (spread + made), is_at_cell)
     tl.store(nodes_gained + env, own_touched * inverse + own_lost, is_env)
     # Accounts.
     at_row = env[:, None] * (3 * num_rows) + row[None, :]
@@ -281,9 +282,9 @@ def _without_contact(
     part = tl.sum(apart * wave[:, None, :], axis=0) + mean * total[None, :]
     of_mean, of_end = part * b[None, :], part * a[None, :]
     if HAS_SOURCE:
-        warmed = tl.sum(made * wave, axis=0)
-        of_mean += (warmed * c)[None, :]
-        of_end += (warmed * b)[None, :]
+        warmed = tl.sum(made * wave[:, None, :], axis=0)
+        of_mean += warmed * c[None, :]
+        of_end += warmed * b[None, :]
     average += of_mean[None, :, :] * wave[:, None, :]
     end += of_end[None, :, :] * wave[:, None, :]
     entered += of_end * total[None, :]
