@@ -6,7 +6,7 @@ with D² the second difference between insulated walls and u [W/(m²·K)] the he
 and the surroundings (`losses`). Eigenvectors of M_a and eigenvalues αμ/Δ² are known beforehand (`quantities.patches`). A
 step of Δt is exact in time:
 
-    θ ← (I + G_x) ⊗ (I + G_y) ⊗ (I + G_z) θ + Δt φ₁(−x) s,   G = Vᵀ diag(e^(−aμ) − 1) V,   φ₁(−x) = (1 − e^(−x))/x
+    θ ← (I + G_x) ⊗ (I + G_y) ⊗ (I + G_z) θ + Δt φ₁(x) s,   G = Vᵀ diag(e^(−aμ) − 1) V,   φ₁(x) = (1 − e^(−x))/x
 
 with a = αΔt/Δ² of an axis and x = Σ aμ of a mode of the box. Axes whose cells are few are taken together as one dense operator,
 and those groups one after the other. An operator acts on what cells differ from their mean and on that mean apart, and what it
@@ -159,21 +159,29 @@ def along(matrix: Tensor, cells: Cells, axis: int) -> Cells:
     return made.movedim(-1, 2 + axis)
 
 
-def by_modes(cells: Cells, factor: Tensor, modes: tuple[Modes, ...]) -> Spread:
-    """Return what the cells gain if modes of the box are multiplied by a factor (env, row, x, y, z), and added.
-
-    What of the sum came through the faces is what these modes have of it.
-    """
-    result = cells
+def to_modes(cells: Cells, modes: tuple[Modes, ...]) -> Cells:
+    """Return what each mode of a box has of cells: their mean apart, so that none of it gets into modes that have none."""
+    there = _there(modes)
+    mean = (cells * there).sum(dim=(-3, -2, -1), keepdim=True) / there.sum(dim=(-3, -2, -1), keepdim=True)
+    result = cells - there * mean
     for axis, own in enumerate(modes):
         result = along(own.vectors, result, axis)
-    result, totals = result * factor, outer([own.totals for own in modes], torch.mul)
-    entered = (result * totals).sum(dim=(-3, -2, -1))
+    return result + mean * outer([own.totals for own in modes], torch.mul)
+
+
+def from_modes(parts: Cells, modes: tuple[Modes, ...]) -> Spread:
+    """Return what cells gain of parts of modes. What of the sum came through the faces is what modes have of it."""
+    entered = (parts * outer([own.totals for own in modes], torch.mul)).sum(dim=(-3, -2, -1))
     for axis, own in enumerate(modes):
-        result = along(own.vectors.transpose(-2, -1), result, axis)
-    there = outer([(own.vectors[:, 0] > 0).to(cells.dtype) for own in modes], torch.mul)
-    excess = result.sum(dim=(-3, -2, -1)) - entered
-    return Spread(result - there * (excess / there.sum(dim=(-3, -2, -1)))[..., None, None, None], entered)
+        parts = along(own.vectors.transpose(-2, -1), parts, axis)
+    there = _there(modes)
+    excess = parts.sum(dim=(-3, -2, -1)) - entered
+    return Spread(parts - there * (excess / there.sum(dim=(-3, -2, -1)))[..., None, None, None], entered)
+
+
+def _there(modes: tuple[Modes, ...]) -> Tensor:
+    """Return 1 for the cells that a row has (row, x, y, z)."""
+    return outer([(own.vectors[:, 0] > 0).to(own.vectors.dtype) for own in modes], torch.mul)
 
 
 def exponents(rates: Float[Tensor, "env row 3"], modes: tuple[Modes, ...]) -> Cells:
@@ -181,24 +189,9 @@ def exponents(rates: Float[Tensor, "env row 3"], modes: tuple[Modes, ...]) -> Ce
     return outer([rates[..., axis, None] * own.exponent for axis, own in enumerate(modes)], torch.add)
 
 
-def warmed(source: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple[Modes, ...], is_implicit: bool) -> Spread:
-    """Return what the cells gain beyond a constant source's Δt s, as it spreads while it is made: (φ₁ − 1) Δt s.
-
-    Args:
-        source: Δt s [K].
-        x: See `exponents`.
-        modes: Those along x, y and z.
-        is_implicit: Whether φ₁ is 1/(1 + x).
-    """
-    if is_implicit:
-        return by_modes(source, -x / (1.0 + x), modes)
-    safe, series = torch.where(x > 1e-3, x, 1.0), -0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
-    return by_modes(source, torch.where(x > 1e-3, -torch.expm1(-safe) / safe - 1.0, series), modes)
-
-
 def semi_implicit(cells: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple[Modes, ...]) -> Spread:
     """Return what a step does that divides each mode by 1 + x."""
-    return by_modes(cells, -x / (1.0 + x), modes)
+    return from_modes(to_modes(cells, modes) * (-x / (1.0 + x)), modes)
 
 
 def outer(parts: list[Tensor], join) -> Tensor:  # type: ignore[no-untyped-def]

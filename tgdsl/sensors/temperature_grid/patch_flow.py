@@ -18,7 +18,6 @@ from torch.nn.functional import pad
 from tgdsl.geometry import planes
 from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
-from tgdsl.sensors.temperature_grid.response import Response, response
 from tgdsl.sensors.temperature_grid.rows import Rows, num_cells
 from tgdsl.sensors.temperature_grid.shares import conductances
 
@@ -33,14 +32,13 @@ def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
     return torch.maximum(patches.area, planes.pi() * planes.power(cubed, 2.0 / 3.0))
 
 
-def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants, x: Tensor) -> tuple[Tensor, Response]:
-    """Return the conductance between each side and each cell of its row (env, row, side, x, y, z) [W/K], and how it responds.
+def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants) -> Tensor:
+    """Return the conductance between each side and each cell of its row (env, row, side, x, y, z) [W/K].
 
     Args:
         patches: Which there are.
         rows: Materials of the rows.
         constants: What `lower` folded.
-        x: What the rows' modes decay by in the step.
     """
     area = patch_area(patches, constants)
     pos, normal = (planes.vec(_of_sides(patches, part) for part in vector) for vector in (patches.pos, patches.normal))
@@ -50,12 +48,11 @@ def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants, x: Tenso
         normal = planes.where(is_object, planes.vec(_of_sides(patches, part) for part in patches.object_normal), normal)
     of_sides = _of_sides(patches, area)
     result = conductances(of_sides, pos, normal, rows.conductivity, rows.boxes, num_cells(rows))
-    responds = response(result, x, rows.modes, "is_semi_implicit" in constants)
     series = resistance(area, patches, patches.topology.lumped, constants)
     if series is None:
-        return result, responds
+        return result
     whole = result.sum(dim=(-3, -2, -1))
-    return result / (1.0 + whole * _of_sides(patches, series))[..., None, None, None], responds
+    return result / (1.0 + whole * _of_sides(patches, series))[..., None, None, None]
 
 
 def _of_sides(patches: ContactPatch, plane: Tensor) -> Tensor:

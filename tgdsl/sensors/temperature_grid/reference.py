@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import factorial
+from typing import Any
 
 import numpy as np
 
@@ -162,14 +165,21 @@ def _store(links, objects, found, before) -> dict[str, np.ndarray]:  # type: ign
 
 
 def _advance(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], objects: list[Block], dt: float) -> None:
-    _touch(spec, found, links, objects, dt)
-    films = [_film(spec, block) for block in links]
-    for block, film in zip(links, films, strict=True):
+    grids, films = [objects[i] for i in found.topology.grids], [_film(spec, block) for block in links]
+    films += [np.zeros(3)] * len(grids)
+    for block, film in zip([*links, *grids], films, strict=True):
         _lose(spec, block, dt, film)
-        block.above = _diffused(spec, block, dt, film, source=_source(spec, block) / block.capacity)
-    for block in (block for i, block in enumerate(objects) if found.topology.links[i] < 0):
-        _lose(spec, block, dt, np.zeros(3))
-        block.above = block.above if block.count is None else _diffused(spec, block, dt)
+    for i in found.topology.lumped:
+        _lose(spec, objects[i], dt, np.zeros(3))
+    touched = _touch(spec, found, links, objects, dt)
+    for n, (block, film, (heat, rate, sigma)) in enumerate(zip([*links, *grids], films, touched, strict=True)):
+        source = _source(spec, block) / block.capacity if n < len(links) else 0.0
+        after = _diffused(spec, block, dt, film, source)
+        if heat.any():
+            power = _operator(spec, block, dt, film)
+            _, _, of_heat, of_rate = _responses([power(k) for k in range(4)], sigma)
+            after = after + (of_heat @ heat + of_rate @ rate).reshape(after.shape)
+        block.above = after
 
 
 def _advance_as_printed(
@@ -277,84 +287,134 @@ def _diffused(
     return modes
 
 
-def _touch(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], objects: list[Block], dt: float) -> None:
-    """Solve the implicit step of all that touches as one dense system: cells, bodies and interfaces."""
+def _touch(
+    spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], objects: list[Block], dt: float
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Return H and J of the cells of each block of cells [K], and σ: one dense system of all cells, bodies and interfaces."""
     where, blocks = found.topology, list(links)
-    blocks += [objects[i] for i in (*where.grids, *where.lumped)]
-    starts = np.cumsum([0, *(block.above.size for block in blocks)])
-    lumped = {i: len(links) + len(where.grids) + n for n, i in enumerate(where.lumped)}
+    blocks += [objects[i] for i in where.grids]
+    bodies = [objects[i] for i in where.lumped]
     gridded = {i: len(links) + n for n, i in enumerate(where.grids)} | {i: own for i, own in enumerate(where.links) if own >= 0}
-    size = int(starts[-1]) + len(where.interfaces)
-    heat, flow = np.zeros(size), np.zeros((size, size))
-    sides_of: dict[int, list[np.ndarray]] = {}
-    above = np.zeros(size)
-    for block, start in zip(blocks, starts, strict=False):
-        heat[start : start + block.above.size] = block.capacity
-        above[start : start + block.above.size] = block.above.ravel()
+    sides: list[tuple[int, int, np.ndarray]] = []
     for (b, o), patch in found.patches.items():
         area = _area(spec, found, links, b, o, patch)
-        film = 0.0 if spec.contact_conductance is None else 1.0 / (spec.contact_conductance * area) if area > 0 else 0.0
         if area <= 0:
             continue
-        sides = [(b, _conductances(links[b], area, patch.pos, patch.normal))]
-        if o in lumped:
-            node = int(starts[lumped[o]])
+        film = 0.0 if spec.contact_conductance is None else 1.0 / (spec.contact_conductance * area)
+        own = _conductances(links[b], area, patch.pos, patch.normal)
+        if o in where.lumped:
             series = film + _inside(objects[o], found.objects[o], area)
-        else:
-            node = int(starts[-1]) + where.interfaces.index((b, o))
-            sides.append((gridded[o], _conductances(blocks[gridded[o]], area, patch.object_pos, patch.object_normal)))
-            series = 0.5 * film
-        for block, own in sides:
-            own = own / (1.0 + own.sum() * series)
-            at = slice(int(starts[block]), int(starts[block]) + own.size)
-            flow[at, node] += own
-            flow[node, at] += own
-            sides_of.setdefault(block, []).append(own)
-    shown = np.ones(size)
-    for block, own_sides in sides_of.items():
-        film = _film(spec, blocks[block]) if block < len(links) else None
-        at = slice(int(starts[block]), int(starts[block]) + blocks[block].above.size)
-        shown[at] = _response(spec, blocks[block], dt, film, own_sides)
-    heat = heat / shown
-    is_held = ~np.isfinite(heat)
-    matrix = np.diag(np.where(is_held, 1.0, heat) + dt * flow.sum(axis=1)) - dt * flow
-    right = np.where(is_held, 1.0, heat) * above
-    for i in np.flatnonzero(is_held):
-        matrix[i], right[i] = np.eye(size)[i], above[i]
-    idle = np.flatnonzero((heat == 0) & (flow.sum(axis=1) == 0))
-    matrix[idle, idle] = 1.0
-    after = above + (np.linalg.solve(matrix, right) - above) / shown
-    for block, start in zip(blocks, starts, strict=False):
-        block.above = after[start : start + block.above.size].reshape(block.above.shape)
+            sides.append((b, where.lumped.index(o), own / (1.0 + own.sum() * series)))
+            continue
+        node, other = len(bodies) + where.interfaces.index((b, o)), gridded[o]
+        sides.append((b, node, own / (1.0 + own.sum() * 0.5 * film)))
+        own = _conductances(blocks[other], area, patch.object_pos, patch.object_normal)
+        sides.append((other, node, own / (1.0 + own.sum() * 0.5 * film)))
+    # Unknown are H and J of each side and cell that it touches, then temperatures of interfaces, in the mean and at the end.
+    row, node, side, cell, flow = (
+        np.concatenate([np.array(part) for part in parts]) if sides else np.zeros(0, dtype=int)
+        for parts in zip(
+            *(
+                (np.full(at.size, r), np.full(at.size, n), np.full(at.size, s), at, dt * own[at])
+                for s, (r, n, own) in enumerate(sides)
+                for at in [np.flatnonzero(own > 0)]
+            ),
+            strict=True,
+        )
+    ) if sides else (np.zeros(0, dtype=int),) * 5  # fmt: skip
+    inverse = np.array([1.0 / body.capacity for body in bodies] + [0.0] * len(where.interfaces))
+    before = np.array([float(body.above.flat[0]) for body in bodies] + [0.0] * len(where.interfaces))
+    num, faces = len(row), [n for n in range(len(bodies), len(before)) if (node == n).any()]
+    free, sigma = np.zeros((2, num)), np.zeros(len(blocks))
+    shows = np.zeros((4, num, num))
+    share = flow / np.array([flow[side == s].sum() for s in side]) if num else flow
+    of_node = np.array([flow[node == n].sum() for n in range(len(before))])
+    for r, block in enumerate(blocks):
+        at = row == r
+        film = _film(spec, block) if r < len(links) else None
+        power = _operator(spec, block, dt, film)
+        phi = [power(k) for k in range(4)]
+        made = dt * _source(spec, block).ravel() / block.capacity if r < len(links) else np.zeros(block.above.size)
+        for k, ends in enumerate(((1, 2), (0, 1))):
+            free[k, at] = (phi[ends[0]] @ block.above.ravel() + phi[ends[1]] @ made)[cell[at]]
+        if not at.any():
+            continue
+        mine = [part[np.ix_(cell[at], cell[at])] for part in phi]
+        weight = flow[at] / flow[at].sum()
+        start, constant = (
+            weight @ part @ flow[at] / block.capacity + weight @ (inverse * of_node)[node[at]] for part in mine[:2]
+        )
+        sigma[r] = 0.0 if spec.scheme == "semi_implicit" else _impulsiveness(start, constant)
+        for k, part in enumerate(_responses(mine, sigma[r])):
+            # Of others a cell shows what all of its side does in the mean.
+            result = np.where(cell[at][:, None] == cell[at][None], part, 0.0)
+            for s, t in itertools.product(set(side[at]), set(side[at])):
+                block_of = np.ix_(side[at] == s, side[at] == t)
+                rest = (part - result)[block_of]
+                result[block_of] += share[at][side[at] == s] @ rest @ share[at][side[at] == t]
+            shows[k][np.ix_(at, at)] = result / block.capacity
+    size, i, j = 2 * num + 2 * len(faces), np.arange(num), num + np.arange(num)
+    matrix, right = np.eye(size), np.zeros(size)
+    lump = np.array([_responses([1.0, 1.0, 0.5, 1.0 / 6.0], sigma[r]) for r in row]).reshape(num, 4)
+    is_same = (node[:, None] == node[None]) * inverse[node][:, None] if num else np.zeros((0, 0))
+    for k, (at, to) in enumerate(itertools.product((i, j), (i, j))):
+        matrix[np.ix_(at, to)] += flow[:, None] * (shows[k] + is_same * lump[None, :, k])
+    right[i], right[j] = (flow * (before[node] - part) if num else part for part in free)
+    for f, n in enumerate(faces):
+        for at, place in ((i, 2 * num + f), (j, 2 * num + len(faces) + f)):
+            matrix[at, place] = -flow * (node == n)
+            matrix[place] = 0.0
+            matrix[place, at] = node == n
+    found_flows = np.linalg.solve(matrix, right)
+    result = []
+    for r, block in enumerate(blocks):
+        heat, rate = np.zeros((2, block.above.size))
+        np.add.at(heat, cell[row == r], found_flows[i][row == r] / block.capacity)
+        np.add.at(rate, cell[row == r], found_flows[j][row == r] / block.capacity)
+        result.append((heat, rate, sigma[r]))
+    for n, body in enumerate(bodies):
+        body.above = body.above - inverse[n] * found_flows[i][node == n].sum()
+    return result
 
 
-def _response(
-    spec: TemperatureGridSpec,
-    block: Block,
-    dt: float,
-    film: np.ndarray | None,
-    sides: list[np.ndarray],
-) -> np.ndarray:
-    """Return κ of each cell: the equation of `response`, sides being conductances."""
-    every = np.sum([own * own.sum() / (own @ own) for own in sides], axis=0)
-    assert block.count is not None
-    at_end = _diffused(spec, _like(block, every), dt, film).ravel()
-    evenly = _diffused(spec, _like(block, np.zeros(block.above.size)), dt, film, source=every.reshape(block.count) / dt).ravel()
-    falling = np.zeros(block.count)
-    if spec.scheme != "semi_implicit":
-        for axis, matrix in enumerate(block.operators(film, spec.scheme == "spectral")):
-            falling += dt * np.moveaxis(np.tensordot(matrix, at_end.reshape(block.count), (1, axis)), 0, axis)
-    whole, kept, average = (np.zeros(block.above.size) for _ in range(3))
-    for own in sides:
-        left, on_average = (own @ part / (own @ every) for part in (at_end, evenly - 0.5 * at_end - falling.ravel() / 12))
-        whole, kept, average = whole + own, kept + own * left, average + own * on_average
-    safe = np.where(whole > 0, whole, 1.0)
-    return np.where(whole > 0, np.maximum(average / safe, kept / safe - block.capacity / (dt * safe)), 1.0)
+def _responses(phi: list[Any], sigma: float) -> list[Any]:
+    """Return what H and J show in the mean and at the end: the equation of `response`."""
+    of_heat = lambda a, b, c: ((1 - sigma) * a + 6 * sigma * (b - c)) / (1 + 2 * sigma)  # noqa: E731
+    of_rate = lambda a, b, c: ((sigma - 1) * a + (1 - 4 * sigma) * b + 6 * sigma * c) / (1 + 2 * sigma)  # noqa: E731
+    return [of_heat(*phi[1:]), of_rate(*phi[1:]), of_heat(*phi[:3]), of_rate(*phi[:3])]
 
 
-def _like(block: Block, above: np.ndarray) -> Block:
-    """Return a block at other temperatures."""
-    return replace(block, above=above.reshape(block.above.shape))
+def _impulsiveness(start: float, constant: float) -> float:
+    """Return σ, that of an exponential by its moments: the equation of `response`."""
+    z = start / (1 + constant - start) + 16 * (1 - start / constant) ** 2 * constant / (1 + constant)
+    if z < 0.02:
+        return 1 - z / 4 + z**2 / 40
+    heat, left = -np.expm1(-z), np.exp(-z)
+    last = 2 * (heat / z - left)
+    return float((last - z * left) / (2 * (heat - last)))
+
+
+def _operator(spec: TemperatureGridSpec, block: Block, dt: float, film: np.ndarray | None) -> Callable[[int], np.ndarray]:
+    """Return φ_k of all of a box, by its number."""
+    x, y, z = block.operators(film, spec.scheme != "exact")
+    one = [np.eye(n) for n in block.count or ()]
+    whole = np.kron(np.kron(x, one[1]), one[2]) + np.kron(np.kron(one[0], y), one[2]) + np.kron(np.kron(one[0], one[1]), z)
+    values, basis = np.linalg.eigh(dt * whole)
+
+    def power(order: int) -> np.ndarray:
+        if spec.scheme == "semi_implicit":
+            return basis / (1 + values) @ basis.T
+        # φ_k is the mean of e^(−x (1 − t)) with the weight t^(k−1)/(k − 1)!
+        t, weight = np.polynomial.legendre.leggauss(200)
+        t, weight = 0.5 * (t + 1), 0.5 * weight
+        of = (
+            np.exp(-values)
+            if order == 0
+            else np.exp(-np.outer(values, 1 - t)) @ (weight * t ** (order - 1) / factorial(order - 1))
+        )
+        return basis * of @ basis.T
+
+    return power
 
 
 def _area(

@@ -1,25 +1,34 @@
-"""What cells that touch something show in a step of the heat that they get, as they conduct it to the cells around.
+"""What cells show of heat that contacts bring within a step, while it is conducted on.
 
-A contact's step is implicit in the cells that it touches (`conduction`). In a long one heat spreads from them while it comes
-in, so that a cell shows a larger heat capacity than its own, C/κ, with
+The heat that flows through a side of a patch in a step, H [J], and its flow at the end of the step times Δt, J [J], stand for
+its course in time: an impulse at the step's begin, a constant and a linear part,
 
-    κ_i = max(r_φ − ½ r_E − r_F/12, r_E − C/(Δt Σ g)),   r_f = w_sᵀ f(x) q/(w_sᵀ q),   q = Σ_t w_t/|w_t|²                [1]
-    E = e^(−x),   φ = (1 − e^(−x))/x,   F = x e^(−x)
+    H a(t) + J b(t),   a = ((1 − σ) δ(t) + 6σ − 6σ t)/(1 + 2σ),   b = ((σ − 1) δ(t) + 1 − 4σ + 6σ t)/(1 + 2σ),   0 ≤ t ≤ 1
 
-of a side s of a patch on a row, w the shares of the cells in its conductance, t all sides of that row that touch, x = Σ αμΔt/Δ²
-of the modes of the box (`diffusion`), and g what joins the cell with all that it touches [W/K]; of a cell in several patches
-their mean by conductance. r_E is what is left below the patch of heat that was there at the step's begin, r_φ of heat that came
-in evenly. A cell's own capacity holds what all of its patches bring; so of sides on the same cells q counts once.
+so that ∫ a = 1, a(1) = 0, ∫ b = 0 and b(1) = 1. A steady flow, H = J, is exact for any σ. Of it a mode of the cells that
+decays by e^(−x) in the step shows at the step's end, and in its mean, over the heat capacity of a cell
 
-The first number makes flows right: cells are taken at the step's begin, and what is left there of former steps' heat counts too
-much, as it falls. The sum of a falling kernel e over steps exceeds its integral by the terms of Euler and Maclaurin,
-∫₀^∞ e dt/Δt ≈ r_φ + Σ_{m ≥ 1} e(mΔt) − ½ e(Δt) + Δt ė(Δt)/12. For αΔt/Δ² → 0 it is ½, the trapezoidal rule. The second keeps
-cells of an even temperature from going beyond what they touch, and the step stable, however long it is.
+    e_a = (1 − σ, 6σ, −6σ) · (φ₀, φ₁, φ₂)/(1 + 2σ),   e_b = (σ − 1, 1 − 4σ, 6σ) · (φ₀, φ₁, φ₂)/(1 + 2σ)                   [1]
+    m_a, m_b: the same of (φ₁, φ₂, φ₃),   φ₀ = e^(−x),   φ_k = (1/(k − 1)! − φ_(k−1))/x
 
-Source: Abramowitz and Stegun, 23.1.30. For a half-space and a long step the sum is known, its kernel being 1/√(πt): κ is then
-−ζ(½) = 1.460 of it, here 1.458.
+A flow that decays as e^(−zt), that of two bodies of one temperature each, has exactly
 
-Shapes: `env` environments, `row` rows of cells, `side` sides of patches on each, `x`, `y`, `z` modes.
+    σ = (J₀ − z e^(−z))/(2 (Q − J₀)),   Q = 1 − e^(−z),   J₀ = 2 (Q/z − e^(−z))
+
+from 1, a linear course, for z → 0 to 1/z, an impulse. z of all that touches a row follows from what its cells, and the bodies
+of one temperature, show of an impulse and of a constant flow, r_k = Σ_st g_s φ_k,st Δt g_t/(C Σ g):
+
+    z = r₀/(1 + r₁ − r₀) + 16 (1 − r₀/r₁)² r₁/(1 + r₁)
+
+The first term is exact for bodies of one temperature, and has what cells conduct within the step in series with the patch. The
+second was fitted to the closed form of a half-space, whose flow first falls as 1/√t: in the first step of a contact it gets its
+heat to 1 %, from the second step on to 0.1 %, for any αΔt/Δ².
+
+Source: Hochbruck and Ostermann, Exponential integrators, *Acta Numerica* 2010, for φ_k. With σ = 1 the step is the Radau IIA
+method of third order, with σ = 0 the (0, 2) Padé approximation: Hairer and Wanner, *Solving Ordinary Differential Equations
+II*, IV.3 and IV.5.
+
+Shapes: `env` environments, `row` rows of cells, `side` sides of patches on each, `x`, `y`, `z` cells or modes.
 """
 
 from __future__ import annotations
@@ -32,63 +41,109 @@ from torch import Tensor
 
 from tgdsl.sensors.temperature_grid.diffusion import Modes, along
 
+Four = tuple[Tensor, Tensor, Tensor, Tensor]
+
 
 class Response(NamedTuple):
-    """Of each side (env, row, side): what is left at the end of heat that was there, r_E, and r_φ − ½ r_E − r_F/12 [1]."""
+    """What heat of unit H and J shows [1], each times the cells' heat capacity: in the mean, then at the end of the step."""
 
-    at_end: Tensor
-    on_average: Tensor
+    mean_of_heat: Tensor
+    mean_of_rate: Tensor
+    end_of_heat: Tensor
+    end_of_rate: Tensor
 
 
-def response(
-    conductance: Float[Tensor, "env row side x y z"],
-    x: Float[Tensor, "#env row x y z"],
-    modes: tuple[Modes, ...],
-    is_implicit: bool,
-) -> Response:
-    """Return what is left of heat at each side.
-
-    Args:
-        conductance: Between sides and cells, in any unit.
-        x: What modes decay by in a step.
-        modes: Those along each axis.
-        is_implicit: Whether a step divides modes by 1 + x.
-    """
-    whole = conductance.sum(dim=(-3, -2, -1), keepdim=True)
-    is_any = whole > 0
-    shares = conductance / torch.where(is_any, whole, 1.0)
-    squared = (shares * shares).sum(dim=(-3, -2, -1), keepdim=True)
-    over = torch.where(is_any, 1.0 / torch.where(is_any, squared, 1.0), 0.0)
-    meets = (shares * (shares * over).sum(dim=2, keepdim=True)).sum(dim=(-3, -2, -1))
-    num_envs, _, sides = shares.shape[:3]
-    own = shares.transpose(1, 2).flatten(0, 1)
-    for axis, part in enumerate(modes):
-        own = along(part.vectors, own, axis)
-    own = own.unflatten(0, (num_envs, sides)).transpose(1, 2)
-    every = (own * over).sum(dim=2)
+def decays(x: Tensor, is_implicit: bool) -> Four:
+    """Return φ₀ − 1, φ₁ − 1, φ₂ − ½ and φ₃ − ⅙ of modes that decay by e^(−x), or by 1/(1 + x): then φ₀ = φ₁ = φ₂ [1]."""
     if is_implicit:
-        kept = 1.0 / (1.0 + x)
-        on_average = 0.5 * kept
-    else:
-        safe, kept = torch.where(x > 1e-3, x, 1.0), torch.exp(-x)
-        average = torch.where(x > 1e-3, -torch.expm1(-safe) / safe, 1.0 - 0.5 * x * (1.0 - x / 3.0))
-        on_average = average - kept * (0.5 + x / 12.0)
-    own = own / torch.where(meets > 0, meets, 1.0)[..., None, None, None]
-    return Response(*((own * (every * part)[:, :, None]).sum(dim=(-3, -2, -1)) for part in (kept, on_average)))
+        less = -x / (1.0 + x)
+        return less, less, 0.5 + less, less
+    is_far = x > 1.0
+    near, far = torch.where(is_far, 1.0, x), torch.where(is_far, x, 1.0)
+    fourth = torch.ones_like(x)
+    for n in range(18, 4, -1):
+        fourth = 1.0 - near * fourth / n
+    third = -near * fourth / 24.0
+    second = -near * (1.0 / 6.0 + third)
+    first = -near * (0.5 + second)
+    zeroth = -near * (1.0 + first)
+    far_first = -torch.expm1(-far) / far
+    far_second = (1.0 - far_first) / far
+    parts = torch.expm1(-far), far_first - 1.0, far_second - 0.5, (0.5 - far_second) / far - 1.0 / 6.0
+    a, b, c, d = (torch.where(is_far, far, near) for far, near in zip(parts, (zeroth, first, second, third), strict=True))
+    return a, b, c, d
 
 
-def fraction_left(
-    found: Response, flow: Float[Tensor, "env row side x y z"], capacity: Tensor
-) -> Float[Tensor, "env row x y z"]:
-    """Return κ of each cell; 1 where it touches nothing.
+def whole(parts: Four) -> Four:
+    """Return φ₀ to φ₃ of what `decays` returns."""
+    a, b, c, d = (part + at_rest for part, at_rest in zip(parts, (1.0, 1.0, 0.5, 1.0 / 6.0), strict=True))
+    return a, b, c, d
+
+
+def response(phi: Four, sigma: Tensor) -> Response:
+    """Return the equation of this module.
 
     Args:
-        found: Of the sides.
-        flow: Δt g [J/K].
-        capacity: C of a row's cells (env, row) [J/K].
+        phi: φ₀ to φ₃.
+        sigma: σ, to multiply them.
     """
-    whole = flow.sum(dim=2)
-    is_met = whole > 0
-    safe = torch.where(is_met, whole, 1.0)
-    at_end, on_average = ((flow * part[..., None, None, None]).sum(dim=2) / safe for part in found)
-    return torch.where(is_met, torch.maximum(on_average, at_end - capacity[..., None, None, None] / safe), 1.0)
+    over = 1.0 / (1.0 + 2.0 * sigma)
+    impulse, linear = (1.0 - sigma) * over, 6.0 * sigma * over
+    constant = (1.0 - 4.0 * sigma) * over
+
+    def of_heat(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+        return impulse * a + linear * (b - c)
+
+    def of_rate(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+        return constant * b + linear * c - impulse * a
+
+    return Response(of_heat(*phi[1:]), of_rate(*phi[1:]), of_heat(*phi[:3]), of_rate(*phi[:3]))
+
+
+def of_cells(phi: Four, modes: tuple[Modes, ...]) -> Four:
+    """Return what each cell shows of its own heat, Σ_m v_im² φ_k (env or 1, row, x, y, z)."""
+    result = list(phi)
+    for axis, part in enumerate(modes):
+        squared = (part.vectors * part.vectors).transpose(-2, -1)
+        result = [along(squared, values, axis) for values in result]
+    a, b, c, d = result
+    return a, b, c, d
+
+
+def of_sides(
+    shares: Float[Tensor, "env row side x y z"], own: Four, phi: Four, modes: tuple[Modes, ...]
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Return what sides show of heat of one another (env, row, side, side): of φ₀ to φ₃, all, and without that of cells alone.
+
+    Args:
+        shares: Those of cells in a side's conductance.
+        own: See `of_cells`.
+        phi: φ₀ to φ₃ of the modes.
+        modes: Modes along each axis.
+    """
+    num_envs, _, sides = shares.shape[:3]
+    waves = shares.transpose(1, 2).flatten(0, 1)
+    for axis, part in enumerate(modes):
+        waves = along(part.vectors, waves, axis)
+    waves = waves.unflatten(0, (num_envs, sides)).transpose(1, 2)
+    every = [_between(waves, values) for values in phi]
+    return every, [all_of - _between(shares, values) for all_of, values in zip(every, own, strict=True)]
+
+
+def _between(parts: Tensor, factor: Tensor) -> Tensor:
+    """Return Σ over cells or modes of parts of two sides times a factor (env, row, side, side)."""
+    return ((parts * factor[:, :, None])[:, :, :, None] * parts[:, :, None]).sum(dim=(-3, -2, -1))
+
+
+def impulsiveness(start: Tensor, constant: Tensor) -> Tensor:
+    """Return σ from r₀ and r₁; 1 where nothing touches."""
+    is_any = constant > 0
+    safe = torch.where(is_any, constant, 1.0)
+    spread = torch.where(is_any, 1.0 - start / safe, 0.0)
+    z = start / (1.0 + constant - start) + 16.0 * spread * spread * constant / (1.0 + constant)
+    is_fast = z > 0.5
+    far, near = torch.where(is_fast, z, 1.0), torch.where(is_fast, 0.5, z)
+    left = torch.exp(-far)
+    last = 2.0 * ((1.0 - left) / far - left)
+    fast = (last - far * left) / (2.0 * (1.0 - left - last))
+    return torch.where(is_fast, fast, 1.0 - 0.25 * near * (1.0 - 0.1 * near))

@@ -16,12 +16,12 @@ from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
 from tgdsl.sensors.temperature_grid import conduction, diffusion, losses
 from tgdsl.sensors.temperature_grid.patch_flow import patch_area, patch_flow, resistance
-from tgdsl.sensors.temperature_grid.response import fraction_left
+from tgdsl.sensors.temperature_grid.response import decays, response, whole
 from tgdsl.sensors.temperature_grid.rows import Rows, is_there, num_cells, of_cells, padded
 from tgdsl.tensors.operations import Operation
 
 LARGEST_BLOCK = 2048
-"""Rows × sides × cells, each the next power of two, that the kernel takes."""
+"""Rows × cells, each the next power of two, that the kernel takes."""
 
 
 class Stepped(NamedTuple):
@@ -51,41 +51,81 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
         constants: What `lower` folded.
         dt: Δt [s].
     """
+    inverse = _of_nodes(patches, _inverse(patches))
     gained, nodes_gained = torch.zeros_like(cells), torch.zeros_like(nodes)
-    touched, inverse = torch.zeros_like(cells[:, :, 0, 0, 0]), _of_nodes(patches, _inverse(patches))
-    if patches.topology.met:
-        conductance, responds = patch_flow(patches, rows, constants, _exponents(rows, dt))
-        flow = dt * conductance
-        left = fraction_left(responds, flow, rows.capacity)
-        sides = conduction.Sides(patches.sides, patches.topology.is_plain)
-        # Sums, and no views of what the module overwrites: derivatives are taken of them later.
-        before = cells + gained, nodes + nodes_gained
-        gained, nodes_gained = conduction.step(*before, rows.capacity[..., None, None, None] / left, inverse, flow, sides)
-        gained = gained / left
-        touched = gained.sum(dim=(-3, -2, -1)) * rows.capacity
-    touched_nodes = _joules(nodes_gained, inverse)
+    # Sums, and no views of what the module overwrites: derivatives are taken of them later.
+    cells, nodes = cells + gained, nodes + nodes_gained
+    blown = radiated = source = touched = torch.zeros_like(cells[:, :, 0, 0, 0])
+    blown_nodes = radiated_nodes = touched_nodes = torch.zeros_like(nodes)
     cooling, of_nodes = _surfaces(rows, patches, inverse, constants)
-    blown = radiated = source = torch.zeros_like(touched)
     if cooling is not None:
-        lost, share = losses.lost(cells + gained, cooling, dt)
-        gained, glow = gained + lost, lost * share
-        radiated, blown = ((part.sum(dim=(-3, -2, -1)) * rows.capacity) for part in (glow, lost - glow))
-    blown_nodes = radiated_nodes = torch.zeros_like(nodes)
+        gained, share = losses.lost(cells, cooling, dt)
+        glow = gained * share
+        radiated, blown = ((part.sum(dim=(-3, -2, -1)) * rows.capacity) for part in (glow, gained - glow))
     if of_nodes is not None:
-        nodes_lost, share = losses.lost(nodes + nodes_gained, of_nodes, dt)
-        nodes_gained, glow = nodes_gained + nodes_lost, nodes_lost * share
-        radiated_nodes, blown_nodes = _joules(glow, inverse), _joules(nodes_lost - glow, inverse)
-    spread, entered = diffused(cells + gained, rows, constants, dt)
-    gained = gained + spread
+        nodes_gained, share = losses.lost(nodes, of_nodes, dt)
+        glow = nodes_gained * share
+        radiated_nodes, blown_nodes = _joules(glow, inverse), _joules(nodes_gained - glow, inverse)
+    made = None
     if "source" in constants:
         made = dt * _made(rows, patches, constants) / rows.capacity[..., None, None, None]
         source = source + made.sum(dim=(-3, -2, -1)) * rows.capacity
-        more = diffusion.warmed(made, _exponents(rows, dt), rows.modes, "is_semi_implicit" in constants)
-        gained, entered = gained + (made + more.gained), entered + more.entered
+    if made is None and not patches.topology.met:
+        spread, entered = diffused(cells + gained, rows, constants, dt)
+    else:
+        spread, entered, heat, got = _in_modes(
+            cells + gained, nodes + nodes_gained, rows, patches, constants, dt, inverse, made
+        )
+        touched, nodes_gained = touched + heat, nodes_gained + inverse * got
+        touched_nodes = torch.where(inverse > 0, got, 0.0)
     if rows.film_radiated is not None:
         linear = entered * rows.capacity
         radiated, blown = radiated + linear * rows.film_radiated, blown + linear * (1.0 - rows.film_radiated)
-    return Stepped(gained, nodes_gained, (source, radiated, blown, touched), (radiated_nodes, blown_nodes, touched_nodes))
+    return Stepped(
+        gained + spread, nodes_gained, (source, radiated, blown, touched), (radiated_nodes, blown_nodes, touched_nodes)
+    )
+
+
+def _in_modes(
+    cells: Tensor,
+    nodes: Tensor,
+    rows: Rows,
+    patches: ContactPatch,
+    constants: Constants,
+    dt: Tensor,
+    inverse: Tensor,
+    made: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return what conduction, linear losses, contact and a source, made in all of the step [K], do at once.
+
+    Returns:
+        What cells gain (env, row, x, y, z) and what of it came through faces (env, row) [K], and what rows (env, row) and
+        nodes (env, node) got from contact [J].
+    """
+    is_implicit = "is_semi_implicit" in constants
+    less, capacity = decays(_exponents(rows, dt), is_implicit), rows.capacity[..., None, None, None]
+    phi, parts = whole(less), diffusion.to_modes(cells, rows.modes)
+    change, total = parts * less[0], torch.zeros_like(cells)
+    touched, got = torch.zeros_like(cells[:, :, 0, 0, 0]), torch.zeros_like(nodes)
+    warmed = None if made is None else diffusion.to_modes(made, rows.modes)
+    if made is not None and warmed is not None:
+        change, total = change + warmed * less[1], total + made
+    if patches.topology.met:
+        mean, end = parts * less[1], change
+        if made is not None and warmed is not None:
+            mean = mean + warmed * less[2]
+        free = cells + diffusion.from_modes(mean, rows.modes).gained, cells + diffusion.from_modes(end, rows.modes).gained
+        if made is not None:
+            free = free[0] + 0.5 * made, free[1] + made
+        sides, flow = conduction.Sides(patches.sides, patches.topology.is_plain), dt * patch_flow(patches, rows, constants)
+        flows = conduction.step(free, nodes, rows.capacity, inverse, flow, sides, phi, rows.modes, is_implicit)
+        shows = response(less, flows.sigma[..., None, None, None])  # without what does not decay: 1 and 0
+        heat, rate = flows.heat / capacity, flows.rate / capacity
+        change = change + diffusion.to_modes(heat, rows.modes) * shows.end_of_heat
+        change = change + diffusion.to_modes(rate, rows.modes) * shows.end_of_rate
+        touched, got, total = flows.heat.sum(dim=(-3, -2, -1)), flows.nodes, total + heat
+    spread, entered = diffusion.from_modes(change, rows.modes)
+    return total + spread, entered, touched, got
 
 
 def _surfaces(
@@ -169,7 +209,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
         _films(rows),
         constants.get("emissivity"),
         source,
-        [getattr(own, name) for name in ("vectors", "totals", "exponent") for own in rows.modes],
+        _mode_table(rows, dt),
         [objects.volumetric_heat, objects.volume, objects.area, objects.conductivity, objects.emissivity],
         [dt, constants["ambient"]],
         constants.get("convection"),
@@ -178,6 +218,15 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     if source is not None:
         made = made + dt * constants["power"]
     return Stepped(gained, nodes_gained, (made, *got.unbind(1)), nodes_got.unbind(1))
+
+
+def _mode_table(rows: Rows, dt: Tensor) -> Tensor:
+    """Return of each mode its values in the cells, their sum, and what `decays` returns (row, mode, cells + 5)."""
+    waves = rows.modes[0].vectors[:, :, None, None, :, None, None] * rows.modes[1].vectors[:, None, :, None, None, :, None]
+    waves = (waves * rows.modes[2].vectors[:, None, None, :, None, None, :]).flatten(4).flatten(1, 3)
+    less = [part[0].flatten(1) for part in decays(_exponents(rows, dt), is_implicit=False)]
+    total = diffusion.outer([own.totals for own in rows.modes], torch.mul).flatten(1)
+    return torch.cat([waves, torch.stack([total, *less], dim=-1)], dim=-1)
 
 
 def _films(rows: Rows) -> list[Tensor]:
@@ -194,12 +243,12 @@ def _inputs(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, con
 
 
 def is_small(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> bool:
-    """Return whether all objects have one temperature each, some of them may meet a link, and a program holds all numbers."""
+    """Return whether there is one object, of one temperature, that may meet a link, and a program holds all numbers."""
     x, y, z = num_cells(rows)
     size = 1
-    for number in (cells.shape[1], nodes.shape[1], x * y * z):
+    for number in (cells.shape[1], x * y * z):
         size *= 1 << max(number - 1, 0).bit_length()
-    is_met = patches.topology.is_plain and len(patches.topology.met) > 0
+    is_met = patches.topology.is_plain and nodes.shape[1] == 1 and len(patches.topology.met) > 0
     return is_met and size <= LARGEST_BLOCK and "is_semi_implicit" not in constants
 
 

@@ -1,11 +1,11 @@
-"""`step` as one Triton kernel, for a GPU in float32 without derivatives: small boxes, and objects of one temperature.
+"""`step` as one Triton kernel, for a GPU in float32 without derivatives: small boxes, and one object of one temperature.
 
-A program takes a block of environments, all rows, sides and cells of them as one block of numbers, from the patches' areas to
-what cells and objects gain. Every object is a node and side n of a row is at node n; their system is solved by Gauss–Jordan
-steps without pivots, as its diagonal dominates. Conduction goes mode by mode.
+A program takes a block of environments, all rows and cells of them as one block of numbers, from the patches' areas to what
+cells and the object, the node, gain. Conduction goes mode by mode, over a table that is computed beforehand: how modes decay is
+the same in all environments.
 
-Shapes of blocks: `C` cells of a box, `E` environments, `R` rows, `S` sides, each a power of two. Cells come first: a thread
-then holds those of one patch, and what there is once for all of them is computed once.
+Shapes of blocks: `C` cells of a box, `E` environments, `R` rows, each a power of two. Cells come first: a thread then holds
+those of one patch, and what there is once for all of them is computed once.
 """
 
 # Only Triton's compiler knows the types in a kernel.
@@ -43,24 +43,25 @@ def heat_step(
     films: list[Tensor],
     emissivity: Tensor | None,
     source: Tensor | None,
-    modes: list[Tensor],
+    modes: Tensor,
     objects: list[Tensor],
     around: list[Tensor],
     convection: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return what cells and nodes gain [K], and rows and nodes from radiation, convection and contact (env, 3, …) [J].
+    """Return what cells and the node gain [K], and rows and node from radiation, convection and contact (env, 3, …) [J].
 
     Args:
-        state: Temperatures of the cells (env, row, x, y, z) and of the nodes (env, node), above ambient [K].
-        patches: Area, resistance in series, centre and normal: eight planes (env, row, side).
+        state: Temperatures of the cells (env, row, x, y, z) and of the node (env, 1), above ambient [K].
+        patches: Area, resistance in series, centre and normal: eight planes (env, row, 1).
         rows: Conductivity, heat capacity by volume, and volume of a cell (row,); lowest corner, sides of a cell and number of
             cells (row, 9); numbers of exposed faces of cells along each axis (row, cell).
         films: Resistance between a cell and its faces across each axis, and what modes lose there, (row, 6); the share of that
             which is radiation (row,).
         emissivity: Of the rows; None if nothing radiates.
         source: Heat source in each cell (row, x, y, z) [W].
-        modes: Modes (row, mode, cell) of three axes, then their sums, then what αΔt/Δ² is multiplied with, (row, mode) each.
-        objects: Heat capacity by volume, volume, area, conductivity and emissivity (env or 1, node).
+        modes: Of each mode of the boxes its values in the cells, their sum, and what `response.decays` returns of it,
+            (row, mode, cells + 5).
+        objects: Heat capacity by volume, volume, area, conductivity and emissivity (env or 1, 1).
         around: Δt and the temperature of the surroundings [°C], scalars.
         convection: Heat transfer coefficient; None if there is none.
     """
@@ -76,7 +77,7 @@ def launch(
     films: Sequence[Tensor],
     emissivity: Tensor | None,
     source: Tensor | None,
-    modes: Sequence[Tensor],
+    modes: Tensor,
     objects: Sequence[Tensor],
     around: Sequence[Tensor],
     convection: Tensor | None,
@@ -84,48 +85,45 @@ def launch(
     """Run the kernel, plain or wrapped, on the arguments of `heat_step`."""
     cells, nodes = (part.contiguous() for part in state)
     num_envs, num_rows, x, y, z = cells.shape
-    num_sides, dt = nodes.shape[1], around[0]
+    dt = around[0]
     gained, nodes_gained = cells.new_empty(cells.shape), nodes.new_empty(nodes.shape)
-    got, nodes_got = cells.new_empty((num_envs, 3, num_rows)), cells.new_empty((num_envs, 3, num_sides))
-    block = block_of(num_rows, num_sides, x * y * z)
-    size = block[0] * block[1] * block[2]
+    got, nodes_got = cells.new_empty((num_envs, 3, num_rows)), cells.new_empty((num_envs, 3, 1))
+    block = block_of(num_rows, x * y * z)
+    size = block[0] * block[1]
     envs = max(1, MIN_PROGRAMS // size)
-    strides = [(part.stride(0) if part.shape[0] > 1 else 0, part.stride(1)) for part in objects]
+    strides = [part.stride(0) if part.shape[0] > 1 else 0 for part in objects]
     run[(triton.cdiv(num_envs, envs),)](
         cells, nodes, *(part.contiguous() for part in patches), *(part.contiguous() for part in (*rows, *films)),
         dt if emissivity is None else emissivity.contiguous(), dt if source is None else source.contiguous(),
-        *(part.contiguous() for part in modes), *objects, *(number for pair in strides for number in pair),
+        modes.contiguous(), *objects, *strides,
         *around, dt if convection is None else convection, gained, nodes_gained, got, nodes_got, num_envs, num_rows,
-        NX=x, NY=y, NZ=z, SIDES=num_sides, ENVS=envs, ROWS=block[0], SIDE=block[1], CELLS=block[2],
+        NX=x, NY=y, NZ=z, ENVS=envs, ROWS=block[0], CELLS=block[1],
         RADIATES=emissivity is not None, BLOWS=convection is not None, HAS_SOURCE=source is not None,
-        FIRST=1 if emissivity is None and convection is None else 0,
         num_warps=max(1, min(8, envs * size // max(OF_WARP[0], min(OF_WARP[1], size)))),
     )  # fmt: skip
     return gained, nodes_gained, got, nodes_got
 
 
-def block_of(num_rows: int, num_sides: int, num_cells: int) -> tuple[int, int, int]:
-    """Return how many rows, sides and cells a block holds: the next powers of two."""
-    rows, sides, cells = (1 << (number - 1).bit_length() for number in (num_rows, num_sides, num_cells))
-    return rows, sides, cells
+def block_of(num_rows: int, num_cells: int) -> tuple[int, int]:
+    """Return how many rows and cells a block holds: the next powers of two."""
+    rows, cells = (1 << (number - 1).bit_length() for number in (num_rows, num_cells))
+    return rows, cells
 
 
 @triton.jit
 def step_kernel(
     cells, nodes, area, series, pos_x, pos_y, pos_z, normal_x, normal_y, normal_z,
-    conductivity, heat, cell_volume, boxes, ends_x, ends_y, ends_z, films, film_radiated, emissivity, source,
-    mode_x, mode_y, mode_z, total_x, total_y, total_z, exponent_x, exponent_y, exponent_z,
+    conductivity, heat, cell_volume, boxes, ends_x, ends_y, ends_z, films, film_radiated, emissivity, source, modes,
     node_heat, node_volume, node_area, node_conductivity, node_emissivity,
-    heat_env, heat_node, volume_env, volume_node, area_env, area_node, own_k_env, own_k_node, emissivity_env, emissivity_node,
+    heat_env, volume_env, area_env, own_k_env, emissivity_env,
     dt, ambient, convection, gained, nodes_gained, got, nodes_got, num_envs, num_rows,
-    NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr, SIDES: tl.constexpr,
-    ENVS: tl.constexpr, ROWS: tl.constexpr, SIDE: tl.constexpr, CELLS: tl.constexpr,
-    RADIATES: tl.constexpr, BLOWS: tl.constexpr, HAS_SOURCE: tl.constexpr, FIRST: tl.constexpr,
+    NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr, ENVS: tl.constexpr, ROWS: tl.constexpr, CELLS: tl.constexpr,
+    RADIATES: tl.constexpr, BLOWS: tl.constexpr, HAS_SOURCE: tl.constexpr,
 ):  # fmt: skip
     """Make a step of some environments."""
     env = tl.program_id(0).to(tl.int64) * ENVS + tl.arange(0, ENVS)
-    row, side, cell = tl.arange(0, ROWS), tl.arange(0, SIDE), tl.arange(0, CELLS)
-    is_env, is_row, is_side, is_cell = env < num_envs, row < num_rows, side < SIDES, cell < NX * NY * NZ
+    row, cell = tl.arange(0, ROWS), tl.arange(0, CELLS)
+    is_env, is_row, is_cell = env < num_envs, row < num_rows, cell < NX * NY * NZ
     place = (cell // (NY * NZ), (cell // NZ) % NY, cell % NZ)
     step = tl.load(dt)
     # Rows.
@@ -140,8 +138,7 @@ def step_kernel(
     is_at_cell = is_env[None, :, None] & is_at[:, None, :]
     before = tl.load(cells + at_cell, is_at_cell, 0.0)
     # Patches.
-    at_side = (env[:, None, None] * num_rows + row[None, :, None]) * SIDES + side[None, None, :]
-    is_at_side = is_env[:, None, None] & is_row[None, :, None] & is_side[None, None, :]
+    at_side, is_at_side = env[:, None] * num_rows + row[None, :], is_env[:, None] & is_row[None, :]
     size = tl.load(area + at_side, is_at_side, 0.0)
     pos = (_at(pos_x, at_side, is_at_side), _at(pos_y, at_side, is_at_side), _at(pos_z, at_side, is_at_side))
     normal = (_at(normal_x, at_side, is_at_side), _at(normal_y, at_side, is_at_side), _at(normal_z, at_side, is_at_side))
@@ -149,50 +146,18 @@ def step_kernel(
     whole = tl.sum(found, axis=0)
     # What is no number stays none: minima and maxima lose it.
     rest = 0.0 * (size + pos[0] + pos[1] + pos[2] + normal[0] + normal[1] + normal[2])
-    flow = found * (step / (1.0 + whole * _at(series, at_side, is_at_side)) + rest)[None, :, :, :]
-    # Nodes.
-    at_node = env[:, None] * SIDES + side[None, :]
-    is_node = is_env[:, None] & is_side[None, :]
-    phi = tl.load(nodes + at_node, is_node, 0.0)
-    own_heat = tl.load(node_heat + env[:, None] * heat_env + side[None, :] * heat_node, is_node, 1.0)
-    own_volume = tl.load(node_volume + env[:, None] * volume_env + side[None, :] * volume_node, is_node, 1.0)
-    inverse = 1.0 / (own_heat * own_volume)
-    # What cells show of the heat that they get: see `response`.
-    rate = k / by_volume * step
-    rates = (rate / (box_x[1] * box_x[1]), rate / (box_y[1] * box_y[1]), rate / (box_z[1] * box_z[1]))
-    waves, powers = (mode_x, mode_y, mode_z), (exponent_x, exponent_y, exponent_z)
-    sums = (total_x, total_y, total_z)
-    shares = found * (1.0 / tl.where(size > 0, whole, 1.0))[None, :, :, :]
-    over = tl.where(size > 0, 1.0, 0.0) / tl.where(size > 0, tl.sum(shares * shares, axis=0), 1.0)
-    at_end, evenly = tl.zeros((ENVS, ROWS, SIDE), tl.float32), tl.zeros((ENVS, ROWS, SIDE), tl.float32)
-    if NX * NY * NZ <= UNROLLED:
-        for mode in tl.static_range(0, NX * NY * NZ):
-            at_end, evenly = _left(
-                at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ
-            )
-    else:
-        for mode in range(NX * NY * NZ):
-            at_end, evenly = _left(
-                at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ
-            )
-    if SIDES > 1:
-        every = tl.sum(shares * over[None, :, :, :], axis=3)
-        meets = tl.where(size > 0, tl.sum(shares * every[:, :, :, None], axis=0), 1.0)
-        at_end, evenly = at_end / meets, evenly / meets
-    total = tl.sum(flow, axis=3)
-    is_met = total > 0
-    per_flow = 1.0 / tl.where(is_met, total, 1.0)
-    on_average = tl.sum(flow * evenly[None, :, :, :], axis=3)
-    kept = tl.sum(flow * at_end[None, :, :, :], axis=3) - capacity[None, None, :]
-    larger = 1.0 / tl.where(is_met, tl.maximum(on_average, kept) * per_flow, 1.0)
-    touched, own_touched = _touched(before, phi, capacity[None, None, :] * larger, inverse, flow, SIDES, ENVS, SIDE)
-    touched = touched * larger
+    flow = found * (step / (1.0 + whole * _at(series, at_side, is_at_side)) + rest)[None, :, :]
+    shares = found * (1.0 / tl.where(size > 0, whole, 1.0))[None, :, :]
+    # The node.
+    phi = tl.load(nodes + env, is_env, 0.0)
+    own_volume = tl.load(node_volume + env * volume_env, is_env, 1.0)
+    inverse = 1.0 / (tl.load(node_heat + env * heat_env, is_env, 1.0) * own_volume)
     # Losses beyond what modes lose.
     around, blowing = tl.load(ambient) + ZERO, 0.0
     if BLOWS:
         blowing = tl.load(convection)
     lost, share = tl.zeros((CELLS, ENVS, ROWS), tl.float32), tl.zeros((CELLS, ENVS, ROWS), tl.float32)
-    own_lost, own_share = tl.zeros((ENVS, SIDE), tl.float32), tl.zeros((ENVS, SIDE), tl.float32)
+    own_lost, own_share = tl.zeros((ENVS,), tl.float32), tl.zeros((ENVS,), tl.float32)
     linear_share = tl.load(film_radiated + row, is_row, 0.0)
     if RADIATES:
         glow = SIGMA * tl.load(emissivity + row, is_row, 0.0)
@@ -200,60 +165,82 @@ def step_kernel(
         face_y = _face(ends_y, films, row, place[1], NY, is_at, by_volume * box_y[1], is_row, 1)
         face_z = _face(ends_z, films, row, place[2], NZ, is_at, by_volume * box_z[1], is_row, 2)
         lost, share = _lost(
-            before + touched, face_x, face_y, face_z, linear_share[None, None, :], glow[None, None, :], blowing, around, step
+            before, face_x, face_y, face_z, linear_share[None, None, :], glow[None, None, :], blowing, around, step
         )
     if RADIATES or BLOWS:
-        own_glow = tl.zeros((ENVS, SIDE), tl.float32)
+        own_glow = tl.zeros((ENVS,), tl.float32)
         if RADIATES:
-            own_glow = SIGMA * tl.load(
-                node_emissivity + env[:, None] * emissivity_env + side[None, :] * emissivity_node, is_node, 0.0
-            )
-        own_exposed = tl.load(node_area + env[:, None] * area_env + side[None, :] * area_node, is_node, 0.0) * inverse
-        own_k = tl.load(node_conductivity + env[:, None] * own_k_env + side[None, :] * own_k_node, is_node, 1.0)
+            own_glow = SIGMA * tl.load(node_emissivity + env * emissivity_env, is_env, 0.0)
+        own_exposed = tl.load(node_area + env * area_env, is_env, 0.0) * inverse
+        own_k = tl.load(node_conductivity + env * own_k_env, is_env, 1.0)
         width = tl.exp(tl.log(tl.where(inverse > 0, own_volume, 1.0)) * (1.0 / 3.0))
-        body = (own_exposed, width / (6.0 * own_k), 0.0)
-        own_lost, own_share = _lost_by_one(phi + own_touched, body, own_glow, blowing, around, step)
-    # Conduction, with linear losses and a source.
-    made = tl.zeros((CELLS, ROWS), tl.float32)
+        own_lost, own_share = _lost_by_one(phi, (own_exposed, width / (6.0 * own_k), 0.0), own_glow, blowing, around, step)
+    # Without contact: conduction, with linear losses and a source; and what modes show of contact, see `response`.
+    made = tl.zeros((CELLS, ENVS, ROWS), tl.float32)
     if HAS_SOURCE:
-        made = tl.load(source + at, is_at, 0.0) * (step / capacity)[None, :]
-    gain = touched + lost
-    apart = before + gain
+        made = tl.load(source + (at_cell - env[None, :, None] * (num_rows * NX * NY * NZ)), is_at_cell, 0.0)
+        made *= (step / capacity)[None, None, :]
     weight = there.to(tl.float32)
-    weight = weight / tl.sum(weight, axis=0)[None, :]
-    weight = tl.where(is_row[None, :], weight, 0.0)
-    mean = tl.sum(apart * weight[:, None, :], axis=0)
-    apart -= mean[None, :, :]
-    spread, entered = tl.zeros((CELLS, ENVS, ROWS), tl.float32), tl.zeros((ENVS, ROWS), tl.float32)
+    weight = tl.where(is_row[None, :], weight / tl.sum(weight, axis=0)[None, :], 0.0)
+    now = before + lost
+    mean = tl.sum(now * weight[:, None, :], axis=0)
+    apart = now - mean[None, :, :]
+    average, end = tl.zeros((CELLS, ENVS, ROWS), tl.float32), tl.zeros((CELLS, ENVS, ROWS), tl.float32)
+    entered = tl.zeros((ENVS, ROWS), tl.float32)
+    none, nothing = tl.zeros((CELLS, ROWS), tl.float32), tl.zeros((ENVS, ROWS), tl.float32)
+    by_cell, by_side = (none, none, none, none), (nothing, nothing, nothing, nothing)
     if NX * NY * NZ <= UNROLLED:
-        for mode in tl.static_range(FIRST, NX * NY * NZ):
-            spread, entered = _with_mode(
-                spread, entered, apart, mean, made, mode, rates, waves, sums, powers, place, row, is_row, is_at, NX, NY, NZ,
-                HAS_SOURCE,
+        for mode in tl.static_range(0, NX * NY * NZ):
+            average, end, entered, by_cell, by_side = _without_contact(
+                average, end, entered, by_cell, by_side, apart, mean, made, shares, modes, mode, row, is_row, cell, is_at,
+                NX * NY * NZ, HAS_SOURCE,
             )  # fmt: skip
     else:
-        for mode in range(FIRST, NX * NY * NZ):
-            spread, entered = _with_mode(
-                spread, entered, apart, mean, made, mode, rates, waves, sums, powers, place, row, is_row, is_at, NX, NY, NZ,
-                HAS_SOURCE,
+        for mode in range(NX * NY * NZ):
+            average, end, entered, by_cell, by_side = _without_contact(
+                average, end, entered, by_cell, by_side, apart, mean, made, shares, modes, mode, row, is_row, cell, is_at,
+                NX * NY * NZ, HAS_SOURCE,
             )  # fmt: skip
+    # Contact: see `conduction`.
+    met = tl.sum(flow, axis=0)
+    bodies = inverse * tl.sum(met, axis=1)
+    sigma = _impulsiveness(
+        by_side[0] * met * (1.0 / capacity)[None, :] + bodies[:, None],
+        by_side[1] * met * (1.0 / capacity)[None, :] + bodies[:, None],
+        met > 0,
+    )
+    heat_of, rate_of, own_touched = _touched(
+        now + (average + 0.5 * made), now + (end + made), phi + own_lost, capacity, inverse, flow,
+        shares, by_cell, by_side, sigma,
+    )  # fmt: skip
+    spread, through = tl.zeros((CELLS, ENVS, ROWS), tl.float32), tl.zeros((ENVS, ROWS), tl.float32)
+    if NX * NY * NZ <= UNROLLED:
+        for mode in tl.static_range(0, NX * NY * NZ):
+            spread, through = _with_contact(
+                spread, through, heat_of, rate_of, sigma, modes, mode, row, is_row, cell, is_at, NX * NY * NZ
+            )
+    else:
+        for mode in range(NX * NY * NZ):
+            spread, through = _with_contact(
+                spread, through, heat_of, rate_of, sigma, modes, mode, row, is_row, cell, is_at, NX * NY * NZ
+            )
+    spread, entered = spread + end, entered + through
     excess = tl.sum(spread, axis=0) - entered
     spread -= excess[None, :, :] * weight[:, None, :]
-    tl.store(gained + at_cell, gain + (spread + made[:, None, :]), is_at_cell)
-    tl.store(nodes_gained + at_node, own_touched + own_lost, is_node)
+    tl.store(gained + at_cell, (lost + heat_of) + (spread + made), is_at_cell)
+    tl.store(nodes_gained + env, own_touched * inverse + own_lost, is_env)
     # Accounts.
-    at_row, is_at_row = env[:, None] * (3 * num_rows) + row[None, :], is_env[:, None] & is_row[None, :]
+    at_row = env[:, None] * (3 * num_rows) + row[None, :]
     radiated = tl.sum(lost * share, axis=0) + entered * linear_share[None, :]
     blown = tl.sum(lost * (1.0 - share), axis=0) + entered * (1.0 - linear_share)[None, :]
-    tl.store(got + at_row, radiated * capacity[None, :], is_at_row)
-    tl.store(got + at_row + num_rows, blown * capacity[None, :], is_at_row)
-    tl.store(got + at_row + 2 * num_rows, tl.sum(touched, axis=0) * capacity[None, :], is_at_row)
+    tl.store(got + at_row, radiated * capacity[None, :], is_at_side)
+    tl.store(got + at_row + num_rows, blown * capacity[None, :], is_at_side)
+    tl.store(got + at_row + 2 * num_rows, tl.sum(heat_of, axis=0) * capacity[None, :], is_at_side)
     is_finite = inverse > 0
     own_capacity = tl.where(is_finite, 1.0, 0.0) / tl.where(is_finite, inverse, 1.0)
-    own = env[:, None] * (3 * SIDES) + side[None, :]
-    tl.store(nodes_got + own, own_lost * own_share * own_capacity, is_node)
-    tl.store(nodes_got + own + SIDES, own_lost * (1.0 - own_share) * own_capacity, is_node)
-    tl.store(nodes_got + own + 2 * SIDES, own_touched * own_capacity, is_node)
+    tl.store(nodes_got + 3 * env, own_lost * own_share * own_capacity, is_env)
+    tl.store(nodes_got + 3 * env + 1, own_lost * (1.0 - own_share) * own_capacity, is_env)
+    tl.store(nodes_got + 3 * env + 2, tl.where(is_finite, own_touched, 0.0), is_env)
 
 
 @triton.jit
@@ -276,68 +263,74 @@ def _is_there(box, place):
 
 
 @triton.jit
-def _left(
-    at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at,
-    NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr,
-):  # fmt: skip
-    """Return r_E and r_φ − ½ r_E − r_F/12 of each side (E, R, S) with what a mode has of them: see `response`."""
-    x, y, z = mode // (NY * NZ), (mode // NZ) % NY, mode % NZ
-    wave = _wave(waves[0], row, x, place[0], NX, is_at)
-    wave *= _wave(waves[1], row, y, place[1], NY, is_at) * _wave(waves[2], row, z, place[2], NZ, is_at)
-    power = rates[0] * _of_mode(powers[0], row, x, NX, is_row)
-    power += rates[1] * _of_mode(powers[1], row, y, NY, is_row)
-    power += rates[2] * _of_mode(powers[2], row, z, NZ, is_row)
-    own = tl.sum(shares * wave[:, None, :, None], axis=0)
-    every = tl.sum(own * over, axis=2)
-    decay = _expm1(-power)
-    left = 1.0 + decay
-    at_end += own * (every * left[None, :])[:, :, None]
-    average = 1.0 + _delayed(power, decay) - left * (0.5 + power * (1.0 / 12.0))
-    return at_end, evenly + own * (every * average[None, :])[:, :, None]
+def _mode(modes, mode, row, is_row, cell, is_at, NUM: tl.constexpr):
+    """Return a mode's values in the cells (C, R), their sum, and φ₀ − 1, φ₁ − 1, φ₂ − ½ and φ₃ − ⅙ of it (R)."""
+    at = modes + (row * NUM + mode) * (NUM + 5)
+    wave = tl.load(at[None, :] + cell[:, None], is_at, 0.0)
+    total, a = tl.load(at + NUM, is_row, 0.0), tl.load(at + NUM + 1, is_row, 0.0)
+    b, c, d = tl.load(at + NUM + 2, is_row, 0.0), tl.load(at + NUM + 3, is_row, 0.0), tl.load(at + NUM + 4, is_row, 0.0)
+    return wave, total, a, b, c, d
 
 
 @triton.jit
-def _with_mode(
-    spread, entered, apart, mean, made, mode, rates, waves, sums, powers, place, row, is_row, is_at,
-    NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr, HAS_SOURCE: tl.constexpr,
+def _without_contact(
+    average, end, entered, by_cell, by_side, apart, mean, made, shares, modes, mode, row, is_row, cell, is_at,
+    NUM: tl.constexpr, HAS_SOURCE: tl.constexpr,
 ):  # fmt: skip
-    """Return `spread` (C, E, R) with what a mode adds in a step, and `entered` (E, R) with what of it came through the faces.
-
-    Of the mode's part of the cells e^(−x) − 1, of that of a source φ₁(−x) − 1.
-    """
-    x, y, z = mode // (NY * NZ), (mode // NZ) % NY, mode % NZ
-    wave = _wave(waves[0], row, x, place[0], NX, is_at)
-    wave *= _wave(waves[1], row, y, place[1], NY, is_at) * _wave(waves[2], row, z, place[2], NZ, is_at)
-    total = (
-        _of_mode(sums[0], row, x, NX, is_row) * _of_mode(sums[1], row, y, NY, is_row) * _of_mode(sums[2], row, z, NZ, is_row)
-    )
-    power = rates[0] * _of_mode(powers[0], row, x, NX, is_row)
-    power += rates[1] * _of_mode(powers[1], row, y, NY, is_row)
-    power += rates[2] * _of_mode(powers[2], row, z, NZ, is_row)
-    decay = _expm1(-power)
-    along = (tl.sum(apart * wave[:, None, :], axis=0) + mean * total[None, :]) * decay[None, :]
+    """Add a mode to what cells gain without contact, in the mean and at the end, and to what all show: see `response`."""
+    wave, total, a, b, c, d = _mode(modes, mode, row, is_row, cell, is_at, NUM)
+    part = tl.sum(apart * wave[:, None, :], axis=0) + mean * total[None, :]
+    of_mean, of_end = part * b[None, :], part * a[None, :]
     if HAS_SOURCE:
-        along += (_delayed(power, decay) * tl.sum(made * wave, axis=0))[None, :]
-    return spread + along[None, :, :] * wave[:, None, :], entered + along * total[None, :]
+        warmed = tl.sum(made * wave[:, None, :], axis=0)
+        of_mean += warmed * c[None, :]
+        of_end += warmed * b[None, :]
+    average += of_mean[None, :, :] * wave[:, None, :]
+    end += of_end[None, :, :] * wave[:, None, :]
+    entered += of_end * total[None, :]
+    a, b, c, d = a + 1.0, b + 1.0, c + 0.5, d + 1.0 / 6.0
+    squared, own = wave * wave, tl.sum(shares * wave[:, None, :], axis=0)
+    own *= own
+    by_cell = (
+        by_cell[0] + squared * a[None, :], by_cell[1] + squared * b[None, :],
+        by_cell[2] + squared * c[None, :], by_cell[3] + squared * d[None, :],
+    )  # fmt: skip
+    by_side = (
+        by_side[0] + own * a[None, :], by_side[1] + own * b[None, :],
+        by_side[2] + own * c[None, :], by_side[3] + own * d[None, :],
+    )  # fmt: skip
+    return average, end, entered, by_cell, by_side
 
 
 @triton.jit
-def _delayed(power, decay):
-    """Return φ₁(x) − 1 = (1 − e^(−x))/x − 1 from x and e^(−x) − 1."""
-    is_any = power > 1e-3
-    return tl.where(is_any, -decay / tl.where(is_any, power, 1.0) - 1.0, -0.5 * power * (1.0 - power * (1.0 / 3.0)))
+def _with_contact(spread, through, heat, rate, sigma, modes, mode, row, is_row, cell, is_at, NUM: tl.constexpr):
+    """Add a mode to what cells gain of contact beyond the heat that they get (C, E, R), and through faces (E, R)."""
+    wave, total, a, b, c, _ = _mode(modes, mode, row, is_row, cell, is_at, NUM)
+    _, _, of_heat, of_rate = _response((a[None, :], b[None, :], c[None, :], c[None, :]), sigma)
+    along = tl.sum(heat * wave[:, None, :], axis=0) * of_heat + tl.sum(rate * wave[:, None, :], axis=0) * of_rate
+    return spread + along[None, :, :] * wave[:, None, :], through + along * total[None, :]
 
 
 @triton.jit
-def _wave(vectors, row, mode, place, NUM: tl.constexpr, is_at):
-    """Return a mode along an axis (C, R)."""
-    return tl.load(vectors + (row[None, :] * NUM + mode) * NUM + place[:, None], is_at, 0.0)
+def _response(phi, sigma):
+    """Return what H and J show in the mean and at the end of a step: see `response`."""
+    over = 1.0 / (1.0 + 2.0 * sigma)
+    impulse, constant, linear = (1.0 - sigma) * over, (1.0 - 4.0 * sigma) * over, 6.0 * sigma * over
+    return (
+        impulse * phi[1] + linear * (phi[2] - phi[3]), constant * phi[2] + linear * phi[3] - impulse * phi[1],
+        impulse * phi[0] + linear * (phi[1] - phi[2]), constant * phi[1] + linear * phi[2] - impulse * phi[0],
+    )  # fmt: skip
 
 
 @triton.jit
-def _of_mode(values, row, mode, NUM: tl.constexpr, is_row):
-    """Return a number of a mode along an axis (R)."""
-    return tl.load(values + row * NUM + mode, is_row, 0.0)
+def _impulsiveness(start, constant, is_any):
+    """Return σ of what rows show of an impulse and of a constant flow: see `response`."""
+    spread = tl.where(is_any, 1.0 - start / tl.where(is_any, constant, 1.0), 0.0)
+    z = start / (1.0 + constant - start) + 16.0 * spread * spread * constant / (1.0 + constant)
+    far, near = tl.where(z > 0.5, z, 1.0), tl.where(z > 0.5, 0.5, z)
+    left = tl.exp(-far)
+    last = 2.0 * ((1.0 - left) / far - left)
+    return tl.where(z > 0.5, (last - far * left) / (2.0 * (1.0 - left - last)), 1.0 - 0.25 * near * (1.0 - 0.1 * near))
 
 
 @triton.jit
@@ -406,7 +399,7 @@ def _radiated(above, glow, around):
 
 @triton.jit
 def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there):
-    """Return the conductances between sides and cells (C, E, R, S) [W/K]: see `shares`."""
+    """Return the conductances between sides and cells (C, E, R) [W/K]: see `shares`."""
     is_any = size > 0
     safe = tl.where(is_any, size, 1e-6)
     edge = 0.5 * tl.sqrt(safe)
@@ -414,24 +407,24 @@ def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, ther
     y = _along(pos[1], normal[1], edge, box_y, place[1], (place[0] == 0) & (place[2] == 0))
     z = _along(pos[2], normal[2], edge, box_z, place[2], (place[0] == 0) & (place[1] == 0))
     fit = safe * x[3] * y[3] * z[3]
-    depth = normal[0] * normal[0] * box_x[1][None, :, None] + normal[1] * normal[1] * box_y[1][None, :, None]
-    depth += normal[2] * normal[2] * box_z[1][None, :, None]
+    depth = normal[0] * normal[0] * box_x[1][None, :] + normal[1] * normal[1] * box_y[1][None, :]
+    depth += normal[2] * normal[2] * box_z[1][None, :]
     radius = tl.sqrt(fit / PI)
-    rho = radius * tl.sqrt(depth * (1.0 / volume)[None, :, None])
+    rho = radius * tl.sqrt(depth * (1.0 / volume)[None, :])
     few = (1.0 - x[4] * (1.0 - x[2])) * (1.0 - y[4] * (1.0 - y[2])) * (1.0 - z[4] * (1.0 - z[2]))
     fitted = 1.0 + 0.75 * rho * (2.0 * few - 1.0) * tl.maximum(1.0 - 2.0 * rho, 0.0)
-    own = k[None, :, None]
+    own = k[None, :]
     cover = tl.where(is_any, 2.0 * own * fit / depth, 0.0)
     spot = tl.where(is_any, 2.0 * own * radius / (1.0 + 0.5 * rho) * fitted, 0.0)
-    of_x, of_y, of_z = (spot * x[4])[None, :, :, :], (spot * y[4])[None, :, :, :], (spot * z[4])[None, :, :, :]
-    result = x[0] * (y[0] * (cover[None, :, :, :] * z[0] + of_z * z[1]) + of_y * y[1] * z[0]) + of_x * x[1] * y[0] * z[0]
-    return tl.where(there[:, None, :, None], result, 0.0)
+    of_x, of_y, of_z = (spot * x[4])[None, :, :], (spot * y[4])[None, :, :], (spot * z[4])[None, :, :]
+    result = x[0] * (y[0] * (cover[None, :, :] * z[0] + of_z * z[1]) + of_y * y[1] * z[0]) + of_x * x[1] * y[0] * z[0]
+    return tl.where(there[:, None, :], result, 0.0)
 
 
 @triton.jit
 def _along(pos, normal, edge, box, place, is_first_of_others):
-    """Return shares and edges (C, E, R, S), Σ w², the part that is in the box, and 1 − n² (E, R, S) along an axis."""
-    low, number, scale = box[0][None, :, None], box[2][None, :, None], (1.0 / box[1])[None, :, None]
+    """Return shares and edges (C, E, R), Σ w², the part that is in the box, and 1 − n² (E, R) along an axis."""
+    low, number, scale = box[0][None, :], box[2][None, :], (1.0 / box[1])[None, :]
     across = tl.maximum(1.0 - normal * normal, 0.0)
     half = edge * tl.sqrt(across) * scale
     middle = 0.5 * number
@@ -441,22 +434,22 @@ def _along(pos, normal, edge, box, place, is_first_of_others):
     centre = (pos - low) * scale
     about = tl.minimum(tl.maximum(centre, width), number - width)
     centre = tl.minimum(tl.maximum(centre, fits), number - fits)
-    at = (place.to(tl.float32) + 0.5)[:, None, None, None]
+    at = (place.to(tl.float32) + 0.5)[:, None, None]
     top = number - 0.5
     first, last = about - width, about + width
-    covered = _below(_inside(last, top)[None, :, :, :] - at) - _below(_inside(first, top)[None, :, :, :] - at)
+    covered = _below(_inside(last, top)[None, :, :] - at) - _below(_inside(first, top)[None, :, :] - at)
     before = tl.maximum(0.5 - first, 0.0) - tl.maximum(0.5 - last, 0.0)
     after = tl.maximum(last - top, 0.0) - tl.maximum(first - top, 0.0)
-    covered += tl.where(at < 1.0, before[None, :, :, :], 0.0)
-    covered += tl.where(tl.abs(at - top[None, :, :, :]) < 0.25, after[None, :, :, :], 0.0)
-    shares = covered * (0.5 / width)[None, :, :, :]
+    covered += tl.where(at < 1.0, before[None, :, :], 0.0)
+    covered += tl.where(tl.abs(at - top[None, :, :]) < 0.25, after[None, :, :], 0.0)
+    shares = covered * (0.5 / width)[None, :, :]
     start, end = centre - fits, centre + fits
-    open_start = tl.minimum(tl.maximum(2.0 * start, 0.0), 1.0)[None, :, :, :]
-    open_end = tl.minimum(tl.maximum(2.0 * (number - end), 0.0), 1.0)[None, :, :, :]
-    at_start = tl.maximum(1.0 - tl.abs(_inside(start, top)[None, :, :, :] - at), 0.0)
-    at_end = tl.maximum(1.0 - tl.abs(_inside(end, top)[None, :, :, :] - at), 0.0)
+    open_start = tl.minimum(tl.maximum(2.0 * start, 0.0), 1.0)[None, :, :]
+    open_end = tl.minimum(tl.maximum(2.0 * (number - end), 0.0), 1.0)[None, :, :]
+    at_start = tl.maximum(1.0 - tl.abs(_inside(start, top)[None, :, :] - at), 0.0)
+    at_end = tl.maximum(1.0 - tl.abs(_inside(end, top)[None, :, :] - at), 0.0)
     edges = 0.5 * (open_start * at_start + open_end * at_end)
-    squared = tl.sum(tl.where(is_first_of_others[:, None, None, None], shares * shares, 0.0), axis=0)
+    squared = tl.sum(tl.where(is_first_of_others[:, None, None], shares * shares, 0.0), axis=0)
     return shares, edges, squared, within, across
 
 
@@ -474,45 +467,44 @@ def _below(offset):
 
 
 @triton.jit
-def _touched(cells, nodes, capacity, inverse, flow, SIDES: tl.constexpr, ENVS: tl.constexpr, SIDE: tl.constexpr):
-    """Return what cells of some capacity (C, E, R) and nodes (E, S) gain by contact [K]: see `conduction`."""
-    over = 1.0 / (capacity + tl.sum(flow, axis=3))
-    weight = flow * (capacity * over)[:, :, :, None]
-    pull = tl.sum(tl.sum(weight, axis=0), axis=1)
-    right = nodes + inverse * tl.sum(tl.sum(weight * cells[:, :, :, None], axis=0), axis=1)
-    if SIDES == 1:
-        after = right / (1.0 + inverse * pull)
-        left = tl.zeros((ENVS, SIDE), tl.float32)
-    else:
-        number = tl.arange(0, SIDE)
-        is_diagonal = (number[:, None] == number[None, :])[None, :, :]
-        share = flow * over[:, :, :, None]
-        coupled = tl.zeros((ENVS, SIDE, SIDE), tl.float32)
-        for m in tl.static_range(SIDES):
-            of_other = tl.sum(tl.where((number == m)[None, None, None, :], share, 0.0), axis=3)
-            both = tl.sum(tl.sum(flow * of_other[:, :, :, None], axis=0), axis=1)
-            coupled += tl.where((number == m)[None, None, :], both[:, :, None], 0.0)
-        coupled = tl.where(is_diagonal, 0.0, coupled)
-        diagonal = 1.0 + inverse * (pull + tl.sum(coupled, axis=2))
-        after = _solved(
-            tl.where(is_diagonal, diagonal[:, :, None], -inverse[:, :, None] * coupled), right, is_diagonal, SIDES, SIDE
-        )
-        left = tl.sum(coupled * (after[:, :, None] - after[:, None, :]), axis=2)
-    across = after[None, :, None, :] - cells[:, :, :, None]
-    left += tl.sum(tl.sum(weight * across, axis=0), axis=1)
-    return tl.sum(flow * across, axis=3) * over, -inverse * left
+def _touched(average, end, phi, capacity, inverse, flow, shares, by_cell, by_side, sigma):
+    """Return H and J of cells over their capacity (C, E, R) [K], and what the node gets (E) [J]: see `conduction`."""
+    over = (1.0 / capacity)[None, :]
+    a, b, c, d = _response(
+        (by_cell[0][:, None, :], by_cell[1][:, None, :], by_cell[2][:, None, :], by_cell[3][:, None, :]), sigma[None, :, :]
+    )
+    ra, rb, rc, rd = _response(by_side, sigma)
+    squared = shares * shares
+    ra, rb = (ra - tl.sum(squared * a, axis=0)) * over, (rb - tl.sum(squared * b, axis=0)) * over
+    rc, rd = (rc - tl.sum(squared * c, axis=0)) * over, (rd - tl.sum(squared * d, axis=0)) * over
+    # Cells: H and J are f S (temperatures of the node − free).
+    per = flow * over[None, :, :]
+    sa, sb, sc, sd = _inverted(1.0 + per * a, per * b, per * c, 1.0 + per * d)
+    ya, yb, yc, yd = tl.sum(flow * sa, axis=0), tl.sum(flow * sb, axis=0), tl.sum(flow * sc, axis=0), tl.sum(flow * sd, axis=0)
+    one, other = tl.sum(flow * (sa * average + sb * end), axis=0), tl.sum(flow * (sc * average + sd * end), axis=0)
+    # Sides: H and J are F (Y (temperatures of the node) − …).
+    fa, fb, fc, fd = _inverted(1.0 + ya * ra + yb * rc, ya * rb + yb * rd, yc * ra + yd * rc, 1.0 + yc * rb + yd * rd)
+    za, zb, zc, zd = fa * ya + fb * yc, fa * yb + fb * yd, fc * ya + fd * yc, fc * yb + fd * yd
+    one, other = fa * one + fb * other, fc * one + fd * other
+    # The node.
+    whole = 1.0 / (1.0 + 2.0 * sigma)
+    of_heat, of_rate = (1.0 + sigma) * whole, -0.5 * whole
+    na, nb, nc, nd = _inverted(
+        1.0 + inverse * tl.sum(of_heat * za + of_rate * zc, axis=1), inverse * tl.sum(of_heat * zb + of_rate * zd, axis=1),
+        inverse * tl.sum(za, axis=1), 1.0 + inverse * tl.sum(zb, axis=1),
+    )  # fmt: skip
+    right, left = phi + inverse * tl.sum(of_heat * one + of_rate * other, axis=1), phi + inverse * tl.sum(one, axis=1)
+    near, last = (na * right + nb * left)[:, None], (nc * right + nd * left)[:, None]
+    one, other = za * near + zb * last - one, zc * near + zd * last - other
+    near, last = near - (ra * one + rb * other), last - (rc * one + rd * other)
+    one_of, other_of = per * (near[None, :, :] - average), per * (last[None, :, :] - end)
+    heat, rate = sa * one_of + sb * other_of, sc * one_of + sd * other_of
+    heat = per * (near[None, :, :] - (average + a * heat + b * rate))
+    return heat, rate, -tl.sum(tl.sum(heat, axis=0) * capacity[None, :], axis=1)
 
 
 @triton.jit
-def _solved(matrix, right, is_diagonal, SIDES: tl.constexpr, SIDE: tl.constexpr):
-    """Return the solution (E, S) of a system whose diagonal dominates."""
-    number = tl.arange(0, SIDE)
-    for n in tl.static_range(SIDES):
-        is_own = (number == n)[None, :]
-        pivot_row = tl.sum(tl.where(is_own[:, :, None], matrix, 0.0), axis=1)
-        pivot = tl.sum(tl.where(is_own, pivot_row, 0.0), axis=1)
-        column = tl.sum(tl.where(is_own[:, None, :], matrix, 0.0), axis=2)
-        factor = tl.where(is_own, 0.0, column / pivot[:, None])
-        matrix -= factor[:, :, None] * pivot_row[:, None, :]
-        right -= factor * tl.sum(tl.where(is_own, right, 0.0), axis=1)[:, None]
-    return right / tl.sum(tl.where(is_diagonal, matrix, 0.0), axis=2)
+def _inverted(a, b, c, d):
+    """Return the inverse of a matrix of two by two."""
+    over = 1.0 / (a * d - b * c)
+    return d * over, -b * over, -c * over, a * over
