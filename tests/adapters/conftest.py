@@ -2,7 +2,7 @@
 
 from importlib.util import find_spec
 
-MISSING = [name for name in ("mjlab",) if find_spec(name) is None]
+MISSING = [name for name in ("mjlab", "newton") if find_spec(name) is None]
 collect_ignore = [f"test_{name}.py" for name in MISSING]
 
 
