@@ -2,8 +2,9 @@
 
 from importlib.util import find_spec
 
-MISSING = [name for name in ("mjlab", "newton") if find_spec(name) is None]
-collect_ignore = [f"test_{name}.py" for name in MISSING]
+NEEDS = {"mjlab": "mjlab", "newton": "newton", "isaaclab": "newton"}
+MISSING = sorted({host for host in NEEDS.values() if find_spec(host) is None})
+collect_ignore = [f"test_{name}.py" for name, host in NEEDS.items() if host in MISSING]
 
 
 def pytest_report_header() -> list[str]:

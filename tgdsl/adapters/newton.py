@@ -36,6 +36,7 @@ class SensorTactile:
     Attributes:
         touch: The module.
         readings: The readings by name, as `touch.outputs` lists them; empty before the first `update`.
+        is_new: The worlds that were reset since the last update of all: they have no contacts.
         solver_observable_kinds: The kinds for `solver.observables`; empty if no sensor reads contacts.
     """
 
@@ -58,7 +59,7 @@ class SensorTactile:
         of_kinds = [_by_world(model, kind) for kind in ("body", "shape", "joint")]
         (bodies, self._labels), (shapes, shape_labels), (joints, joint_labels) = of_kinds
         self._bodies, self._com = self._tensor(bodies), wp.to_torch(model.body_com)[self._tensor(bodies)]
-        self._is_new = torch.zeros(len(bodies), dtype=torch.bool, device=self.touch.device)
+        self.is_new = torch.zeros(len(bodies), dtype=torch.bool, device=self.touch.device)
         self._shape_body = wp.to_torch(model.shape_body).long()  # −1: the world's
         self._shape_world = wp.to_torch(model.shape_world).long().clamp(min=0 if len(bodies) == 1 else -1)
         self._shape_place = torch.zeros_like(self._shape_body)
@@ -77,8 +78,8 @@ class SensorTactile:
         self._kinematics(model)
 
     def reset(self, worlds: Worlds = None) -> None:
-        """Begin a new episode in some worlds. They have no contacts until the next `update` of all worlds."""
-        self._is_new |= self._mask(worlds)
+        """Begin a new episode in some worlds."""
+        self.is_new |= self._mask(worlds)
         self.touch.reset(self._mask(worlds))
 
     def update(
@@ -94,7 +95,7 @@ class SensorTactile:
             fields: Fields of `SceneState` that Newton's state does not hold, such as `dt`, `last_action` or `variant`.
         """
         if worlds is None:
-            self._is_new.zero_()
+            self.is_new.zero_()
         fields |= self._kinematics(state) | (self._contacts(state, contacts, observables) if self._inputs.pairs else {})
         with torch.no_grad():
             self.readings = self.touch(SceneState(**fields), mask=None if worlds is None else self._mask(worlds))
@@ -125,13 +126,13 @@ class SensorTactile:
         force = torch.zeros_like(rows["normal"]) if acting is None else wp.to_torch(acting)[: len(shapes), :3]
         is_met = (force != 0).any(dim=1) | (((points[:, 1] - points[:, 0]) * rows["normal"]).sum(dim=1) < 0)
         place, world = self._shape_place[shapes], self._shape_world[shapes].amax(dim=1)
-        is_contact = is_filled & is_met & (world >= 0) & ~self._is_new[world]
+        is_contact = is_filled & is_met & (world >= 0) & ~self.is_new[world]
         columns = {"pos": points.mean(dim=1), "normal": rows["normal"], "force": force, "env": world.clamp(min=0)}
         settings = {"num_envs": len(self._bodies), "is_contact": is_contact, "force_on": 1}
         return contacts_by_pair(self._inputs, self._geoms, place, **columns, **settings)
 
     def _mask(self, worlds: Worlds) -> Bool[Tensor, " world"]:
-        mask = torch.zeros_like(self._is_new)
+        mask = torch.zeros_like(self.is_new)
         mask[slice(None) if worlds is None else worlds] = True
         return mask
 
