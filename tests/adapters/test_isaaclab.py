@@ -13,7 +13,8 @@ from types import ModuleType
 import pytest
 import torch
 import warp as wp
-from newton_host import DEPTH, LOAD, Host, document
+from newton_host import Host
+from scene_of_adapters import DEPTH, LOAD, document
 
 from tgdsl.adapters.newton import SensorTactile
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 import warp as wp
 from newton.sensors import SensorContact
-from newton_host import DEPTH, LOAD, SCENE, SOLVERS, WORLDS, Host, document
+from newton_host import SOLVERS, WORLDS, Host
+from scene_of_adapters import DEPTH, LOAD, SCENE, document
 
 from tgdsl.adapters.newton import SensorTactile
 from tgdsl.errors import SimulationError, StateError

@@ -286,11 +286,10 @@ class BatchSimulation(Simulation):
         return self._touch.read_few(state, rows, self.num_envs)
 
     def _open_device(self, device: str, options: SimOptions) -> torch.device:
-        try:
-            importlib.import_module("mujoco.batch")
-        except ImportError as error:
+        if tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 17):
             problem = f"MuJoCo {mujoco.__version__} has no `mujoco.batch`, by which tgdsl simulates on a CPU"
-            raise SimulationError(f'{problem}: pip install "mujoco>=3.17"') from error
+            raise SimulationError(f'{problem}: pip install "mujoco>=3.17"')
+        importlib.import_module("mujoco.batch")
         if unknown := [word for word in options.get("per_env", ()) if word not in PER_ENV]:
             hint = did_you_mean(unknown[0], PER_ENV, "words")
             raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {hint}')
