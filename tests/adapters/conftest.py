@@ -8,4 +8,4 @@ collect_ignore = [f"test_{name}.py" for name, host in NEEDS.items() if host in M
 
 
 def pytest_report_header() -> list[str]:
-    return [f"not installed, so not tested: {name} (make test-adapters)" for name in MISSING]
+    return [f"not installed here, so not tested: {name}" for name in MISSING]

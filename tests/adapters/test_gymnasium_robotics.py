@@ -18,7 +18,8 @@ def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
     exec(lines, names)
     touch, readings = names["touch"], names["readings"]
     model, data = names["env"].model, names["env"].data
-    net = {pair.link: np.zeros(3) for pair in touch.inputs.pairs}
+    (links,) = (output.bodies for output in touch.outputs if output.name == "tips")
+    net = {link: np.zeros(3) for link in links}
     assert len(net) == 5 and readings["skin"].shape[1] == 100
     for i in range(data.ncon):
         wrench, contact = np.zeros(6), data.contact[i]
