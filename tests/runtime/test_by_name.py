@@ -140,3 +140,15 @@ def test_a_world_that_an_engine_does_not_list_is_at_rest():
     assert fields["body_quat"][:, 1].tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
     assert not any(fields[name][:, 1].any() for name in ("body_pos", "body_linvel", "body_angvel"))
     assert fields["body_pos"][:, 0].tolist() == [[1.0] * 3] * 2
+
+
+def test_bodies_of_one_name_are_refused():
+    inputs, places = Inputs(("body_pos",), ("box",), (), {}, 0), torch.zeros(1, 2, 4)
+    with pytest.raises(SimulationError, match=re.escape('the scene has 2 bodies "a/box"; give each a name of its own')):
+        tgdsl.bodies_by_name(inputs, ["a/box", "a/box"], places[..., :3], places)
+    with pytest.raises(SimulationError, match="this module reads body_linvel, expected all arguments"):
+        tgdsl.bodies_by_name(Inputs(("body_linvel",), ("box",), (), {}, 0), ["box"], places[:, :1, :3], places[:, :1])
+    with pytest.raises(SimulationError, match="linvel_at is given without angvel"):
+        tgdsl.bodies_by_name(
+            inputs, ["box"], *[places[:, :1, :3], places[:, :1], places[:, :1, :3]], linvel_at=places[:, :1, :3]
+        )

@@ -118,8 +118,7 @@ class SensorTactile:
             rows = {name: values[: int(contacts.rigid_contact_count.numpy()[0])] for name, values in rows.items()}
         is_filled = torch.arange(len(rows["normal"]), device=self.touch.device) < wp.to_torch(contacts.rigid_contact_count)
         shapes = torch.where(is_filled[:, None], torch.stack([rows["shape0"], rows["shape1"]], dim=1).long(), 0)
-        of_world = torch.eye(7, device=self.touch.device)[6:]
-        poses = torch.cat([wp.to_torch(state.body_q), of_world])
+        poses = torch.cat([wp.to_torch(state.body_q), torch.eye(7, device=self.touch.device)[6:]])  # the world's at the end
         pose = poses[self._shape_body[shapes]]
         local = torch.stack([rows["point0"] + rows["offset0"], rows["point1"] + rows["offset1"]], dim=1)
         points = pose[..., :3] + rotated(pose[..., [6, 3, 4, 5]], local)

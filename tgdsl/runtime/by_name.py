@@ -74,7 +74,9 @@ def bodies_by_name(
     """
     if quat_order == "xyzw":
         quat = quat[..., [3, 0, 1, 2]]
-    if linvel is not None and angvel is not None and linvel_at is not None:
+    if linvel is not None and linvel_at is not None:
+        if angvel is None:
+            raise SimulationError("linvel_at is given without angvel, which takes velocities to the origin")
         linvel = linvel - torch.linalg.cross(angvel, rotated(quat, linvel_at.expand_as(linvel)))
     fields = {"body_pos": pos, "body_quat": quat, "body_linvel": linvel, "body_angvel": angvel}
     missing = [name for name in fields if name in inputs.fields and fields[name] is None]
@@ -95,7 +97,10 @@ def bodies_by_name(
 
 @functools.lru_cache(maxsize=64)
 def _body_index(bodies: tuple[str, ...], names: tuple[str, ...], device: torch.device) -> Int[Tensor, " body"]:
-    return torch.tensor([index_of(body, names, "body", "bodies") for body in bodies], dtype=torch.int64, device=device)
+    ids = [index_of(body, names, "body", "bodies") for body in bodies]
+    if twice := [names[i] for i in ids if names.count(names[i]) > 1]:
+        raise SimulationError(f'the scene has {names.count(twice[0])} bodies "{twice[0]}"; give each a name of its own')
+    return torch.tensor(ids, dtype=torch.int64, device=device)
 
 
 class Geoms(NamedTuple):
@@ -243,17 +248,18 @@ def contacts_by_pair(
     if "contact_found" in inputs.fields:
         fields["contact_found"] = pos.new_zeros(bins + 1).index_add_(0, key, torch.ones_like(forces[:, 0]))[:-1]
         fields["contact_found"] = fields["contact_found"].view(num_envs, -1)
-    slotted = {
-        "contact_pos": on_link(pos, torch.ones_like(sign)),
-        "contact_normal": on_link(normal, sign),
-        "contact_force": forces,
-        "contact_torque": torch.zeros_like(forces) if torque is None else on_link(torque, acting),
-    }
-    slot = _ranks(key)
-    place = torch.where((key < bins) & (slot < inputs.slots), key * inputs.slots + slot, bins * inputs.slots)
-    for name in (name for name in SLOT_FIELDS if name in inputs.fields):
-        filled = pos.new_zeros(bins * inputs.slots + 1, 3).index_copy_(0, place, slotted[name])
-        fields[name] = filled[:-1].view(num_envs, -1, inputs.slots, 3)
+    if wanted := [name for name in SLOT_FIELDS if name in inputs.fields]:
+        slotted = {
+            "contact_pos": on_link(pos, torch.ones_like(sign)),
+            "contact_normal": on_link(normal, sign),
+            "contact_force": forces,
+            "contact_torque": torch.zeros_like(forces) if torque is None else on_link(torque, acting),
+        }
+        slot = _ranks(key)
+        place = torch.where((key < bins) & (slot < inputs.slots), key * inputs.slots + slot, bins * inputs.slots)
+        for name in wanted:
+            filled = pos.new_zeros(bins * inputs.slots + 1, 3).index_copy_(0, place, slotted[name])
+            fields[name] = filled[:-1].view(num_envs, -1, inputs.slots, 3)
     return {name: value[:, row_of_pair] for name, value in fields.items()}
 
 
