@@ -97,7 +97,7 @@ IN_FUNCTIONS = {
     ("runtime.warp.stream", "warp"),
     ("surfaces.meshlab", "pymeshlab"),
 }
-"""Where warp, an extra, and pymeshlab, which is GPL-3, are imported: inside functions, and nowhere else."""
+"""Where warp, an extra, and pymeshlab, which is GPL-3, are imported: inside functions, and nowhere else but in adapters to simulators on warp."""
 
 
 def places(*libraries: str) -> set[tuple[str, str, bool]]:
@@ -157,7 +157,8 @@ def test_foreign_libraries_are_imported_in_their_places():
             foreign = {room_of(imported) for imported, _ in imports(file)}
             assert not foreign & {"mujoco", "mujoco_warp", "ruamel", "pymeshlab"}, name
             assert name.startswith(CLAMPED) or not foreign & {"trimesh", "igl", "skfem"}, name
-    assert places("warp", "mujoco_warp", "pymeshlab") == {(*place, True) for place in IN_FUNCTIONS}
+    heavy = {place for place in places("warp", "mujoco_warp", "pymeshlab") if not place[0].startswith("adapters.")}
+    assert heavy == {(*place, True) for place in IN_FUNCTIONS}
     assert not {name for name, _, inside in places("pxr") if not inside}, (
         "pxr takes a quarter of a second: import it in functions"
     )

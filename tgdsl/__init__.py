@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from tgdsl.module.taxels.identity import check_taxels as check_taxels
     from tgdsl.rl.env import TouchEnv
     from tgdsl.runtime.batch.simulation import BatchSimulation
+    from tgdsl.runtime.by_name import Geoms as Geoms
+    from tgdsl.runtime.by_name import bodies_by_name as bodies_by_name
+    from tgdsl.runtime.by_name import contacts_by_pair as contacts_by_pair
     from tgdsl.runtime.connect import connect as connect
     from tgdsl.runtime.read import read_mujoco as read_mujoco
     from tgdsl.runtime.read import read_warp as read_warp
@@ -45,6 +48,7 @@ _PLACES = {
     "ArtifactError": "errors",
     "BatchSimulation": "runtime.batch.simulation",
     "FileError": "errors",
+    "Geoms": "runtime.by_name",
     "HandError": "errors",
     "ObservationError": "errors",
     "RobotError": "errors",
@@ -57,9 +61,11 @@ _PLACES = {
     "TgdslError": "errors",
     "TouchEnv": "rl.env",
     "WarpSimulation": "runtime.warp",
+    "bodies_by_name": "runtime.by_name",
     "check_taxels": "module.taxels.identity",
     "compile": "tuning.compile",
     "connect": "runtime.connect",
+    "contacts_by_pair": "runtime.by_name",
     "instrument": "compiler.scene",
     "load": "module.artifact",
     "read_mujoco": "runtime.read",
@@ -72,6 +78,7 @@ __all__ = [
     "ArtifactError",
     "BatchSimulation",
     "FileError",
+    "Geoms",
     "HandError",
     "ObservationError",
     "RobotError",
@@ -84,9 +91,11 @@ __all__ = [
     "TgdslError",
     "TouchEnv",
     "WarpSimulation",
+    "bodies_by_name",
     "check_taxels",
     "compile",
     "connect",
+    "contacts_by_pair",
     "instrument",
     "load",
     "read_mujoco",

@@ -58,7 +58,7 @@ def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
     (folder.parent / "package.xml").write_text("<package format='3'><name>hand_description</name></package>")
     wedge().export(folder / "wedge.stl")
     model = load_model(path)
-    assert model.is_urdf
+    assert model.is_rounded
     rotation = Rotation.from_euler("xyz", [0.3, -0.4, 0.5]).as_matrix()
     expected = (wedge().vertices * 1e-3) @ rotation.T + [0.01, -0.02, 0.03]
     assert nearest(trimesh_of(model, "palm").vertices, expected) < MESH_TOLERANCE
@@ -70,7 +70,7 @@ def test_urdf_primitives_and_joints(tmp_path):
     links = link_of("base", "<box size='.02 .04 .06'/>") + link_of("a", "<cylinder radius='.01' length='.04'/>")
     path = urdf_of(tmp_path, links + joint_of("j", "base", "a", "revolute"), "hand.xml")  # told by its root, not its name
     model = load_model(path)
-    assert model.is_urdf
+    assert model.is_rounded
     assert [geom.shape for geom in model.geoms] == ["box", "cylinder"]
     np.testing.assert_allclose(trimesh_of(model, "base").extents, [0.02, 0.04, 0.06])
     np.testing.assert_allclose(trimesh_of(model, "a").extents, [0.02, 0.02, 0.04], rtol=2e-3)

@@ -1,1 +1,28 @@
 """Touch in other people's simulators: a file each, which imports the simulator that it is for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+from tgdsl.errors import SimulationError
+from tgdsl.module.artifact import load
+from tgdsl.module.module import TactileModule
+from tgdsl.tuning.compile import compile
+
+Document = str | PathLike[str] | Mapping[str, Any]
+
+
+def module_of(document: Document, host: str) -> TactileModule:
+    """Compile a document, or load an artefact (`.safetensors`), for a host that is read once a control step.
+
+    Raises:
+        SimulationError: If the module is advanced at each physics step.
+    """
+    is_artifact = not isinstance(document, Mapping) and str(document).endswith(".safetensors")
+    touch = load(document) if is_artifact else compile(document)  # pyright: ignore[reportArgumentType]
+    if touch.inputs.substeps > 1:
+        what = f"this module is advanced at {touch.inputs.substeps} physics steps a call"
+        raise SimulationError(f"{what}, and {host} reads it once a control step")
+    return touch

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from os import PathLike
 from typing import Any
 
 import mujoco
@@ -19,12 +18,11 @@ from jaxtyping import Bool, Float
 from mjlab.sensor import Sensor, SensorCfg
 from torch import Tensor
 
-from tgdsl.errors import SimulationError, TgdslError, did_you_mean
-from tgdsl.module.artifact import load
+from tgdsl.adapters import Document, module_of
+from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.read import read_warp
-from tgdsl.tuning.compile import compile
 
 
 @dataclass
@@ -38,15 +36,17 @@ class TouchSensorCfg(SensorCfg):
         names: Names in mjlab's scene by those in the document, where they differ otherwise.
     """
 
-    document: str | PathLike[str] | Mapping[str, Any] = field(kw_only=True)
+    document: Document = field(kw_only=True)
     prefix: str = ""
     names: Mapping[str, str] = field(default_factory=dict)
 
     def build(self) -> TouchSensor:
-        """Compile the document, or load the artefact."""
-        is_artifact = not isinstance(self.document, Mapping) and str(self.document).endswith(".safetensors")
-        touch = load(self.document) if is_artifact else compile(self.document)  # pyright: ignore[reportArgumentType]
-        return TouchSensor(self, touch)
+        """Compile the document, or load the artefact.
+
+        Raises:
+            SimulationError: If the module is advanced at each physics step.
+        """
+        return TouchSensor(self, module_of(self.document, "mjlab"))
 
 
 class TouchSensor(Sensor):
@@ -73,11 +73,8 @@ class TouchSensor(Sensor):
         """Look up the document's names in the compiled scene.
 
         Raises:
-            SimulationError: If the scene lacks one, or several names match it; if the module is advanced at each physics step.
+            SimulationError: If the scene lacks one, or several names match it.
         """
-        if self.touch.inputs.substeps > 1:
-            what = f"this module is advanced at {self.touch.inputs.substeps} physics steps a call"
-            raise SimulationError(f"{what}, and mjlab reads it once a control step")
         self.touch.to(device)
         inputs = self.touch.inputs.renamed(self._cfg.names, prefix=self._cfg.prefix)
         self._scene = (mj_model, model.struct, data.struct, inputs)

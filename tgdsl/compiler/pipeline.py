@@ -20,13 +20,14 @@ from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SpecError, TgdslError, did_you_mean, listed
 from tgdsl.formats.mjcf import xml_files
+from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import Unfelt
 from tgdsl.placement.reach import unfelt
 from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable
 from tgdsl.schema.load import load
-from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.loaded import GIVEN, Loaded
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
@@ -65,6 +66,7 @@ def compile_plan(
     progress: Progress | None = None,
     sensors: Collection[str] | None = None,
     choice: Choice = UNCHOSEN,
+    scene: Model | None = None,
 ) -> Plan:
     """Return the Plan of a document.
 
@@ -75,6 +77,7 @@ def compile_plan(
         progress: Called with a line of text for each long job.
         sensors: Names of the document's sensors that are wanted; default: all.
         choice: What was chosen where sensors have an `accuracy`: see `tuning.compile`, which chooses.
+        scene: The scene, in place of the document's.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
@@ -82,17 +85,17 @@ def compile_plan(
         TgdslError: If a sensor has an `accuracy` and nothing was chosen.
     """
     all_kinds, tell = known_kinds(kinds), progress or silent
-    loaded = load(document, {**(overrides or {}), **choice.changes}, all_kinds, sensors=sensors)
-    resolved = resolve(loaded, tell)
-    _check_chosen(loaded, choice)
+    loaded = load(document, {**(overrides or {}), **choice.changes}, all_kinds, sensors=sensors, has_scene=scene is not None)
+    resolved = resolve(loaded, tell, None if scene is None else models_of(loaded, scene))
+    _check_chosen(loaded, choice, scene)
     written = _written(document, overrides, all_kinds, sensors) if choice.changes else loaded
-    plan = lower.plan(loaded, resolved, all_kinds, _origin(written), tell)
+    plan = lower.plan(loaded, resolved, all_kinds, _origin(written, scene), tell)
     tell("compiling the scene")
-    scene = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
-    return choice.noted(dataclasses.replace(plan, scene=scene))
+    kept = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
+    return choice.noted(dataclasses.replace(plan, scene=kept))
 
 
-def _check_chosen(loaded: Loaded, choice: Choice) -> None:
+def _check_chosen(loaded: Loaded, choice: Choice, scene: Model | None) -> None:
     """Refuse a document some `accuracy` of which nobody has looked at.
 
     Raises:
@@ -101,7 +104,8 @@ def _check_chosen(loaded: Loaded, choice: Choice) -> None:
     names = [name for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None and name not in choice.notes]
     if names:
         problem = f"{listed(names)}: `accuracy` takes a run of the scene"
-        raise TgdslError(f"{loaded.source.file}: {problem}; compile with `tgdsl.compile`, or set it to null")
+        way = "compile with `tgdsl.compile`" if scene is None else "compile without `scene=`"
+        raise TgdslError(f"{loaded.source.file}: {problem}; {way}, or set it to null")
 
 
 def _written(
@@ -182,17 +186,17 @@ def all_layouts(
     return spec, placed(document, bare, resolutions or tuple(spec.resolutions)).layouts
 
 
-def _origin(loaded: Loaded) -> Origin:
-    robot = loaded.robot_file
-    assert robot is not None
-    digest = hashlib.sha256()
-    for path in xml_files(robot):
+def _origin(loaded: Loaded, scene: Model | None) -> Origin:
+    robot, digest = loaded.robot_file, hashlib.sha256()
+    for path in () if robot is None else xml_files(robot):
         digest.update(path.read_bytes())
+    if scene is not None:
+        digest.update(scene.mjcf.encode())
     parts = [loaded.source.value, loaded.layout.source.value if loaded.layout else None]
     text = json.dumps(parts, sort_keys=True, default=str)
     return Origin(
         document_sha256=hashlib.sha256(text.encode()).hexdigest(),
-        robot=portable(robot),
+        robot=GIVEN if robot is None else portable(robot),
         robot_sha256=digest.hexdigest(),
         resolution=loaded.resolution or "",
         versions={"tgdsl": version("tgdsl"), "mujoco": mujoco.__version__},

@@ -18,6 +18,7 @@ from tgdsl.errors import LowerError, Problem, RobotError, SampleError, SpecError
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
 from tgdsl.files.find import colliders_file, is_file, robot_names
+from tgdsl.formats.built import differences
 from tgdsl.formats.joints import RobotJoints, robot_joints
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
@@ -27,7 +28,7 @@ from tgdsl.plan.scene import Collider, SceneObject
 from tgdsl.scene.colliders import with_colliders
 from tgdsl.scene.contact_bits import bits_that_meet
 from tgdsl.schema.colliders import load_colliders
-from tgdsl.schema.loaded import Loaded, LoadedLayout
+from tgdsl.schema.loaded import GIVEN, Loaded, LoadedLayout
 from tgdsl.schema.select import select
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors.base import SensorSpec
@@ -303,11 +304,18 @@ def _unlisted(robot: Model, scene: Model, listed: Collection[str], rigid: Collec
             yield name, "not listed under `objects`" if model.body(i).name else "no name, so `objects` cannot list it"
 
 
-def models_of(loaded: Loaded) -> Models:
-    """Load the robot, and the scene if there is one; a file that does not exist is a mistake of the document."""
+def models_of(loaded: Loaded, given: Model | None = None) -> Models:
+    """Load the robot, and the scene if there is one; a file that does not exist is a mistake of the document.
+
+    Args:
+        loaded: The document.
+        given: The scene. The models that the document names must be those in it.
+    """
     model_name = loaded.spec.robot.model
     robot = scene = None
-    if loaded.robot_file is None:
+    if given is not None and model_name == GIVEN:
+        robot = given
+    elif loaded.robot_file is None:
         hint = (
             did_you_mean(model_name, robot_names(), "robots")
             if "/" not in model_name
@@ -318,20 +326,29 @@ def models_of(loaded: Loaded) -> Models:
         robot = load_model(loaded.robot_file)
     if loaded.spec.scene is None:
         is_faulty = loaded.raw(("scene",)) is not None  # and its mistake is reported already
-        return Models(robot, None if is_faulty else robot)
-    scene_file = loaded.folder / loaded.spec.scene.model
-    if is_file(scene_file):
-        scene = load_model(scene_file)
+        scene = None if is_faulty else robot
+    elif is_file(loaded.folder / loaded.spec.scene.model):
+        scene = load_model(loaded.folder / loaded.spec.scene.model)
     else:
         loaded.note(("scene", "model"), f'there is no file "{loaded.spec.scene.model}"', "paths are relative to this document")
-    return Models(robot, scene)
+    if given is None:
+        return Models(robot, scene)
+    for key, model in {"robot": robot, "scene": scene if scene is not robot else None}.items():
+        if model is not None and model is not given and (found := list(differences(model, given))):
+            problem = f"this model is not the one in the given scene: {listed(found, 4)}"
+            loaded.note((key, "model"), problem, "without `model`, names are those of the scene")
+    return Models(robot, given)
 
 
 def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
     """Return the primitive colliders that the document asks for: those of a file beside the robot's."""
+    place = ("robot", "collision")
+    if loaded.spec.robot.collision == "primitive" and loaded.spec.robot.model == GIVEN:
+        problem = "colliders lie beside a robot's file, and this document names none"
+        loaded.note(place, problem, "expected `collision: mesh`, or `robot: {model: …}`")
     if loaded.spec.robot.collision != "primitive" or loaded.robot_file is None:
         return ()
-    place, file = ("robot", "collision"), colliders_file(loaded.robot_file)
+    file = colliders_file(loaded.robot_file)
     if file is None:
         beside = loaded.robot_file.with_name("colliders.yaml")
         problem = f'"{loaded.spec.robot.model}" has no primitive colliders: there is no file {beside}'

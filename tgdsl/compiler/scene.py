@@ -266,5 +266,5 @@ def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
     """
     with muted_mujoco():
         loaded = instrument(model.spec.copy(), inputs).compile()
-    if names := differing_fields(loaded, again, model.is_urdf):
+    if names := differing_fields(loaded, again, model.is_rounded):
         raise RobotError(f"{model.file}: this scene cannot be kept faithfully: in MuJoCo's model {listed(names)} would differ")

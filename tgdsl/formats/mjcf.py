@@ -29,7 +29,7 @@ def read_mjcf(path: Path) -> Model:
     refuse_unreadable(path, spec)
     rewritten = rewrite_meshes(spec)
     compiled = spec.copy().compile()  # of which the spec remembers nothing, such as hulls that other geoms do not need
-    return Model(path, spec, compiled, is_urdf=False, rewritten=rewritten)
+    return Model(path, spec, compiled, is_rounded=False, rewritten=rewritten)
 
 
 def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:

@@ -41,15 +41,15 @@ class Model:
         file: The file it came from.
         spec: MuJoCo's editable model.
         compiled: MuJoCo's compiled model.
-        is_urdf: Whether it is URDF.
-        mjcf: The MJCF that it was turned into, if it is URDF or USD; else empty.
+        is_rounded: Whether `mjcf` has six digits, as of URDF.
+        mjcf: The MJCF that it was turned into, if its file is no MJCF; else empty.
         rewritten: Files of meshes that `spec` has in memory, in another format, by their names there.
     """
 
     file: Path
     spec: mujoco.MjSpec
     compiled: mujoco.MjModel
-    is_urdf: bool
+    is_rounded: bool
     mjcf: str = ""
     rewritten: Mapping[str, Path] = field(default_factory=dict)
 

@@ -47,7 +47,7 @@ def read_urdf(path: Path) -> Model:
         compiled = spec.compile()
         pairs = listed([f"{base} and {link}" for base, link in overlaps])
         warnings.warn(f"{path}: links that overlap where a joint connects them do not collide: {pairs}", stacklevel=4)
-    return Model(path, spec, compiled, is_urdf=True, mjcf=mjcf_of(spec), rewritten=rewritten)
+    return Model(path, spec, compiled, is_rounded=True, mjcf=mjcf_of(spec), rewritten=rewritten)
 
 
 def _overlaps_with_base(model: mujoco.MjModel) -> list[tuple[str, str]]:

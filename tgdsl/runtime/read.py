@@ -1,4 +1,4 @@
-"""States of scenes that others step with MuJoCo or MuJoCo Warp, gathered by the readers of tgdsl's own simulations."""
+"""States of scenes that others step with MuJoCo or MuJoCo Warp."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.batch.simulation import ArrayReader
+from tgdsl.runtime.by_name import Geoms, contacts_by_pair
 from tgdsl.runtime.simulators.fields import FORCES, MOVED, STATE_ARRAYS
+from tgdsl.runtime.simulators.model_ids import model_geoms
 from tgdsl.runtime.warp.contacts import PairContacts
 from tgdsl.runtime.warp.simulation import StateReader, view
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
 
+_CONTACT_ARRAYS = ("geom", "pos", "dist", "includemargin", "efc_address")
 _WARP_ARRAYS = ("time", *(name for name in STATE_ARRAYS if name != "sensordata"), *MOVED.values(), *FORCES.values())
 
 
@@ -37,7 +40,7 @@ def read_mujoco(
 
     Args:
         touch: The module that will read the state.
-        model: The scene. Contacts are read of its sensors: `tgdsl.instrument` adds them before it is compiled.
+        model: The scene. It needs no contact sensors.
         data: Its data, or the data of several environments.
         inputs: `touch.inputs.renamed(…)` where names differ; by default a name may also be the end of one name in the scene
             after a slash, as "palm" is of "robot/palm".
@@ -46,14 +49,43 @@ def read_mujoco(
         The state, (env, …), float64, on the module's device.
 
     Raises:
-        SimulationError: If the scene lacks a body, a joint, an actuator or a contact sensor, or several names match one.
+        SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one.
     """
     own = inputs or touch.inputs
-    reader = _reader(touch, own, (model,), lambda: ArrayReader(own, model))
+    reader, geoms = _reader(touch, own, (model,), lambda: (ArrayReader(own, model), model_geoms(model)))
     envs: list[mujoco.MjData] = list(data) if isinstance(data, Sequence) else [data]
-    fields: dict[str, Any] = reader.read({name: np.stack([getattr(env, name) for env in envs]) for name in reader.names})
+    contacts = {name: value.numpy() for name, value in _contacts(own, model, geoms, envs).items()}
+    fields: dict[str, Any] = reader.read(
+        {name: np.stack([getattr(env, name) for env in envs]) for name in reader.names}, contacts
+    )
     time = torch.tensor([env.time for env in envs], dtype=torch.float64)
     return SceneState(**fields, time=time).to(touch.device)
+
+
+def _contacts(inputs: Inputs, model: mujoco.MjModel, geoms: Geoms, envs: Sequence[mujoco.MjData]) -> dict[str, torch.Tensor]:
+    """Return the contacts of some environments by pair; those beyond the margin, which a `gap` adds, are none."""
+    every = [env.contact for env in envs]
+    frames = np.concatenate([contact.frame for contact in every]).reshape(-1, 3, 3)
+    wrenches = np.zeros((len(frames), 6))
+    places = [(env, i) for env in envs for i in range(env.ncon)]
+    for (env, i), wrench in zip(places, wrenches, strict=True):
+        mujoco.mj_contactForce(model, env, i, wrench)
+    in_world = np.einsum("nvi,nij->nvj", wrenches.reshape(-1, 2, 3), frames)
+    column = {name: np.concatenate([getattr(contact, name) for contact in every]) for name in _CONTACT_ARRAYS}
+    is_contact = (column["dist"] < column["includemargin"]) | (column["efc_address"] >= 0)
+    tensor = torch.from_numpy
+    return contacts_by_pair(
+        inputs,
+        geoms,
+        tensor(column["geom"]),
+        pos=tensor(column["pos"]),
+        normal=tensor(frames[:, 0]),
+        force=tensor(in_world[:, 0]),
+        torque=tensor(in_world[:, 1]),
+        env=torch.repeat_interleave(torch.tensor([env.ncon for env in envs])),
+        num_envs=len(envs),
+        is_contact=tensor(is_contact),
+    )
 
 
 def read_warp(

@@ -16,7 +16,7 @@ from tgdsl.fields.models import Usual
 from tgdsl.files import find
 from tgdsl.schema import yaml
 from tgdsl.schema.document import document_model
-from tgdsl.schema.loaded import Loaded, LoadedLayout
+from tgdsl.schema.loaded import GIVEN, Loaded, LoadedLayout
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.schema.references import reference_problems
 from tgdsl.schema.validation import validate
@@ -103,6 +103,7 @@ def load(
     kinds: tuple[Kind, ...] = KINDS,
     needs_sensors: bool = True,
     sensors: Collection[str] | None = None,
+    has_scene: bool = False,
 ) -> Loaded:
     """Read a document and its layout.
 
@@ -112,6 +113,7 @@ def load(
         kinds: The sensor kinds that the document may use.
         needs_sensors: Whether it is a mistake to have none.
         sensors: Names of those that are wanted, the others being left out but for those that they read; default: all.
+        has_scene: Whether a scene is given: the document then needs no model.
 
     Returns:
         The document with the problems found so far: call `raise_problems` when all stages have added theirs.
@@ -134,6 +136,8 @@ def load(
         raise SpecError([source.problem(("task",), problem, hint, on_key=True)])
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
+    if has_scene and source.get(("robot", "model")) is None:
+        source.set("robot.model", GIVEN)
     if sensors is not None:
         source.keep("sensors", _with_upstream(source.value.get("sensors"), sensors, kinds))
     model = document_model(kinds, needs_sensors)

@@ -12,6 +12,9 @@ from tgdsl.schema.document import Spec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.schema.yaml import Path, Source
 
+GIVEN = "<scene>"
+"""The robot's model of a document that names none, where a scene is given."""
+
 
 @dataclass(kw_only=True)
 class Section:

@@ -11,6 +11,7 @@ from tgdsl.compiler import pipeline
 from tgdsl.compiler.pipeline import Document
 from tgdsl.console.progress import Progress
 from tgdsl.errors import TgdslError
+from tgdsl.formats.built import built_scene
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import Kind
@@ -46,6 +47,7 @@ def compile(
     dtype: torch.dtype | str = torch.float32,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    scene: Any = None,
 ) -> TactileModule:
     """Compile a document to a module.
 
@@ -61,13 +63,16 @@ def compile(
         device: Where the module lives.
         progress: Called with a line for each long job, such as "object mug: distances", each time that something begins; meshes
             that are met for the first time take seconds, sensors with an `accuracy` a run of the scene.
+        scene: A scene that is built already, in place of the document's: an `mujoco.MjSpec`, an `mujoco.MjModel` or a
+            `pxr.Usd.Stage`. The document then needs no model: it has the scene's names. Models that it names must be those in
+            the scene.
 
     Returns:
         The module, not yet compiled by torch: call its `compile()` for fused kernels.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column; an `accuracy` that nothing holds.
-        RobotError: If a robot or scene file cannot be read, or has something unsupported.
+        RobotError: If a robot or scene cannot be read, or has something unsupported.
         TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides are
             no mapping.
     """
@@ -75,5 +80,8 @@ def compile(
     if not isinstance(overrides, Mapping | None):
         raise TgdslError(f"overrides are a mapping from dotted paths to values, found {type(overrides).__name__}")
     all_overrides = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
-    plan = compile_plan(document, all_overrides, kinds, progress, sensors)
+    if scene is None:
+        plan = compile_plan(document, all_overrides, kinds, progress, sensors)
+    else:
+        plan = pipeline.compile_plan(document, all_overrides, kinds, progress, sensors, scene=built_scene(scene))
     return TactileModule(plan, known_kinds(kinds), dtype).to(device)

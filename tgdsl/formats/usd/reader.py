@@ -80,7 +80,7 @@ def read_usd(path: Path) -> Model:
     """
     text = usd_to_mjcf(path)
     spec = mujoco.MjSpec.from_string(text)
-    return Model(path, spec, spec.compile(), is_urdf=False, mjcf=text)
+    return Model(path, spec, spec.compile(), is_rounded=False, mjcf=text)
 
 
 def usd_to_mjcf(path: Path) -> str:

@@ -312,17 +312,16 @@ def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 class ArrayReader:
-    """Gathers the fields of a state that are poses, velocities, contacts or joints from MuJoCo's arrays (env, …), by name."""
+    """Gathers the fields of a state that are poses, velocities or joints from MuJoCo's arrays (env, …), by name."""
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel):
         self._bodies = BodyFields(inputs, model, index=np.asarray, take=_rows, cross=_cross)
-        self._contacts = ContactSensors(model, inputs)
         self.joints = JointColumns.of(inputs, model)
         self.names = tuple(dict.fromkeys((*STATE_ARRAYS, *self.joints.fields.values())))
 
-    def read(self, arrays: Mapping[str, Array], kept: Mapping[str, Array] | None = None) -> dict[str, torch.Tensor]:
-        """Return the fields, each an array of its own; those that are `kept`, by field, are taken as they are."""
-        values = self._bodies.read(arrays) | self._contacts.read(arrays["sensordata"]) | dict(kept or {})
+    def read(self, arrays: Mapping[str, Array], others: Mapping[str, Array]) -> dict[str, torch.Tensor]:
+        """Return the fields, each an array of its own; `others`, by field, are taken as they are."""
+        values = self._bodies.read(arrays) | dict(others)
         now = {name: array for name, array in self.joints.fields.items() if name not in values}
         values |= {name: self.joint_values(name, arrays[array]) for name, array in now.items()}
         return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in values.items()}
@@ -341,7 +340,7 @@ class BatchReader:
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, batch: mujoco.batch.Batch):
         self._batch = batch
-        self._reader = ArrayReader(inputs, model)
+        self._reader, self._contacts = ArrayReader(inputs, model), ContactSensors(model, inputs)
         for name in self._reader.names:
             batch.bind(name)  # an array is filled only by calls that come after its first use
         self._kept = {name: self._joints_now(name) for name in self._reader.joints.moved}
@@ -360,7 +359,8 @@ class BatchReader:
         """Return the fields of some environments (default: all), (env, …), each an array of its own."""
         chosen = slice(None) if rows is None else rows
         live = {name: getattr(self._batch, name)[chosen] for name in self._reader.names}
-        return self._reader.read(live, {name: kept[chosen].copy() for name, kept in self._kept.items()})
+        kept = {name: kept[chosen].copy() for name, kept in self._kept.items()}
+        return self._reader.read(live, self._contacts.read(live["sensordata"]) | kept)
 
     def _joints_now(self, name: str, rows: SomeRows = None) -> Array:
         array = getattr(self._batch, self._reader.joints.fields[name])
@@ -402,11 +402,10 @@ class BatchSimulation(Simulation):
         return self._touch.read_few(state, rows, self.num_envs)
 
     def _open_device(self, device: str, options: SimOptions) -> torch.device:
-        try:
-            importlib.import_module("mujoco.batch")
-        except ImportError as error:
+        if tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 17):
             problem = f"MuJoCo {mujoco.__version__} has no `mujoco.batch`, by which tgdsl simulates on a CPU"
-            raise SimulationError(f'{problem}: pip install "mujoco>=3.17"') from error
+            raise SimulationError(f'{problem}: pip install "mujoco>=3.17"')
+        importlib.import_module("mujoco.batch")
         if unknown := [word for word in options.get("per_env", ()) if word not in PER_ENV]:
             hint = did_you_mean(unknown[0], PER_ENV, "words")
             raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {hint}')

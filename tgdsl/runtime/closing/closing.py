@@ -417,7 +417,7 @@ def closing_of(touch: TactileModule) -> Closing | str:
     """
     spec = SceneModels(touch.plan.scene, prepare=name_all).first()
     with muted_mujoco():
-        scene = Model(Path(touch.plan.origin.robot), spec, spec.compile(), is_urdf=False)
+        scene = Model(Path(touch.plan.origin.robot), spec, spec.compile(), is_rounded=False)
     if angles_are_misread(scene.compiled):
         problem = f"{touch.plan.origin.robot}: no hinge turns by more than 2π degrees"
         warnings.warn(f'{problem}: is `angle="radian"` missing in its <compiler>? The hand hardly moves', stacklevel=2)

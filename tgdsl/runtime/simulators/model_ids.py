@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Int
 
-from tgdsl.errors import SimulationError, did_you_mean, listed
-from tgdsl.plan.inputs import ContactPart
+from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.runtime.by_name import Geoms, index_of
 
 _ELEMENTS = {
     "body": ("nbody", "body", "bodies"),
@@ -37,16 +37,9 @@ def element_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     element = getattr(model, kind)
     try:
         return int(element(name).id)
-    except KeyError as error:
+    except KeyError:
         count, one, several = _ELEMENTS[kind]
-        known = [element(i).name for i in range(getattr(model, count))]
-        nested = [i for i, path in enumerate(known) if path.endswith(f"/{name}")]
-        if len(nested) == 1:
-            return nested[0]
-        if nested:
-            what = f'"{name}" may be any of the {several} {listed([known[i] for i in nested])}'
-            raise SimulationError(f"{what}; say which: touch.inputs.renamed({{{name!r}: {known[nested[0]]!r}}})") from error
-        raise SimulationError(f'the scene has no {one} "{name}"; {did_you_mean(name, known, several)}') from error
+        return index_of(name, [element(i).name for i in range(getattr(model, count))], one, several)
 
 
 def keyframe_id(model: mujoco.MjModel, name: str | None) -> int:
@@ -54,11 +47,11 @@ def keyframe_id(model: mujoco.MjModel, name: str | None) -> int:
     return -1 if name is None else element_id(model, "key", name)
 
 
-def part_geoms(model: mujoco.MjModel, part: ContactPart) -> Int[np.ndarray, " geom"]:
-    """Return the indices of the geoms of a part of an object or link."""
-    if part.kind == "geom":
-        return np.array([element_id(model, "geom", part.name)])
-    return geoms_of(model, element_id(model, "body", part.name), part.kind == "subtree")
+def model_geoms(model: mujoco.MjModel) -> Geoms:
+    """Return the names of a model's geoms, and of their bodies."""
+    bodies = [model.body(i).name or f"#{i}" for i in range(model.nbody)]
+    parents = tuple((bodies[i], bodies[model.body_parentid[i]]) for i in range(1, model.nbody))
+    return Geoms(tuple(bodies[i] for i in model.geom_bodyid), tuple(model.geom(i).name for i in range(model.ngeom)), parents)
 
 
 def geoms_of(model: mujoco.MjModel, body: int, with_below: bool) -> Int[np.ndarray, " geom"]:

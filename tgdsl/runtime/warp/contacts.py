@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
 from functools import reduce
 from importlib.metadata import version
 from typing import Any, no_type_check
@@ -23,9 +22,10 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.module.state import shape_of
-from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
+from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
-from tgdsl.runtime.simulators.model_ids import part_geoms
+from tgdsl.runtime.by_name import pair_rows
+from tgdsl.runtime.simulators.model_ids import model_geoms
 from tgdsl.runtime.warp.stream import libraries
 
 TRIED = ("3.11.0", "3.17.0")
@@ -82,28 +82,24 @@ class PairContacts:
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, num_envs: int, device: torch.device):
         wp, mjw = libraries()
         self._fields = [name for name in ("contact_found", *_VECTORS) if name in inputs.fields]
-        geoms = {name: _geoms(model, inputs.parts_of(name)) for name in inputs.bodies_of}
-        links = {link: i for i, link in enumerate(dict.fromkeys(pair.link for pair in inputs.pairs))}
-        pairs = [(geoms[pair.object], links[pair.link]) for pair in inputs.pairs]
-        rows = {pair: row for row, pair in enumerate(dict.fromkeys(pairs))}
+        rows = pair_rows(inputs, model_geoms(model))
         self._row_of_pair: Int[Tensor, " pair"] | None = None
-        if len(rows) < len(pairs):
-            self._row_of_pair = torch.tensor([rows[pair] for pair in pairs], dtype=torch.int64, device=device)
+        if rows.num_rows < len(inputs.pairs):
+            self._row_of_pair = torch.from_numpy(rows.row_of_pair).to(device)
         names = list(self._fields)
         if any(name in names for name in SLOT_FIELDS) and "contact_found" not in names:
             names.append("contact_found")  # it says which slot is free
-        shapes = {name: (num_envs, len(rows), *shape_of(name, inputs)[1:]) for name in names}
+        shapes = {name: (num_envs, rows.num_rows, *shape_of(name, inputs)[1:]) for name in names}
         # One piece of memory, which one call clears.
         self._memory = torch.zeros(sum(math.prod(shape) for shape in shapes.values()), dtype=torch.float32, device=device)
         pieces = self._memory.split([math.prod(shape) for shape in shapes.values()])
         self.arrays = {name: part.view(shape) for (name, shape), part in zip(shapes.items(), pieces, strict=True)}
         self._launch, self._kernel = wp.launch, _kernel(wp, mjw)
-        link_of = np.full(model.ngeom, len(links), dtype=np.int32)
-        for link, i in links.items():
-            link_of[list(_geoms(model, inputs.parts_of_link(link)))] = i
-        tables = (link_of, _row_table(rows, model.ngeom, len(links)))
         self._outputs: list[Any] = [
-            *(wp.array(table, dtype=int, device=wp.device_from_torch(device)) for table in tables),
+            *(
+                wp.array(table, dtype=int, device=wp.device_from_torch(device))
+                for table in (rows.link_of_geom, rows.row_of_geoms)
+            ),
             inputs.slots,
             wp.from_torch(self.arrays["contact_found"]) if "contact_found" in names else None,
             *(wp.from_torch(self.arrays[name], dtype=wp.vec3) if name in names else None for name in _VECTORS),
@@ -125,26 +121,6 @@ class PairContacts:
         """Return the fields that are wanted, each a tensor of its own."""
         rows = self._row_of_pair
         return {name: self.arrays[name].clone() if rows is None else self.arrays[name][:, rows] for name in self._fields}
-
-
-def _geoms(model: mujoco.MjModel, parts: Sequence[ContactPart]) -> tuple[int, ...]:
-    return tuple(np.unique(np.concatenate([part_geoms(model, part) for part in parts])).tolist())
-
-
-def _row_table(
-    rows: Mapping[tuple[tuple[int, ...], int], int], num_geoms: int, num_links: int
-) -> Int[np.ndarray, "layer geom link"]:
-    """Return the rows that contacts of an object's geom and a link belong to; −1 where there are no more, and of no link."""
-    none = np.full((num_geoms, num_links + 1), -1, dtype=np.int32)
-    layers: list[np.ndarray] = []
-    for (geoms, link), row in rows.items():
-        for geom in geoms:
-            free = next((layer for layer in layers if layer[geom, link] < 0), None)
-            if free is None:
-                free = none.copy()
-                layers.append(free)
-            free[geom, link] = row
-    return np.stack(layers or [none])
 
 
 def foreign_sensors(model: mujoco.MjModel, inputs: Inputs) -> Int[np.ndarray, " sensor"]:

@@ -98,7 +98,7 @@ def _define(writer: StageWriter, geom: int) -> tuple[Any, np.ndarray | None]:
 def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
     """Write a mesh's triangles as its file has them, and what MuJoCo makes of them."""
     model, mesh, u = writer.model, int(writer.model.geom_dataid[geom]), usd_modules()
-    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(_file_vertices(model, mesh)))
+    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(file_vertices(model, mesh)))
     first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     shape.CreateFaceVertexIndicesAttr(u.Vt.IntArray.FromNumpy(model.mesh_face[first : first + count].astype(np.int32).ravel()))
     shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
@@ -108,7 +108,7 @@ def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
     set_customs(shape.GetPrim(), MESH, lambda name: getattr(asset, name), lambda name: getattr(default, name))
 
 
-def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
+def file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
     """Return a mesh's vertices in the frame of its file [m], in float32 and in MuJoCo's order.
 
     MuJoCo moves them to the mesh's principal axes, which costs a last bit here and there; its hull of a symmetric mesh depends

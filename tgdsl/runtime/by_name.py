@@ -1,0 +1,274 @@
+"""Fields of a state from the arrays of any physics engine, by the names that it has for bodies and geoms.
+
+Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them, `slot` contacts per pair, `own` the engine's
+bodies, `contact` contacts of all environments in any order.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, did_you_mean, listed
+from tgdsl.geometry.rotations import rotated
+from tgdsl.plan.inputs import ContactPart, Inputs
+from tgdsl.quantities.contacts import SLOT_FIELDS
+
+
+def index_of(name: str, known: Sequence[str], one: str, several: str) -> int:
+    """Return the index of a name, or of the only one that ends in it after a slash.
+
+    Args:
+        name: The name, such as "palm", which is the end of "robot/palm".
+        known: Names of the scene's elements; equal ones count once.
+        one: What one element is called, such as "body".
+        several: What several are called.
+
+    Raises:
+        SimulationError: If there is none of that name, or several names end in it.
+    """
+    if name in known:
+        return known.index(name)
+    nested = list(dict.fromkeys(path for path in known if path.endswith(f"/{name}")))
+    if len(nested) == 1:
+        return known.index(nested[0])
+    if nested:
+        what = f'"{name}" may be any of the {several} {listed(nested)}'
+        raise SimulationError(f"{what}; say which: touch.inputs.renamed({{{name!r}: {nested[0]!r}}})")
+    raise SimulationError(f'the scene has no {one} "{name}"; {did_you_mean(name, list(dict.fromkeys(known)), several)}')
+
+
+def bodies_by_name(
+    inputs: Inputs,
+    names: Sequence[str],
+    pos: Float[Tensor, "env own 3"],
+    quat: Float[Tensor, "env own 4"],
+    linvel: Float[Tensor, "env own 3"] | None = None,
+    angvel: Float[Tensor, "env own 3"] | None = None,
+    *,
+    quat_order: Literal["wxyz", "xyzw"] = "wxyz",
+    linvel_at: Float[Tensor, "*env own 3"] | None = None,
+) -> dict[str, Float[Tensor, "env body ..."]]:
+    """Return the fields of a state that are poses and velocities of bodies.
+
+    Args:
+        inputs: What the module reads: `touch.inputs`, or `touch.inputs.renamed(…)` where names differ.
+        names: Names of the engine's bodies, in the order of its arrays. A name may also end in the module's, after a slash, as
+            "robot/palm" does. The body "world", if the module reads it and the engine has none, rests at the origin.
+        pos: Position of each body's frame, in the world [m].
+        quat: Orientation of each body.
+        linvel: Velocity of each body, in the world [m/s].
+        angvel: Angular velocity of each body, in the world [rad/s].
+        quat_order: The order of the numbers of `quat`.
+        linvel_at: The point of each body whose velocity `linvel` is, such as its centre of mass, in the body's frame [m];
+            default: the frame's origin.
+
+    Raises:
+        SimulationError: If the engine lacks a body, or several names match it.
+    """
+    if quat_order == "xyzw":
+        quat = quat[..., [3, 0, 1, 2]]
+    if linvel is not None and linvel_at is not None:
+        if angvel is None:
+            raise SimulationError("linvel_at is given without angvel, which takes velocities to the origin")
+        linvel = linvel - torch.linalg.cross(angvel, rotated(quat, linvel_at.expand_as(linvel)))
+    fields = {"body_pos": pos, "body_quat": quat, "body_linvel": linvel, "body_angvel": angvel}
+    missing = [name for name in fields if name in inputs.fields and fields[name] is None]
+    if missing:
+        raise SimulationError(f"this module reads {listed(missing)}, expected all arguments that these are made of")
+    needs_world = "world" in inputs.bodies and "world" not in names
+    index = _body_index(inputs.bodies, (*names, "world") if needs_world else tuple(names), pos.device)
+    result = {}
+    for name, value in fields.items():
+        if value is not None and name in inputs.fields:
+            if needs_world:
+                at_rest = torch.zeros_like(value[:, :1])
+                at_rest[..., 0] = name == "body_quat"
+                value = torch.cat([value, at_rest], dim=1)
+            result[name] = value[:, index]
+    return result
+
+
+@functools.lru_cache(maxsize=64)
+def _body_index(bodies: tuple[str, ...], names: tuple[str, ...], device: torch.device) -> Int[Tensor, " body"]:
+    ids = [index_of(body, names, "body", "bodies") for body in bodies]
+    if twice := [names[i] for i in ids if names.count(names[i]) > 1]:
+        raise SimulationError(f'the scene has {names.count(twice[0])} bodies "{twice[0]}"; give each a name of its own')
+    return torch.tensor(ids, dtype=torch.int64, device=device)
+
+
+class Geoms(NamedTuple):
+    """The geoms (shapes, colliders) of an environment, by name.
+
+    Attributes:
+        bodies: Name of the body of each geom.
+        names: Name of each geom; needed only for modules with objects that share a body.
+        parents: Name of each body's parent; needed only for modules whose objects or links have child bodies without joints.
+    """
+
+    bodies: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    parents: tuple[tuple[str, str], ...] = ()
+
+    def of_part(self, part: ContactPart) -> Int[np.ndarray, " geom"]:
+        """Return the indices of the geoms of a part of an object or link, ascending.
+
+        Raises:
+            SimulationError: If the scene lacks it, or the names that it takes to find it were not given.
+        """
+        if part.kind == "geom":
+            return np.array([index_of(part.name, self.names, "geom", "geoms")])
+        parents = dict(self.parents)
+        known = tuple(dict.fromkeys((*self.bodies, *parents)))
+        bodies = {known[index_of(part.name, known, "body", "bodies")]}
+        if part.kind == "subtree":
+            if not parents:
+                raise SimulationError(f'the contacts of "{part.name}" include those of bodies below it: Geoms needs `parents`')
+            below = set(bodies)
+            while below := {body for body, parent in parents.items() if parent in below} - bodies:
+                bodies |= below
+        return np.flatnonzero([body in bodies for body in self.bodies])
+
+
+class PairRows(NamedTuple):
+    """Which pairs the contacts of two geoms belong to.
+
+    A row is a link and an object's geoms: pairs of one link whose objects have the same geoms share it.
+
+    Attributes:
+        row_of_pair: The row of each pair.
+        num_rows: Number of rows.
+        link_of_geom: Index of each geom's link; of none, the number of links.
+        row_of_geoms: The rows of contacts of an object's geom and a link; −1 where there are no more, and of no link.
+    """
+
+    row_of_pair: Int[np.ndarray, " pair"]
+    num_rows: int
+    link_of_geom: Int[np.ndarray, " geom"]
+    row_of_geoms: Int[np.ndarray, "layer geom link"]
+
+
+def pair_rows(inputs: Inputs, geoms: Geoms) -> PairRows:
+    """Look up the geoms of a module's pairs.
+
+    Raises:
+        SimulationError: If the scene lacks a body or geom of a pair, or several names match it.
+    """
+    return _pair_rows(tuple((inputs.parts_of(pair.object), inputs.parts_of_link(pair.link)) for pair in inputs.pairs), geoms)
+
+
+_Parts = tuple[ContactPart, ...]
+
+
+@functools.lru_cache(maxsize=64)
+def _pair_rows(parts: tuple[tuple[_Parts, _Parts], ...], geoms: Geoms) -> PairRows:
+    links = {link: i for i, link in enumerate(dict.fromkeys(link for _, link in parts))}
+    pairs = [(_indices(geoms, target), links[link]) for target, link in parts]
+    rows = {pair: row for row, pair in enumerate(dict.fromkeys(pairs))}
+    link_of = np.full(len(geoms.bodies), len(links), dtype=np.int32)
+    for link, i in links.items():
+        link_of[list(_indices(geoms, link))] = i
+    none = np.full((len(geoms.bodies), len(links) + 1), -1, dtype=np.int32)
+    layers: list[np.ndarray] = []
+    for (of_object, link), row in rows.items():
+        for geom in of_object:
+            free = next((layer for layer in layers if layer[geom, link] < 0), None)
+            if free is None:
+                free = none.copy()
+                layers.append(free)
+            free[geom, link] = row
+    return PairRows(np.array([rows[pair] for pair in pairs], dtype=np.int64), len(rows), link_of, np.stack(layers or [none]))
+
+
+def _indices(geoms: Geoms, parts: _Parts) -> tuple[int, ...]:
+    return tuple(np.unique(np.concatenate([geoms.of_part(part) for part in parts])).tolist())
+
+
+def contacts_by_pair(
+    inputs: Inputs,
+    geoms: Geoms | Sequence[str],
+    pairs: Int[Tensor, "contact 2"],
+    *,
+    pos: Float[Tensor, "contact 3"],
+    normal: Float[Tensor, "contact 3"],
+    force: Float[Tensor, "contact 3"],
+    torque: Float[Tensor, "contact 3"] | None = None,
+    force_on: Literal[1, 2] = 2,
+    env: Int[Tensor, " contact"] | None = None,
+    num_envs: int = 1,
+    is_contact: Bool[Tensor, " contact"] | None = None,
+) -> dict[str, Float[Tensor, "env pair ..."]]:
+    """Return the fields of a state that are contacts, from an engine's contacts in any order.
+
+    Nothing waits for a GPU. Contacts fill a pair's slots in the order given; beyond the slots they count in the net force.
+
+    Args:
+        inputs: What the module reads: `touch.inputs`, or `touch.inputs.renamed(…)` where names differ.
+        geoms: Name of the body of each geom of an environment, which `pairs` are indices of; or `Geoms`.
+        pairs: The two geoms of each contact; negative where it has none.
+        pos: Where each contact is, in the world [m].
+        normal: Unit normal from the first geom to the second, in the world.
+        force: Force on the body of one of them, in the world [N].
+        torque: Torque about `pos` on the same body, in the world [N·m]; default: zero.
+        force_on: The geom on whose body `force` and `torque` act: the first or the second.
+        env: The environment of each contact; default: the first.
+        num_envs: Number of environments.
+        is_contact: Which rows are contacts; default: whatever carries force.
+
+    Raises:
+        SimulationError: If the engine lacks a body or geom, or several names match it.
+    """
+    rows = pair_rows(inputs, geoms if isinstance(geoms, Geoms) else Geoms(tuple(geoms)))
+    row_of_pair, link_of_geom, row_of_geoms = (_on_device(table, pos.device) for table in (rows[0], rows[2], rows[3]))
+    is_contact = (force != 0).any(dim=-1) if is_contact is None else is_contact
+    is_contact = is_contact & (pairs >= 0).all(dim=-1)
+    one, other = pairs.long().clamp(min=0).T
+    env = torch.zeros_like(one) if env is None else env.long()
+    # Each contact is of several rows: a geom may be the object's of one pair and the link's of another, or of several objects.
+    found = torch.cat([row_of_geoms[:, one, link_of_geom[other]], row_of_geoms[:, other, link_of_geom[one]]])
+    num_layers, bins = len(row_of_geoms), num_envs * rows.num_rows  # one more bin holds contacts of no pair
+    key = torch.where((found >= 0) & is_contact, env * rows.num_rows + found, bins).T
+    key, shape = key.flatten(), key.shape
+    sign = pos.new_ones(2 * num_layers, 1)
+    sign[num_layers:] = -1.0  # there the object is the second geom
+
+    def on_link(values: Tensor, sign: Tensor) -> Tensor:
+        return (values[:, None] * sign).expand(*shape, 3).reshape(-1, 3)
+
+    acting = sign if force_on == 2 else -sign
+    forces, fields = on_link(force, acting), {}
+    if "contact_netforce" in inputs.fields:
+        fields["contact_netforce"] = pos.new_zeros(bins + 1, 3).index_add_(0, key, forces)[:-1].view(num_envs, -1, 3)
+    if "contact_found" in inputs.fields:
+        fields["contact_found"] = pos.new_zeros(bins + 1).index_add_(0, key, torch.ones_like(forces[:, 0]))[:-1]
+        fields["contact_found"] = fields["contact_found"].view(num_envs, -1)
+    if wanted := [name for name in SLOT_FIELDS if name in inputs.fields]:
+        slotted = {
+            "contact_pos": on_link(pos, torch.ones_like(sign)),
+            "contact_normal": on_link(normal, sign),
+            "contact_force": forces,
+            "contact_torque": torch.zeros_like(forces) if torque is None else on_link(torque, acting),
+        }
+        slot = _ranks(key)
+        place = torch.where((key < bins) & (slot < inputs.slots), key * inputs.slots + slot, bins * inputs.slots)
+        for name in wanted:
+            filled = pos.new_zeros(bins * inputs.slots + 1, 3).index_copy_(0, place, slotted[name])
+            fields[name] = filled[:-1].view(num_envs, -1, inputs.slots, 3)
+    return {name: value[:, row_of_pair] for name, value in fields.items()}
+
+
+def _on_device(table: np.ndarray, device: torch.device) -> Tensor:
+    return torch.from_numpy(table).to(device)
+
+
+def _ranks(key: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
+    """Return how many equal numbers stand before each."""
+    ordered, order = key.sort(stable=True)
+    rank = torch.arange(len(key), device=key.device) - torch.searchsorted(ordered, ordered)
+    return torch.empty_like(rank).index_copy_(0, order, rank)
