@@ -18,7 +18,6 @@ from jaxtyping import Int
 
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, SimulationError, TgdslError, listed
-from tgdsl.module.module import TactileModule
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.playing.policy import (
@@ -148,7 +147,7 @@ def prepare(
     sensed = compile_sensed(loaded, device, progress, feels=feels, also=also)
     moved, model = moved_joints(loaded, sensed), SceneModels(sensed.touch.plan.scene).model({})
     if card is not None:
-        check_card(saved, moved, _alone(loaded, sensed, feels))
+        check_card(saved, moved, sensed.touch)
         changes = [*changes, *changes_around(card, loaded, model)]
     joints = sensed.touch.inputs.joints
     try:
@@ -204,11 +203,6 @@ def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple
     except LowerError as error:
         raise DeployError(f"goal: {error} (`{error.field}` of the task's document)") from error
     return dataclasses.replace(loaded, spec=spec), tuple(goal)
-
-
-def _alone(loaded: LoadedTask, sensed: Sensed, feels: Sequence[Felt]) -> TactileModule:
-    """Return the module of environments in which the policy acts alone."""
-    return sensed.touch if len(feels) < 2 else compile_sensed(loaded, "cpu", feels=feels[:1]).touch
 
 
 def _size(
