@@ -41,7 +41,7 @@ EMULATED = "agg_force"
 """What an emulated hand's fingertips feel, whatever a policy makes of it."""
 
 
-_OF_CARDS = ("touch", "placement", "resolution", "noise", "joint_vel")
+_OF_CARDS = ("sensors", "touch", "placement", "resolution", "noise", "joint_vel")
 """What of a task's document is as it was where the policy was learned."""
 
 
