@@ -131,10 +131,14 @@ def test_urdf_inertias_are_mended_with_one_warning(tmp_path):
 def test_urdf_links_without_mass_or_moments_can_move(tmp_path):
     links = link_of("base", "<sphere radius='.01'/>") + "<link name='knuckle'/>"
     links += link_of("tip", "<sphere radius='.01'/>", "<inertial><mass value='.1'/></inertial>")
-    path = urdf_of(tmp_path, links + joint_of("j", "base", "knuckle", "revolute") + joint_of("k", "knuckle", "tip", "revolute"))
-    with pytest.warns(UserWarning, match="mended: knuckle, tip$"):
+    links += link_of(
+        "pad", "<sphere radius='.01'/>", "<inertial><mass value='0'/><inertia ixx='0' iyy='0' izz='0'/></inertial>"
+    )
+    joints = (("base", "knuckle"), ("knuckle", "tip"), ("tip", "pad"))
+    path = urdf_of(tmp_path, links + "".join(joint_of(f"{one}_{two}", one, two, "revolute") for one, two in joints))
+    with pytest.warns(UserWarning, match="mended: knuckle, tip, pad$"):
         model = load_model(path).compiled
-    np.testing.assert_allclose(model.body_mass[1:], [0.1, 1e-6, 0.1])
+    np.testing.assert_allclose(model.body_mass[1:], [0.1, 1e-6, 0.1, 1e-6])
     np.testing.assert_allclose(model.body_inertia[2:], 1e-9)
 
 

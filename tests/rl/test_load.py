@@ -15,6 +15,7 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.actions import ZeroActor
 from tgdsl.rl.playing.evaluation import evaluate
+from tgdsl.rl.playing.provenance import provenance
 from tgdsl.rl.schema import task_schema
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
@@ -71,6 +72,7 @@ def test_all_mistakes_are_told_at_once(tmp_path):
         ("joints: [left, right]", 'joints: ["thumb*"]', 5, "joints[0]", 'no actuated joint matches "thumb*"'),
         ("object: ball", "object: cube", 4, "object", 'has no object "cube", only ball'),
         ("keyframe: home", "keyframe: hom", 6, "keyframe", 'the scene has no keyframe "hom"'),
+        ("object: ball", "object: ball\nsensors: {nearr: {radius: 4 mm}}", 5, "sensors.nearr", 'has no sensor "nearr"'),
         ("sensors.yaml", "sensor.yaml", 3, "document", 'there is no file "sensor.yaml"'),
         ("in_palm_rotate", "in_palm_rotat", 2, "task", 'there is no task "in_palm_rotat"'),
         ("in_palm_rotate", "nowhere.py:Task", 2, "task", "nowhere.py: FileNotFoundError: there is no such file"),
@@ -84,6 +86,21 @@ def test_what_does_not_fit_the_scene_is_told_at_its_place(tmp_path, old, new, li
     (found,) = problems(lambda: TouchEnv(task, 2))
     assert (found.file, found.line, found.path) == (str(task), line, path)
     assert says in found.what
+
+
+def test_a_task_replaces_what_the_sensors_document_says(tmp_path):
+    """It compiles as a document that says so itself, and its card has the radius."""
+    task = write_task(tmp_path, more="touch: proximity\n")
+    sensors = tmp_path / "sensors.yaml"
+    text = sensors.read_text()
+    arrays = []
+    for radius, overrides in (("10 mm", {"sensors.near.radius": "4 mm"}), ("4 mm", {}), ("10 mm", {})):
+        sensors.write_text(text.replace("kind: proximity,", f"kind: proximity, radius: {radius},"))
+        env = TouchEnv(task, 2, overrides=overrides)
+        arrays.append({name: array.tobytes() for name, array in env.touch.plan.arrays.items()})
+        if overrides:
+            assert provenance(env.loaded, env.sim.model)["sensors"]["sensors"]["near"]["radius"] == 0.004
+    assert arrays[0] == arrays[1] != arrays[2]
 
 
 def test_a_sensor_that_the_document_lacks_is_named(tmp_path):

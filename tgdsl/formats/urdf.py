@@ -194,7 +194,8 @@ def _package_name(folder: Path) -> str | None:
 def _mend(link: ET.Element, moving: Collection[str]) -> bool:
     """Replace the link's inertia if its principal moments are missing, not positive or break the triangle inequality.
 
-    A moving link that has neither mass nor geometry gets `LEAST_MASS`, as MuJoCo moves nothing that weighs nothing.
+    A moving link without mass gets `LEAST_MASS`, as MuJoCo moves nothing that weighs nothing; one that has geometry and no
+    `<inertial>` takes its mass from that.
 
     Args:
         link: The link, changed in place.
@@ -205,7 +206,10 @@ def _mend(link: ET.Element, moving: Collection[str]) -> bool:
         if link.get("name") not in moving or link.find("collision") is not None or link.find("visual") is not None:
             return False
         inertial = ET.SubElement(link, "inertial")
-        ET.SubElement(inertial, "mass", {"value": repr(LEAST_MASS)})
+        ET.SubElement(inertial, "mass", {"value": "0"})
+    mass = inertial.find("mass")
+    if mass is not None and link.get("name") in moving and float(mass.get("value", "0")) <= 0.0:
+        mass.set("value", repr(LEAST_MASS))
     if inertia is None:
         inertia = ET.SubElement(inertial, "inertia")
     try:

@@ -1,14 +1,19 @@
-"""Whether two tables of taxels are the same: a hash of the exact table, and a comparison that overlooks rounding.
+"""Whether two tables of taxels are the same within rounding: by a comparison of tables, or of their ids.
 
 What learns from readings knows a taxel by its row alone, so that another order of rows is another input. Tables are the same if
 as many rows are on the same links and bodies, in the same cells, at the same places: to within `POSITION` for positions and
 radii, `DIRECTION` for normals and tangents, `AREA` for areas. Vertices that went through float32 are 1e-8 m away, two taxels of
-a hand at least some 1e-4 m apart. A hash tells bits apart, and is asked only where there is no table.
+a hand at least some 1e-4 m apart.
+
+An id is coarser: it is of links, rows and cells, of the interval of 1 mm in which a length is, and of that of 0.1 in which a
+component of a direction is. It has a half for each of two grids, half an interval apart, and is the same if either half is: a
+number that rounding takes across a line of one grid is in the middle of an interval of the other.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,6 +29,9 @@ DIRECTION = 1e-4
 """Largest distance of two unit vectors that are the same direction: an angle [rad]."""
 AREA = 0.05
 """Largest difference of two areas that are the same, relative to the larger: sampled ones are counted in points."""
+_LENGTH_CELL, _DIRECTION_CELL = 1e-3, 0.1
+_SHIFTS = (0.5 * np.sqrt(0.3), 0.5 * np.sqrt(0.3) + 0.5)
+"""Where the grids of ids begin, in cells: numbers that people draw, such as halves of a millimetre, are on no line."""
 REQUIRED = ("link", "body", "pos", "normal")
 COMPARED = (*REQUIRED, "tangent", "radius", "area", "row", "column")
 _TOLERANCES = {"pos": POSITION, "normal": DIRECTION, "tangent": DIRECTION, "radius": POSITION, "area": AREA}
@@ -34,16 +42,23 @@ them."""
 
 
 def taxels_id(layout: Layout) -> str:
-    """Return a hash of a layout's rows: names of link and body, place, directions, radius, area and cell, to the last bit."""
-    digest = hashlib.sha256()
-    for link in layout.links:
-        for name in (link.name, link.body):
-            digest.update(f"{len(name.encode())} {name} ".encode())
-    floats = (layout.pos, layout.normal, layout.tangent, layout.radius, layout.area)
-    for array in (layout.link_id.astype("<i8"), layout.cell.astype("<i8"), *(own.astype("<f8") for own in floats)):
-        digest.update(f"{array.shape} ".encode())
-        digest.update(np.ascontiguousarray(array + 0).tobytes())  # −0 is 0
-    return digest.hexdigest()[:32]
+    """Return a hash of a layout's rows: names of link and body, place, directions, radius and cell; see `is_same_id`."""
+    names = [[link.name, link.body] for link in layout.links]
+    return "".join(_grid_digest(layout, json.dumps(names), shift) for shift in _SHIFTS)
+
+
+def is_same_id(one: str, other: str) -> bool:
+    """Return whether two ids may be of the same table, to within rounding."""
+    return one[:16] == other[:16] or one[16:] == other[16:]
+
+
+def _grid_digest(layout: Layout, names: str, shift: float) -> str:
+    digest = hashlib.sha256(names.encode())
+    lengths, directions = (layout.pos, layout.radius), (layout.normal, layout.tangent)
+    numbers = [*(own / _LENGTH_CELL for own in lengths), *(own / _DIRECTION_CELL for own in directions)]
+    for array in (layout.link_id, layout.cell, *(np.floor(own + shift) for own in numbers)):
+        digest.update(f"{array.shape} ".encode() + array.astype("<i8").tobytes())
+    return digest.hexdigest()[:16]
 
 
 def columns_of(layout: Layout) -> dict[str, np.ndarray]:

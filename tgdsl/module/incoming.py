@@ -166,8 +166,8 @@ class Incoming:
         if is_bad.any():
             self._warned.add("poses")
             envs = listed([str(env) for env in is_bad.nonzero().flatten().tolist()])
-            problem = f"poses of bodies are not finite in environments {envs}: their readings mean nothing"
-            warnings.warn(f"{problem}; this is said once, and not of states on a GPU", stacklevel=7)
+            problem = f"poses of bodies are not finite in environments {envs}: what depends on them is read as not-a-number"
+            warnings.warn(f"{problem}; this is said once, and not of states on a GPU: look for NaN in readings", stacklevel=7)
 
     def _dt_tensor(self, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Return dt as a tensor that is written only when it changes.

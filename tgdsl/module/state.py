@@ -51,8 +51,9 @@ class SceneState:
     dtype and then cast, so that far from the origin nothing is lost.
 
     A number that is none is not taken for zero: whatever depends on it, in its environment, is read as not-a-number, what
-    `contact_found` gates included. A slot is unused where force, torque and normal are all zero; where it is then does not
-    matter. A contact whose normal is zero acts where it is, and what needs its normal is read as not-a-number.
+    `contact_found` gates included. Poses that are none are warned of once on the CPU. A GPU would have to be waited for, so
+    there `readings[name].isnan()` tells. A slot is unused where force, torque and normal are all zero; where it is then does
+    not matter. A contact whose normal is zero acts where it is, and what needs its normal is read as not-a-number.
 
     Attributes:
         body_pos: Position of each body's frame [m].

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.console.progress import Progress
-from tgdsl.errors import SpecError, listed
+from tgdsl.errors import SpecError, did_you_mean, listed
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.load import LoadedTask
@@ -140,7 +140,7 @@ def compile_sensed(
     types = of_policy if feels is None else [each.type for each in feels]
     sensor = _sensors_of(loaded, kinds, {"task": senses, "touch": [SENSED[type_][0] for type_ in types]})
     by_kind = {kind: sensor[kind] for kind in senses}
-    overrides: dict[str, Any] = {"observations": {}}
+    overrides: dict[str, Any] = {"observations": {}} | _sensor_overrides(loaded)
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
     if spec.variants is not None:
@@ -291,10 +291,21 @@ def sensors_document(loaded: LoadedTask) -> Loaded:
         raise loaded.error(("document",), f'there is no file "{spec.document}"', hint)
     document = load(file, kinds=known_kinds())
     document.raise_problems()
+    for name in spec.sensors.keys() - document.spec.sensors.keys():
+        problem = f'"{spec.document}" has no sensor "{name}"'
+        raise loaded.error(("sensors", name), problem, did_you_mean(name, document.spec.sensors, "sensors"))
+    if spec.sensors:
+        document = load(file, _sensor_overrides(loaded), known_kinds())
+        document.raise_problems()
     if spec.object not in document.spec.objects:
         problem = f'"{spec.document}" has no object "{spec.object}", only {listed(list(document.spec.objects))}'
         raise loaded.error(("object",), problem)
     return document
+
+
+def _sensor_overrides(loaded: LoadedTask) -> dict[str, Any]:
+    """Return what the task replaces in the sensors' document, by dotted path."""
+    return {f"sensors.{name}.{key}": value for name, keys in loaded.spec.sensors.items() for key, value in keys.items()}
 
 
 def _kinds(document: Loaded) -> dict[str, str]:

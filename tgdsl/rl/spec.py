@@ -141,6 +141,8 @@ class TaskSpec(SpecModel):
     with the file relative to this document."""
     document: str
     """The sensors' document, relative to this one: robot, scene, objects and sensors, of which those needed are taken."""
+    sensors: dict[str, dict[str, Any]] = {}
+    """What is otherwise than in the sensors' document, by sensor: `{near: {radius: 4 mm}}`."""
     object: str
     """The document's object that the task is about."""
     variants: Annotated[tuple[Annotated[StrictInt, Field(ge=0)], ...], Field(min_length=1)] | None = None

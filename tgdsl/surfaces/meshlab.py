@@ -51,6 +51,15 @@ class Shell:
         """Distance to either side of a face at which points are tested for being inside [m]."""
         return max(1e-6 * float(np.ptp(self.surface.corners.reshape(-1, 3), axis=0).max()), LENGTH_TOLERANCE)
 
+    @cached_property
+    def is_closed(self) -> Bool[np.ndarray, " component"]:
+        """Which solid components have no border: faces pass every edge as often one way as the other."""
+        edges = _edges(self.surface.faces)
+        low, high = edges.min(axis=1), edges.max(axis=1)
+        _, edge = np.unique(low * len(self.surface.vertices) + high, return_inverse=True)
+        sense = np.bincount(edge, np.where(edges[:, 0] == low, 1.0, -1.0))[edge]
+        return self.is_solid & (np.bincount(np.repeat(self.component, 3), sense != 0) == 0)
+
     def solid(self, component: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
         """Return vertices and faces of one component."""
         used, faces = np.unique(self.surface.faces[self.component == component], return_inverse=True)

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from tgdsl.surfaces.region import LENGTH_TOLERANCE, Region
 from tgdsl.surfaces.surface import Surface
@@ -54,10 +54,18 @@ class OrthographicView:
     rounding: float
 
     @staticmethod
-    def of(surface: Surface, axes: Float[np.ndarray, "3 3"]) -> OrthographicView:
-        """Return the view of a surface along `axes[2]`, without faces that are edge-on or have no area."""
+    def of(
+        surface: Surface, axes: Float[np.ndarray, "3 3"], is_one_sided: Bool[np.ndarray, " face"] | bool = False
+    ) -> OrthographicView:
+        """Return the view of a surface along `axes[2]`, without faces that are edge-on or have no area.
+
+        Args:
+            surface: The surface.
+            axes: Unit vectors of u, v and t.
+            is_one_sided: Which faces are left out where they look along the rays, as those of solids are hidden then.
+        """
         cosine = surface.face_normals @ axes[2]
-        face_id = np.flatnonzero(np.abs(cosine) > EDGE_ON)
+        face_id = np.flatnonzero((np.abs(cosine) > EDGE_ON) & ((cosine < 0) | np.logical_not(is_one_sided)))
         corners = surface.corners[face_id] @ axes.T
         is_front = cosine[face_id] < 0
         # A face that looks against the rays turns clockwise in (u, v), because t points away from its viewer.

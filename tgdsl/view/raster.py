@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 Array = np.ndarray
+_FRAGMENTS = 100_000
+"""Fragments drawn at a time, to bound memory."""
 
 
 class Camera(NamedTuple):
@@ -82,14 +84,17 @@ def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fra
     """
     face, row, left, right = _scanlines(corners, width, height)
     count = right - left + 1
-    inside = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    fragments = Fragments(np.full(height * width, -np.inf), np.full(height * width, -1), np.zeros((height * width, 3)))
+    chunk = np.cumsum(count) // _FRAGMENTS
+    for run in np.split(np.arange(len(face)), np.flatnonzero(np.diff(chunk)) + 1):
+        column = np.arange(count[run].sum()) - np.repeat(np.cumsum(count[run]) - count[run] - left[run], count[run])
+        _draw(fragments, corners, np.repeat(face[run], count[run]), np.repeat(row[run], count[run]), column, width)
+    return Fragments(*(part.reshape(height, width, *part.shape[1:]) for part in fragments))
+
+
+def _draw(fragments: Fragments, corners: Array, face: Array, row: Array, column: Array, width: int) -> None:
+    """Draw triangles at some pixels where they are nearer than what is there."""
     drawn, index = np.unique(face, return_inverse=True)
-    face, index, row, column = (
-        np.repeat(face, count),
-        np.repeat(index, count),
-        np.repeat(row, count),
-        np.repeat(left, count) + inside,
-    )
     start = corners[drawn, 0, :2]
     (x, y), (x_end, y_end) = (corners[drawn, 1, :2] - start).T, (corners[drawn, 2, :2] - start).T
     area = x * y_end - x_end * y
@@ -99,13 +104,10 @@ def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fra
     weights = np.clip(np.stack([1 - second[0] - second[1], *second], axis=-1), 0, 1)
     nearness = (weights * corners[face, :, 2]).sum(axis=1)
     pixel = row * width + column
-    nearest = np.full(height * width, -np.inf)
-    np.maximum.at(nearest, pixel, nearness)
-    won = nearness == nearest[pixel]
-    fragments = Fragments(nearest, np.full(height * width, -1), np.zeros((height * width, 3)))
+    np.maximum.at(fragments.nearness, pixel, nearness)
+    won = nearness == fragments.nearness[pixel]
     fragments.face[pixel[won]] = face[won]
     fragments.weights[pixel[won]] = weights[won]
-    return Fragments(*(part.reshape(height, width, *part.shape[1:]) for part in fragments))
 
 
 def _scanlines(corners: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:

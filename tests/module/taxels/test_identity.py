@@ -9,7 +9,7 @@ from safetensors import safe_open
 from torch import nn
 
 import tgdsl
-from tgdsl.errors import ArtifactError, TaxelError, TgdslError
+from tgdsl.errors import TaxelError, TgdslError
 from tgdsl.formats.robot import export_model, load_model
 from tgdsl.module.artifact import load_plan
 from tgdsl.placement.propose.propose import propose
@@ -67,12 +67,12 @@ def test_modules_and_tables(three):
         tgdsl.check_taxels(touch, {"tuch": touch.taxels["touch"]})
 
 
-def test_ids_tell_bits_apart(three):
-    touch, same, _ = three
-    assert len({module.taxels_id for module in three}) == 3
+def test_ids_tell_other_taxels_apart_but_no_rounding(three):
+    touch, same, other = three
     tgdsl.check_taxels(touch, touch.taxels_id)
-    with pytest.raises(TaxelError, match=f"{touch.taxels_id}, {same.taxels_id} is expected: 3 taxels of 1 links"):
-        tgdsl.check_taxels(touch, same.taxels_id)
+    tgdsl.check_taxels(touch, same.taxels_id)
+    with pytest.raises(TaxelError, match=f"{touch.taxels_id}, {other.taxels_id} is expected: 3 taxels of 1 links"):
+        tgdsl.check_taxels(touch, other.taxels_id)
     assert f"taxels_id {touch.taxels_id}\n" in touch.explain()
 
 
@@ -97,11 +97,10 @@ def test_artefacts(three, tmp_path):
     assert str(caught.value) == str(path) + OTHER_ORDER
 
 
-def test_a_plan_with_another_id_is_refused(three):
+def test_a_plan_with_an_id_of_an_older_version_is_read(three):
     plan = three[0].plan
     text = plan.to_json().replace(plan.taxels_id, "0" * 32)
-    with pytest.raises(ArtifactError, match="the taxels are not those that the plan was written with"):
-        type(plan).from_json(text, plan.arrays)
+    assert type(plan).from_json(text, plan.arrays).taxels_id == plan.taxels_id
 
 
 def test_rollouts(three, tmp_path):
@@ -186,8 +185,8 @@ def test_a_robot_that_was_exported_has_the_same_taxels(tmp_path, name, text):
         )
         for model in (name, "twin.usda")
     ]
-    assert modules[0].taxels_id != modules[1].taxels_id
     tgdsl.check_taxels(modules[0], modules[1])
+    tgdsl.check_taxels(modules[0], modules[1].taxels_id)
 
 
 class Marker:

@@ -314,12 +314,68 @@ def test_a_side_that_a_links_own_hinge_does_not_carry_it_to_is_weak(tmp_path):
     assert {link.name: link.doubt for link in along.links}["t2"] == ""
 
 
-def test_markers_are_no_tips(tmp_path):
-    """A ball of 0.3 mm has 4 π r² = 0.0113 cm²; the links before the markers are the tips, whatever these are called."""
-    proposal = propose(loaded(tmp_path, hand_with_thumb(THUMB.format("0 1 0", "-90 0"))), DENSITY)
+@pytest.mark.parametrize(("radius", "area"), [(".0003", "0.011"), (".001", "0.13")])
+def test_markers_are_no_tips(tmp_path, radius, area):
+    """Balls have 4 π r²; the links before the markers are the tips, whatever these are called."""
+    text = hand_with_thumb(THUMB.format("0 1 0", "-90 0")).replace(".0003", radius)
+    proposal = propose(loaded(tmp_path, text), DENSITY)
     assert set(proposal.groups["tips"]) == {"fb", "gb", "t2"}
     reasons = dict(proposal.left_out)
-    assert reasons["f_end"] == reasons["g_end"] == "a marker: its surface is 0.011 cm²"
+    assert reasons["f_end"] == reasons["g_end"] == f"a marker: its surface is {area} cm²"
+
+
+def test_a_thumb_faces_as_it_bends_and_not_along_its_hinges(tmp_path):
+    """The first hinge swings the thumb along y; the others, about y, bend it along x."""
+    thumb = THUMB.format("0 1 0", "0 90").replace('axis="0 1 0" range="-90 0"', 'axis="0 1 0" range="0 90"')
+    thumb = thumb.replace(
+        '-.03 0 .01"><joint name="t0" axis="0 1 0" range="0 90"/>', '-.03 .04 .01"><joint name="t0" axis="1 0 0" range="0 60"/>'
+    )
+    links = {link.name: link for link in propose(loaded(tmp_path, hand_with_thumb(thumb)), DENSITY).links}
+    assert {links[name].facing for name in ("t0", "t1", "t2")} == {(1.0, 0.0, 0.0)}
+    assert {links[name].doubt for name in ("t0", "t1", "t2")} == {""}
+
+
+def fingers_along_x(bent: float, joints: str) -> str:
+    """Three fingers that lie along x beside a palm and bend toward z; their brackets are below their hinges.
+
+    Args:
+        bent: How far each link is bent at the start [deg].
+        joints: A pair of joints, of a bracket and of what it carries; `{0}` is the finger's number.
+    """
+    first, second = joints.split("|")
+    fingers = "".join(
+        f"""<body name="f{i}" pos=".04 {y} 0" euler="0 {-bent} 0">{first.format(i)}<geom type="box" size=".012 .008 .006" pos=".01 0 -.02"/>
+        <body name="g{i}" pos=".05 0 0" euler="0 {-bent} 0">{second.format(i)}<geom type="capsule" fromto="0 0 0 .04 0 0" size=".007"/>
+        </body></body>"""
+        for i, y in enumerate((-0.03, 0.0, 0.03))
+    )
+    return (
+        f'<mujoco><worldbody><body name="palm"><geom type="box" size=".04 .04 .008"/>{fingers}</body></worldbody>{{}}</mujoco>'
+    )
+
+
+def test_a_palm_faces_where_bones_go_and_not_brackets(tmp_path):
+    """A bracket 10 mm before and 20 mm below its hinge goes along x as the finger bends toward z."""
+    joints = '<joint axis="0 -1 0" range="-20 100"/>|<joint axis="0 -1 0" range="-20 100"/>'
+    links = propose(loaded(tmp_path, fingers_along_x(0.0, joints).format("")), DENSITY).links
+    assert {link.name: link.facing for link in links}["palm"] == (0.0, 0.0, 1.0)
+
+
+def test_one_drive_of_all_fingers_closes_where_tips_meet(tmp_path):
+    """The links are bent by 70 degrees at the start, and the drive straightens them."""
+    joints = '<joint name="f{0}" axis="0 1 0" range="0 70"/>|<joint name="g{0}" axis="0 1 0" range="0 70"/>'
+    bound = "".join(f'<joint joint1="{name}" joint2="f0"/>' for name in ("f1", "f2", "g0", "g1", "g2"))
+    text = fingers_along_x(70.0, joints).format(f"<equality>{bound}</equality>")
+    robot = loaded(tmp_path, text)
+    assert closing_motion(robot)["f0"] == pytest.approx((np.radians(70), 0.0))
+    facing = {link.name: link.facing for link in propose(robot, DENSITY).links}
+    assert {facing[name] for name in ("palm", "g0", "g1", "g2")} == {(0.0, 0.0, 1.0)}
+
+
+def test_a_wrist_that_turns_all_around_is_no_jaw(tmp_path):
+    text = world(one_jaw("-180 180"))
+    links = propose(loaded(tmp_path, text), DENSITY).links
+    assert {link.facing for link in links} == {None}
 
 
 @pytest.mark.parametrize("limits", ["-30 90", "-40 60", "0 30"])

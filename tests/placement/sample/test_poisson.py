@@ -105,6 +105,33 @@ def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
     assert (np.linalg.norm(found.pos, axis=1) < 0.0098).sum() <= 1
 
 
+def test_components_are_closed_if_they_have_no_border():
+    whole, holed, turned = (trimesh.creation.icosphere(3, 0.01) for _ in range(3))
+    holed.update_faces(np.arange(len(holed.faces)) > 0)
+    turned.faces[0] = turned.faces[0, ::-1]
+    for i, mesh in enumerate((whole, holed, turned)):
+        mesh.apply_translation([0.03 * i, 0, 0])
+    shell = meshlab.outer_shell(surface_of(trimesh.util.concatenate([whole, holed])))
+    assert shell.is_solid.tolist() == [True, True] and shell.is_closed.tolist() == [True, False]
+    assert meshlab.outer_shell(surface_of(turned)).is_closed.tolist() == [True]  # cleaning makes the windings agree
+
+
+def test_what_is_seen_is_outside_of_closed_meshes_without_winding_numbers(monkeypatch):
+    """A ball and, inside of it but for a cap, another: only points that the first directions do not see are asked for."""
+    asked, winding = list[int](), meshlab.Shell.winding
+    monkeypatch.setattr(meshlab.Shell, "winding", lambda own, i, pos: asked.append(len(pos)) or winding(own, i, pos))
+    small = ball(0.005)
+    small.apply_translation([0.01, 0, 0])
+    surface = surface_of(trimesh.util.concatenate([ball(0.01), small]))
+    shell = meshlab.outer_shell(surface)
+    asked.clear()
+    found = poisson.pool(shell, Region(None, (), (), ()), seed=0, count=1, spacing=None)
+    # The circle in which they meet is at x = 8.75 mm: caps of 1.25 mm and of 3.75 mm are inside the other ball.
+    outside = 2 * np.pi * (0.01 * 0.01875 + 0.005 * 0.00625)
+    assert found is not None and found.area == pytest.approx(outside, rel=0.01)
+    assert sum(asked) < 0.5 * len(found.pos)
+
+
 def test_poisson_on_open_meshes():
     bowl = ball(0.01)
     bowl.update_faces(bowl.triangles_center[:, 2] > 0)

@@ -14,8 +14,27 @@ from tgdsl.rl.train.policies import card_of, write_policy
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
 
+def test_sensors_that_environments_lack_are_not_compared(tmp_path):
+    """On a hand there is what the policy feels with, and not what only its task reads; but something must be there."""
+    learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
+    file = tmp_path / "policy.pt"
+    card = card_of(learner, made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
+    write_policy(learner, card, file)
+    extra = {"card.json": "", "taxels.csv": ""}
+    module = torch.jit.load(file, _extra_files=extra)
+    head, *rows = extra["taxels.csv"].decode().splitlines(keepends=True)
+    others = [f"nowhere,{row.partition(',')[2]}" for row in rows]
+    for text, is_fit in ((head + "".join(rows + others), True), (head + "".join(others), False)):
+        torch.jit.save(module, file, _extra_files={"card.json": extra["card.json"], "taxels.csv": text})
+        if is_fit:
+            policy_for(learner.env, read_policy(file))
+        else:
+            with pytest.raises(PolicyError, match='other taxels: this module: there is no sensor "nowhere", whose taxels'):
+                policy_for(learner.env, read_policy(file))
+
+
 def test_taxels_may_differ_by_rounding(tmp_path):
-    """Another id says that some bit differs; the table in the file says by how much."""
+    """The table in the file says by how much."""
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     file, touch = tmp_path / "policy.pt", learner.env.touch
     card = card_of(learner, made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from tgdsl.errors import TaxelError, TgdslError, did_you_mean
-from tgdsl.layout.identity import REQUIRED, Columns, check_same_rows, columns_of
+from tgdsl.layout.identity import REQUIRED, Columns, check_same_rows, columns_of, is_same_id
 from tgdsl.module.plan_file import load_plan
 from tgdsl.plan.plan import Plan
 from tgdsl.tensors.torch_internals import HookedModule
@@ -39,8 +39,8 @@ Taxels = HasPlan | Mapping[str, Any] | str | PathLike[str]
 def check_taxels(touch: HasPlan, expected: Taxels, what: str = "this module") -> None:
     """Refuse a module whose sensors have other taxels than expected, or the same ones in another order.
 
-    Tables are compared with the tolerances of `layout.identity`; ids, of which the same rows within rounding have others, only
-    where there is no table. Sensors of the module that nothing is expected of may have any taxels.
+    Tables and ids are compared within rounding, as `layout.identity` says. Sensors of the module that nothing is expected of
+    may have any taxels.
 
     Args:
         touch: The module.
@@ -113,10 +113,10 @@ def _note_taxels(module: SavedTaxels, state_dict: Any, prefix: str, metadata: di
 
 
 def _check_id(plan: Plan, expected: str, what: str) -> None:
-    if plan.taxels_id != expected:
+    if not is_same_id(plan.taxels_id, expected):
         has = f"the taxels' id is {plan.taxels_id}, {expected} is expected: {plan.layout.num_taxels} taxels of"
-        hint = "an id tells the last bits apart; a table, an artefact or a module would say which rows differ"
-        raise TaxelError(f"{what}: {has} {len(plan.layout.links)} links are not the same to the last bit; {hint}")
+        hint = "a table, an artefact or a module would say which rows differ"
+        raise TaxelError(f"{what}: {has} {len(plan.layout.links)} links are others; {hint}")
 
 
 def _tables(expected: Taxels) -> Mapping[str, Columns]:

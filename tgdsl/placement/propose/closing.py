@@ -4,7 +4,8 @@ The evidence, in the order in which it decides:
 
 1. A finger curls: a hinge whose range bends away from its start, in the sense of rotation of another hinge of its finger that
    bends too, closes at the far end. That a tip then moves away from the others, as a thumb's may, is named but does not count:
-   what is nearer depends on the pose of the rest of the hand, how a finger curls does not.
+   what is nearer depends on the pose of the rest of the hand, how a finger curls does not. A joint that drives all fingers
+   closes where the tips draw nearer: fingers may be curled at the start.
 2. The tips draw nearer: any other joint closes at the end at which the tips that it moves are clearly nearer to those of the
    other chains and to the palm, with the other joints half closed and closed; a slide, and the only hinge of a chain, even
    against its range. A hinge of a curling finger that has its range against it stays undecided.
@@ -76,6 +77,10 @@ class Closing:
         self.turned = {joint: self._turned(joint) for joint in candidates}
         self.lean = {joint: self._lean(joint) for joint in candidates}
         self.sense = self._curling()
+        for joint in self.sense:
+            if {self.chain[self.segment(hinge)] for hinge in self.turned[joint]} == set(self.chain.values()):
+                gain = self._gain(joint, {})
+                self.sense[joint] = float(np.sign(gain)) if abs(gain) > MIN_CLOSING else self.sense[joint]
         self.bending = self._bending(candidates)
         others = {joint: float(np.mean(self._range(joint))) for joint in self.bending}
         half = {joint: self._gain(joint, others) for joint in self.bending}

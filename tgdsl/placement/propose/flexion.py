@@ -31,7 +31,10 @@ PARALLEL, BESIDE = 0.99, 0.25
 """A bar beside a finger turns about an axis with at least this cosine to the finger's, nearer than this share of its length."""
 ALONG = 0.3
 """Least cosine of the angle between where a link faces and where its own hinge carries it; else its side is weak."""
+ALONG_HINGE = 0.7
+"""Least cosine of the angle between where a link faces and the axis of a hinge beyond: fingers bend across their hinges."""
 ACROSS = "its own hinge carries it across the side that it faces"
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 UNCLEAR = "which side is the inner one is not clear"
 """Why a link has no inner side, where nothing better is known."""
 
@@ -90,23 +93,24 @@ class Flexion:
     def _moving_side(self, body: int) -> InnerSide:
         if (facing := self._meeting(body)) is not None:
             return InnerSide(facing, self._doubt(self.tree.segment[body]))
-        if (carried := self._carried(self.tree.segment[body])) is not None:
-            joint, along = carried
-            turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
-            return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
-        return self._taken_over(body)
+        if (side := self._flexor(self.tree.segment[body])) is None:
+            return InnerSide(None, UNCLEAR)
+        joint, along = side
+        turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
+        return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
 
     def _is_across(self, body: int, side: InnerSide) -> bool:
         """Return whether hinges of a link's own have a lever on it and none carries it to its inner side or away from it."""
         data, model, segment = self._frames(self.open), self.tree.model, self.tree.segment[body]
-        hinges = [j for j in self.tree.joints(segment) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE)]
+        hinges = [j for j in self.tree.joints(segment) if int(model.jnt_type[j]) == _HINGE]
         if side.facing is None or not hinges:
             return False
         facing = data.xmat[body].reshape(3, 3) @ side.facing / np.linalg.norm(side.facing)
         carried = np.cross(data.xaxis[hinges], self.tree.middle(segment, data) - data.xanchor[hinges])
         lever = np.linalg.norm(carried, axis=1)
         has_lever = lever.min() >= MIN_LEVER * np.sqrt(self._area(segment))
-        return bool(has_lever and (np.abs(carried @ facing) < ALONG * lever).all())
+        is_across = has_lever and bool((np.abs(carried @ facing) < ALONG * lever).all())
+        return is_across and not any(self._is_along_hinge(segment, along) for along in carried / lever[:, None])
 
     def _bars(self) -> set[int]:
         """Return the segments that are alone in their chain and are driven together with the longer chain beside them.
@@ -176,16 +180,29 @@ class Flexion:
     def _area(self, segment: int) -> float:
         return sum(self.tree.area[body] for body in self.tree.bodies[segment])
 
-    def _taken_over(self, body: int) -> InnerSide:
-        """Return the side of the nearest link beyond, as it faces while joints that bend both ways are as at the start."""
-        beyond = [s for s in self.tree.below(self.tree.segment[body]) if self.tree.bodies[s]]
+    def _flexor(self, segment: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
+        """Return where a segment faces in the world in the open pose, and the joint that says so.
+
+        It faces where that joint carries it, unless this is along the axis of a hinge beyond, such as of a thumb that is
+        brought before the palm: it then takes the side of the nearest segment beyond that has one.
+        """
+        carried = self._carried(segment)
+        if carried is not None and not self._is_along_hinge(segment, carried[1]):
+            return carried
+        beyond = [s for s in self.tree.below(segment) if self.tree.bodies[s]]
         for other in sorted(beyond, key=lambda s: (len(self.tree.path(s)), s)):
-            if (carried := self._carried(other)) is not None:
-                facing = self._frames(self.open).xmat[other].reshape(3, 3).T @ carried[1]
+            if (side := self._flexor(other)) is not None:
+                along = self._frames(self.open).xmat[other].reshape(3, 3).T @ side[1]
                 data = self._frames(self.straight)
-                turned = data.xmat[body].reshape(3, 3).T @ data.xmat[other].reshape(3, 3) @ facing
-                return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[carried[0]].doubt)
-        return InnerSide(None, UNCLEAR)
+                along = data.xmat[segment].reshape(3, 3).T @ data.xmat[other].reshape(3, 3) @ along
+                return side[0], self._frames(self.open).xmat[segment].reshape(3, 3) @ along
+        return carried
+
+    def _is_along_hinge(self, segment: int, along: Float[np.ndarray, " 3"]) -> bool:
+        """Return whether a direction in the open pose is along the axis of a hinge beyond a segment that closes."""
+        data, beyond = self._frames(self.open), set(self.tree.below(segment))
+        hinges = [j for j in self.motion() if self.closing.segment(j) in beyond and int(self.tree.model.jnt_type[j]) == _HINGE]
+        return bool((np.abs(data.xaxis[hinges] @ along) > ALONG_HINGE).any())
 
     def _doubt(self, segment: int) -> str:
         return next((self.closing.motions[joint].doubt for joint in self._nearest(segment)), "")
@@ -241,11 +258,19 @@ class Flexion:
         return InnerSide(None, UNCLEAR)
 
     def _curled(self) -> Float[np.ndarray, " 3"] | None:
-        """Return where most fingers, as they curl, carry their first links in the open pose; None if no majority does."""
-        found = []
+        """Return where most fingers, as they curl, carry their first bones in the open pose; None if no majority does."""
+        found, data, motion, place = [], self._frames(self.open), self.motion(), self.closing.segment
+        curling = {j for joint, m in self.closing.motions.items() if m.is_curling for j in self.closing.turned[joint]}
         for chain in self.hand.chains:
-            carried = [self._carried(s) for s in chain if self.tree.bodies[s]]
-            found += [c[1] for c in carried if c is not None and self.closing.motions[c[0]].is_curling][:1]
+            hinges = sorted(
+                (j for j in curling & motion.keys() if place(j) in chain), key=lambda j: len(self.tree.path(place(j)))
+            )
+            beyond = [j for j in hinges[1:] if place(hinges[0]) in self.tree.path(place(j))]
+            if beyond:
+                opened, closed = motion[hinges[0]]
+                bone = data.xanchor[beyond[0]] - data.xanchor[hinges[0]]
+                found.append(np.cross(np.sign(closed - opened) * data.xaxis[hinges[0]], bone))
+        found = [along / max(float(np.linalg.norm(along)), 1e-9) for along in found]
         alike = [[other for other in found if one @ other > MIN_COSINE] for one in found]
         most = max(alike, key=len, default=[])
         return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None

@@ -9,8 +9,8 @@ from tgdsl.placement.propose.hands import MAX_FINGER, Hand, KinematicTree
 
 BESIDE = 0.5
 """A fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed."""
-MIN_BEND = np.radians(19.9)
-"""A jaw that turns by less does not grip; no angle that people draw."""
+MIN_BEND, MAX_BEND = np.radians(19.9), np.radians(200.1)
+"""A jaw that turns by less does not grip, and what turns by more is a wrist; no angles that people draw."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
@@ -34,7 +34,7 @@ def gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
         return None
     joint = joints[0]
     is_hinge = int(model.jnt_type[joint]) == _HINGE and bool(model.jnt_limited[joint])
-    if not is_hinge or np.ptp(model.jnt_range[joint]) < MIN_BEND:
+    if not is_hinge or not MIN_BEND <= np.ptp(model.jnt_range[joint]) <= MAX_BEND:
         return None
     ends = [_ahead(tree, joint, parent, float(value)) for value in model.jnt_range[joint]]
     own = tree.bodies[segment]

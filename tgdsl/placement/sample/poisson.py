@@ -33,8 +33,9 @@ from tgdsl.surfaces.surface import Surface
 
 CANDIDATES = 20
 """Least number of points per sample from which an exact count is chosen."""
-DIRECTIONS = 100
-"""Directions from which points are looked at: what none of them sees is a pocket that nothing outside can touch."""
+DIRECTIONS, FIRST_DIRECTIONS = 100, 10
+"""Directions from which points are looked at: what none of them sees is a pocket that nothing outside can touch. Whether what
+the first ones do not see is inside of solids is found before it is looked at from the others."""
 PER_SAMPLE = 50
 """Points per sample by which the area of each sample is measured; also the density of the pool for a spacing."""
 MIN_POOL, MAX_POOL = 10_000, 400_000
@@ -181,29 +182,42 @@ def _on_outer_surface(
     component = shell.component[face]
     is_geom = np.ones(len(shell.surface.geoms), bool) if region.is_geom is None else region.is_geom
     is_out = np.ones(len(pos), dtype=bool)
+    directions = _directions()
+    is_seen = _visible(shell, above, normal, directions[:FIRST_DIRECTIONS])
     for solid in np.flatnonzero(shell.is_solid).tolist():
-        is_out[is_out] = shell.winding(solid, above[is_out]) < 0.5
+        doubtful = np.flatnonzero(is_out & ~(is_seen & shell.is_closed[solid]))  # nothing seen is inside a closed surface
+        is_out[doubtful] = shell.winding(solid, above[doubtful]) < 0.5
         if is_geom[shell.surface.face_geom[shell.component == solid]].any():
             later = np.flatnonzero(is_out & (component > solid))
             is_out[later] = shell.winding(solid, below[later]) < 0.5
-    is_out[is_out] = _visible(shell, above[is_out], normal[is_out])
+    left = np.flatnonzero(is_out & ~is_seen)
+    is_out[left] = _visible(shell, above[left], normal[left], directions[FIRST_DIRECTIONS:])
     return is_out
 
 
-def _visible(shell: Shell, above: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return which points just above faces are visible from far away in some direction."""
-    is_visible = np.zeros(len(above), dtype=bool)
+def _directions() -> Float[np.ndarray, "direction 3"]:
+    """Return unit vectors that cover the sphere evenly; every side of it is met early."""
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(DIRECTIONS)
-    # A Fibonacci lattice covers the sphere evenly; walking it in steps of 37 meets every side early.
     height = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
     ring = np.sqrt(1.0 - height**2)
-    lattice = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)
-    for direction in lattice[37 * np.arange(DIRECTIONS) % DIRECTIONS]:
+    fibonacci = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)
+    return fibonacci[37 * np.arange(DIRECTIONS) % DIRECTIONS]
+
+
+def _visible(
+    shell: Shell,
+    above: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "direction 3"],
+) -> Bool[np.ndarray, " n"]:
+    """Return which points just above faces are visible from far away along some direction."""
+    is_visible = np.zeros(len(above), dtype=bool)
+    for direction in directions:
         left = np.flatnonzero(~is_visible)
         left = left[normal[left] @ direction < -0.05]
         if not len(left):
             continue
-        view = OrthographicView.of(shell.surface, frame(direction))
+        view = OrthographicView.of(shell.surface, frame(direction), shell.is_closed[shell.component])
         uvt = above[left] @ view.axes.T
         is_visible[left] = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2]
     return is_visible

@@ -35,7 +35,7 @@ EMULATED = "agg_force"
 """What an emulated hand's fingertips feel, whatever a policy makes of it."""
 
 
-_OF_CARDS = ("touch", "placement", "resolution", "noise", "joint_vel")
+_OF_CARDS = ("sensors", "touch", "placement", "resolution", "noise", "joint_vel")
 """What of a task's document is as it was where the policy was learned."""
 
 
@@ -144,8 +144,7 @@ def prepare(
     sensed = compile_sensed(loaded, device, progress, feels=feels, also=also)
     moved, model = moved_joints(loaded, sensed), SceneModels(sensed.touch.plan.scene).model({})
     if card is not None:
-        alone = sensed.touch if len(feels) < 2 else compile_sensed(loaded, "cpu", feels=feels[:1]).touch
-        check_card(saved, moved, alone)
+        check_card(saved, moved, sensed.touch)
         changes += changes_around(card, loaded, model)
     try:
         actuators = Actuators.of(model, moved)

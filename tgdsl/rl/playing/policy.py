@@ -30,7 +30,7 @@ from torch import Tensor
 
 from tgdsl.errors import TaxelError, TgdslError, did_you_mean
 from tgdsl.layout.identity import Columns
-from tgdsl.module.taxels.identity import HasPlan, check_taxels
+from tgdsl.module.taxels.identity import HasPlan, check_taxels, plan_tables
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.provenance import changes_around, is_close, spec_differences
 from tgdsl.rl.playing.rollout import Actor
@@ -279,8 +279,8 @@ def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
 def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None:
     """See that a policy with a card is for what the environments have.
 
-    Taxels may differ by rounding, as those of a robot that was exported do: where their ids are not the same, the tables are
-    compared.
+    Taxels may differ by rounding, as those of a robot that was exported do. Sensors that the environments lack, such as those
+    that only the task reads, are not compared.
 
     Args:
         saved: The policy's file.
@@ -294,11 +294,11 @@ def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None
     assert card is not None
     if list(joints) != list(card["joints"]):
         raise PolicyError(f"{file}: this policy moves {', '.join(card['joints'])}, not {', '.join(joints)}")
-    if GROUP in card["groups"] and card["taxels"] != touch.plan.taxels_id:
-        if not saved.taxels:
-            raise PolicyError(f"{file}: this policy feels with other taxels")
+    if GROUP in card["groups"]:
+        here = plan_tables(touch.plan)
+        shared = {name: table for name, table in saved.taxels.items() if name in here}
         try:
-            check_taxels(touch, saved.taxels)
+            check_taxels(touch, shared or saved.taxels)
         except TaxelError as error:
             raise PolicyError(f"{file}: this policy feels with other taxels: {error}") from error
 
