@@ -22,7 +22,7 @@ from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory.memory import Memory, kept, store
+from tgdsl.module.memory.memory import Memory, kept, store, stored
 from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows, rows_of
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
@@ -199,6 +199,56 @@ class TactileModule(HookedModule):
         finally:
             if is_first:
                 self.free()
+
+    def initial_memory(self, num_envs: int, dt: float | None = None) -> dict[str, Tensor]:
+        """Return what sensors remember before their first call, for `step`.
+
+        Args:
+            num_envs: Number of environments.
+            dt: Shortest time between steps [s], if `inputs.fields` has it: delays keep so many calls.
+
+        Returns:
+            Tensors by name, (env, …), but for the random numbers' keys and what else all environments share, `clock.SHARED`.
+
+        Raises:
+            StateError: If the time is wanted.
+        """
+        if "dt" in self.inputs.fields and dt is None:
+            raise StateError("initial_memory: expected `dt`, the time between steps [s]: this module reads SceneState.dt")
+        memory = Memory(self.plan.sensors, self.plan.readings())
+        memory.clock.copy_seed(self.memory.clock)
+        return memory.tensors(num_envs, dt, self.dtype, self.device)
+
+    def step(
+        self, state: SceneState, memory: Mapping[str, Tensor], reset: Bool[Tensor, " env"] | None = None
+    ) -> tuple[dict[str, Float[Tensor, "env *step row channel"]], dict[str, Tensor]]:
+        """Read all sensors as a call does, as a function: nothing is held, and nothing changes in place.
+
+        Derivatives go through the memory from step to step.
+
+        Args:
+            state: The scene, at one instant.
+            memory: What sensors remember: `initial_memory`, or the result of the step before.
+            reset: Environments that begin an episode at this step; default: none.
+
+        Returns:
+            Readings by name, and the memory after the step.
+
+        Raises:
+            StateError: As a call does, or if the memory is another module's or of another number of environments.
+        """
+        self.constants.refresh()
+        tensors = self.incoming.tensors(state, self.dtype, self.device)
+        self.memory.check(memory, tensors["body_pos"].shape[0], state.dt)
+        return self.pure_step(tensors, memory, reset)
+
+    def pure_step(
+        self, tensors: Mapping[str, Tensor], memory: Mapping[str, Tensor], reset: Tensor | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Do what `step` does with the fields of a state that `inputs` names, traceable in one graph."""
+        before = dict(memory) if reset is None else self.memory.restarted(memory, reset)
+        readings, updated = self.core(dict(tensors), before)
+        return {name: readings[name] for name in self.plan.readings()}, stored(before, updated)
 
     def free(self) -> None:
         """Let go of all that sensors remember, and of the number of environments; the seed is kept.

@@ -166,7 +166,7 @@ def _path(place: Tensor, state: State, is_first: Tensor) -> tuple[Tensor, dict[s
 def _listener(gathered: Gathered, constants: Constants, place: Tensor) -> Vec:
     """Return where the microphone is in the world, planes (env, 1) [m]."""
     if "pos" in constants:
-        return planes.split(constants["pos"].to(place.dtype).expand(len(place), 1, 3))
+        return planes.split(constants["pos"].to(place.dtype).expand(place.shape[0], 1, 3))
     return gathered[Places]
 
 

@@ -110,8 +110,8 @@ def _rows(nodes: Tensor, inverse: Tensor, pulled: Tensor, num_bodies: int, num_n
     if num_nodes == num_bodies:
         return bodies, inverse
     is_idle = (pulled[:, num_bodies:] <= 0).to(nodes.dtype)
-    stores = torch.cat([bodies.expand(len(pulled), -1), is_idle], dim=1)
-    return stores, torch.cat([inverse.expand(len(pulled), -1), torch.ones_like(is_idle)], dim=1)
+    stores = torch.cat([bodies.expand(pulled.shape[0], -1), is_idle], dim=1)
+    return stores, torch.cat([inverse.expand(pulled.shape[0], -1), torch.ones_like(is_idle)], dim=1)
 
 
 def _solved(
