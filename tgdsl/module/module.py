@@ -6,9 +6,13 @@ felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `step` 
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,6 +24,7 @@ from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
 from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
+from tgdsl.module.export.signature import Signature
 from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.incoming import Incoming
 from tgdsl.module.memory.memory import Memory, kept, store, stored
@@ -36,7 +41,7 @@ from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.known import kinds_by_sensor, quantities_of
 from tgdsl.sensors.noise.stages import stages_of
 from tgdsl.tensors.buffers import Constants
-from tgdsl.tensors.devices import check_dtype
+from tgdsl.tensors.devices import check_dtype, dtype_of
 from tgdsl.tensors.env_ids import EnvIds, env_mask
 from tgdsl.tensors.torch_internals import HookedModule
 
@@ -249,6 +254,55 @@ class TactileModule(HookedModule):
         before = dict(memory) if reset is None else self.memory.restarted(memory, reset)
         readings, updated = self.core(dict(tensors), before)
         return {name: readings[name] for name in self.plan.readings()}, stored(before, updated)
+
+    def export(
+        self,
+        path: str | PathLike[str],
+        to: str | None = None,
+        *,
+        dt: float | None = None,
+        state_dtype: torch.dtype | str | None = None,
+        source: str = "",
+        overrides: Sequence[str] = (),
+    ) -> Signature:
+        """Write `step` and `observe` as a file that runs without tgdsl: see docs/export.md. The module stays as it is.
+
+        The file has the module's constants, dtype, device and seed, and takes any number of environments.
+
+        Args:
+            path: The file.
+            to: "pt2" (torch.export), "aoti" (AOTInductor, for C++) or "onnx"; default: by the ending .pt2, .aoti.pt2 or .onnx.
+            dt: Time between steps [s]; default: what the document says. The file is made for it.
+            state_dtype: Dtype of the state's floats; default: the module's.
+            source: What it is exported from, for `tgdsl verify`.
+            overrides: What was overridden of it.
+
+        Returns:
+            Names, shapes and dtypes of all inputs and outputs, in order.
+
+        Raises:
+            TgdslError: If a sensor cannot be exported, the format is none, or what writes it is not installed.
+            FileError: If the file cannot be written.
+        """
+        from tgdsl.module.export.formats import format_of, write
+        from tgdsl.module.export.program import EXAMPLE_ENVS, FlatStep, Step, signature_of, traced
+
+        file = Path(path)
+        file_format = format_of(file, to)
+        dt = (dt or self.inputs.dt or None) if "dt" in self.inputs.fields else None
+        if "dt" in self.inputs.fields and dt is None:
+            raise TgdslError("export: expected `dt`, the time between steps [s], which the document does not say")
+        touch = copy.deepcopy(self)
+        touch.free()
+        state = touch.example_state(EXAMPLE_ENVS, dtype=dtype_of(state_dtype or self.dtype))
+        state = replace(state, dt=dt, contact_found=None if state.contact_found is None else state.contact_found > 0)
+        tensors = touch.incoming.tensors(state, touch.dtype, touch.device)
+        memory = touch.initial_memory(EXAMPLE_ENVS, dt)
+        step = Step(touch.plan, touch.constants, touch.pure_step, touch.observe, tensors, memory, dt)
+        flat = FlatStep(step)
+        signature = signature_of(flat, step, source, overrides)
+        write(traced(flat, touch.plan), signature, file, file_format, touch.inductor_options())
+        return signature
 
     def free(self) -> None:
         """Let go of all that sensors remember, and of the number of environments; the seed is kept.
