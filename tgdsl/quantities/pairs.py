@@ -178,4 +178,6 @@ def gates(found: Tensor, place: Int[Tensor, " pair"], dtype: torch.dtype) -> Flo
         dtype: Dtype of the result.
     """
     column = found[:, place]
+    if column.dtype == torch.bool:  # ONNX has no isnan of these
+        return torch.where(column, 0.0, -torch.inf).to(dtype)
     return torch.where(column > 0, 0.0, torch.where(column.isnan(), torch.nan, -torch.inf)).to(dtype)
