@@ -76,6 +76,7 @@ def _write_onnx(program: torch.export.ExportedProgram, signature: Signature, pat
         output_names=names[1],
         opset_version=OPSET,
         dynamo=True,
+        optimize=False,  # it takes x + 1e-24 for x
         verbose=False,
     )
     model = converted.model_proto

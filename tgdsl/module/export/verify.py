@@ -88,9 +88,8 @@ def _record(signature: Signature, touch: TactileModule, num_envs: int, num_calls
     dtypes = {port.name: getattr(torch, port.dtype) for port in signature.inputs}
     memory, generator = touch.initial_memory(num_envs, signature.dt), torch.Generator().manual_seed(num_envs)
     for call in range(num_calls):
-        state = dataclasses.replace(touch.example_state(num_envs, call, spread=SPREAD).to(dtypes["body_pos"]), dt=signature.dt)
-        if state.contact_found is not None:
-            state.contact_found = state.contact_found > 0
+        state = touch.example_state(num_envs, call, dtypes["body_pos"], SPREAD)
+        state = dataclasses.replace(state, dt=signature.dt)
         reset = (torch.rand(num_envs, generator=generator) < 0.3) & (call % RESET_EVERY == RESET_EVERY - 1)
         with torch.no_grad():
             tensors = touch.incoming.tensors(state, touch.dtype, touch.device)
