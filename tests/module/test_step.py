@@ -70,7 +70,7 @@ def test_derivatives_go_through_memory(tmp_path, noise, history):
 
 def test_memory_that_does_not_fit_is_refused(noisy):
     state, memory = felt_state(noisy, 4), noisy.initial_memory(4, 0.01)
-    with pytest.raises(StateError, match='expected `dt`, the time between steps'):
+    with pytest.raises(StateError, match="expected `dt`, the time between steps"):
         noisy.initial_memory(4)
     with pytest.raises(StateError, match='memory: found no "a:noise/gain"; expected `initial_memory`|memory: found no "a:'):
         noisy.step(state, {})

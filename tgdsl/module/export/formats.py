@@ -28,7 +28,9 @@ def format_of(path: Path, to: str | None) -> Format:
     """
     result = to or next((name for name in reversed(ENDINGS) if path.name.endswith(ENDINGS[name])), None)
     if result not in ENDINGS:
-        raise TgdslError(f"found {to or path.name!r}, expected one of {', '.join(ENDINGS)}, or a file's name with {'.pt2 or .onnx'}")
+        raise TgdslError(
+            f"found {to or path.name!r}, expected one of {', '.join(ENDINGS)}, or a file's name with {'.pt2 or .onnx'}"
+        )
     ending = ".onnx" if result == "onnx" else ".pt2"
     if path.suffix != ending:
         raise TgdslError(f"{path}: the format {result} has the ending {ending}")
@@ -37,9 +39,7 @@ def format_of(path: Path, to: str | None) -> Format:
     return result
 
 
-def write(
-    program: torch.export.ExportedProgram, signature: Signature, path: Path, to: Format, options: dict[str, Any]
-) -> None:
+def write(program: torch.export.ExportedProgram, signature: Signature, path: Path, to: Format, options: dict[str, Any]) -> None:
     """Write an exported step.
 
     Args:

@@ -36,7 +36,7 @@ class Step(NamedTuple):
         plan: Its plan.
         module: Holds its constants.
         pure_step: `TactileModule.pure_step`.
-        observe: `TactileModule.observe`.
+        observe: `observing.observe` of this plan.
         tensors: Fields of a state of `EXAMPLE_ENVS` environments.
         memory: Memory of as many.
         dt: Time between steps [s], if fields have it.
@@ -121,8 +121,10 @@ def traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
     env = torch.export.Dim.DYNAMIC
     with torch.no_grad():
         program = torch.export.export(flat, tuple(example.values()), dynamic_shapes=(tuple({0: env} for _ in example),))
-    for node in program.graph.nodes:
-        if isinstance(node.target, torch._ops.OpOverload) and node.target.namespace not in ("aten", "prims"):
+    for node in list(program.graph.nodes):
+        if node.target is torch.ops.aten.unbind.int and not node.users:  # of no rows: torch writes it and cannot read it
+            program.graph.erase_node(node)
+        elif isinstance(node.target, torch._ops.OpOverload) and node.target.namespace not in ("aten", "prims"):
             raise _refused(node.target.name().split(".")[0], plan)
     return program
 
@@ -137,7 +139,9 @@ def _refused(operation: str, plan: Plan) -> TgdslError:
 def _is_on_host(part: Any) -> bool:
     """Return whether triangles are searched for some use of a quantity."""
     found: list[Any] = []
-    tree.mapped(part, lambda array: array, lambda record: found.append(record) if getattr(record, "stays_on_host", False) else None)
+    tree.mapped(
+        part, lambda array: array, lambda record: found.append(record) if getattr(record, "stays_on_host", False) else None
+    )
     return bool(found)
 
 

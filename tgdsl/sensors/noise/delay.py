@@ -102,7 +102,7 @@ class DelayStage(Stage[DelayValues, DelayMemory]):
 
 def _entry(ring: Tensor, slot: Tensor) -> Signal:
     """Return what a ring (env, call, channel, row) holds at a place, (env, 1) or (env, row)."""
-    env = torch.arange(len(ring), device=ring.device)
+    env = torch.arange(ring.shape[0], device=ring.device)
     if slot.shape[1] == 1:  # whole signals, which lie together
         return ring[env, slot[:, 0]]
     place = slot[:, None, None].expand(-1, 1, *ring.shape[2:])
