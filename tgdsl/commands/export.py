@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from tgdsl.commands.arguments import OUT, DocumentOrArtefact, Overrides, in_working_folder, module_of
 from tgdsl.console.progress import StatusLine
 

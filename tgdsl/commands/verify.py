@@ -42,8 +42,7 @@ class Verify:
             for name, value in differences.items():
                 print(f"  {name:<40}{value:.1e}")
         refused = "refused" if verdict.refuses_other_dtypes else "NOT refused"
-        print(
-            f"largest difference {verdict.worst:.1e} of full scale (at most {TOLERANCE:g}); inputs of a wrong dtype are {refused}"
-        )
+        print(f"largest difference {verdict.worst:.1e} of full scale (at most {TOLERANCE:g})")
+        print(f"inputs of a wrong dtype are {refused}")
         if not verdict.is_equal:
             sys.exit(1)

@@ -97,9 +97,9 @@ def test_what_cannot_be_exported_is_refused_by_name(noisy, tmp_path):
         touch.export(tmp_path / "hand.pt2")
     with pytest.raises(TgdslError, match="expected `dt`, the time between steps"):
         noisy.export(tmp_path / "hand.pt2")
-    with pytest.raises(TgdslError, match="found 'hand.txt', expected one of pt2, aoti, onnx"):
+    with pytest.raises(TgdslError, match=r"found 'hand\.txt', expected one of pt2, aoti, onnx"):
         noisy.export(tmp_path / "hand.txt", dt=0.01)
-    with pytest.raises(TgdslError, match="the format onnx has the ending .onnx"):
+    with pytest.raises(TgdslError, match=r"the format onnx has the ending \.onnx"):
         noisy.export(tmp_path / "hand.pt2", "onnx", dt=0.01)
     assert not (tmp_path / "hand.pt2").exists()
 

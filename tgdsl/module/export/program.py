@@ -146,7 +146,7 @@ def _is_on_host(part: Any) -> bool:
 
 
 def without_strides(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:
-    """Return a graph less its views by strides that view a whole tensor: hints for Inductor, which ONNX has no operation for."""
+    """Return a graph less views by strides of whole tensors, hints for Inductor, and less asserts: ONNX has neither."""
     for node in list(program.graph.nodes):
         if node.target is torch.ops.aten.as_strided.default:
             value, result = (n.meta["val"] for n in (node.args[0], node))
