@@ -80,6 +80,29 @@ def test_agg_force_is_the_papers_formula(touch, readings):
     np.testing.assert_allclose(found["plain"][:, :6].numpy(), 2 * per_link.transpose(0, 2, 1).reshape(3, 6), rtol=1e-12)
 
 
+def test_the_centre_of_pressure_is_where_normal_forces_balance(tmp_path):
+    """Taxels at 0, 4, 8, 12 mm along x of `a`; forces of 1 N and 3 N along −z on the first and the last balance at 9 mm.
+
+    Shear and pull on a taxel move nothing; a link without pressure reads 0; what is no number is not hidden.
+    """
+    terms = {"policy": [{"type": "cop", "of": "touch"}], "firm": [{"type": "cop", "of": "touch", "threshold": "5 N"}]}
+    touch = tgdsl.compile(observing(tmp_path, terms), dtype=torch.float64)
+    force = torch.zeros(3, 6, 6, dtype=torch.float64)
+    force[0, 0, :3], force[0, 3, :3] = torch.tensor([0.5, 0, -1.0]), torch.tensor([0, 0, -3.0])
+    force[0, 5, :3] = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)  # pulls on the second taxel of b
+    force[1, 1, :3] = torch.tensor([0, -7.0, 0])  # on the second taxel of a, whose normal is y
+    force[2, 0, 2] = torch.nan
+    found = touch.observe({"touch": force})
+    policy = found["policy"].unflatten(1, (6, 2))
+    a, b = policy[:2].unbind(2)
+    expected = [[0.5, 0, -4, 0.009, 0, 0.01], [0, -7, 0, 0.004, 0, 0.01]]
+    torch.testing.assert_close(a, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-15)
+    torch.testing.assert_close(b[0], torch.tensor([0.6, 0, 0.8, 0, 0, 0], dtype=torch.float64), rtol=0, atol=0)
+    assert not b[1].any() and policy[2, 2:, 0].isnan().all() and not policy[2, :, 1].any()
+    firm = found["firm"].unflatten(1, (6, 2))
+    assert not firm[0, 3:].any() and torch.equal(firm[1], policy[1]), "4 N are within the threshold, 7 N beyond"
+
+
 def test_agg_bool_counts_more_than_two(touch, readings):
     found = touch.observe(readings)
     np.testing.assert_array_equal(found["links"][:, 6:].numpy(), [[1, 0], [0, 0], [0, 0]])

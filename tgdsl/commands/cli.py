@@ -14,6 +14,7 @@ from tgdsl.commands.cache import Cache
 from tgdsl.commands.calibrate import Calibrate
 from tgdsl.commands.compile import Compile
 from tgdsl.commands.explain import Explain
+from tgdsl.commands.export import Export
 from tgdsl.commands.export_usd import ExportUsd
 from tgdsl.commands.grasps import Grasps
 from tgdsl.commands.hand.hand import Hand
@@ -32,10 +33,13 @@ from tgdsl.commands.report.bench import Bench
 from tgdsl.commands.report.doctor import Doctor
 from tgdsl.commands.run import Run
 from tgdsl.commands.schema import Schema
+from tgdsl.commands.verify import Verify
 from tgdsl.errors import SpecError, TgdslError
 
 Command = (
     Annotated[Compile, tyro.conf.subcommand("compile")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Verify, tyro.conf.subcommand("verify")]
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]

@@ -6,9 +6,13 @@ felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `step` 
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,8 +24,9 @@ from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
 from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
+from tgdsl.module.export.signature import Signature
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory.memory import Memory, chosen_rows, few_rows, kept, read_rows, rows_of, store
+from tgdsl.module.memory.memory import Memory, chosen_rows, few_rows, kept, read_rows, rows_of, store, stored
 from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, observe, outputs_of
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
 from tgdsl.module.state import SceneState
@@ -33,7 +38,7 @@ from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.known import kinds_by_sensor, quantities_of
 from tgdsl.sensors.noise.pipeline import stages_of
 from tgdsl.tensors.buffers import Constants
-from tgdsl.tensors.devices import check_dtype
+from tgdsl.tensors.devices import check_dtype, dtype_of
 from tgdsl.tensors.env_ids import EnvIds, env_mask
 from tgdsl.tensors.torch_internals import HookedModule
 
@@ -196,6 +201,105 @@ class TactileModule(HookedModule):
         finally:
             if is_first:
                 self.free()
+
+    def initial_memory(self, num_envs: int, dt: float | None = None) -> dict[str, Tensor]:
+        """Return what sensors remember before their first call, for `step`.
+
+        Args:
+            num_envs: Number of environments.
+            dt: Shortest time between steps [s], if `inputs.fields` has it: delays keep so many calls.
+
+        Returns:
+            Tensors by name, (env, …), but for the random numbers' keys and what else all environments share, `clock.SHARED`.
+
+        Raises:
+            StateError: If the time is wanted.
+        """
+        if "dt" in self.inputs.fields and dt is None:
+            raise StateError("initial_memory: expected `dt`, the time between steps [s]: this module reads SceneState.dt")
+        memory = Memory(self.plan.sensors, self.plan.readings())
+        memory.clock.copy_seed(self.memory.clock)
+        return memory.tensors(num_envs, dt, self.dtype, self.device)
+
+    def step(
+        self, state: SceneState, memory: Mapping[str, Tensor], reset: Bool[Tensor, " env"] | None = None
+    ) -> tuple[dict[str, Float[Tensor, "env *step row channel"]], dict[str, Tensor]]:
+        """Read all sensors as a call does, as a function: nothing is held, and nothing changes in place.
+
+        Derivatives go through the memory from step to step.
+
+        Args:
+            state: The scene, at one instant.
+            memory: What sensors remember: `initial_memory`, or the result of the step before.
+            reset: Environments that begin an episode at this step; default: none.
+
+        Returns:
+            Readings by name, and the memory after the step.
+
+        Raises:
+            StateError: As a call does, or if the memory is another module's or of another number of environments.
+        """
+        self.constants.refresh()
+        tensors = self.incoming.tensors(state, self.dtype, self.device)
+        self.memory.check(memory, tensors["body_pos"].shape[0], state.dt)
+        return self.pure_step(tensors, memory, reset)
+
+    def pure_step(
+        self, tensors: Mapping[str, Tensor], memory: Mapping[str, Tensor], reset: Tensor | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Do what `step` does with the fields of a state that `inputs` names, traceable in one graph."""
+        before = dict(memory) if reset is None else self.memory.restarted(memory, reset)
+        readings, updated = self.core(dict(tensors), before)
+        return {name: readings[name] for name in self.plan.readings()}, stored(before, updated)
+
+    def export(
+        self,
+        path: str | PathLike[str],
+        to: str | None = None,
+        *,
+        dt: float | None = None,
+        state_dtype: torch.dtype | str | None = None,
+        source: str = "",
+        overrides: Sequence[str] = (),
+    ) -> Signature:
+        """Write `step` and `observe` as a file that runs without tgdsl: see docs/export.md. The module stays as it is.
+
+        The file has the module's constants, dtype, device and seed, and takes any number of environments.
+
+        Args:
+            path: The file.
+            to: "pt2" (torch.export), "aoti" (AOTInductor, for C++) or "onnx"; default: by the ending .pt2, .aoti.pt2 or .onnx.
+            dt: Time between steps [s]; default: what the document says. The file is made for it.
+            state_dtype: Dtype of the state's floats; default: the module's.
+            source: What it is exported from, for `tgdsl verify`.
+            overrides: What was overridden of it.
+
+        Returns:
+            Names, shapes and dtypes of all inputs and outputs, in order.
+
+        Raises:
+            TgdslError: If a sensor cannot be exported, the format is none, or what writes it is not installed.
+            FileError: If the file cannot be written.
+        """
+        from tgdsl.module.export.formats import format_of, write
+        from tgdsl.module.export.program import EXAMPLE_ENVS, FlatStep, Step, signature_of, traced
+
+        file = Path(path)
+        file_format = format_of(file, to)
+        dt = (dt or self.inputs.dt or None) if "dt" in self.inputs.fields else None
+        if "dt" in self.inputs.fields and dt is None:
+            raise TgdslError("export: expected `dt`, the time between steps [s], which the document does not say")
+        touch = copy.deepcopy(self)
+        touch.free()
+        state = replace(touch.example_state(EXAMPLE_ENVS, dtype=dtype_of(state_dtype or self.dtype)), dt=dt)
+        tensors = touch.incoming.tensors(state, touch.dtype, touch.device)
+        memory = touch.initial_memory(EXAMPLE_ENVS, dt)
+        observed = partial(observe, touch.plan, touch.constants)
+        step = Step(touch.plan, touch.constants, touch.pure_step, observed, tensors, memory, dt)
+        flat = FlatStep(step)
+        signature = signature_of(flat, step, source, overrides)
+        write(traced(flat, touch.plan), signature, file, file_format, touch.inductor_options())
+        return signature
 
     def free(self) -> None:
         """Let go of all that sensors remember, and of the number of environments; the seed is kept.

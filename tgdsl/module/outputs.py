@@ -137,7 +137,7 @@ def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
         _check(where, all_readings[term.reading], readings[term.reading])
     if not readings:
         raise ObservationError("there are no readings, so nothing says how many environments there are")
-    counts = {name: len(reading) for name, reading in readings.items() if name in all_readings}
+    counts = {name: reading.shape[0] for name, reading in readings.items() if name in all_readings}
     if not counts:
         unknown = next(iter(readings))
         raise ObservationError(f'this module has no reading "{unknown}"; {did_you_mean(unknown, all_readings, "readings")}')

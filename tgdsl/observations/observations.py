@@ -22,7 +22,7 @@ from pydantic import Field, StrictInt
 from torch import Tensor
 
 from tgdsl.errors import ObservationError
-from tgdsl.fields.models import Positive, SpecModel
+from tgdsl.fields.models import Positive, Quantity, SpecModel
 from tgdsl.layout.layout import Layout
 from tgdsl.observations.proprioception import JointSpec
 
@@ -85,6 +85,19 @@ class AggForceObservation(OfReading):
     """Factor from summed depth to the unit of the hand's aggregate force [unit/m]."""
     axes: Literal["xyz", "zyx"] = "zyx"
     """Order of the link-frame axes; `zyx` is that of the XHand1's aggregate pressure."""
+
+
+class CopObservation(OfReading):
+    """Force on each link [N] and its centre of pressure [m], link frame, of a `kinematic_taxel` or `force_taxel` sensor.
+
+    The force is F = Σ f_j, the centre c = Σ p_j x_j / Σ p_j, with f_j the force on taxel j, x_j its position, n_j its outward
+    normal and p_j = max(0, −f_j · n_j). Where Σ p_j is at most `threshold`, c = 0.
+    """
+
+    type: Literal["cop"]
+    """Force [N] and centre of pressure [m] per link."""
+    threshold: Annotated[float, Quantity("force", ge=0.0)] = 0.0
+    """Normal force of a link up to which it has no centre of pressure [N]."""
 
 
 class ForceObservation(OfReading):
@@ -156,6 +169,7 @@ ReadingSpec = (
     | AggBoolObservation
     | DepthObservation
     | AggForceObservation
+    | CopObservation
     | ForceObservation
     | ForceTorqueObservation
     | ElastomerObservation
@@ -174,6 +188,7 @@ WANTED: dict[str, tuple[tuple[str, ...], str]] = {
     "agg_bool": (("contact",), "taxel"),
     "depth": (("depth",), "taxel"),
     "agg_force": (("depth",), "taxel"),
+    "cop": (_FORCE, "taxel"),
     "force": (_FORCE, "taxel"),
     "force_torque": (_FORCE + _TORQUE, "taxel"),
     "elastomer": (_MARKER, "taxel"),
@@ -188,7 +203,7 @@ HAND_ONLY = {"taxel_counts": 5 * 120 * 3, "taxel_saturated": 5 * 120}
 
 
 def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
-    """Return the folded operator of an aggregate: a matrix (taxel, feature), and the threshold of a count."""
+    """Return the folded operator of an aggregate: matrices (taxel, feature), thresholds, normals (axis, taxel)."""
     num_links = len(layout.links)
     belongs = (layout.link_id[:, None] == np.arange(num_links)).astype(np.float64)
     if isinstance(spec, AggBoolObservation):
@@ -197,6 +212,9 @@ def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
         axes = ["xyz".index(axis) for axis in spec.axes]
         per_axis = [spec.scale * layout.normal[:, axis, None] * belongs for axis in axes]
         return {"operator": np.concatenate(per_axis, axis=1)}
+    if isinstance(spec, CopObservation):
+        moment = np.concatenate([layout.pos[:, axis, None] * belongs for axis in range(3)], axis=1)
+        return {"operator": belongs, "moment": moment, "normal": layout.normal.T, "threshold": np.asarray(spec.threshold)}
     return {}
 
 
@@ -212,6 +230,8 @@ def num_features(type_: str, num_channels: int, num_rows: int, num_links: int) -
         return num_links
     if type_ == "agg_force":
         return 3 * num_links
+    if type_ == "cop":
+        return 6 * num_links
     return num_channels * num_rows
 
 
@@ -235,6 +255,13 @@ def observe(
         return torch.where(count.isnan(), count, bit)
     if type_ == "agg_force":
         return reading[:, :, channels[0]] @ constants["operator"]
+    if type_ == "cop":
+        force = reading[:, :, list(channels)].unbind(2)
+        pressing = -sum(part * normal for part, normal in zip(force, constants["normal"], strict=True)).clamp(max=0)
+        total = pressing @ constants["operator"]
+        is_free = (total <= constants["threshold"]).repeat(1, 3)
+        centre = pressing @ constants["moment"] / torch.where(is_free, 1.0, total.repeat(1, 3))
+        return torch.cat([*(part @ constants["operator"] for part in force), torch.where(is_free, 0.0, centre)], dim=1)
     if "rows" in constants:
         reading = reading.index_select(1, constants["rows"])
     if channels == tuple(range(reading.shape[2])):

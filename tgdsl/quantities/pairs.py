@@ -171,4 +171,6 @@ def at_probes(part: Float[Tensor, "env pairs"], own: slice, pair: Int[Tensor, " 
 def gates(found: Tensor, place: Int[Tensor, " pair"], dtype: torch.dtype) -> Float[Tensor, "env pair"]:
     """Return 0 where a pair is in contact by the state's `contact_found`, −∞ where it is not; not-a-number where that is."""
     column = found[:, place]
+    if column.dtype == torch.bool:  # ONNX has no isnan of these
+        return torch.where(column, 0.0, -torch.inf).to(dtype)
     return torch.where(column > 0, 0.0, torch.where(column.isnan(), torch.nan, -torch.inf)).to(dtype)

@@ -53,9 +53,12 @@ class Operation(Generic[P, R]):
 
 
 def are_kernel_inputs(*tensors: Tensor) -> bool:
-    """Return whether a Triton kernel can take these: all float32 on a GPU, and no derivatives are wanted, which it lacks."""
+    """Return whether a Triton kernel can take these: all float32 on a GPU, and no derivatives are wanted, which it lacks.
+
+    An exported program has none: it runs where tgdsl is not.
+    """
     are_fit = all(tensor.is_cuda and tensor.dtype == torch.float32 for tensor in tensors)
-    return HAS_TRITON and len(tensors) > 0 and are_fit and not needs_autograd(*tensors)
+    return HAS_TRITON and len(tensors) > 0 and are_fit and not (needs_autograd(*tensors) or torch.compiler.is_exporting())
 
 
 def needs_autograd(*tensors: Tensor) -> bool:

@@ -6,8 +6,8 @@ Nothing else in tgdsl touches a name of torch that begins with an underscore (`t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import FunctionType, MethodType
 from typing import Any
@@ -175,6 +175,54 @@ def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:
     if hints is not None:
         hints[size.node.expr] = value
     return size
+
+
+def assert_dtype(tensor: Tensor, dtype: torch.dtype) -> None:
+    """Have a graph of torch.export refuse tensors of another dtype: it looks at shapes by itself, and at nothing else."""
+    torch.ops.aten._assert_tensor_metadata(tensor, None, None, dtype)
+
+
+@contextmanager
+def checked_packages() -> Iterator[None]:
+    """Have AOTInductor's packages refuse inputs of a wrong dtype, shape, stride or device, or of unlike numbers of rows.
+
+    Inductor writes such checks, but for the last, and has them done only where AOTI_RUNTIME_CHECK_INPUTS is set; else wrong
+    tensors are read as if they were right. Here they are always done, and 1 is a size like any other.
+    """
+    from torch._inductor import config
+    from torch._inductor.codegen.cpp_wrapper_cpu import CppWrapperCpu
+    from torch._inductor.virtualized import V
+
+    unset, set_ = "env_var_value != nullptr && env_var_value[0]", "env_var_value == nullptr || env_var_value[0]"
+    original = CppWrapperCpu.generate_input_output_runtime_checks
+
+    def generate(self: Any) -> None:
+        original(self)
+        lines = self.prefix._lines
+        at = [i for i, line in enumerate(lines) if isinstance(line, str) and unset in line]
+        assert len(at) == 1 and lines[-1].strip() == "}", "another version of Inductor, which writes other checks"
+        lines[at[0]] = lines[at[0]].replace(unset, set_)
+        lines.insert(-1, _EQUAL_ROWS.format(count=len(V.graph.graph_inputs)))
+
+    CppWrapperCpu.generate_input_output_runtime_checks = generate
+    try:
+        with config.patch({"aot_inductor.check_lowerbound": False}):
+            yield
+    finally:
+        CppWrapperCpu.generate_input_output_runtime_checks = original
+
+
+_EQUAL_ROWS = """
+    for (int i = 0; i < {count}; i++) {{
+        int64_t rows, first;
+        AOTI_TORCH_ERROR_CODE_CHECK(aoti_torch_get_size(input_handles[i], 0, &rows));
+        AOTI_TORCH_ERROR_CODE_CHECK(aoti_torch_get_size(input_handles[0], 0, &first));
+        if (rows != first) {{
+            throw std::runtime_error("input_handles[" + std::to_string(i) + "]: found " + std::to_string(rows)
+                + " rows, input_handles[0] has " + std::to_string(first));
+        }}
+    }}
+"""
 
 
 def num_compiled_graphs() -> int:

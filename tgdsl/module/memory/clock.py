@@ -103,11 +103,22 @@ class Clock(HookedModule):
         if self.num_envs is not None:
             self._count_anew()
 
+    def copy_seed(self, other: Clock) -> None:
+        """Draw the random numbers that another clock draws after `seed`."""
+        self._seed, self._first_env = other._seed, other._first_env
+
     def reset(self, chosen: Tensor) -> None:
         """Begin a new episode in the environments of a mask."""
         if self.num_envs is not None:
             self.get_buffer("episode").add_(chosen)
             self.get_buffer("age").masked_fill_(chosen, 0)
+
+    @staticmethod
+    def restarted(memory: Mapping[str, Tensor], chosen: Tensor) -> dict[str, Tensor]:
+        """Return the counts that `reset` changes, of memory that is not this clock's own."""
+        if "clock/age" not in memory:
+            return {}
+        return {"clock/episode": memory["clock/episode"] + chosen, "clock/age": memory["clock/age"].masked_fill(chosen, 0)}
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what `nows` and `after` want, by name."""
@@ -200,7 +211,7 @@ class Clock(HookedModule):
 def _env(memory: Mapping[str, Tensor]) -> Tensor:
     """Return the numbers of the environments that are read, (env,), counted over all processes."""
     age = memory["clock/age"]
-    return (memory[ENV] if ENV in memory else torch.arange(len(age), device=age.device)) + memory["clock/first_env"]
+    return (memory[ENV] if ENV in memory else torch.arange(age.shape[0], device=age.device)) + memory["clock/first_env"]
 
 
 def _rank() -> int:

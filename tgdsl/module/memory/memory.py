@@ -87,6 +87,7 @@ class Memory(HookedModule):
                 assert s.history is not None
                 shape = (s.history.length, len(reading.channels), reading.num_rows)
                 self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
+        self._restarted = {f"{s.name}:{n}": part.rest for s in sensors for n, part in s.state.items() if "/" not in n}
         self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
         stacks = {reading.name for s in sensors for reading in s.windows if reading.steps}  # their windows hold them already
         self._kept = {
@@ -134,12 +135,31 @@ class Memory(HookedModule):
                     room = torch.zeros(num_envs, *shape, dtype=dtype, device=device)
                     self.register_buffer(f"{KEPT}{name}", room, persistent=False)
         held = held_buffers(self)
-        for path, (sensor, planned) in self._rings.items():
-            if _calls(planned, dt)[0] > held[path].shape[1]:
-                problem = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
-                raise StateError(f"{problem} {planned.past:g} s of so many calls; begin with the shortest dt")
+        self._check_rings(held, dt)
         self._watch.look(held)
         return held | self.clock.tensors()
+
+    def check(self, memory: Mapping[str, Tensor], num_envs: int, dt: float | None) -> None:
+        """Look at memory that is not held here.
+
+        Raises:
+            StateError: If some of it is missing, of another shape or number of environments, or its rings are too short for dt.
+        """
+        clock = ("clock/age", "clock/step") if self.clock.is_wanted else ()
+        if missing := [name for name in (*self._planned, *clock) if name not in memory]:
+            raise StateError(f'memory: found no "{missing[0]}"; expected `initial_memory`, or what the step before returned')
+        for name, planned in self._planned.items():
+            shape, rest = tuple(memory[name].shape), (*(("call",) if planned.past else ()), *planned.shape)
+            if shape[0] != num_envs or len(shape) != len(rest) + 1 or shape[len(shape) - len(planned.shape) :] != planned.shape:
+                expected = ", ".join(map(str, (num_envs, *rest)))
+                raise StateError(f'memory: "{name}" has shape {shape}, expected ({expected})')
+        self._check_rings(memory, dt)
+
+    def _check_rings(self, memory: Mapping[str, Tensor], dt: float | None) -> None:
+        for path, (sensor, planned) in self._rings.items():
+            if _calls(planned, dt)[0] > memory[path].shape[1]:
+                problem = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
+                raise StateError(f"{problem} {planned.past:g} s of so many calls; begin with the shortest dt")
 
     @property
     def num_kept(self) -> int | None:
@@ -197,11 +217,17 @@ class Memory(HookedModule):
 
     def reset(self, chosen: Tensor) -> None:
         """Begin a new episode in the environments of a mask; what noise and history remember restarts by its age."""
-        for path, planned in self._planned.items():
-            if "/" not in path.partition(":")[2] and not path.startswith(WINDOW):
-                buffer = self.get_buffer(path)
-                buffer.masked_fill_(broadcast_over(chosen, buffer), planned.rest)
+        for path, rest in self._restarted.items():
+            buffer = self.get_buffer(path)
+            buffer.masked_fill_(broadcast_over(chosen, buffer), rest)
         self.clock.reset(chosen)
+
+    def restarted(self, memory: Mapping[str, Tensor], chosen: Tensor) -> dict[str, Tensor]:
+        """Return what `reset` makes of memory that is not this module's own."""
+        at_rest = {
+            path: memory[path].masked_fill(broadcast_over(chosen, memory[path]), rest) for path, rest in self._restarted.items()
+        }
+        return {**memory, **at_rest, **self.clock.restarted(memory, chosen)}
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
         """Move or cast all buffers; what was handed out last lies elsewhere."""
@@ -250,11 +276,19 @@ def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
     with torch.no_grad():
         for name, value in updated.items():
             if value.ndim < memory[name].ndim:
-                env, place = _entry_of(memory, name)
-                memory[name].index_put_((env, place), value.detach())
+                memory[name].index_put_(_entry_of(memory, name), value.detach())
         for name, value in updated.items():
             if value.ndim == memory[name].ndim:
                 memory[name].copy_(value.detach())
+
+
+def stored(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return memory with new state in the place of the old one, as `store` writes it; derivatives go through it."""
+    result = {**memory, **updated}
+    for name, value in updated.items():
+        if value.ndim < memory[name].ndim:
+            result[name] = memory[name].index_put(_entry_of(memory, name), value)
+    return result
 
 
 def kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -274,7 +308,7 @@ def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mas
 def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
     """Return the places of this call's entries in a ring: environment, and which of its calls."""
     place = materialised(memory["clock/step"] % memory[name].shape[1])
-    return torch.arange(len(place), device=place.device), place
+    return torch.arange(place.shape[0], device=place.device), place
 
 
 def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:

@@ -45,8 +45,12 @@ EXPECTED = (1000, 100)
 
 
 def are_compacted(pos: Vec, strength: Vec) -> bool:
-    """Return whether `active_points` can take these and saves time: on a CPU, for several environments, without derivatives."""
-    return pos[0].device.type == "cpu" and pos[0].shape[0] != 1 and not needs_autograd(*pos, *strength)
+    """Return whether `active_points` can take these and saves time: on a CPU, for several environments, without derivatives.
+
+    An exported program cannot have its operation.
+    """
+    is_here = pos[0].device.type == "cpu" and not torch.compiler.is_exporting()
+    return is_here and pos[0].shape[0] != 1 and not needs_autograd(*pos, *strength)
 
 
 def active_points(pos: Vec, strength: Vec) -> Iterator[Row]:

@@ -167,7 +167,7 @@ def forward(
     history = torch.where(is_first[..., None], 0.0, state.history)
     sound = torch.cat([history, emitted], dim=2)
     path = _path(place, state, is_first)
-    fixed = None if constants.pos is None else constants.pos.to(place.dtype).expand(len(place), 1, 3)
+    fixed = None if constants.pos is None else constants.pos.to(place.dtype).expand(place.shape[0], 1, 3)
     listener = gathered[Places] if fixed is None else planes.split(fixed)
     here = planes.vec((m - place[:, i]).to(emitted.dtype) for i, m in enumerate(listener))
     age = age_of_sound(planes.vec(here[i][:, None] - path[:, i] for i in range(3)), constants.speed * context.dt)

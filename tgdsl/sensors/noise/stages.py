@@ -165,7 +165,7 @@ class Delay(Stage):
 
 def _entry(ring: Tensor, slot: Tensor) -> Signal:
     """Return the entries of a ring (env, call, channel, row) at slots (env, 1) or (env, row)."""
-    env = torch.arange(len(ring), device=ring.device)
+    env = torch.arange(ring.shape[0], device=ring.device)
     if slot.shape[1] == 1:  # whole signals, which are contiguous
         return ring[env, slot[:, 0]]
     place = slot[:, None, None].expand(-1, 1, *ring.shape[2:])

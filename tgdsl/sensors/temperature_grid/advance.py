@@ -46,10 +46,10 @@ def advanced(patches: ContactPatch, context: Context, constants: Constants, stat
     rows = rows_of(constants, patches, any(f"is_{name}" in constants for name in ("spectral", "semi_implicit", "paper")))
     where, lumped, grids = patches.topology, list(patches.topology.lumped), list(patches.topology.grids)
     cells, cells_low = state["cells"], state["cells_low"]
-    objects = objects_low = cells.new_zeros((len(cells), 0, 1, 1, 1))
+    objects = objects_low = cells.new_zeros((cells.shape[0], 0, 1, 1, 1))
     if where.num_objects:
         most = [max(own[axis] for own in where.cells) for axis in range(3)]
-        objects, objects_low = (state[name].reshape(len(cells), -1, *most) for name in ("objects", "objects_low"))
+        objects, objects_low = (state[name].reshape(cells.shape[0], -1, *most) for name in ("objects", "objects_low"))
     all_cells = _with_objects(cells, objects[:, grids], rows) if grids else cells
     nodes = objects[:, :, 0, 0, 0] if where.is_plain else objects[:, lumped, 0, 0, 0]
     if "is_paper" in constants:

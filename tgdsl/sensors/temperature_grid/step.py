@@ -204,7 +204,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     source = constants.get("source")
     gained, nodes_gained, got, nodes_got = heat_step(
         [cells, nodes],
-        [part.expand(len(cells), -1, -1) for part in (area, series, *patches.pos, *patches.normal)],
+        [part.expand(cells.shape[0], -1, -1) for part in (area, series, *patches.pos, *patches.normal)],
         [*(constants[name] for name in ("conductivity", "volumetric_heat", "volume", "box")), *rows.ends],
         _films(rows),
         constants.get("emissivity"),

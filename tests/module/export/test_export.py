@@ -1,0 +1,195 @@
+"""Exported steps: the file computes what the module computes, for any number of environments, where tgdsl is not."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from noisy_modules import CONTACT_NOISE, EVERY_KNOB, document, felt_state
+from oracles.geometry import mesh_scene
+from ruamel.yaml import YAML
+
+import tgdsl
+from tgdsl.commands.export import Export
+from tgdsl.commands.verify import Verify
+from tgdsl.errors import ArtifactError, TgdslError
+from tgdsl.module.export.signature import read_signature
+from tgdsl.module.export.verify import verify
+
+ROOT = Path(__file__).parents[3]
+SENSORS = {
+    "a": {"noise": EVERY_KNOB, "history": 3},
+    "b": {"rate": 40, "noise": {"read_delay": 0.013}},
+    "c": {"kind": "contact", "noise": CONTACT_NOISE, "history": {"length": 4, "reduce": "median"}},
+}
+OBSERVED = {
+    "observations": {
+        "policy": [{"type": "force_torque", "of": "a"}, {"type": "agg_bool", "of": "c"}, {"type": "cop", "of": "b"}]
+    }
+}
+KINDS = {
+    "contact": (), "depth": (), "distance": (), "touch": (), "force": (), "solver": (), "near": (), "skin": (), "heat": (),
+    "sound": (), "motors": (), "ear": ("sound", "motors"),
+}  # fmt: skip
+"""Sensors of examples/every_sensor.yaml, one of each kind, with those that it reads."""
+needs_onnx = pytest.mark.skipif(
+    not find_spec("onnxruntime"), reason='onnxruntime is not installed: pip install "tgdsl[export]"'
+)
+needs_compiler = pytest.mark.skipif(not (shutil.which("g++") and shutil.which("cmake")), reason="g++ or cmake is not installed")
+ONNX_NOISE = "ignore:.*(treespec|LeafSpec).*:FutureWarning"
+
+
+@pytest.fixture
+def noisy(tmp_path):
+    return tgdsl.compile(document(tmp_path, SENSORS, **OBSERVED)).seed(11)
+
+
+def of_kind(name: str) -> tgdsl.TactileModule:
+    made = YAML(typ="safe").load(ROOT / "examples" / "every_sensor.yaml")
+    made["robot"] = {key: str(ROOT / "examples" / value) for key, value in made["robot"].items()}
+    made["scene"] = {"model": str(ROOT / "examples" / "palm_cube.xml")}
+    sensors = {sensor: made["sensors"][sensor] for sensor in (*KINDS[name], name)}
+    return tgdsl.compile({**made, "sensors": sensors, "observations": {}, "resolution": "low"})
+
+
+def test_a_file_computes_what_the_module_computes(noisy, tmp_path):
+    """Noise of all sorts, delays, rates, histories, observations, resets; batches of 1, 7 and 64; no tgdsl to import."""
+    noisy(felt_state(noisy))
+    signature = noisy.export(tmp_path / "hand.pt2", dt=0.01)
+    assert noisy.num_envs == 4, "the module stays as it is"
+    assert read_signature(tmp_path / "hand.pt2") == signature
+    verdict = verify(tmp_path / "hand.pt2", noisy, num_calls=12)
+    assert list(verdict.differences) == [1, 7, 64]
+    assert verdict.differences[7].keys() == {"reading/a", "reading/b", "reading/c", "observation/policy"}
+    assert verdict.worst <= 1e-6 and verdict.is_equal
+    other = verify(tmp_path / "hand.pt2", tgdsl.compile(document(tmp_path, SENSORS, **OBSERVED)).seed(12), num_calls=3)
+    assert other.worst > 0.01 and not other.is_equal, "other random numbers are noticed"
+
+
+def test_inputs_that_do_not_fit_are_refused(noisy, tmp_path):
+    signature = noisy.export(tmp_path / "hand.pt2", dt=0.01)
+    program = torch.export.load(tmp_path / "hand.pt2").module()
+    given = [torch.zeros(5, *port.shape, dtype=getattr(torch, port.dtype)) for port in signature.inputs]
+    assert len(program(*given)) == len(signature.outputs)
+    for i, tensor in enumerate(given):
+        for wrong in (tensor.to(torch.float64), tensor[:3]):
+            with pytest.raises((RuntimeError, AssertionError)):
+                program(*given[:i], wrong, *given[i + 1 :])
+
+
+def test_states_in_double_precision(noisy, tmp_path):
+    signature = noisy.export(tmp_path / "hand.pt2", dt=0.01, state_dtype="float64")
+    assert {port.name: port.dtype for port in signature.inputs}["body_pos"] == "float64"
+    assert verify(tmp_path / "hand.pt2", noisy, num_calls=3).is_equal
+
+
+def test_what_cannot_be_exported_is_refused_by_name(noisy, tmp_path):
+    import trimesh
+
+    touch, _ = mesh_scene(trimesh.creation.box((0.04, 0.04, 0.04)), [(0, 0, 0.025)], query="raycast", surface="visual")
+    with pytest.raises(TgdslError, match="s cannot be exported: `query: raycast` searches triangles with NVIDIA Warp"):
+        touch.export(tmp_path / "hand.pt2")
+    with pytest.raises(TgdslError, match="expected `dt`, the time between steps"):
+        noisy.export(tmp_path / "hand.pt2")
+    with pytest.raises(TgdslError, match=r"found 'hand\.txt', expected one of pt2, aoti, onnx"):
+        noisy.export(tmp_path / "hand.txt", dt=0.01)
+    with pytest.raises(TgdslError, match=r"the format onnx has the ending \.onnx"):
+        noisy.export(tmp_path / "hand.pt2", "onnx", dt=0.01)
+    assert not (tmp_path / "hand.pt2").exists()
+
+
+def test_files_of_others_and_of_other_taxels_are_refused(noisy, tmp_path):
+    (tmp_path / "text.pt2").write_text("no archive")
+    with zipfile.ZipFile(tmp_path / "empty.pt2", "w"):
+        pass
+    for name in ("text.pt2", "empty.pt2"):
+        with pytest.raises(ArtifactError, match="expected a file that `tgdsl export` wrote"):
+            read_signature(tmp_path / name)
+    with pytest.raises(ArtifactError, match="cannot be read: No such file"):
+        read_signature(tmp_path / "none.pt2")
+    noisy.export(tmp_path / "hand.pt2", dt=0.01)
+    with pytest.raises(ArtifactError, match="its taxels are other ones than the module's"):
+        verify(tmp_path / "hand.pt2", tgdsl.compile(document(tmp_path, {"a": {"links": "tip"}})))
+
+
+def test_the_commands_export_and_verify(tmp_path, capsys, monkeypatch):
+    (tmp_path / "hand.yaml").write_text(json.dumps(document(tmp_path, {"a": {}}), default=float))
+    monkeypatch.chdir(tmp_path)
+    Export(tmp_path / "hand.yaml").run()
+    printed = capsys.readouterr().out
+    assert "in    0  body_pos                          float32  (env, 3, 3)" in printed
+    assert "tgdsl verify hand.pt2" in printed
+    Verify(Path("hand.pt2"), calls=2).run()
+    printed = capsys.readouterr().out
+    assert "64 environments, 2 calls" in printed and "inputs of a wrong dtype are refused" in printed
+    tgdsl.compile(tmp_path / "hand.yaml").export("hand.pt2")
+    with pytest.raises(ArtifactError, match="does not say what it was exported from; name it with --of"):
+        Verify(Path("hand.pt2")).run()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_is_exported(name, tmp_path):
+    touch = of_kind(name)
+    touch.export(tmp_path / "hand.pt2", dt=0.01)
+    assert verify(tmp_path / "hand.pt2", touch).worst <= 1e-6
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.filterwarnings(ONNX_NOISE)
+def test_a_compiled_package_computes_what_the_module_computes(noisy, tmp_path):
+    signature = noisy.export(tmp_path / "hand.aoti.pt2", dt=0.01)
+    assert verify(tmp_path / "hand.aoti.pt2", noisy).is_equal
+    program = torch._inductor.aoti_load_package(str(tmp_path / "hand.aoti.pt2"))
+    given = [torch.zeros(5, *port.shape, dtype=getattr(torch, port.dtype)) for port in signature.inputs]
+    assert len(program(*given)) == len(signature.outputs)
+    for i, tensor in enumerate(given):
+        for wrong in (tensor.to(torch.float64), tensor[:3]):
+            with pytest.raises(RuntimeError):
+                program(*given[:i], wrong, *given[i + 1 :])
+
+
+@pytest.mark.slow
+@needs_onnx
+@pytest.mark.filterwarnings(ONNX_NOISE)
+@pytest.mark.parametrize("name", ["noisy", "force", "heat", "skin"])
+def test_onnx_runtime_computes_what_the_module_computes(name, request, tmp_path):
+    touch = request.getfixturevalue("noisy") if name == "noisy" else of_kind(name)
+    touch.export(tmp_path / "hand.onnx", dt=0.01)
+    assert verify(tmp_path / "hand.onnx", touch).is_equal
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.filterwarnings(ONNX_NOISE)
+def test_cpp_reads_what_python_reads(noisy, tmp_path):
+    """examples/cpp, built here, prints the readings of states that it makes from a seed as Python does."""
+    signature = noisy.export(tmp_path / "hand.aoti.pt2", dt=0.01)
+    build = ["cmake", "-S", str(ROOT / "examples" / "cpp"), "-B", str(tmp_path / "build")]
+    subprocess.run([*build, f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"], check=True, capture_output=True)
+    subprocess.run(["cmake", "--build", str(tmp_path / "build")], check=True, capture_output=True)
+    memory, num_envs = noisy.initial_memory(7, 0.01), 7
+    lines = []
+    for call in range(5):
+        state = dataclasses.replace(felt_state(noisy, num_envs, call).to(torch.float32), dt=0.01)
+        state.contact_found = state.contact_found > 0
+        reset = torch.arange(num_envs) == call
+        given = {**noisy.incoming.tensors(state, noisy.dtype, noisy.device), "reset": reset}
+        for port in signature.inputs:
+            if not port.name.startswith("memory/"):
+                file = tmp_path / f"{call}_{port.name.replace('/', '_')}.bin"
+                file.write_bytes(given[port.name].contiguous().numpy().tobytes())
+        readings, memory = noisy.step(state, memory, reset)
+        lines.append(readings["a"].flatten().numpy())
+    command = [str(tmp_path / "build" / "touch"), str(tmp_path / "hand.aoti.pt2"), str(tmp_path), str(num_envs), "5"]
+    subprocess.run(command, check=True, capture_output=True)
+    found = np.fromfile(tmp_path / "reading_a.bin", np.float32)
+    expected = np.concatenate(lines)
+    assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()

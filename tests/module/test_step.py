@@ -1,0 +1,80 @@
+"""The step as a function: memory goes in and comes out, and derivatives go through it."""
+
+import dataclasses
+
+import pytest
+import torch
+from noisy_modules import EVERY_KNOB, EXAMPLE, document, felt_state
+
+import tgdsl
+from tgdsl.errors import StateError
+
+NOISY = {"a": {"noise": EVERY_KNOB, "history": 3}, "b": {"rate": 40, "noise": {"read_delay": 0.013}}}
+
+
+@pytest.fixture
+def noisy(tmp_path):
+    return tgdsl.compile(document(tmp_path, NOISY), dtype=torch.float64).seed(7)
+
+
+def test_steps_read_what_calls_read(noisy):
+    """Noise, delays, rates, history and resets; memory of a step is not changed by the next one."""
+    memory = noisy.initial_memory(4, 0.01)
+    for call in range(12):
+        state, reset = felt_state(noisy, 4, call), torch.tensor([False, call == 5, call in (3, 4), False])
+        if call:
+            noisy.reset(reset)
+        before = {name: value.clone() for name, value in memory.items()}
+        readings, after = noisy.step(state, memory, reset if call else None)
+        expected = noisy(state)
+        assert all(torch.equal(readings[name], expected[name]) for name in expected)
+        assert all(torch.equal(memory[name], before[name]) for name in before)
+        memory = after
+    held = noisy.memory.tensors(4, 0.01, noisy.dtype, noisy.device)
+    assert held.keys() == memory.keys() and all(torch.equal(held[name], memory[name]) for name in held)
+
+
+def test_steps_of_every_kind_read_what_calls_read():
+    touch = tgdsl.compile(EXAMPLE, resolution="low")
+    memory = touch.initial_memory(2, 0.01)
+    for call in range(3):
+        state = touch.example_state(2, call)
+        readings, memory = touch.step(state, memory)
+        expected = touch(state)
+        assert all(torch.equal(readings[name], expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize(("noise", "history"), [({"read_delay": 0.02}, None), ({}, {"length": 3, "reduce": "mean"})])
+def test_derivatives_go_through_memory(tmp_path, noise, history):
+    """∂(reading two steps later)/∂(position now), against central differences in float64."""
+    sensor = {"noise": noise, **({"history": history} if history else {})}
+    touch = tgdsl.compile(document(tmp_path, {"a": sensor}), dtype=torch.float64)
+    states = [felt_state(touch, 8, seed) for seed in range(3)]
+
+    def last(pos):
+        memory = touch.initial_memory(8, 0.01)
+        for state in (dataclasses.replace(states[0], body_pos=pos), *states[1:]):
+            readings, memory = touch.step(state, memory)
+        return readings["a"].sum()
+
+    pos = states[0].body_pos.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(last(pos), pos)
+    steepest = gradient.abs().flatten().topk(3).indices
+    for place in [tuple(map(int, index)) for index in zip(*torch.unravel_index(steepest, pos.shape), strict=True)]:
+        shift = torch.zeros_like(pos)
+        shift[place] = 1e-7
+        difference = (last(pos.detach() + shift) - last(pos.detach() - shift)) / 2e-7
+        assert abs(difference) > 1e-3
+        assert difference.item() == pytest.approx(gradient[place].item(), rel=1e-5, abs=1e-5)
+
+
+def test_memory_that_does_not_fit_is_refused(noisy):
+    state, memory = felt_state(noisy, 4), noisy.initial_memory(4, 0.01)
+    with pytest.raises(StateError, match="expected `dt`, the time between steps"):
+        noisy.initial_memory(4)
+    with pytest.raises(StateError, match='memory: found no "a:'):
+        noisy.step(state, {})
+    with pytest.raises(StateError, match=r"expected \(3, "):
+        noisy.step(felt_state(noisy, 3), memory)
+    with pytest.raises(StateError, match="begin with the shortest dt"):
+        noisy.step(dataclasses.replace(state, dt=1e-3), memory)

@@ -1,0 +1,1 @@
+"""Modules out of Python: torch.export, AOTInductor and ONNX."""

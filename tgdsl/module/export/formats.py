@@ -1,0 +1,84 @@
+"""Files of exported steps: torch.export's, AOTInductor's and ONNX."""
+
+from __future__ import annotations
+
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from tgdsl.errors import TgdslError
+from tgdsl.files.write import atomic_path
+from tgdsl.module.export.program import without_strides
+from tgdsl.module.export.signature import ENTRY, Signature
+from tgdsl.tensors.torch_internals import checked_packages
+
+Format = Literal["pt2", "aoti", "onnx"]
+ENDINGS: dict[Format, str] = {"pt2": ".pt2", "aoti": ".aoti.pt2", "onnx": ".onnx"}
+OPSET = 20
+
+
+def format_of(path: Path, to: str | None) -> Format:
+    """Return the format of a file, by its name's ending if it is not given.
+
+    Raises:
+        TgdslError: If there is no such format, the name has another ending, or what writes it is not installed.
+    """
+    result = to or next((name for name in reversed(ENDINGS) if path.name.endswith(ENDINGS[name])), None)
+    if result not in ENDINGS:
+        raise TgdslError(
+            f"found {to or path.name!r}, expected one of {', '.join(ENDINGS)}, or a file's name with {'.pt2 or .onnx'}"
+        )
+    ending = ".onnx" if result == "onnx" else ".pt2"
+    if path.suffix != ending:
+        raise TgdslError(f"{path}: the format {result} has the ending {ending}")
+    if result == "onnx" and not (find_spec("onnx") and find_spec("onnxscript")):
+        raise TgdslError('ONNX files need onnx and onnxscript: pip install "tgdsl[export]"')
+    return result
+
+
+def write(program: torch.export.ExportedProgram, signature: Signature, path: Path, to: Format, options: dict[str, Any]) -> None:
+    """Write an exported step.
+
+    Args:
+        program: Its graph.
+        signature: What goes in and comes out.
+        path: The file.
+        to: Its format.
+        options: What Inductor is asked for, see `TactileModule.inductor_options`.
+
+    Raises:
+        FileError: If the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        if to == "onnx":
+            _write_onnx(program, signature, temporary)
+        elif to == "pt2":
+            torch.export.save(program, str(temporary), extra_files={ENTRY: signature.to_json()})
+        else:
+            with checked_packages():
+                configs = {**options, "aot_inductor.metadata": {Path(ENTRY).stem: signature.to_json()}}
+                torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=configs)
+            with zipfile.ZipFile(temporary, "a") as archive:
+                folder = archive.namelist()[0].partition("/")[0]
+                archive.writestr(f"{folder}/extra/{ENTRY}", signature.to_json())
+
+
+def _write_onnx(program: torch.export.ExportedProgram, signature: Signature, path: Path) -> None:
+    import onnx
+
+    names = [[port.name for port in ports] for ports in (signature.inputs, signature.outputs)]
+    converted: Any = torch.onnx.export(
+        without_strides(program),
+        input_names=names[0],
+        output_names=names[1],
+        opset_version=OPSET,
+        dynamo=True,
+        optimize=False,  # it takes x + 1e-24 for x
+        verbose=False,
+    )
+    model = converted.model_proto
+    onnx.helper.set_model_props(model, {Path(ENTRY).stem: signature.to_json()})
+    onnx.save(model, str(path))
