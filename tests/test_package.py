@@ -90,7 +90,7 @@ def test_loading_waits_for_what_only_compiling_needs():
 def test_environments_leave_triton_alone():
     """Its LLVM and that of MuJoCo's software renderer, which `MUJOCO_GL=osmesa` loads, do not go into one process."""
     assert in_python(
-        "import sys, tgdsl.rl.env, tgdsl.rl.playing.play, tgdsl.module.explain; print('triton' in sys.modules)"
+        "import sys, tgdsl.rl.env, tgdsl.rl.playing.rollout, tgdsl.module.explain; print('triton' in sys.modules)"
     ) == ["False"]
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_tasks import STEPS, TASK, small_task
 
-from tgdsl.rl.playing.record import Record
+from tgdsl.rl.playing.record import PlayRecord
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
@@ -197,7 +197,7 @@ def test_ctrl_c_leaves_nothing_half_written(base, here, monkeypatch, where):
         raise KeyboardInterrupt
 
     if where == "stepping":
-        monkeypatch.setattr(Record, "add", interrupted)
+        monkeypatch.setattr(PlayRecord, "add", interrupted)
     else:
         monkeypatch.setattr(np, "savez_compressed", interrupted)
     before = sorted(base.rglob("*"))

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from task_references import TERMS
 from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
@@ -97,7 +98,7 @@ def reference_rates(task, reference, spec, record: Record, dt: float) -> Record:
     rows = []
     for t, own in enumerate(reference(spec, record, dt), start=1):
         row = {name: value[t] for name, value in instants.items()} | {"last_action": record["action"][t - 1]} | limits
-        rates = own | {name: term.reference(row) for name, term in shared.items()}
+        rates = own | {name: TERMS[type(term)](term, row) for name, term in shared.items()}
         rows.append(own | {name: getattr(weights, name) * rates[name] for name in task.terms})
     return _stacked(rows)
 

@@ -1,12 +1,19 @@
 """Weights and other numbers of terms that follow the progress of learning, in steps that are already compiled too."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from tiny_tasks import tiny_env, write_task
 
 from tgdsl.errors import SpecError
-from tgdsl.rl.load import load_task
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task, number_owners
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "tasks"
+TASKS = ("in_palm_rotate", "in_hand_repose", "screwdriver", "grip_force", "hot_ball")
+QUIET = {"touch": "none"}
 
 EFFORT = "terms: {more: {term: linear, of: rewards.effort, first: 10, last: 30, start: 0, end: -0.5}}\n"
 NEAR = """terms:
@@ -55,6 +62,43 @@ def test_a_parameter_of_a_term_follows_too(tmp_path):
         np.testing.assert_allclose(made.info.terms["close"], 2 * env.control_step * rate, rtol=1e-6)
 
 
+@pytest.mark.parametrize("name", TASKS)
+def test_each_number_of_a_task_that_follows_has_the_effect_that_it_has_in_the_document(name):
+    """To the bit, all at once: rewards, observations and ends with nine tenths of each number."""
+    loaded = load_task(EXAMPLES / f"{name}.yaml", QUIET)
+    numbers = {
+        path: 0.9 * dict(owner)[path.rpartition(".")[2]] for path, owner in number_owners(loaded.task, loaded.spec, {}).items()
+    }
+    terms = {
+        f"c{i}": {"term": "linear", "of": path, "first": 0, "last": 1, "start": value, "end": value}
+        for i, (path, value) in enumerate(numbers.items())
+    }
+    env, other = (
+        TouchEnv(EXAMPLES / f"{name}.yaml", 4, threads=1, overrides=QUIET | more) for more in (numbers, {"terms": terms})
+    )
+    assert len(other.curricula.values) == len(numbers) >= 13
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(40):
+        action = 2 * torch.rand((4, env.num_actions), generator=generator) - 1
+        one, two = env.step(action), other.step(action)
+        assert torch.equal(one.reward, two.reward) and torch.equal(one.terminated, two.terminated)
+        for mine, theirs in ((one.obs, two.obs), (one.info.terms, two.info.terms)):
+            assert all(torch.equal(value, theirs[key]) for key, value in mine.items())
+
+
+def test_stages_of_a_number_in_one_document(tmp_path):
+    """What progress pays while the object coasts falls from 1 to 0, as runs with another `--set` each had it."""
+    more = "terms: {stage: {term: linear, of: hold.coasting_pay, first: 10, last: 20, start: 1, end: 0}}\n"
+    env, pays = tiny_env(tmp_path, more=more), []
+    for iteration in (0, 15, 20):
+        env.curricula.advance(iteration, None)
+        env.reset(0)
+        env.step(torch.zeros(4, 2))
+        assert not env.task.holding.is_held(env.now).any()
+        pays.append(env.task.memory["pay"].tolist())
+    assert pays == [[1.0] * 4, [0.5] * 4, [0.0] * 4]
+
+
 def test_a_compiled_step_reads_the_number_of_each_iteration(tmp_path):
     """Without a break of its graph, and without one that is compiled again."""
     env = tiny_env(tmp_path, more=EFFORT)
@@ -87,13 +131,20 @@ def test_a_curriculum_of_ones_own_and_its_state(tmp_path):
 @pytest.mark.parametrize(
     ("change", "path", "says"),
     [
-        (("rewards.effort", "rewards.efort"), "terms.more.of", 'there is no number "rewards.efort" of a term; did you mean'),
-        (("rewards.effort", "terms.more.end"), "terms.more.of", 'there is no number "terms.more.end" of a term'),
+        (
+            ("rewards.effort", "rewards.efort"),
+            "terms.more.of",
+            'there is no number "rewards.efort" that can change; did you mean',
+        ),
+        (("rewards.effort", "terms.more.end"), "terms.more.of", 'there is no number "terms.more.end" that can change'),
+        (("rewards.effort", "episode"), "terms.more.of", 'there is no number "episode" that can change'),
+        (("rewards.effort", "max_force"), "terms.more", "max_force would be 0: "),
+        (("rewards.effort", "hold.coasting_pay"), "terms.more", "hold.coasting_pay would be -0.5: "),
         (("last: 30", "last: 10"), "terms.more", "first and last are both 10"),
     ],
 )
 def test_what_is_wrong_with_a_curriculum_is_told_at_its_place(tmp_path, change, path, says):
     with pytest.raises(SpecError) as caught:
         load_task(write_task(tmp_path, more=EFFORT.replace(*change)))
-    (problem,) = caught.value.problems
+    problem = caught.value.problems[0]
     assert problem.path == path and says in f"{problem.what}; {problem.hint}"

@@ -67,10 +67,79 @@ def test_a_function_of_ones_own_happens_at_each_reset(tmp_path):
     torch.testing.assert_close(env.sim.qvel[[0, 2], 5], before[[0, 2]])
 
 
+def test_what_is_random_at_resets_may_be_drawn_again_at_intervals(tmp_path):
+    """Friction, mass and drives: within their ranges, of other numbers each time, and the same in the simulation."""
+    more = """randomise: {drive: {gain: [0.5, 1.5]}}
+episode: 60 s
+terms:
+  slippery: {term: friction, factor: [0.2, 0.4], mode: interval, interval: [0.1 s, 0.2 s]}
+  heavy: {term: mass, added: [100 g, 200 g]}
+  wear: {term: drive, mode: interval, interval: [0.1 s, 0.2 s]}
+"""
+    env = flying(tmp_path, more)
+    setup, properties = env.task.setup, env.sim.properties
+    rows = []
+    for _ in range(60):
+        env.step(torch.zeros(4, 2))
+        torch.testing.assert_close(properties.friction(setup.object), setup.friction)
+        torch.testing.assert_close(properties.mass(setup.object), setup.mass)
+        rows.append(
+            torch.stack(
+                [setup.friction / setup.scene_friction, setup.mass - setup.scene_mass, env.actuation.drawn["gain"][:, 0]]
+            )
+        )
+    factor, added, gain = (value.numpy() for value in torch.stack(rows, dim=1))
+    for values, low, high in ((factor[8:], 0.2, 0.4), (added, 0.1, 0.2), (gain, 0.5, 1.5)):
+        assert low <= values.min() and values.max() <= high
+    assert (added == added[0]).all() and len(set(added[0])) == 4
+    for values in (factor, gain):
+        assert all(8 <= np.count_nonzero(np.diff(column)) <= 15 for column in values.T)
+
+
+@pytest.mark.parametrize(
+    ("short", "term"),
+    [
+        ("friction: [0.5, 1.5]", "friction, factor: [0.5, 1.5]"),
+        ("mass: [0, 100 g]", "mass, added: [0, 100 g]"),
+        (
+            "push: {x: [1 N, 2 N], interval: [0.1 s, 0.2 s], duration: 50 ms}",
+            "push, x: [1 N, 2 N], interval: [0.1 s, 0.2 s], duration: 50 ms",
+        ),
+    ],
+)
+def test_the_short_form_is_an_event_of_its_own_random_numbers(tmp_path, short, term):
+    """Of many environments, the short form and the term have the same means and ranges; of each, other numbers."""
+    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    one = flying(tmp_path / "a", f"randomise: {{{short}}}\nepisode: 60 s\n", 64)
+    two = flying(tmp_path / "b", f"terms: {{other: {{term: {term}}}}}\nepisode: 60 s\n", 64)
+    found = []
+    for env in (one, two):
+        for _ in range(9):
+            env.step(torch.zeros(64, 2))
+        setup = env.task.setup
+        found.append(torch.stack([setup.friction, setup.mass, env.sim.qvel[:, 3]]).numpy())
+    moved = [i for i in range(3) if np.ptp(found[0][i]) > 1e-9]
+    assert len(moved) == 1 and not np.array_equal(*(rows[moved[0]] for rows in found))
+    low, high = (getattr(found[0][moved[0]], end)() for end in ("min", "max"))
+    assert abs(found[1][moved[0]].mean() - found[0][moved[0]].mean()) < 0.25 * (high - low)
+    others = [i for i in range(3) if i not in moved]
+    np.testing.assert_array_equal(found[0][others], found[1][others])
+
+
 def test_a_saved_environment_goes_on_with_its_events(tmp_path):
     env = flying(tmp_path, KNOCK)
     changes(env, 7)
     again = tiny_env(tmp_path, gravity="0 0 0", more=KNOCK)
+    again.load_state_dict(env.state_dict())
+    np.testing.assert_array_equal(changes(again, 20), changes(env, 20))
+
+
+def test_a_saved_environment_goes_on_within_a_push(tmp_path):
+    more = (
+        "randomise: {push: {x: [1 N, 2 N], interval: [0.1 s, 0.1 s], duration: 0.1 s}}\nepisode: 60 s\ndrop_distance: 100 m\n"
+    )
+    env, again = flying(tmp_path, more), tiny_env(tmp_path, gravity="0 0 0", more=more)
+    assert not changes(env, 3).any() and changes(env, 2)[-1, :, 0].all()
     again.load_state_dict(env.state_dict())
     np.testing.assert_array_equal(changes(again, 20), changes(env, 20))
 

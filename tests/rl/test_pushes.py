@@ -1,5 +1,8 @@
 """Pushes: a free ball gains F Δt / m, intervals and forces are those drawn, and only chosen environments begin again."""
 
+from types import SimpleNamespace
+
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -8,7 +11,8 @@ from warp_cases import warp
 import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.pushes import Pushes, PushSpec
+from tgdsl.rl.events import Events, event_terms
+from tgdsl.rl.spec import PushSpec, RandomSpec
 from tgdsl.runtime.batch.simulation import BatchSimulation
 
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
@@ -25,15 +29,27 @@ STEP = 0.025
 PAPER = PushSpec(x=(-1, 1), y=(-1, 1), z=(-5, 0))
 
 
-def arrays(num_envs: int) -> dict[str, torch.Tensor]:
-    return {"xfrc_applied": torch.zeros(num_envs, 3, 6, dtype=torch.float64)}
+class Pushes(Events):
+    """The events of `randomise: {push: …}` on the ball of a simulation, or of arrays alone."""
+
+    def __init__(self, spec, arrays, draws):
+        applied = arrays["xfrc_applied"]
+        setup = SimpleNamespace(
+            model=mujoco.MjModel.from_xml_string(BALL), object="ball", num_envs=len(applied), device=applied.device,
+            dtype=applied.dtype, control_step=STEP, draws=draws,
+        )  # fmt: skip
+        super().__init__(event_terms(RandomSpec(push=spec), {}), SimpleNamespace(arrays=arrays), setup, None)
+        self.force = applied[:, 2, :3]
+
+    def begin(self, chosen, episode):
+        self.reset(torch.tensor(chosen), torch.tensor(episode), is_placed=True)
 
 
 def begun(spec=PAPER, num_envs=1, seed=0, first_env=0, episode=1):
-    own = arrays(num_envs)
-    pushes = Pushes(spec, own, 2, STEP, Draws(seed, num_envs, first_env=first_env))
-    pushes.reset(torch.ones(num_envs, dtype=torch.bool), torch.full((num_envs,), episode))
-    return pushes, own["xfrc_applied"]
+    applied = torch.zeros(num_envs, 3, 6, dtype=torch.float64)
+    pushes = Pushes(spec, {"xfrc_applied": applied}, Draws(seed, num_envs, first_env=first_env))
+    pushes.begin([True] * num_envs, [episode] * num_envs)
+    return pushes, applied
 
 
 @BOTH
@@ -49,8 +65,8 @@ def test_a_free_ball_gains_force_times_time_over_mass(tmp_path, simulator, durat
     }
     sim = simulator(tgdsl.compile(document), 2, substeps=5)
     spec = PushSpec(x=(0.2, 0.2), y=(-0.3, 0.3), interval=(0.1, 0.1), duration=duration)
-    pushes = Pushes(spec, sim._arrays, sim.model.body("ball").id, sim.control_step, Draws(0, 2))
-    pushes.reset(torch.tensor([True, True]), torch.tensor([1, 1]))
+    pushes = Pushes(spec, sim._arrays, Draws(0, 2))
+    pushes.begin([True, True], [1, 1])
     gained, forces = np.zeros((2, 3)), set()
     for _ in range(2 * (4 + steps)):
         pushes.advance()
@@ -68,7 +84,7 @@ def test_intervals_and_forces_are_uniform_in_their_ranges():
     for _ in range(500):
         pushes.advance()
         is_pushed = pushes.force.any(dim=1).numpy()
-        assert torch.equal(applied[:, 2, :3], pushes.force) and not applied[:, :2].any() and not applied[:, 2, 3:].any()
+        assert not applied[:, :2].any() and not applied[:, 2, 3:].any()
         since += 1
         waits += since[is_pushed].tolist()
         forces += pushes.force[torch.from_numpy(is_pushed)].tolist()
@@ -92,17 +108,17 @@ def test_pushes_are_the_same_for_64_environments_as_for_twice_32():
 
 
 def test_only_chosen_environments_begin_anew():
-    pushes, applied = begun(PushSpec(x=(1, 1), interval=(0.05, 0.05), duration=10.0), num_envs=3)
+    pushes, _ = begun(PushSpec(x=(1, 1), interval=(0.05, 0.05), duration=10.0), num_envs=3)
     for _ in range(2):
         pushes.advance()
     assert pushes.force[:, 0].tolist() == [1, 1, 1]
-    pushes.reset(torch.tensor([False, True, False]), torch.tensor([1, 2, 1]))
-    assert pushes.force[:, 0].tolist() == applied[:, 2, 0].tolist() == [1, 0, 1]
+    pushes.begin([False, True, False], [1, 2, 1])
+    assert pushes.force[:, 0].tolist() == [1, 0, 1]
     pushes.advance()
     pushes.advance()
     assert pushes.force[:, 0].tolist() == [1, 1, 1]
 
 
 def test_what_cannot_be_is_named():
-    with pytest.raises(SimulationError, match=r"pushes every 0.01 s, more often than control steps of 0.025 s"):
+    with pytest.raises(SimulationError, match=r'the event "push" comes every 0.01 s, more often than control steps of 0.025 s'):
         begun(PushSpec(x=(1.0, 1.0), interval=(0.01, 1.0)))

@@ -14,9 +14,9 @@ from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
     from tgdsl.rl.env import TouchEnv
-    from tgdsl.rl.playing.actor import Actor
     from tgdsl.rl.playing.policy import PolicyFile
-    from tgdsl.rl.playing.record import Record
+    from tgdsl.rl.playing.record import PlayRecord
+    from tgdsl.rl.playing.rollout import Actor
     from tgdsl.view.trace import TouchTrace
 
 _FILES = {"record": "played.npz", "video": "played.mp4"}
@@ -54,11 +54,11 @@ class Play:
 
     def run(self) -> None:
         """Step, show, and write the files."""
-        from tgdsl.files.write import check_writable, with_folder
+        from tgdsl.files.write import check_writable
         from tgdsl.rl.playing.actions import check_actions
-        from tgdsl.rl.playing.play import steps_of
         from tgdsl.rl.playing.policy import read_policy
-        from tgdsl.rl.playing.record import Record
+        from tgdsl.rl.playing.record import PlayRecord
+        from tgdsl.rl.playing.rollout import steps_of
 
         files = {name: check_writable(self.out / file) for name, file in _FILES.items()}
         if self.policy is not None and self.actions != "zero":
@@ -71,9 +71,9 @@ class Play:
             env = self._env(progress)
         try:
             steps = steps_of(env, self.seconds)
-            record = Record(env, steps)
+            record = PlayRecord(env, steps)
             trace = self._steps(env, self._actor(env, policy), record, steps)
-            record.write(with_folder(files["record"]))
+            record.write(files["record"])
             print(f"record: {files['record']}")
             if self.video:
                 self._draw(env, record, trace, files["video"])
@@ -100,12 +100,12 @@ class Play:
             print(f"changed since the policy was learned: {line}")
         return policy
 
-    def _steps(self, env: TouchEnv, actor: Actor, record: Record, steps: int) -> TouchTrace | None:
+    def _steps(self, env: TouchEnv, actor: Actor, record: PlayRecord, steps: int) -> TouchTrace | None:
         """Make all steps, and return what the first environment's taxels read; None if no taxel is read."""
         from tqdm import tqdm
 
         from tgdsl.console.live import LiveTable
-        from tgdsl.rl.playing.play import play
+        from tgdsl.rl.playing.rollout import rollout
         from tgdsl.rl.playing.tally import Tally
         from tgdsl.view.picture import chosen_output
         from tgdsl.view.trace import TouchTrace
@@ -115,18 +115,18 @@ class Play:
         felt = {output.name: env.now.readings[output.name] for output in on_taxels}  # a distance is read without touch too
         trace = TouchTrace(env.touch, chosen_output(env.touch, felt), steps) if felt else None
         with tqdm(total=steps, desc="playing", unit="step", disable=None, leave=False) as bar:
-            for played in play(env, actor, steps, self.seed):
-                record.add(played)
-                tally.add(played.step.info)
+            for moment in rollout(actor, env, steps):
+                record.add(moment)
+                tally.add(moment.step.info)
                 if trace is not None:
-                    trace.add(played.index + 1, env.now.readings)
+                    trace.add(moment.index + 1, env.now.readings)
                 bar.update()
                 with bar.external_write_mode():
-                    time = (played.index + 1) * env.control_step
-                    live.show(tally.lines(time), is_last=played.index == steps - 1)
+                    time = (moment.index + 1) * env.control_step
+                    live.show(tally.lines(time), is_last=moment.index == steps - 1)
         return trace
 
-    def _draw(self, env: TouchEnv, record: Record, trace: TouchTrace | None, file: Path) -> None:
+    def _draw(self, env: TouchEnv, record: PlayRecord, trace: TouchTrace | None, file: Path) -> None:
         """Draw the video, or say why there is none."""
         from tgdsl.rl.playing.video import VideoError, video
 

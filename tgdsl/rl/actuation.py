@@ -225,7 +225,7 @@ class Actuation:
         draws: Draws,
         substeps: int = 1,
     ):
-        """Begin with all drives ideal, at their joints' present positions; `reset` draws.
+        """Begin with all drives ideal, at their joints' present positions.
 
         Args:
             actuators: The actuators.
@@ -270,21 +270,29 @@ class Actuation:
             self._top_speed = torch.from_numpy(np.where(actuators.is_slide, np.inf, drive.top_speed)).to(device, dtype)
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
-    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
-        """Draw the drives of some environments again, which hold the positions that their joints now have.
+    def draw(self, chosen: Bool[Tensor, " env"], count: Int[Tensor, " env"]) -> None:
+        """Draw the drives of some environments again.
 
         Args:
             chosen: The environments.
-            episode: How often each was reset.
-            at_controls: Whether targets are the present controls instead, as those of a hand that presses.
+            count: A count of each environment's own: other numbers at each count.
         """
         if self._random:
             num = self.target.shape[1]
-            share = self._draws.side_by_side(dict.fromkeys(self._random, num), episode, chosen).view(len(episode), -1, num)
+            share = self._draws.side_by_side(dict.fromkeys(self._random, num), count, chosen).view(len(count), -1, num)
             new = self._low + self._span * share
             if self._random[-1] == "delay":
                 new = torch.cat([new[:, :-1], new[:, -1:].floor().clamp(max=int(self.spec.delay[1]))], dim=1)
             put(self._drawn, chosen[:, None], new.to(self._drawn.dtype).transpose(0, 1))
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
+        """Have the drives of some environments begin again: see `place`.
+
+        Args:
+            chosen: The environments.
+            episode: How often each was reset.
+            at_controls: Whether targets are the present controls, as those of a hand that presses.
+        """
         put(self._count, chosen, episode << 32)
         self.place(chosen, at_controls)
 
@@ -370,7 +378,6 @@ class Actuation:
         return ends
 
     def _arrived(self) -> Float[Tensor, "env joint"]:
-        """Return the targets that have arrived at the drives."""
         if len(self._past) == 1:
             return self._past[0]
         return self._past.gather(0, self.drawn["delay"].to(torch.int64)[None])[0]

@@ -1,15 +1,19 @@
-"""Numbers of terms that change while a policy is learned: tensors on the device, which captured steps read."""
+"""Numbers that change while a policy is learned: tensors on the device, which captured steps read."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from tgdsl.fields.models import SpecModel
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.terms import CurriculumTerm, Term
+
+M = TypeVar("M", bound=SpecModel)
 
 
 class Curricula:
@@ -17,21 +21,17 @@ class Curricula:
 
     Attributes:
         values: The numbers that they change, by dotted path: tensors without axes.
-        spec: The task's document, with these weights instead of its own.
+        spec: The task's document, with these tensors in place of its own numbers.
         terms: The terms that it adds, in the same way.
     """
 
     def __init__(self, loaded: LoadedTask, like: Tensor):
-        """Begin with the numbers before the first iteration, of the dtype and on the device of `like`."""
         self._terms = {name: term for name, term in loaded.terms.items() if isinstance(term, CurriculumTerm)}
         self.values = {term.of: torch.zeros((), dtype=like.dtype, device=like.device) for term in self._terms.values()}
-        self.spec: TaskSpec = loaded.spec
-        if weights := self._changed("rewards."):
-            rewards = getattr(loaded.spec, "rewards")  # noqa: B009 (of the task's own model)
-            self.spec = loaded.spec.model_copy(update={"rewards": rewards.model_copy(update=weights)})
+        self.spec: TaskSpec = _with(loaded.spec, {path: v for path, v in self.values.items() if not path.startswith("terms.")})
         other_terms = {name: term for name, term in loaded.terms.items() if name not in self._terms}
         self.terms: Mapping[str, Term] = {
-            name: term.model_copy(update=self._changed(f"terms.{name}.")) for name, term in other_terms.items()
+            name: _with(term, _below(f"terms.{name}", self.values)) for name, term in other_terms.items()
         }
         self.advance(0, None)
 
@@ -45,5 +45,14 @@ class Curricula:
         for term in self._terms.values():
             self.values[term.of].fill_(term.value(iteration, score))
 
-    def _changed(self, start: str) -> dict[str, Tensor]:
-        return {path.removeprefix(start): value for path, value in self.values.items() if path.startswith(start)}
+
+def _below(start: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {path.removeprefix(f"{start}."): value for path, value in values.items() if path.startswith(f"{start}.")}
+
+
+def _with(model: M, values: Mapping[str, Tensor]) -> M:
+    """Return a model with other values by dotted path, which are not checked."""
+    update: dict[str, Any] = {path: value for path, value in values.items() if "." not in path}
+    for name in {path.partition(".")[0] for path in values} - update.keys():
+        update[name] = _with(getattr(model, name), _below(name, values))
+    return model.model_copy(update=update)

@@ -28,13 +28,12 @@ from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.curricula import Curricula
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes, Observations, Step, StepInfo
-from tgdsl.rl.events import Events
+from tgdsl.rl.events import Events, event_terms
 from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
-from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints
-from tgdsl.rl.task import Now
+from tgdsl.rl.task import Now, checked
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_be_nonempty
 from tgdsl.tensors.fused import FusedCall
@@ -62,7 +61,6 @@ class TouchEnv:
         sim: The simulation.
         touch: The module.
         actuation: The drives of the joints that the policy moves.
-        pushes: Forces that push the object.
         curricula: Numbers of terms that change while a policy is learned: whoever learns calls `advance`.
         groups: Size of each group of observations.
         felt: Sources of the groups of touch.
@@ -126,15 +124,14 @@ class TouchEnv:
             self.task = loaded.task(self.curricula.spec, setup)
         except LowerError as error:
             raise loaded.error((error.field,), error.what, error.hint) from error
-        self._events = Events(self.curricula.terms, self.sim, setup)
         self._draws, self._first_env = draws, first_env
         random, arrays = self.spec.randomise, self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
         self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
-        self.pushes = Pushes(random.push, arrays, int(setup.model.body(setup.object).id), setup.control_step, draws)
+        self._events = Events(event_terms(random, self.curricula.terms), self.sim, setup, self.actuation)
         self._control_step = setup.control_step  # MuJoCo takes a while to tell
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
-        self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
+        self._episodes = Episodes(self.sim, self.task, self.actuation, self._events, is_compiled)
         self._action = torch.zeros((num_envs, self.num_actions), dtype=torch.float32, device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
         is_measured = self.spec.joint_vel == "measured"
@@ -149,11 +146,14 @@ class TouchEnv:
         self._step_by, self._logic_by = (
             one_thread if is_alone else nullcontext for is_alone in (is_small, is_plain and not is_small)
         )
-        self._has_stepped = True
-        self._prepare(progress or silent, is_compiled)
-        self._has_stepped = False
-        self._obs = self.reset(seed)
-        self.groups = {name: value.shape[1] for name, value in self._obs.items()}
+        self._has_stepped, tell = False, progress or silent
+        if is_cuda or is_compiled:
+            tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
+        obs = self.reset(seed)
+        self._episodes.sum_up(tuple(self._rates(self.now, torch.zeros_like(self.sim.faults))))
+        self.groups = {name: value.shape[1] for name, value in obs.items()}
+        if is_cuda or is_compiled:
+            self._prepare(seed)
 
     @property
     def num_envs(self) -> int:
@@ -211,7 +211,7 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             if seed is not None:
                 self._draws.reseed(seed)
-                self._episodes.restart_counters()
+                self._episodes.number.zero_()
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
@@ -249,6 +249,10 @@ class TouchEnv:
         self._obs, self._is_loaded = step.obs, False
         return step._replace(obs=dict(step.obs))
 
+    def observe(self) -> Observations:
+        """Return the last observations, by group."""
+        return dict(self._obs)
+
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
 
@@ -259,7 +263,6 @@ class TouchEnv:
         """
         with torch.inference_mode(False), torch.no_grad(), self._dispatch():
             self.actuation.follow(control)
-            self.pushes.advance()
             self._events.advance()
             self.sim.step(self.sim.ctrl)
             now = self._instant = self._now(self.sim.read())
@@ -295,11 +298,8 @@ class TouchEnv:
             SimulationError: If they were others; nothing has changed.
         """
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
-        own["episodes"], saved = self._episodes.with_matching_sums(state.get("episodes", {}))
-        state = {**state, "episodes": saved} if "episodes" in state else state
         saving.refuse_other_parts(own, {part: saved_part for part, saved_part in state.items() if part != "sim"})
         self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
-        self._episodes.expect(tuple(name.removeprefix("sums/") for name in saved if name.startswith("sums/")))
         for part, memory in self._memory().items():
             saving.restore(memory, state[part])
         self.touch.load_state_dict(dict(state["touch"]))
@@ -315,26 +315,22 @@ class TouchEnv:
     def _memory(self) -> dict[str, dict[str, Tensor]]:
         """Return the memory outside simulation and module: live tensors by part and name."""
         actions = {"used": self._used, "before": self._before}
-        parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
-        memory = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
+        memory = {"episodes": self._episodes.memory(), "actuation": self.actuation.memory()}
+        memory |= {"task": self.task.memory, "actions": actions}
         memory |= {"speeds": self._speeds.memory()} if self._speeds else {}
         memory |= {"curricula": self.curricula.values} if self.curricula.values else {}
         return memory | ({"events": self._events.memory} if self._events.memory else {})
 
-    def _prepare(self, tell: Progress, is_compiled: bool) -> None:
+    def _prepare(self, seed: int) -> None:
         """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
-        is_cuda = self.sim.qpos.is_cuda
-        if not (is_cuda or is_compiled):
-            return
-        tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
-        self.reset()
+        self._has_stepped = True
         for _ in range(PREPARING_STEPS):
             self.step(torch.zeros_like(self._action))
+        self._has_stepped = False
+        self.reset(seed)
 
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Begin episodes of some environments."""
         self._episodes.begin(chosen)
-        self._events.reset(chosen, self._episodes.number)
         for held in (self._used, self._before):
             held.masked_fill_(chosen[:, None], 0.0)
 
@@ -372,7 +368,6 @@ class TouchEnv:
         is_bad = ~action.isfinite().all(dim=1)
         self.actuation.command(action)
         self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
-        self.pushes.advance()
         return torch.where(is_bad[:, None], torch.nan, ctrl)
 
     def _measure(self, now: Now, begun: Bool[Tensor, " env"] | None = None) -> None:
@@ -385,19 +380,13 @@ class TouchEnv:
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
-        rates = self.task.rates(now, terminated)
+        rates = self._rates(now, terminated)
         for name, term in self.curricula.terms.items():
-            if isinstance(term, RewardTerm):
-                if name in rates:
-                    raise SimulationError(
-                        f"the task's `reward` has a term \"{name}\" already: give the document's another name"
-                    )
-                rates[name] = self._checked(name, term.weight * term.rate(now, self.task.setup), terminated)
-            elif isinstance(term, TerminationTerm):
-                terminated = terminated | self._checked(name, term.is_over(now, self.task.setup), terminated)
+            if isinstance(term, TerminationTerm):
+                terminated = terminated | checked(f'the term "{name}"', term.is_over(now, self.task.setup), self.num_envs)
         earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self._control_step).float()
         reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
-        self._episodes.add(tuple(rates), earned, reward)
+        self._episodes.add(earned, reward)
         truncated = (self.steps >= self.max_steps) & ~terminated
         obs = self._observe(now)
         if may_be_nonempty(faults):
@@ -409,17 +398,22 @@ class TouchEnv:
         info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults.clone())
         return Step(obs, reward, terminated, truncated, info)
 
-    def _checked(self, name: str, value: Tensor, like: Tensor, ndim: int = 1) -> Tensor:
-        """Return what a term returns, (env,) or (env, feature).
-
-        Raises:
-            SimulationError: If it is of another shape.
-        """
-        if not isinstance(value, Tensor) or value.ndim != ndim or len(value) != len(like):
-            given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
-            expected = f"({len(like)},)" if ndim == 1 else f"({len(like)}, …)"
-            raise SimulationError(f'the term "{name}" returns {given}, expected a tensor {expected}')
-        return value
+    def _rates(self, now: Now, terminated: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward as rates, those of the document among them [1/s]."""
+        task = type(self.task).__name__
+        rates = {
+            name: checked(f'{task}: the term "{name}" of `reward`', value, self.num_envs)
+            for name, value in self.task.reward(now, terminated).items()
+        }
+        if not rates:
+            raise SimulationError(f"{task}: `reward` has no terms, expected one at least")
+        for name, term in self.curricula.terms.items():
+            if isinstance(term, RewardTerm):
+                if name in rates:
+                    problem = f"the task's `reward` has a term \"{name}\" already: give the document's another name"
+                    raise SimulationError(problem)
+                rates[name] = checked(f'the term "{name}"', term.weight * term.rate(now, self.task.setup), self.num_envs)
+        return rates
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
         """Return the instant that readings are of."""
@@ -438,8 +432,8 @@ class TouchEnv:
             link_force=force,
             normal_force=normal_force,
             distance=readings[distance].amin(dim=2).to(none) if distance else none,
-            friction=self._episodes.friction,
-            mass=self._episodes.mass,
+            friction=self.task.setup.friction,
+            mass=self.task.setup.mass,
             readings=readings,
             time=self.sim.time,
         )
@@ -450,9 +444,12 @@ class TouchEnv:
         exact = groups.proprio(now)
         proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
         result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
-        terms = {name: term for name, term in self.curricula.terms.items() if isinstance(term, ObservationTerm)}
-        result |= {
-            name: self._checked(name, term.observe(now, self.task.setup), proprio, ndim=2) for name, term in terms.items()
-        }
-        result |= self.task.checked_observations(now, result)
+        task = type(self.task).__name__
+        for name, term in self.curricula.terms.items():
+            if isinstance(term, ObservationTerm):
+                result[name] = checked(f'the term "{name}"', term.observe(now, self.task.setup), self.num_envs, 2)
+        for name, value in self.task.observe(now).items():
+            if name in result:
+                raise SimulationError(f'{task}: `observe` has a group "{name}", as all tasks do; call it otherwise')
+            result[name] = checked(f'{task}: the group "{name}" of `observe`', value, self.num_envs, 2)
         return {name: value.to(self.device, torch.float32) for name, value in result.items()}

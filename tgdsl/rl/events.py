@@ -1,4 +1,4 @@
-"""Events of a document: what happens to environments at each reset, or after intervals that are drawn.
+"""Events of all environments: those of `randomise`, and those that a document adds under `terms`.
 
 Shapes: `env` environments.
 """
@@ -6,74 +6,107 @@ Shapes: `env` environments.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
+from tgdsl.rl.actuation import ONE, ZERO, Actuation, DriveSpec
 from tgdsl.rl.draws import whole
+from tgdsl.rl.spec import PushSpec, RandomSpec
 from tgdsl.rl.task import Setup
-from tgdsl.rl.terms import Event, EventTerm, Term
+from tgdsl.rl.terms import Drive, Event, EventTerm, Friction, Mass, Push, Term
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
+
+
+def event_terms(random: RandomSpec, terms: Mapping[str, Term]) -> dict[str, EventTerm]:
+    """Return the events of a task's document by the names of their random numbers.
+
+    Args:
+        random: The document's `randomise`, the short form of events.
+        terms: The document's terms.
+    """
+    events: dict[str, EventTerm] = {}
+    if random.friction != ONE:
+        events["friction"] = Friction(factor=random.friction)
+    if random.mass != ZERO:
+        events["mass"] = Mass(added=random.mass)
+    if random.drive != DriveSpec():
+        events["drive"] = Drive()
+    if any(getattr(random.push, axis) != getattr(PushSpec(), axis) for axis in "xyz"):
+        events["push"] = Push(**dict(random.push))
+    return events | {f"event {name}": term for name, term in terms.items() if isinstance(term, EventTerm)}
 
 
 class Events:
     """The events of all environments.
 
     Attributes:
-        memory: Control steps until the next one and how often it has happened, above that the episode, by name: live tensors.
+        memory: By name, control steps until the next event, negative while one lasts, and how many there were, above them the
+            episode: live tensors.
     """
 
-    def __init__(self, terms: Mapping[str, Term], sim: Simulation, setup: Setup):
-        """Begin; `reset` draws when the first ones come.
+    def __init__(self, terms: Mapping[str, EventTerm], sim: Simulation, setup: Setup, actuation: Actuation):
+        """Begin; an episode's begin draws when the first ones come.
+
+        Args:
+            terms: What `event_terms` returned.
+            sim: The simulation.
+            setup: The setup of the environments.
+            actuation: The drives.
 
         Raises:
             SimulationError: If an event would come more often than control steps.
         """
-        self._terms = {name: term for name, term in terms.items() if isinstance(term, EventTerm)}
-        self._sim, self._setup, self.memory = sim, setup, dict[str, Tensor]()
-        for name, term in self._terms.items():
+        self._terms, self._setup, self.memory = terms, setup, dict[str, Tensor]()
+        self._event = partial(Event, sim, setup, actuation)
+        for name, term in terms.items():
+            if term.mode == "reset":
+                continue
             if term.interval[0] < setup.control_step:
-                problem = f'the event "{name}" comes every {term.interval[0]:g} s, more often than control steps'
+                called = name.removeprefix("event ")
+                problem = f'the event "{called}" comes every {term.interval[0]:g} s, more often than control steps'
                 raise SimulationError(f"{problem} of {setup.control_step:g} s; expected an interval of at least one")
             for kind in ("left", "count"):
                 self.memory[f"{name}/{kind}"] = torch.zeros(setup.num_envs, dtype=torch.int64, device=setup.device)
 
-    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> None:
-        """Have events at a reset happen, and draw when the others come first.
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], is_placed: bool) -> None:
+        """Have events at a reset happen, end those that last, and draw when the others come first.
 
         Args:
             chosen: The environments.
             episode: How often each was reset.
+            is_placed: Whether the scene was reset; before that, events happen that change what the scene is made of.
         """
         for name, term in self._terms.items():
-            put_rows(self.memory[f"{name}/count"], chosen, episode << 32)
             if term.mode == "reset":
-                self._happen(name, term, chosen)
-            else:
+                if term.changes_model != is_placed:
+                    term.apply(self._event(chosen, episode, name))
+            elif is_placed:
+                put_rows(self.memory[f"{name}/count"], chosen, episode << 32)
+                term.end(self._event(chosen, self.memory[f"{name}/count"], name))
                 self._wait(name, term, chosen)
 
     def advance(self) -> None:
-        """Have events happen that are due: once per control step, before its physics."""
+        """Begin and end events: once per control step, before its physics."""
         for name, term in self._terms.items():
-            left, count = self.memory[f"{name}/left"], self.memory[f"{name}/count"]
             if term.mode == "reset":
                 continue
+            left, count = self.memory[f"{name}/left"], self.memory[f"{name}/count"]
             left -= 1
-            is_due = left <= 0
-            if may_be_nonempty(is_due):
-                count += is_due
-                self._happen(name, term, is_due)
-                self._wait(name, term, is_due)
-
-    def _happen(self, name: str, term: EventTerm, chosen: Bool[Tensor, " env"]) -> None:
-        term.apply(Event(self._sim, self._setup, chosen, self.memory[f"{name}/count"], name))
+            begins, ends = left == 0, left == -term.num_steps(self._setup.control_step)
+            if may_be_nonempty(begins | ends):
+                count += begins
+                term.apply(self._event(begins, count, name))
+                term.end(self._event(ends, count, name))
+                self._wait(name, term, ends)
 
     def _wait(self, name: str, term: EventTerm, chosen: Bool[Tensor, " env"]) -> None:
         """Draw how many control steps there are before the next one."""
         first, last = (round(end / self._setup.control_step) for end in term.interval)
-        purpose = f"event {name} interval"
+        purpose = f"{name} interval"
         share = self._setup.draws.shares({purpose: 1}, self.memory[f"{name}/count"], chosen)[purpose]
         put_rows(self.memory[f"{name}/left"], chosen, whole(share, first, last)[:, 0])

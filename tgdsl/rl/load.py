@@ -12,7 +12,10 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
+from pydantic import ValidationError
+
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
+from tgdsl.fields.models import SpecModel
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
@@ -83,13 +86,13 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
     task = _task_class(source, folder)
     problems: list[Problem] = list(source.problems)
     spec = validate(source, (), task.Spec, problems, REQUIRED)
-    terms = _terms(source, folder, spec, problems) if isinstance(spec, TaskSpec) else {}
+    terms = _terms(source, folder, task, spec, problems) if isinstance(spec, TaskSpec) else {}
     if problems or not isinstance(spec, TaskSpec):
         raise SpecError(problems)
     return LoadedTask(spec, task, source, folder, terms)
 
 
-def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]) -> dict[str, Term]:
+def _terms(source: Source, folder: Path, task: type[Task[Any]], spec: TaskSpec, problems: list[Problem]) -> dict[str, Term]:
     """Return the terms that a document adds; note what is wrong with them."""
     terms = {}
     for name, value in spec.terms.items():
@@ -108,21 +111,35 @@ def _terms(source: Source, folder: Path, spec: TaskSpec, problems: list[Problem]
             )
         elif isinstance(term, Term):
             terms[name] = term
-    numbers_of = numbers(spec, terms)
+    owners = number_owners(task, spec, terms)
     for name, term in terms.items():
-        if isinstance(term, CurriculumTerm) and term.of not in numbers_of:
-            problem = f'there is no number "{term.of}" of a term'
-            problems.append(source.problem(("terms", name, "of"), problem, did_you_mean(term.of, numbers_of, "numbers")))
+        if not isinstance(term, CurriculumTerm):
+            continue
+        if term.of not in owners:
+            problem, hint = f'there is no number "{term.of}" that can change', did_you_mean(term.of, owners, "numbers")
+            problems.append(source.problem(("terms", name, "of"), problem, hint))
+            continue
+        owner, key = owners[term.of], term.of.rpartition(".")[2]
+        for value in term.extremes():
+            try:
+                type(owner).model_validate({**dict(owner), key: value})
+            except ValidationError as error:
+                reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+                problems.append(source.problem(("terms", name), f"{term.of} would be {value:g}: {reason}"))
     return terms
 
 
-def numbers(spec: TaskSpec, terms: Mapping[str, Term]) -> dict[str, float]:
-    """Return the numbers that a curriculum may change, by dotted path: weights of the task's terms, numbers of the others."""
-    fields = {f"rewards.{name}": value for name, value in getattr(spec, "rewards", ())}
-    for name, term in terms.items():
-        if not isinstance(term, CurriculumTerm):
-            fields |= {f"terms.{name}.{key}": value for key, value in term}
-    return {path: value for path, value in fields.items() if isinstance(value, float)}
+def number_owners(task: type[Task[Any]], spec: TaskSpec, terms: Mapping[str, Term]) -> dict[str, SpecModel]:
+    """Return the models of the numbers that a curriculum may change, by dotted path: of the task and of the terms."""
+    own = [name for name in type(spec).model_fields if name not in (*TaskSpec.model_fields, *task.constants)]
+    owners: dict[str, SpecModel] = {name: spec for name in own if isinstance(getattr(spec, name), float)}
+    models = {name: getattr(spec, name) for name in own}
+    models |= {f"terms.{name}": term for name, term in terms.items() if not isinstance(term, CurriculumTerm)}
+    for path, model in models.items():
+        if isinstance(model, SpecModel):
+            constants = model.constants if isinstance(model, Term) else ()
+            owners |= {f"{path}.{key}": model for key, value in model if isinstance(value, float) and key not in constants}
+    return owners
 
 
 def _task_class(source: Source, folder: Path) -> type[Task[Any]]:

@@ -50,7 +50,6 @@ def task_schema() -> dict[str, Any]:
 
 
 def _renamed(schema: Any, others: Mapping[str, str]) -> Any:
-    """Return a schema whose references to some definitions are to those of another name."""
     if isinstance(schema, dict):
         return {name: _reference(part, others) if name == "$ref" else _renamed(part, others) for name, part in schema.items()}
     return [_renamed(part, others) for part in schema] if isinstance(schema, list) else schema

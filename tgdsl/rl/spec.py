@@ -8,7 +8,6 @@ from pydantic import Field, StrictInt, model_validator
 
 from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Radius, Range, RangeOf, SpecModel
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
-from tgdsl.rl.pushes import PushSpec
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.train.spec import TrainSpec
 
@@ -31,6 +30,7 @@ SENSED: dict[str, tuple[str, str]] = {
 }
 """The kind of sensor that each type reads, and the observation that is made of it."""
 Time = Annotated[float, Quantity("time", gt=0.0)]
+ForceRange = Annotated[Range, RangeOf("force")]
 Whole = Annotated[StrictInt, Field(ge=1)]
 Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]
 """Between the bounds that MuJoCo has."""
@@ -92,6 +92,21 @@ class PhysicsSpec(SpecModel):
     def capacities(self) -> dict[str, int]:
         """Capacities of the GPU's simulator."""
         return self.model_dump(include={"nconmax", "njmax"}, exclude_none=True)
+
+
+class PushSpec(SpecModel):
+    """How strongly and how often an object is pushed."""
+
+    x: ForceRange = ZERO
+    """Force along the world's x [N]."""
+    y: ForceRange = ZERO
+    """Force along the world's y [N]."""
+    z: ForceRange = ZERO
+    """Force along the world's z [N]."""
+    interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
+    """Time from the end of one push to the begin of the next, drawn for each [s]."""
+    duration: Time = 0.025
+    """How long a push lasts, rounded up to control steps [s]."""
 
 
 class RandomSpec(SpecModel):

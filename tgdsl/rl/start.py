@@ -12,8 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import Problem, SimulationError, SpecError, did_you_mean
-from tgdsl.rl.actuation import ONE, ZERO, Actuators
+from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
+from tgdsl.rl.events import event_terms
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed
 from tgdsl.rl.task import Setup
@@ -85,8 +86,7 @@ def make_simulation(
         actuators=own.actuators,
         pairs=own.pairs,
     )
-    random = spec.randomise
-    per_env = [name for name, value, rest in (("mass", random.mass, ZERO), ("friction", random.friction, ONE)) if value != rest]
+    per_env = [name for term in event_terms(spec.randomise, loaded.terms).values() for name in term.per_env]
     options: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
     options |= {"watch": watch, "on_fault": "note", "device": device, "per_env": per_env, "threads": threads}
     options |= spec.physics.capacities
@@ -113,6 +113,7 @@ def make_setup(
         raise loaded.error(("joints",), str(error)) from error
     num_variants = _num_variants(sensed, loaded.spec.object)
     rows = sensed.touch.rows[sensed.contact]["body"].tolist() if sensed.contact else ()
+    friction, mass = (get(sensed.object).to(sim.qpos).clone() for get in (sim.properties.friction, sim.properties.mass))
     return Setup(
         num_envs=sim.num_envs,
         device=sim.qpos.device,
@@ -131,15 +132,16 @@ def make_setup(
         first_half_height=_first_half_height(sim, sensed),
         variant=((torch.arange(sim.num_envs) + first_env) % num_variants).to(sim.qpos.device),
         num_variants=num_variants,
-        friction=sim.properties.friction(sensed.object).to(sim.qpos).clone(),
-        mass=sim.properties.mass(sensed.object).to(sim.qpos).clone(),
+        friction=friction.clone(),
+        mass=mass.clone(),
+        scene_friction=friction,
+        scene_mass=mass,
         draws=draws,
         rows={kind: (name, sensed.touch.rows[name]) for kind, name in sensed.by_kind.items()},
     )
 
 
 def _num_variants(sensed: Sensed, name: str) -> int:
-    """Return how many variants an object has; environment i of all processes has variant i modulo their number."""
     inputs = sensed.touch.inputs
     return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 
@@ -154,7 +156,6 @@ def _half_heights(sim: Simulation, sensed: Sensed, name: str) -> Float[Tensor, "
 
 
 def _first_half_height(sim: Simulation, sensed: Sensed) -> float:
-    """Return how far the object's first variant reaches below its body's origin [m], whatever the environments here have."""
     first = SceneModels(sensed.touch.plan.scene).model({})
     return half_height(first, sensed.object, sim.qpos[0].double().cpu().numpy())
 

@@ -1,8 +1,8 @@
 """A task: how an episode begins and ends, what is observed and rewarded, and how well it went.
 
-A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done and its groups; the spec; `reference`, its own
-terms of the reward and the end of an episode in float64 NumPy; then the class: its terms, `reset`, `advance`, `is_over`,
-`observe`, `score`.
+A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done and its groups; the spec; then the class: its
+terms, `reset`, `advance`, `is_over`, `observe`, `score`. Numbers of the document are read in each step, as a curriculum may
+change them, but for those that the class lists as its `constants`.
 
 A term of the reward is a method marked by `reward_term`, or a shared one of `tgdsl.rl.terms` such as `near = Near.of_task(0.1,
 width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order.
@@ -45,6 +45,18 @@ from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 S = TypeVar("S", bound=TaskSpec)
 
 
+def checked(what: str, value: object, num_envs: int, ndim: int = 1) -> Tensor:
+    """Return what a task or a term returns: a tensor (env,) or (env, feature).
+
+    Raises:
+        SimulationError: If it is something else.
+    """
+    if isinstance(value, Tensor) and value.ndim == ndim and len(value) == num_envs:
+        return value
+    given = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+    raise SimulationError(f"{what} is {given}, expected a tensor ({num_envs},{' …' if ndim > 1 else ''})")
+
+
 @dataclass(frozen=True, eq=False)
 class Setup:
     """What a task is made for.
@@ -69,6 +81,8 @@ class Setup:
         num_variants: How many there are; 1 if the object has none.
         friction: Coefficient of sliding friction of each object: a live tensor, redrawn before `reset`.
         mass: Mass of each object [kg], in the same way.
+        scene_friction: The same as the scene has it.
+        scene_mass: The same.
         draws: Random numbers.
         rows: By kind of sensor that the task looks at: its reading's name in `Now.readings`, and a table of that one's rows.
         grasps: Grasps that episodes begin from; None if the task's document has none.
@@ -93,6 +107,8 @@ class Setup:
     num_variants: int
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
+    scene_friction: Float[Tensor, " env"]
+    scene_mass: Float[Tensor, " env"]
     draws: Draws
     rows: Mapping[str, tuple[str, TaxelTable]]
     grasps: GraspTable | None = None
@@ -229,6 +245,7 @@ class Task(ABC, Generic[S]):
         is_less_better: Whether its score is an error.
         hand_groups: Groups of its own that `observe_hand` makes without a scene; of policies that see no others, hands can have
             some.
+        constants: Keys of its document that are read once, when it is made: no curriculum can change them.
         goal_units: Units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for.
         terms: Terms of its reward by name.
         Rewards: Model of their weights.
@@ -243,6 +260,7 @@ class Task(ABC, Generic[S]):
     score_unit: ClassVar[str]
     is_less_better: ClassVar[bool] = False
     hand_groups: ClassVar[tuple[str, ...]] = ()
+    constants: ClassVar[tuple[str, ...]] = ()
     goal_units: ClassVar[tuple[str, ...]] = ()
     terms: ClassVar[Mapping[str, TaskReward]] = {}
     Rewards: ClassVar[type[SpecModel]] = SpecModel
@@ -270,7 +288,6 @@ class Task(ABC, Generic[S]):
             )
 
     def __init__(self, spec: S, setup: Setup):
-        """Begin with nothing remembered; what a task remembers it takes from `keep`."""
         self.spec, self.setup, self.memory = spec, setup, {}
         weights = getattr(spec, "rewards", None)
         self._rates = {name: term.rate_of(self) for name, term in self.terms.items() if getattr(weights, name) is not None}
@@ -329,41 +346,6 @@ class Task(ABC, Generic[S]):
     @abstractmethod
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
-
-    def rates(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return what `reward` returns, seen to be that.
-
-        Raises:
-            SimulationError: If it is not: terms (env,), one at least.
-        """
-        result = self.reward(now, is_over)
-        for name, value in result.items():
-            if not isinstance(value, Tensor) or value.shape != is_over.shape:
-                raise self._wrong(f'the term "{name}" of `reward`', value, f"({len(is_over)},)")
-        if not result:
-            raise SimulationError(f"{type(self).__name__}: `reward` has no terms, expected one at least")
-        return result
-
-    def checked_observations(self, now: Now, taken: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return what `observe` returns, seen to be that.
-
-        Raises:
-            SimulationError: If it is not: groups (env, feature), of other names than those that are taken.
-        """
-        result, num = self.observe(now), self.setup.num_envs
-        for name, value in result.items():
-            if not isinstance(value, Tensor) or value.ndim != 2 or len(value) != num:
-                raise self._wrong(f'the group "{name}" of `observe`', value, f"({num}, …)")
-            if name in taken:
-                raise SimulationError(
-                    f'{type(self).__name__}: `observe` has a group "{name}", as all tasks do; call it otherwise'
-                )
-        return result
-
-    def _wrong(self, what: str, value: object, expected: str) -> SimulationError:
-        is_tensor = isinstance(value, Tensor)
-        result = f"of shape {tuple(value.shape)}" if is_tensor else f"a {type(value).__name__}"
-        return SimulationError(f"{type(self).__name__}: {what} is {result}, expected a tensor {expected}")
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""

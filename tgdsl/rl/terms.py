@@ -18,13 +18,13 @@ Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 from __future__ import annotations
 
 import inspect
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import create_model, model_validator
@@ -33,18 +33,18 @@ from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Number, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl import groups
+from tgdsl.rl.actuation import Actuation, Factor
 from tgdsl.rl.draws import within
-from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.spec import PushSpec, TaskSpec
 from tgdsl.rl.task import Now, Rate, Setup, Task, TaskReward
 from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.tensors.env_ids import put_rows
 
 FREE_SHARE = 0.95
 """Share of a joint's range that costs nothing."""
 Force = Annotated[float, Quantity("force", gt=0.0)]
 Speed = Annotated[float, Quantity("speed", gt=0.0)]
 Spin = Annotated[float, Quantity("number", gt=0.0)]
-Row = Mapping[str, np.ndarray]
-"""One instant of one environment: fields of `Now`, and `low`, `high` and `max_torque` of `Setup`."""
 
 
 class Term(SpecModel, ABC):
@@ -56,6 +56,8 @@ class Term(SpecModel, ABC):
 
     senses: ClassVar[tuple[str, ...]] = ()
     """Kinds of sensors of the sensors' document that it looks at: see `Task.senses`."""
+    constants: ClassVar[tuple[str, ...]] = ()
+    """Parameters that no curriculum can change."""
     term: str | None = None
     """Which term it is: a name, or `package.module:Class` or `file.py:Class`; default: the name that it has in the document."""
 
@@ -71,10 +73,6 @@ class RewardTerm(Term):
     @abstractmethod
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         """Return its rate without the weight; the reward is the sum of all rates times Δt."""
-
-    def reference(self, row: Row) -> float | np.floating:
-        """Return the rate of one environment in float64, for tests: of `Now`'s fields and the limits of `Setup`."""
-        raise NotImplementedError
 
     @classmethod
     def of_task(cls, weight: float, **parameters: str) -> TaskReward:
@@ -133,34 +131,50 @@ class Event:
     Attributes:
         sim: The simulation; its `arrays` and `properties` may be changed, of the chosen environments alone.
         setup: The setup of the environments.
+        actuation: The drives.
         chosen: The environments in which it happens: decide by this mask, not by `if`.
-        count: How often it has happened in each environment, above that the episode.
-        name: Its name in the document.
+        count: How often each environment was reset; of events at intervals, how often it has happened, above that the episode.
+        stream: What its random numbers are for.
     """
 
     sim: Simulation
     setup: Setup
+    actuation: Actuation
     chosen: Bool[Tensor, " env"]
     count: Int[Tensor, " env"]
-    name: str
+    stream: str
+
+    def shares(self, num: int) -> Float[Tensor, "env num"]:
+        """Return random numbers between 0 and 1, float32: others each time that it happens."""
+        return self.setup.draws.shares({self.stream: num}, self.count, self.chosen)[self.stream]
 
     def uniform(self, num: int, low: float = 0.0, high: float = 1.0) -> Float[Tensor, "env num"]:
         """Return random numbers between two bounds, of physics' dtype: others each time that it happens."""
-        purpose = f"event {self.name}"
-        return within(self.setup.draws.shares({purpose: num}, self.count, self.chosen)[purpose].to(self.setup.dtype), low, high)
+        return within(self.shares(num).to(self.setup.dtype), low, high)
 
 
 class EventTerm(Term):
     """Something that happens to the simulation, at each reset or after intervals that are drawn."""
 
+    changes_model: ClassVar[bool] = False
+    """Whether it changes what the scene is made of: at a reset it then happens before the scene begins again."""
+    per_env: ClassVar[tuple[str, ...]] = ()
+    """Properties of objects that environments have of their own for it: see `tgdsl.simulate`."""
     mode: Literal["reset", "interval"] = "interval"
     """When it happens."""
     interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
-    """Time from one to the next, drawn for each [s]."""
+    """Time from the end of one to the begin of the next, drawn for each [s]."""
 
     @abstractmethod
     def apply(self, event: Event) -> None:
         """Change the simulation."""
+
+    def num_steps(self, control_step: float) -> int:
+        """Return how many control steps it lasts; by default none."""
+        return 0
+
+    def end(self, event: Event) -> None:
+        """Change the simulation where it ends, and where an episode begins; by default nothing."""
 
 
 def event_term(function: Callable[..., None]) -> type[EventTerm]:
@@ -181,10 +195,10 @@ def event_term(function: Callable[..., None]) -> type[EventTerm]:
 
 
 class CurriculumTerm(Term):
-    """A weight or another number of a term that follows the progress of learning."""
+    """A number of the task or of a term that follows the progress of learning."""
 
     of: str
-    """The number: `rewards.effort`, or `terms.slip.weight`."""
+    """The number: `rewards.effort`, `hold.coasting_pay`, `max_spin`, or `terms.slip.weight`."""
 
     @abstractmethod
     def value(self, iteration: int, score: float | None) -> float:
@@ -195,15 +209,16 @@ class CurriculumTerm(Term):
             score: Mean score of the episodes that have ended last, in `Task.score_unit`; None: none has ended yet.
         """
 
+    def extremes(self) -> tuple[float, ...]:
+        """Return numbers that the document is checked with; by default the first one."""
+        return (self.value(0, None),)
+
 
 class ActionRate(RewardTerm):
     """Change of the action, |a_t − a_{t−1}|²."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.action - now.last_action).square().sum(dim=1)
-
-    def reference(self, row: Row) -> float | np.floating:
-        return np.sum((row["action"] - row["last_action"]) ** 2)
 
 
 class JointLimit(RewardTerm):
@@ -215,10 +230,6 @@ class JointLimit(RewardTerm):
         middle, half = 0.5 * (setup.low + setup.high), 0.5 * (setup.high - setup.low)
         return ((now.joint_pos - middle).abs() - FREE_SHARE * half).clamp(min=0.0).sum(dim=1)
 
-    def reference(self, row: Row) -> float | np.floating:
-        middle, half = 0.5 * (row["low"] + row["high"]), 0.5 * (row["high"] - row["low"])
-        return np.sum(np.maximum(abs(row["joint_pos"] - middle) - 0.95 * half, 0.0))
-
 
 class Work(RewardTerm):
     """Power of the drives, braking included, Σ_j |τ_j q̇_j|."""
@@ -228,18 +239,12 @@ class Work(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.torque * now.joint_vel).abs().sum(dim=1)
 
-    def reference(self, row: Row) -> float | np.floating:
-        return np.sum(np.abs(row["torque"] * row["joint_vel"]))
-
 
 class Effort(RewardTerm):
     """Squares of the torques as shares of the largest ones, Σ_j (τ_j/τ_max,j)²; a drive without a limit makes none."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return (now.torque / setup.max_torque).square().sum(dim=1)
-
-    def reference(self, row: Row) -> float | np.floating:
-        return np.sum((row["torque"] / row["max_torque"]) ** 2)
 
 
 class ContactForce(RewardTerm):
@@ -252,9 +257,6 @@ class ContactForce(RewardTerm):
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return ((vector_norm(now.link_force, dim=2) - self.max_force).clamp(min=0.0) / self.max_force).sum(dim=1)
 
-    def reference(self, row: Row) -> float | np.floating:
-        return sum(max(0.0, np.linalg.norm(f) - self.max_force) / self.max_force for f in row["link_force"])
-
 
 class Near(RewardTerm):
     """How near the probes of `surface_distance` are to the object, mean_p exp(−max(0, d_p)/λ): from 0 to 1, which is touch."""
@@ -265,9 +267,6 @@ class Near(RewardTerm):
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         return torch.exp(-now.distance.clamp(min=0.0) / self.width).mean(dim=1)
-
-    def reference(self, row: Row) -> float | np.floating:
-        return np.mean(np.exp(-np.maximum(row["distance"], 0.0) / self.width))
 
 
 class ObjectSpeed(RewardTerm):
@@ -284,10 +283,6 @@ class ObjectSpeed(RewardTerm):
             (vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(velocities, free, strict=True)
         )
         return speed + spin
-
-    def reference(self, row: Row) -> float | np.floating:
-        speed, spin = np.linalg.norm(row["linvel"]), np.linalg.norm(row["angvel"])
-        return max(0.0, speed / self.free_speed - 1.0) + max(0.0, spin / self.free_spin - 1.0)
 
 
 class ForceLimit(TerminationTerm):
@@ -342,6 +337,74 @@ class ObjectVelocity(EventTerm):
         event.sim.arrays["qvel"][:, first : first + 6] += torch.where(event.chosen[:, None], added, 0.0)
 
 
+class Friction(EventTerm):
+    """The object's coefficient of sliding friction is the scene's times a factor."""
+
+    changes_model = True
+    per_env = ("friction",)
+    mode: Literal["reset", "interval"] = "reset"
+    """When it happens."""
+    factor: Factor
+    """The factor."""
+
+    def apply(self, event: Event) -> None:
+        setup = event.setup
+        put_rows(setup.friction, event.chosen, setup.scene_friction * within(event.shares(1), *self.factor)[:, 0])
+        event.sim.properties.set(event.chosen, friction={setup.object: setup.friction})
+
+
+class Mass(EventTerm):
+    """The object's mass is the scene's and something more."""
+
+    changes_model = True
+    per_env = ("mass",)
+    mode: Literal["reset", "interval"] = "reset"
+    """When it happens."""
+    added: Annotated[Range, RangeOf("mass", ge=0.0)]
+    """What is added [kg]."""
+
+    def apply(self, event: Event) -> None:
+        setup = event.setup
+        put_rows(setup.mass, event.chosen, setup.scene_mass + within(event.shares(1), *self.added)[:, 0])
+        event.sim.properties.set(event.chosen, mass={setup.object: setup.mass})
+
+
+class Drive(EventTerm):
+    """The drives are drawn again within `randomise.drive`."""
+
+    changes_model = True
+    mode: Literal["reset", "interval"] = "reset"
+    """When it happens."""
+
+    def apply(self, event: Event) -> None:
+        event.actuation.draw(event.chosen, event.count)
+
+
+class Push(EventTerm, PushSpec):
+    """A force in world axes, uniform in a box, acts at the centre of mass of the object's body for a while.
+
+    Source of forces and intervals: Chung et al., *Tactile Genesis*, appendix, "Domain Randomization", which does not say for
+    how long a force acts: a control step is our choice.
+    """
+
+    constants = ("duration",)
+
+    def apply(self, event: Event) -> None:
+        counted = replace(event, count=event.count - 1)  # from 0
+        share = counted.uniform(3)
+        force = torch.stack([within(share[:, i], *getattr(self, axis)) for i, axis in enumerate("xyz")], dim=1)
+        put_rows(self._applied(event), event.chosen, force)
+
+    def num_steps(self, control_step: float) -> int:
+        return math.ceil(self.duration / control_step - 1e-9)
+
+    def end(self, event: Event) -> None:
+        put_rows(self._applied(event), event.chosen, 0.0)
+
+    def _applied(self, event: Event) -> Float[Tensor, "env 3"]:
+        return event.sim.arrays["xfrc_applied"][:, int(event.setup.model.body(event.setup.object).id), :3]
+
+
 class Linear(CurriculumTerm):
     """`start` up to `first`, `end` from `last` on, and linear between: of iterations, or of the score."""
 
@@ -362,6 +425,9 @@ class Linear(CurriculumTerm):
             raise ValueError(f"first and last are both {self.first:g}, expected a change that takes some time")
         return self
 
+    def extremes(self) -> tuple[float, ...]:
+        return self.start, self.end
+
     def value(self, iteration: int, score: float | None) -> float:
         x = iteration if self.by == "iteration" else self.first if score is None else score
         share = min(1.0, max(0.0, (x - self.first) / (self.last - self.first)))
@@ -381,6 +447,10 @@ TERMS: Mapping[str, type[Term]] = {
     "link_force": LinkForce,
     "object_state": ObjectState,
     "object_velocity": ObjectVelocity,
+    "friction": Friction,
+    "mass": Mass,
+    "drive": Drive,
+    "push": Push,
     "linear": Linear,
 }
 """The terms that documents may name."""

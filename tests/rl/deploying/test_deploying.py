@@ -66,9 +66,9 @@ def test_on_a_simulation_it_does_what_it_does_in_environments(task, joint_vel):
             torch.testing.assert_close(value[0], obs[name][moment.episode], **CLOSE)
         if target is not None:
             torch.testing.assert_close(moment.target[0], target[moment.episode], rtol=0, atol=1e-6)
-    last = [moment.judged for moment in found if moment.index == len(expected) - 1]
-    assert all(own.is_over and own.is_held for own in last) and not any(m.judged.is_over for m in found if m.index < 20)
-    np.testing.assert_allclose([own.score for own in last], scores, atol=1e-5)
+    last = [moment.step for moment in found if moment.index == len(expected) - 1]
+    assert all(own.truncated for own in last) and not any(m.step.info.ended for m in found if m.index < 20)
+    np.testing.assert_allclose([own.info.score for own in last], scores[:, None], atol=1e-5)
     assert max(moment.obs["tactile_sensors"].abs().max() for moment in found) > 10
 
 
@@ -106,7 +106,7 @@ def test_an_emulated_hand_shows_what_the_simulation_does(task, blind):
         torch.testing.assert_close(other[:, :6], one[:, :6], rtol=2e-7, atol=1e-7)
         torch.testing.assert_close(other[:, 6:12], one[:, 6:12], rtol=0, atol=4e-7 / 0.02)
         assert torch.equal(one[:, 12:], other[:, 12:])
-        assert simulated.judged.score == pytest.approx(emulated.judged.score, abs=1e-6)
+        assert simulated.step.info.score.item() == pytest.approx(emulated.step.info.score.item(), abs=1e-6)
     last = runs[1][-1]
     assert last.obs["tactile_sensors"].abs().max() > 50 * half_count
     assert (runs[0][-1].obs["tactile_sensors"] != last.obs["tactile_sensors"]).any() and last.age_s is None
@@ -165,7 +165,7 @@ def test_a_log_is_acted_on_and_moves_nothing(task, policy, tmp_path):
         wanted = np.clip(target + 0.05 * np.clip(moment.action[0].numpy(), -1, 1), -1, 1)
         target = 0.8 * wanted + 0.2 * target
         np.testing.assert_allclose(moment.target[0], target, atol=1e-9)
-        assert moment.judged is None and moment.obs["goal"].tolist() == [[1.0]]
+        assert moment.step.info.score.isnan() and moment.obs["goal"].tolist() == [[1.0]]
     report = found.report()
     assert report.scores is None and not report.moves and report.age.median > 0
     assert str(report).startswith(f"no score: {log} has no scene that knows what happened; 1 episode, {len(moments)} control")

@@ -9,8 +9,8 @@ from tgdsl.errors import SimulationError
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actions import ScriptError, actor_of, check_actions
-from tgdsl.rl.playing.play import play, steps_of
-from tgdsl.rl.playing.record import Record
+from tgdsl.rl.playing.record import PlayRecord
+from tgdsl.rl.playing.rollout import rollout, steps_of
 from tgdsl.rl.playing.tally import Tally
 
 NUM_ENVS = 3
@@ -106,8 +106,9 @@ def test_scripts_that_do_wrong(env, script, tmp_path):
 
 
 def played(env, actions="random", steps=2 * STEPS + 2):
-    record, tally, kept = Record(env, steps), Tally(env), []
-    for each in play(env, actor_of(env, actions, 1), steps, seed=4):
+    env.reset(4)
+    record, tally, kept = PlayRecord(env, steps), Tally(env), []
+    for each in rollout(actor_of(env, actions, 1), env, steps):
         record.add(each)
         tally.add(each.step.info)
         kept.append(each)
@@ -156,7 +157,7 @@ def test_a_record_holds_what_happened(env, tmp_path):
 
 def test_a_record_beyond_all_memory(env):
     with pytest.raises(SimulationError, match="records of 3 environments at 1000000000000 steps need about"):
-        Record(env, 10**12)
+        PlayRecord(env, 10**12)
 
 
 def test_a_record_without_an_end(env, tmp_path):
@@ -188,7 +189,8 @@ def test_a_tally_shows_means_of_the_present_episodes_and_of_those_that_have_ende
 def test_faults_are_counted(env, script):
     actor = "def act(env, obs):\n    return [[float('nan') if env.steps[1] == 3 else 0] * 2, [0, 0], [0, 0]]\n"
     tally = Tally(env)
-    steps = play(env, actor_of(env, script(actor)), 5)
+    env.reset(0)
+    steps = rollout(actor_of(env, script(actor)), env, 5)
     with pytest.warns(UserWarning, match="not finite"):
         infos = [each.step.info for each in steps]
     for info in infos:

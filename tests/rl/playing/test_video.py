@@ -14,8 +14,8 @@ from tgdsl.errors import FileError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing import video as module
 from tgdsl.rl.playing.actions import ZeroActor
-from tgdsl.rl.playing.play import play
-from tgdsl.rl.playing.record import Record
+from tgdsl.rl.playing.record import PlayRecord
+from tgdsl.rl.playing.rollout import rollout
 from tgdsl.rl.playing.video import HEIGHT, WIDTH, VideoError, video
 
 SCENE = """
@@ -117,8 +117,9 @@ def test_without_opengl(monkeypatch, tmp_path):
 def test_bodies_that_are_put_by_mocap_are_where_they_were(opengl, monkeypatch, tmp_path):
     """The example to copy moves its object so."""
     env = TouchEnv(TASK, 2, threads=1, overrides={"touch": "none"})
-    record, places = Record(env, 2), []
-    for played in play(env, ZeroActor(env), 2):
+    env.reset(0)
+    record, places = PlayRecord(env, 2), []
+    for played in rollout(ZeroActor(env), env, 2):
         record.add(played)
 
     def noted(self, data, camera):

@@ -124,7 +124,7 @@ def test_a_rollout_holds_what_was_seen_done_and_said(make):
     step = found.env.step
 
     def recorded(action):
-        obs, told = dict(found.env._obs), found.env.task.decoded(found.env.now)
+        obs, told = found.env.observe(), found.env.task.decoded(found.env.now)
         rows.append((obs, action.clone(), {name: value.clone() for name, value in told.items()}))
         return step(action)
 
@@ -236,7 +236,8 @@ def test_to_stop_and_go_on_is_to_go_on(make, tmp_path, kind):
     assert (other.iteration, other.samples) == (2, 2 * 4 * 10)
     other.env.load_state_dict(envs)
     for distiller in (one, other):
-        distiller.go_on_from(distiller.env.step(torch.zeros(distiller.env.num_envs, distiller.env.num_actions)).obs)
+        distiller.env.step(torch.zeros(distiller.env.num_envs, distiller.env.num_actions))
+        distiller.go_on_here()
         torch.set_rng_state(generator)
         distiller.iterate()
     assert all(torch.equal(a, b) for a, b in zip(weights(one), weights(other), strict=True))
@@ -294,9 +295,7 @@ def test_what_an_iteration_tells_is_of_each_block(make):
         return made
 
     found.env.step = recorded
-    found.roll()
-    found.learn()
-    told = found._told().told
+    told = found.iterate().told
     for i, key in enumerate(found.keys):
         own = slice(2 * i, 2 * i + 2)
         count = float(ended[own].sum())

@@ -56,7 +56,7 @@ def test_streams_and_graphs_change_nothing(distillers):
         for distiller in distillers:
             distiller.set_rate(number / 5)
         found.roll()
-        other._begin()
+        other.go_on()
         for value, its in zip(other._of_rollout(), found._of_rollout(), strict=True):
             value.copy_(its)
         for distiller in distillers:

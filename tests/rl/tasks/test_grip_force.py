@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 from task_records import Recorder, assert_reference
+from task_references import grip_force
 
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.tasks.grip_force import GripForce, reference
+from tgdsl.rl.tasks.grip_force import GripForce
 from tgdsl.scene.scene import Choice, SceneModels
 
 FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
@@ -58,7 +59,7 @@ def command(env):
 
 def by_command(spec, record, dt):
     """The reference, told when commands were new by their change."""
-    return reference(spec, {**record, "is_new": np.diff(record["command"], prepend=0.0) != 0}, dt)
+    return grip_force(spec, {**record, "is_new": np.diff(record["command"], prepend=0.0) != 0}, dt)
 
 
 ODD = {

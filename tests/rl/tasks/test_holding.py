@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from task_references import pay as paid
 from tiny_tasks import tiny_env
 
 from tgdsl.rl import terms
 from tgdsl.rl.links import are_fingers
-from tgdsl.rl.tasks.holding import Holding, HoldSpec, reference
+from tgdsl.rl.tasks.holding import Holding, HoldSpec
 
 HAND = """<mujoco><worldbody>
   <body name="arm"><joint name="lift" type="slide" axis="0 0 1"/><geom size=".01" mass="1"/>
@@ -55,7 +56,7 @@ def test_two_fingers_or_one_and_the_palm_hold():
     assert holding.is_held(now).tolist() == [is_held for _, is_held in FORCES]
     assert holding.pay(now).tolist() == pytest.approx(expected, abs=1e-15)
     fingers = np.array([False, True, True, True])
-    assert [reference(spec, force.numpy(), fingers) for force in now.link_force] == expected
+    assert [paid(spec, force.numpy(), fingers) for force in now.link_force] == expected
     assert Holding(HoldSpec(links=1), setup).is_held(now).tolist() == [False, False, True, True, True, True]
 
 

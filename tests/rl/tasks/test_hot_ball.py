@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 from task_records import Recorder, assert_reference
+from task_references import hot_ball
 
 from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.tasks.hot_ball import HotBall, reference
+from tgdsl.rl.tasks.hot_ball import HotBall
 from tgdsl.schema.load import load
 
 FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
@@ -95,7 +96,7 @@ def test_rewards_ends_and_scores_equal_the_reference():
             put_on(env, [0] * 8, press=0.03)
         recorder.step(action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 12
-    assert assert_reference(recorder, reference) == {*HotBall.Rewards.model_fields, "is_over", "score"}
+    assert assert_reference(recorder, hot_ball) == {*HotBall.Rewards.model_fields, "is_over", "score"}
     env.close()
 
 
@@ -105,7 +106,7 @@ def test_the_document_as_it_is_equals_the_reference():
     recorder = Recorder(env, cells)
     for action in random_actions(env, 100):
         recorder.step(action)
-    assert {"approach", "action_rate", "work"} <= assert_reference(recorder, reference)
+    assert {"approach", "action_rate", "work"} <= assert_reference(recorder, hot_ball)
     env.close()
 
 

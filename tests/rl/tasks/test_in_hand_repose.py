@@ -9,13 +9,14 @@ import torch
 from paper_drives import PAPER
 from scipy.spatial.transform import Rotation
 from task_records import Recorder, reference_rates
+from task_references import in_hand_repose
 from tiny_tasks import tiny_env
 
 from tgdsl.errors import SpecError
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.tasks.in_hand_repose import InHandRepose, InHandReposeSpec, reference
+from tgdsl.rl.tasks.in_hand_repose import InHandRepose, InHandReposeSpec
 
 FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
 DOCUMENTS = [FOLDER / "in_hand_repose.yaml", FOLDER / "in_hand_repose_sharpa.yaml"]
@@ -78,7 +79,7 @@ def compare(env, recorder, first_episode=2, kind="any"):
             if number not in axes:
                 axes[number] = [goal_axes(env.num_envs, number, k, kind) for k in range(12)]
             record["goal_axis"] = np.stack([axis[env_id] for axis in axes[number]])
-            expected = reference_rates(env.task, reference, env.spec, record, env.control_step)
+            expected = reference_rates(env.task, in_hand_repose, env.spec, record, env.control_step)
             assert expected.keys() == found.keys()
             for name, value in expected.items():
                 scale = max(1.0, float(np.abs(value).max()))

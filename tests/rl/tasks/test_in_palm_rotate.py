@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 from task_records import Recorder, assert_reference
+from task_references import in_palm_rotate
 from tiny_tasks import tiny_env
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.links import are_fingers
-from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate, reference
+from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "in_palm_rotate.yaml"
 MORE = "episode: 0.5 s\nmax_force: 0.05 N\nfree_distance: 1 mm\ndrop_distance: 20 mm\naction: {scale: 0.3}\n"
@@ -24,7 +25,7 @@ def held_reference(env):
     """Return the reference, given largest torques and which links are fingers."""
     setup = env.task.setup
     own = {"fingers": are_fingers(setup.model, setup.links)}
-    return lambda spec, record, dt: reference(spec, record | own, dt)
+    return lambda spec, record, dt: in_palm_rotate(spec, record | own, dt)
 
 
 def random_actions(env, num, seed=0):

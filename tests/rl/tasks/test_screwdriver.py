@@ -10,11 +10,12 @@ import pytest
 import torch
 from pincer_tasks import LENGTH, pincer_env
 from task_records import Recorder, assert_reference
+from task_references import screwdriver
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.links import are_fingers
-from tgdsl.rl.tasks.screwdriver import Screwdriver, reference
+from tgdsl.rl.tasks.screwdriver import Screwdriver
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "screwdriver.yaml"
 ODD = {
@@ -52,7 +53,7 @@ def by_tip(env, upright, length):
     def told(spec, record, dt):
         down = np.array([0, 0, -length])
         tip = record["pos"] + np.stack([rotation(quat) @ down for quat in record["quat"]])
-        return reference(spec, {**record, **own, "tip": tip, "upright_pos": upright, "upright_tip": upright + down}, dt)
+        return screwdriver(spec, {**record, **own, "tip": tip, "upright_pos": upright, "upright_tip": upright + down}, dt)
 
     return told
 

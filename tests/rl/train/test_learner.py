@@ -85,7 +85,7 @@ def test_a_return_goes_on_with_the_value_at_the_end_of_an_episode_that_was_cut_o
     assert steps[-1].truncated.all() and len(steps) == STEPS
     with torch.no_grad():
         final = algorithm.critic(learner._seen(steps[-1].info.final_obs))[:, 0]
-        begun = algorithm.critic(learner._obs)[:, 0]
+        begun = algorithm.critic(learner._seen(learner.env.observe()))[:, 0]
     assert (final - begun).abs().min() > 1e-4
     torch.testing.assert_close(paid[-1].flatten(), steps[-1].reward + algorithm.gamma * final)
     torch.testing.assert_close(paid[-2].flatten(), steps[-2].reward)

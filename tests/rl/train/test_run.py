@@ -18,8 +18,7 @@ from small_runs import small_learner
 
 from tgdsl.errors import FileError, TgdslError
 from tgdsl.rl.load import load_task
-from tgdsl.rl.playing.differences import differences
-from tgdsl.rl.train import folder as folders
+from tgdsl.rl.playing.provenance import differences
 from tgdsl.rl.train.checkpoint import CheckpointError, read_checkpoint, restore, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder, documents, made_from
 from tgdsl.rl.train.run import DivergedError, Run
@@ -164,8 +163,9 @@ def test_a_slim_checkpoint_rounds_moments_alone(tmp_path):
     run, learner = begun(tmp_path)
     run.learn(1, float("inf"))
     state = state_of(learner, 0.0)
-    sizes = [write_checkpoint(state, tmp_path / f"{slim}.pt", slim) for slim in (False, True)]
-    assert sizes == [(tmp_path / f"{slim}.pt").stat().st_size for slim in (False, True)] and sizes[1] < sizes[0]
+    for slim in (False, True):
+        write_checkpoint(state, tmp_path / f"{slim}.pt", slim)
+    assert (tmp_path / "True.pt").stat().st_size < (tmp_path / "False.pt").stat().st_size
     slim = read_checkpoint(tmp_path / "True.pt")
     other, _ = small_learner(tmp_path)
     restore(other, slim, tmp_path / "True.pt")
@@ -392,7 +392,7 @@ def test_a_folder_that_cannot_be_written_is_named_before_a_run_begins(tmp_path):
         RunFolder(tmp_path).check(is_resumed=True)
 
 
-def test_a_disk_that_is_full_is_named_before_a_run_begins(tmp_path, monkeypatch):
+def test_a_disk_that_is_full_is_named_before_a_run_begins(tmp_path):
     learner, loaded = small_learner(tmp_path)
     folder = RunFolder(tmp_path / "run")
     folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
@@ -406,10 +406,6 @@ def test_a_disk_that_is_full_is_named_before_a_run_begins(tmp_path, monkeypatch)
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
     assert not folder.checkpoint.exists()
-    full = type("Usage", (), {"free": 1000})()
-    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: full)
-    with pytest.raises(FileError, match=r"checkpoint\.pt: 0\.\d\d MiB are free on the disk, checkpoints take 0\.\d\d MiB"):
-        Run(learner, folder, EVERY)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

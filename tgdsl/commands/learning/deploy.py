@@ -93,9 +93,9 @@ class Deploy:
         """Make all steps and report them; Ctrl-C ends them early."""
         from tqdm import tqdm
 
-        from tgdsl.rl.deploying.record import DeployRecord
+        from tgdsl.rl.deploying.deploy import DeployRecord
 
-        record = DeployRecord(found.prepared)
+        record = DeployRecord(found.prepared.moved.names)
         failed: TgdslError | None = None
         with tqdm(desc="acting", unit="step", disable=None, leave=False) as bar:
             try:
@@ -106,7 +106,7 @@ class Deploy:
                 bar.write("interrupted")
             except TgdslError as error:  # a hand that no longer answers: report the steps so far
                 failed = error
-        if failed is None or record.num_steps:
+        if failed is None or len(record):
             print(found.report())
             print("\n".join(record.lines()))
             if self.out is not None:

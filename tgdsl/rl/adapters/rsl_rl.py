@@ -42,7 +42,6 @@ class TouchVecEnv(VecEnv):
     """
 
     def __init__(self, touch_env: TouchEnv):
-        """Translate an environment, and begin a new episode in all of it."""
         self.touch_env, self.device = touch_env, touch_env.device
         self.num_envs, self.num_actions = touch_env.num_envs, touch_env.num_actions
         self.max_episode_length = touch_env.max_steps

@@ -6,7 +6,6 @@ Shapes: `actuator` actuators of the scene, `joint` joints that the policy moves,
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -15,52 +14,74 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import torch
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.console.progress import Progress
-from tgdsl.rl.deploying.acting import HandActor
+from tgdsl.console.tables import text_table
+from tgdsl.rl.deploying.hand import EVERYONE, Hand
 from tgdsl.rl.deploying.prepared import DeployError, Prepared, prepare
 from tgdsl.rl.deploying.report import Quantiles, Report, Scores
-from tgdsl.rl.deploying.scene import Judged, TaskScene
+from tgdsl.rl.deploying.scene import TaskScene, first_step
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.evaluation import SEED
+from tgdsl.rl.playing.policy import Policy
+from tgdsl.rl.playing.record import Record
+from tgdsl.rl.playing.rollout import Moment, rollout
 from tgdsl.runtime.connect import connect, kind_of
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
 
-APPROACH_S = 2.0
-"""Time in which a hand that may move goes to the keyframe from which it shall act [s]."""
 EMULATED_SPEED, EMULATED_CURRENT, EMULATED_GAIN, EMULATED_WATCHDOG_S = 1e6, 300, 100, 1.0
 """Limits of an emulated hand: its drives are those of the scene, and it is not to wait for them."""
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """One control step of a policy.
+class HandMoment(Moment):
+    """One control step of a policy on a source; `step` is what a scene's task says of it.
 
     Attributes:
         episode: Number of the episode, from 0.
-        index: Number of the control step in it, from 0.
-        obs: The policy's groups of observations.
-        action: What it asked for, from −1 to 1.
         target: Set-points of the joints that it moves [rad].
         age_s: How old the sample was [s]; None where nothing runs in real time.
         inference_s: From then until the set-points were there [s].
-        judged: What the scene's task says after the step; None without a scene.
     """
 
     episode: int
-    index: int
-    obs: Mapping[str, Float[Tensor, "env feature"]]
-    action: Float[Tensor, "env joint"]
     target: Float[Tensor, "env joint"]
     age_s: float | None
     inference_s: float
-    judged: Judged | None
+
+
+class DeployRecord(Record):
+    """A record of a policy on a source.
+
+    The file holds, of each control step, its `episode` and `index` in it (step,), observations `obs:<group>` (step, feature)
+    that the action was chosen from, the `action` (step, joint) from −1 to 1, the `target` (step, joint) [rad], `age` and
+    `inference` (step,) [s], and the `score` so far (step,); an age and a score that are not known are NaN. `joints` names the
+    joints.
+    """
+
+    def add(self, moment: HandMoment) -> None:
+        """Add one step."""
+        numbers = {"episode": moment.episode, "index": moment.index, "inference": moment.inference_s}
+        numbers |= {"age": np.nan if moment.age_s is None else moment.age_s, "score": float(moment.step.info.score)}
+        values = {f"obs:{name}": value for name, value in moment.obs.items()}
+        values |= {"action": moment.action.double().clamp(-1.0, 1.0), "target": moment.target}
+        self.add_rows({name: value.numpy() for name, value in values.items()})
+        self.add_rows({name: np.array([number]) for name, number in numbers.items()})
+
+    def lines(self) -> list[str]:
+        """Return a table of actions and targets, joint by joint."""
+        action, target = self["action"], self["target"]
+        rows = [
+            (name, f"{action[:, i].mean():.3f}", f"{action[:, i].std():.3f}", f"{low:.3f} to {high:.3f}")
+            for i, (name, low, high) in enumerate(zip(self.joints, target.min(axis=0), target.max(axis=0), strict=True))
+        ]
+        return text_table(("joint", "mean action", "spread", "targets [rad]"), rows).splitlines()
 
 
 @dataclass
@@ -174,7 +195,7 @@ class Deployment:
         )
         return TaskScene(env)
 
-    def steps(self, episodes: int = 1, seconds: float | None = None) -> Iterator[Moment]:
+    def steps(self, episodes: int = 1, seconds: float | None = None) -> Iterator[HandMoment]:
         """Act, and yield each control step.
 
         A scene's episodes end as the task says; others, and a log that is not over, after some time.
@@ -193,14 +214,12 @@ class Deployment:
         longest = self.prepared.loaded.spec.episode if seconds is None else seconds
         is_whole = seconds is None and kind_of(self.source).name == "log"
         num_steps = None if is_whole else max(1, round(longest / self.prepared.control_step))
-        self._sums = _Sums()
-        actor = HandActor(self.prepared, is_exact=self.has_scene and not self._is_emulated)
+        self._sums, policy = _Sums(), self.prepared.policy()
         if self.has_scene:
             for episode in range(episodes):
                 scene = self.scene(episode)
                 with self._connected(scene) as connection:
-                    actor.begin(scene.start)
-                    yield from self._episode(episode, connection, actor, num_steps, scene)
+                    yield from self._episode(episode, connection, policy, num_steps, scene)
             return
         with self._connected(None) as connection:
             for episode in range(episodes):
@@ -208,8 +227,7 @@ class Deployment:
                     break
                 if episode:
                     connection.reset()
-                self._approach(connection, actor)
-                yield from self._episode(episode, connection, actor, num_steps, None)
+                yield from self._episode(episode, connection, policy, num_steps, None)
 
     def report(self) -> Report:
         """Return what came of the steps that were made.
@@ -252,43 +270,27 @@ class Deployment:
             opened.pop_all()
         return result
 
-    def _approach(self, connection: Connection, actor: HandActor) -> None:
-        """Begin where a hand is, or go to a keyframe's controls first, if it may move."""
-        held = actor.hold(connection.observe()["joint_pos"])
-        if self._start is not None:
-            held = torch.from_numpy(self._start.copy())
-            if self.moves:
-                for _ in range(round(APPROACH_S / connection.control_step)):
-                    connection.step(held[None])
-        actor.begin(held)
-
     def _episode(
-        self, episode: int, connection: Connection, actor: HandActor, num_steps: int | None, scene: TaskScene | None
-    ) -> Iterator[Moment]:
+        self, episode: int, connection: Connection, policy: Policy, num_steps: int | None, scene: TaskScene | None
+    ) -> Iterator[HandMoment]:
         """Make the steps of one episode."""
-        sums = self._sums
-        late = getattr(connection.source, "num_late_steps", 0)
-        goal = torch.tensor([self.prepared.goal or ()], dtype=torch.float64)
-        index, judged = 0, None if scene is None else scene.judged
-        while (num_steps is None or index < num_steps) and not connection.is_over:
-            began = time.monotonic()
-            age = connection.age_s
-            obs = actor.observe(connection.observe(), goal if judged is None else judged.goal)
-            control = actor.act(obs)
-            inference = time.monotonic() - began
-            connection.step(control)
-            sums.seconds += time.monotonic() - began
-            sums.ages.append(age)
-            sums.inferences.append(inference)
-            judged = None if scene is None else scene.judged
-            yield Moment(episode, index, obs, actor.action, actor.target, age, inference, judged)
-            index += 1
-            if judged is not None and judged.is_over:
+        sums, late = self._sums, getattr(connection.source, "num_late_steps", 0)
+        hand = Hand(self.prepared, connection, scene, is_exact=self.has_scene and not self._is_emulated)
+        hand.begin(self._start, self.moves)
+        policy.begin(EVERYONE)
+        info = first_step().info
+        for moment in rollout(policy, hand, num_steps):
+            info = moment.step.info
+            sums.seconds += hand.seconds
+            sums.ages.append(hand.age_s)
+            sums.inferences.append(hand.inference_s)
+            yield HandMoment(*vars(moment).values(), episode, hand.target, hand.age_s, hand.inference_s)
+            if info.ended or connection.is_over:
                 break
         sums.late_steps += getattr(connection.source, "num_late_steps", 0) - late
-        sums.are_held.append(judged is None or judged.is_held)
-        if judged is not None:
-            sums.scores.append(judged.score)
+        sums.are_held.append(bool(~info.ended | (scene is not None and info.is_whole(scene.max_steps))))
+        if scene is not None:
+            sums.scores.append(float(info.score))
 
 
 def deploy(
@@ -298,7 +300,7 @@ def deploy(
     *,
     episodes: int = 1,
     seconds: float | None = None,
-    watch: Callable[[Moment], None] | None = None,
+    watch: Callable[[HandMoment], None] | None = None,
     **options: Any,
 ) -> Report:
     """Run a policy on a source; return what came of it.
@@ -338,5 +340,4 @@ def emulated_limits(prepared: Prepared) -> MotionLimits:
 
 
 def _needs_goal(prepared: Prepared) -> bool:
-    """Return whether the policy sees a group that is made of what is asked for."""
     return any(name in prepared.loaded.task.hand_groups for name in prepared.groups)

@@ -163,12 +163,10 @@ def prepare(
 
 
 def _with(loaded: LoadedTask, values: Mapping[str, Any]) -> LoadedTask:
-    """Return a document with other values."""
     return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=dict(values)))
 
 
 def _default_groups(loaded: LoadedTask) -> list[str]:
-    """Return the groups that a policy without a card sees."""
     there = {"proprio", *loaded.task.hand_groups, *([GROUP] if loaded.spec.touch != "none" else [])}
     return [name for name in ACTOR_GROUPS if name in there]
 
@@ -207,7 +205,6 @@ def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple
 
 
 def _alone(loaded: LoadedTask, sensed: Sensed, feels: Sequence[Felt]) -> TactileModule:
-    """Return the module of environments in which the policy acts alone."""
     return sensed.touch if len(feels) < 2 else compile_sensed(loaded, "cpu", feels=feels[:1]).touch
 
 

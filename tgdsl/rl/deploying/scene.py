@@ -5,7 +5,7 @@ Shapes: `actuator` actuators of the scene.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
 
 import numpy as np
 import torch
@@ -14,30 +14,22 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.episodes import Step, StepInfo
 from tgdsl.runtime.stepped_scene import SteppedScene
 
 
-class Judged(NamedTuple):
-    """What the task says of an episode so far.
-
-    Attributes:
-        goal: What is asked for now.
-        score: The score.
-        is_over: Whether it has ended, for good or as time is over.
-        is_held: Whether nothing has ended it before its time was over.
-    """
-
-    goal: Float[Tensor, "env goal"]
-    score: float
-    is_over: bool
-    is_held: bool
+def first_step(score: float = math.nan) -> Step:
+    """Return a step of one environment that brings nothing and ends nothing."""
+    is_so, count, value = torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int64), torch.zeros(1)
+    return Step({}, value, is_so, is_so, StepInfo(is_so, {}, {}, value + score, value, count, {}, is_so))
 
 
 class TaskScene(SteppedScene):
     """One environment of a task, told where its joints shall go. An episode that is over stands still until it is reset.
 
     Attributes:
-        judged: What the task says: of the instant that the readings are of.
+        goal: What the task asks for now.
+        last_step: What the task says: of the instant that the readings are of.
     """
 
     def __init__(self, env: TouchEnv):
@@ -53,6 +45,11 @@ class TaskScene(SteppedScene):
         self._note_start()
 
     @property
+    def max_steps(self) -> int:
+        """Control steps of an episode that nothing ends before."""
+        return self._env.max_steps
+
+    @property
     def start(self) -> Float[Tensor, " actuator"]:
         """Set-points that hold at the start of an episode, or were told since [rad]: a copy."""
         return self._setpoints[0].cpu().clone()
@@ -63,12 +60,10 @@ class TaskScene(SteppedScene):
 
     def advance(self) -> dict[str, Tensor]:
         """Make one control step, unless the episode is over; return the readings."""
-        if self.judged.is_over:
+        if self.last_step.info.ended:
             return self.readings
         step = self._env.follow(self._setpoints)
-        goal, info = self._env.task.asked().cpu().clone(), step.info
-        ended = bool(info.ended)
-        self.judged = Judged(goal, float(info.score), ended, not ended or bool(info.is_whole(self._env.max_steps)))
+        self.goal, self.last_step = self._env.task.asked().cpu().clone(), step
         return self.read()
 
     def begin(self) -> dict[str, Tensor]:
@@ -89,4 +84,4 @@ class TaskScene(SteppedScene):
         env = self._env
         self._setpoints = env.sim.ctrl.clone()
         self._setpoints[:, torch.from_numpy(env.task.setup.actuators.actuator)] = env.actuation.target
-        self.judged = Judged(env.task.asked().cpu().clone(), float(env.task.score()), False, True)
+        self.goal, self.last_step = env.task.asked().cpu().clone(), first_step(float(env.task.score()))

@@ -17,7 +17,7 @@ from torch import Tensor
 from tgdsl.errors import TgdslError, did_you_mean, raised_at
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.playing.rollout import Actor
 
 KINDS = ("zero", "random", "script")
 """Actions by one word; else they are a function of a file, `FILE.py:FUNCTION`."""
@@ -33,7 +33,6 @@ class ZeroActor(Actor):
     """Asks for nothing: zeros."""
 
     def __init__(self, env: TouchEnv):
-        """Begin."""
         self._action = torch.zeros((env.num_envs, env.num_actions), dtype=torch.float32, device=env.device)
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
@@ -45,7 +44,6 @@ class RandomActor(Actor):
     """Numbers from −1 to 1, the same for an environment however many there are."""
 
     def __init__(self, env: TouchEnv, seed: int):
-        """Begin."""
         self._draws = Draws(seed, env.num_envs, env.device)
         self._count = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
         self._num = env.num_actions

@@ -15,8 +15,8 @@ from scipy.stats import t as student_t
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actor import Actor
 from tgdsl.rl.playing.gait import Gait, GaitMeter
+from tgdsl.rl.playing.rollout import Actor, rollout
 
 SEED = 1_000_003
 """What is random in the episodes follows from it, whatever a policy was learned with."""
@@ -108,22 +108,23 @@ def evaluate_each(
     quota[:, : episodes % size] += 1
     quota = quota.flatten()
     done, sums = torch.zeros_like(quota), torch.zeros((6, env.num_envs), dtype=torch.float64, device=env.device)
-    obs, index = env.reset(seed), 0
+    env.reset(seed)
+    actor.begin(torch.ones_like(quota, dtype=torch.bool))
     meter = GaitMeter(env, blocks)
-    actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-    while index % CHECKED_EVERY or (left := int((quota - done).sum())):
-        if index % CHECKED_EVERY == 0:
-            progress(f"evaluating: {blocks * episodes - left:,} of {blocks * episodes:,} episodes")
-        step = env.step(actor(obs))
-        info, obs, index = step.info, step.obs, index + 1
-        is_asked = done < quota
+    progress(f"evaluating: 0 of {blocks * episodes:,} episodes")
+    for moment in rollout(actor, env):
+        info, is_asked = moment.step.info, done < quota
         meter.add(is_asked & ~info.ended)
         counts = info.ended & is_asked
         score = info.score.double()
         numbers = [score, score.square(), info.is_whole(env.max_steps), info.episode_return, info.episode_steps, info.faults]
         sums += torch.where(counts, torch.stack([value.double() for value in numbers]), 0.0)
         done += counts
-        actor.begin(info.ended)
+        if (moment.index + 1) % CHECKED_EVERY == 0:
+            left = int((quota - done).sum())
+            progress(f"evaluating: {blocks * episodes - left:,} of {blocks * episodes:,} episodes")
+            if not left:
+                break
     each = sums.view(6, blocks, size).sum(dim=2).T.tolist()
     count = min(size, episodes)
     return [

@@ -264,6 +264,5 @@ def percentile(counts: Tensor, share: float = PERCENTILE) -> float | None:
 
 
 def _percentiles(names: Sequence[str], counts: Tensor) -> dict[str, float]:
-    """Return the percentile of each row that has values, by its name."""
     result = {name: percentile(row) for name, row in zip(names, counts, strict=True)}
     return {name: value for name, value in result.items() if value is not None}

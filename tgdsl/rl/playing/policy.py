@@ -32,9 +32,8 @@ from tgdsl.errors import TaxelError, TgdslError, did_you_mean
 from tgdsl.layout.identity import Columns
 from tgdsl.module.taxels.identity import HasPlan, check_taxels
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actor import Actor
-from tgdsl.rl.playing.differences import is_close, spec_differences
-from tgdsl.rl.playing.provenance import changes_around
+from tgdsl.rl.playing.provenance import changes_around, is_close, spec_differences
+from tgdsl.rl.playing.rollout import Actor
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.spec import TaskSpec
 
@@ -48,6 +47,8 @@ POLICY = "policy.pt"
 """Name of a run's policy in its folder."""
 CARD = "card.json"
 """Name of the card in the file."""
+FIELDS = ("groups", "joints", "taxels", "spec", "spec.task", "spec.action", "spec.physics.timestep", "spec.physics.substeps")
+"""What every card has."""
 TAXELS = "taxels.csv"
 """Name of the table of taxels in the file."""
 
@@ -169,17 +170,13 @@ class Policy(Actor):
         Raises:
             PolicyError: If it does not fit.
         """
-        self.groups, self._num_envs = tuple(groups), num_envs
+        self.groups = tuple(groups)
         self._module, card, file = saved.module(device), saved.card, saved.file
-        total = sum(groups.values())
-        taken = f"{' + '.join(f'{name} ({size})' for name, size in groups.items())} = {total}"
+        total, taken = sum(groups.values()), _summands(groups)
         first = next((weight.shape[1] for weight in self._module.parameters() if weight.ndim == 2), total)
-        num_inputs = sum(card["groups"].values()) if card else first
-        if num_inputs != total:
-            raise PolicyError(f"{file}: this policy takes {num_inputs} numbers, not {taken}; name its groups, in its order")
-        if card and not _is_in_order(card["groups"], groups):
-            group_sizes = " + ".join(f"{name} ({size})" for name, size in card["groups"].items())
-            raise PolicyError(f"{file}: this policy takes {group_sizes}, not {taken}; name its groups, in its order")
+        theirs = f"{first} numbers" if card is None else _summands(card["groups"])
+        if first != total if card is None else not _is_in_order(card["groups"], groups):
+            raise PolicyError(f"{file}: this policy takes {theirs}, not {taken}; name its groups, in its order")
         try:
             with torch.no_grad():
                 output = self._module(torch.zeros((num_envs, total), dtype=torch.float32, device=device))
@@ -267,9 +264,13 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
 
 
 def _without_folder(task: str) -> str:
-    """Return a task's name; of one in a file, whose folder is relative to the document, without that: `task.py:Class`."""
+    """Return a task's name; of one in a file without the folder, which is relative to the document: `task.py:Class`."""
     file, colon, class_ = task.rpartition(":")
     return f"{Path(file).name}{colon}{class_}"
+
+
+def _summands(groups: Mapping[str, int]) -> str:
+    return f"{' + '.join(f'{name} ({size})' for name, size in groups.items())} = {sum(groups.values())}"
 
 
 def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
@@ -320,17 +321,10 @@ def _module(content: bytes, device: torch.device | str, extra_files: dict[str, A
 
 
 def _check_fields(card: Any, file: Path) -> None:
-    """See that a card has what is asked of it.
-
-    Raises:
-        PolicyError: If not.
-    """
-    spec = card.get("spec") if isinstance(card, dict) else None
-    missing = [name for name in ("groups", "joints", "taxels", "spec") if not isinstance(card, dict) or name not in card]
-    missing = missing or [
-        f"spec.{name}" for name in ("task", "action", "physics") if not isinstance(spec, dict) or name not in spec
-    ]
-    physics = {} if missing or not isinstance(spec, dict) else spec["physics"]
-    missing = missing or [f"spec.physics.{name}" for name in ("timestep", "substeps") if name not in physics]
-    if missing:
-        raise PolicyError(f"{file}: its {CARD} has no {missing[0]}: this is not what tgdsl train writes")
+    """Raise `PolicyError` if a card lacks what is asked of it."""
+    for path in FIELDS:
+        part = card
+        for key in path.split("."):
+            if not isinstance(part, dict) or key not in part:
+                raise PolicyError(f"{file}: its {CARD} has no {path}: this is not what tgdsl train writes")
+            part = part[key]

@@ -1,4 +1,4 @@
-"""A record of what happened in environments, as one `.npz` file.
+"""A record of what a policy did, as one `.npz` file.
 
 Shapes: `step` control steps, `env` environments, `joint` joints that the policy moves, `feature` numbers of a group, `episode`
 episodes that have ended, `nq` as in MuJoCo's model.
@@ -6,82 +6,111 @@ episodes that have ended, `nq` as in MuJoCo's model.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from tgdsl.files.write import atomic_open
+from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.play import Played, poses_of
+from tgdsl.rl.playing.rollout import Moment
 from tgdsl.runtime.simulators.memory import refuse_beyond_memory
+
+Column = Shaped[np.ndarray, "row ..."]
 
 
 class Record:
-    """Keeps steps and writes them.
+    """Columns to which rows are added, and which are written with the names of the joints.
+
+    Attributes:
+        joints: The joints that the policy moves.
+    """
+
+    def __init__(self, joints: Sequence[str]):
+        self.joints = tuple(joints)
+        self._columns: dict[str, list[Column]] = {}
+
+    def __getitem__(self, name: str) -> Column:
+        """Return a column."""
+        return np.concatenate(self._columns[name])
+
+    def __len__(self) -> int:
+        """Return how many times rows of the first column were added."""
+        return len(next(iter(self._columns.values()), ()))
+
+    def add_rows(self, columns: Mapping[str, Column]) -> None:
+        """Add rows, as many of each column."""
+        for name, rows in columns.items():
+            self._columns.setdefault(name, []).append(rows)
+
+    def write(self, path: Path, **words: str) -> None:
+        """Write the file; it appears whole or not at all.
+
+        Args:
+            path: The file.
+            words: Words to write with the columns, by name.
+        """
+        columns = {name: self[name] for name in self._columns} | {"joints": np.array(self.joints)}
+        with atomic_open(with_folder(path)) as file:
+            np.savez_compressed(file, **columns, **{name: np.array(word) for name, word in words.items()})  # type: ignore[arg-type]
+
+
+class PlayRecord(Record):
+    """A record of environments.
 
     The file holds, of each control step, its start's `time` (step,) [s], the observations `obs:<group>` (step, env, feature)
-    that the action was chosen from, `qpos` (step, env, nq), where there are mocap bodies `mocap_pos` (step, env, body, 3) and
-    `mocap_quat` (step, env, body, 4), the `action` (step, env, joint); and what came of it: `reward`, `term:<name>` (weight and
-    Δt included), `score`, `terminated`, `truncated`, `fault`, (step, env) each. See `Played`. Of each episode that has ended it
-    holds `ended:step`, `ended:env`, `ended:return`, `ended:steps`, `ended:score` (episode,) and its last observations
-    `ended:obs:<group>` (episode, feature). `joints` and `score_unit` say what joints and scores are.
+    that the action was chosen from, `qpos` (step, env, nq) at the start of the step, where there are mocap bodies `mocap_pos`
+    (step, env, body, 3) and `mocap_quat` (step, env, body, 4), the `action` (step, env, joint); and what came of it: `reward`,
+    `term:<name>` (weight and Δt included), `score`, `terminated`, `truncated`, `fault`, (step, env) each. Observations are of
+    one physics step before the start, but for the first of an episode. Of each episode that has ended it holds `ended:step`,
+    `ended:env`, `ended:return`, `ended:steps`, `ended:score` (episode,) and its last observations `ended:obs:<group>`
+    (episode, feature). `joints` and `score_unit` say what joints and scores are.
     """
 
     def __init__(self, env: TouchEnv, num_steps: int):
-        """Begin.
+        """Begin with environments that have just been reset.
 
         Raises:
             SimulationError: If this computer has too little memory for so many steps.
         """
-        self._env, self._num_steps = env, num_steps
-        self._poses = tuple(poses_of(env))
-        poses = sum(value.element_size() * value[0].numel() for value in poses_of(env).values())
+        super().__init__(env.joint_names)
+        self._env = env
+        names = ("qpos", "mocap_pos", "mocap_quat") if env.sim.model.nmocap else ("qpos",)
+        self._live = {name: env.sim.arrays[name] for name in names}
+        poses = sum(value.element_size() * value[0].numel() for value in self._live.values())
         numbers = 4 * (sum(env.groups.values()) + env.num_actions) + poses
         refuse_beyond_memory(f"records of {env.num_envs} environments at {num_steps} steps", numbers * env.num_envs * num_steps)
-        self._steps: dict[str, np.ndarray] = {}
-        self._ended: dict[str, list[np.ndarray]] = {}
+        self._poses = self._copied_poses()
 
     def poses(self, env: int) -> dict[str, Float[np.ndarray, "step ..."]]:
-        """Return where everything was before each step in one environment, by MuJoCo's names, as `Played.poses`."""
-        return {name: self._steps[name][:, env] for name in self._poses}
+        """Return where everything was before each step in one environment, by MuJoCo's names."""
+        return {name: self[name][:, env] for name in self._live}
 
-    def add(self, played: Played) -> None:
-        """Keep one step."""
-        for name, value in self._row(played).items():
-            column = self._steps.setdefault(name, np.empty((self._num_steps, *value.shape), value.dtype))
-            column[played.index] = value
-        info = played.step.info
-        rows = np.flatnonzero(info.ended.cpu().numpy())
-        own = {"return": info.episode_return, "steps": info.episode_steps, "score": info.score}
-        own |= {f"obs:{group}": value for group, value in info.final_obs.items()}
-        ended = {name: _numpy(value)[rows] for name, value in own.items()}
-        for name, values in {"step": np.full(len(rows), played.index), "env": rows, **ended}.items():
-            self._ended.setdefault(f"ended:{name}", []).append(values)
+    def add(self, moment: Moment) -> None:
+        """Add a control step, right after it was made."""
+        step, info = moment.step, moment.step.info
+        values = {f"obs:{group}": value for group, value in moment.obs.items()} | {"action": moment.action}
+        values |= {"reward": step.reward, **{f"term:{name}": value for name, value in info.terms.items()}}
+        values |= {"score": info.score, "terminated": step.terminated, "truncated": step.truncated, "fault": info.faults}
+        rows = {name: _numpy(value) for name, value in values.items()} | self._poses
+        self.add_rows({"time": np.array([moment.index * self._env.control_step])})
+        self.add_rows({name: value[None] for name, value in rows.items()})
+        self._poses = self._copied_poses()
+        ended = np.flatnonzero(_numpy(info.ended))
+        of_episode = {"return": info.episode_return, "steps": info.episode_steps, "score": info.score}
+        of_episode |= {f"obs:{group}": value for group, value in info.final_obs.items()}
+        self.add_rows({"ended:step": np.full(len(ended), moment.index), "ended:env": ended})
+        self.add_rows({f"ended:{name}": _numpy(value)[ended] for name, value in of_episode.items()})
 
-    def write(self, path: Path) -> None:
-        """Write the file; it appears whole or not at all."""
-        named = {"joints": np.array(self._env.joint_names), "score_unit": np.array(self._env.task.score_unit)}
-        ended = {name: np.concatenate(values) for name, values in self._ended.items()}
-        with atomic_open(path) as file:
-            np.savez_compressed(file, **self._steps, **ended, **named)  # type: ignore[arg-type]
+    def write(self, path: Path, **words: str) -> None:
+        """Write the file: see `Record.write`."""
+        super().write(path, score_unit=self._env.task.score_unit, **words)
 
-    def _row(self, played: Played) -> dict[str, np.ndarray]:
-        step, info = played.step, played.step.info
-        return {
-            "time": np.array(played.index * self._env.control_step),
-            **{f"obs:{group}": _numpy(value) for group, value in played.obs.items()},
-            **{name: _numpy(value) for name, value in played.poses.items()},
-            "action": _numpy(played.action),
-            "reward": _numpy(step.reward),
-            **{f"term:{name}": _numpy(value) for name, value in info.terms.items()},
-            "score": _numpy(info.score),
-            "terminated": _numpy(step.terminated),
-            "truncated": _numpy(step.truncated),
-            "fault": _numpy(info.faults),
-        }
+    def _copied_poses(self) -> dict[str, np.ndarray]:
+        return {name: _numpy(value) for name, value in self._live.items()}
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy()
+    return np.array(tensor.detach().cpu().numpy())  # a copy: an environment's own tensors change

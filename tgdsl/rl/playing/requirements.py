@@ -88,7 +88,6 @@ def _requirement(part: str) -> Requirement:
 
 
 def _bound(value: str, dimension: str | Dimension) -> float:
-    """Return a value in SI units."""
     if dimension != SHARE:
         return parse(value, dimension)
     return 0.01 * parse(value.removesuffix("%"), "number") if value.endswith("%") else parse(value, "number")

@@ -17,7 +17,6 @@ class Tally:
     """
 
     def __init__(self, env: TouchEnv):
-        """Begin."""
         self._env = env
         self.num_ended = self.num_faults = 0
         self._now: dict[str, float] = {}

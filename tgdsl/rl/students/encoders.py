@@ -86,7 +86,6 @@ class Mlp(Embedding):
     """Linear layers."""
 
     def __init__(self, size: int, encoder: Encoder):
-        """Draw weights from torch's generator."""
         super().__init__()
         self.layers = mlp(size, encoder.hidden, encoder.size)
 
@@ -102,7 +101,6 @@ class Lstm(Embedding):
     """
 
     def __init__(self, size: int, encoder: Encoder):
-        """Draw weights from torch's generator."""
         super().__init__()
         width = encoder.hidden[-1]
         self.of_input, self.of_memory = nn.Linear(size, 4 * width), nn.Linear(width, 4 * width)
@@ -119,7 +117,6 @@ class Images(Embedding):
     """What networks of images have in common: features as images of links, with a channel that tells where there are taxels."""
 
     def __init__(self, grid: Grid):
-        """Take over where taxels are."""
         super().__init__()
         self.grid = grid
         cells = torch.tensor(grid.taxels).view(grid.shape)
@@ -149,7 +146,6 @@ class Convolution(Images):
     """Convolutions, the same ones of all links, then a projection of all that they find."""
 
     def __init__(self, encoder: Encoder):
-        """Draw weights from torch's generator."""
         assert encoder.grid is not None
         super().__init__(encoder.grid)
         channels = (encoder.grid.channels + 1, *encoder.hidden)
@@ -170,7 +166,6 @@ class RecurrentConvolution(Images):
     """Long short-term memory whose products are convolutions, gates layer-normed per image; then a projection."""
 
     def __init__(self, encoder: Encoder):
-        """Draw weights from torch's generator."""
         assert encoder.grid is not None
         super().__init__(encoder.grid)
         self.width, cells = encoder.hidden[0], len(encoder.grid.taxels)

@@ -1,7 +1,7 @@
 """DAgger: students act, each in its block of environments, and learn what the teacher would have done there.
 
 An iteration is a rollout of `steps` control steps and `epochs` passes through it, a gradient step per `gradient_length` control
-steps. On a GPU, who acts and each pass are CUDA graphs, and the host waits once per iteration.
+steps. On a GPU, who acts and each pass are CUDA graphs.
 
 Shapes: `env` environments, `student` students of a stack, `row` environments of a block, `joint`, `target` as in `student.py`.
 """
@@ -21,32 +21,27 @@ from torch import Tensor
 from tgdsl.errors import did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.playing.rollout import Actor, Moment
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
 from tgdsl.rl.students.rollout import Rollout, joined
 from tgdsl.rl.students.student import Architecture, Student, forgotten
 from tgdsl.rl.students.teacher import BoundTeacher
 from tgdsl.rl.train.graphs import Captured, SideBySide
-from tgdsl.rl.train.iteration import Clock, EpisodeTally, Iteration
+from tgdsl.rl.train.iteration import Learning
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
 
 
-class Distiller:
+class Distiller(Learning):
     """Teaches students.
 
     Attributes:
-        env: The environments.
-        ranks: The processes: one.
         rollouts: The students by stack, in the order of their blocks.
-        groups: Groups of observations of each student by name.
-        iteration: Number of iterations so far.
-        samples: How many control steps these took in all environments.
+        keys: The students, in the same order.
     """
 
     rates = "distill.learning_rate"
-    """What of the document makes smaller steps."""
 
     def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: BoundTeacher, keys: Sequence[StudentKey], seed: int):
         """Make the students; torch's own random generators are seeded.
@@ -62,8 +57,8 @@ class Distiller:
             SpecError: If a group of observations or a privileged number that is named is not there.
             StudentError: If images are wanted of taxels on no grid.
         """
-        self.env, self.ranks, self._teacher, self._spec = env, Ranks(), teacher, loaded.spec.distill
-        self.iteration = self.samples = 0
+        self._teacher, self._spec = teacher, loaded.spec.distill
+        super().__init__(env, Ranks(), self._spec.steps)
         self._targets = self._checked_targets(loaded)
         names = groups_of(loaded, env.groups)
         stacked: dict[Architecture, list[StudentKey]] = {}
@@ -71,99 +66,57 @@ class Distiller:
             stacked.setdefault(architecture(loaded, env, key, names), []).append(key)
         self.rollouts: list[Rollout] = []
         for networks, members in stacked.items():
-            self.rollouts.append(self._rollout(networks, members, names, env.num_envs // len(keys)))
-        self.keys = [key for rollout in self.rollouts for key in rollout.keys]
-        seen = [each for rollout in self.rollouts for each in rollout.seen]
-        self.groups = {key.name: list(each) for key, each in zip(self.keys, seen, strict=True)}
+            first, rows = self.rollouts[-1].envs.stop if self.rollouts else 0, env.num_envs // len(keys)
+            seen = tuple(tuple(seen_by(key, names)) for key in members)
+            self.rollouts.append(Rollout.made(networks, tuple(members), seen, first, rows, self._spec, env.device))
+        self.keys = [key for each in self.rollouts for key in each.keys]
+        seen_groups = [groups for each in self.rollouts for groups in each.seen]
+        self.groups = {key.name: list(groups) for key, groups in zip(self.keys, seen_groups, strict=True)}
         self._allocate()
         torch.manual_seed(seed)
-
-    def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it.
-
-        Args:
-            share: How much of the run is over, 0 to 1: `final_learning_rate` is the rate when all of it is.
-        """
-        self.set_rate(share)
-        self.roll()
-        self.learn()
-        return self._told()
 
     @property
     def episode_names(self) -> list[str]:
         """Numbers of the episodes that ended, from iterations in which any did."""
-        return [*self._tally.names, *(f"Score/{key.name}" for key in self.keys)]
+        return [*super().episode_names, *(f"Score/{key.name}" for key in self.keys)]
 
     def set_rate(self, share: float) -> None:
         """Learn at the rate that stands when a share of the run is over."""
         first, last = self._spec.learning_rate, self._spec.final_learning_rate
         self._rate = first if last is None else first * (last / first) ** share
-        for rollout in self.rollouts:
-            rollout.stack.set_rate(self._rate)
+        for each in self.rollouts:
+            each.stack.set_rate(self._rate)
 
-    def roll(self) -> None:
-        """Make a rollout; the host does not wait for a GPU, but for captures at the first calls."""
-        obs = self._begin()
-        self._clock.start()
-        for rollout in self.rollouts:
-            rollout.begun.copy_(rollout.memory)
-        for t in range(self._spec.steps):
-            self._see(obs)
-            self._chosen()
-            self._keep(t)
-            step = self.env.step(self._action)
-            obs, ended = step.obs, step.info.ended
-            self._ended[t].copy_(ended)
-            self._forget(ended)
-            self._tally.add(step)
-            counted = torch.stack([torch.ones_like(step.info.score), step.info.score]).double()
-            self._scores += torch.where(ended, counted, 0.0)
-        self._obs = obs
-        self._clock.split()
+    def __call__(self, obs: Mapping[str, Tensor]) -> Tensor:
+        """Return what the students ask for; keep that, what they saw, and what the teacher would do."""
+        copy_each(list(self._seen.values()), [obs[name] for name in self._seen])
+        self._chosen()
+        t = self._step
+        self._labels[t].copy_(self._label)
+        for each, x in zip(self.rollouts, self._inputs, strict=True):
+            each.x[t].copy_(x)
+            each.before[t].copy_(each.split(self._asked))
+        if self._targets:
+            privileged = self.env.task.decoded(self.env.now)
+            self._privileged[t].copy_(torch.stack([privileged[name] for name in self._targets], dim=1))
+        return self._action
 
-    def learn(self) -> None:
-        """Learn from the rollout; the same."""
-        self._losses.zero_()
-        if self._spec.aggregate > 1:
-            self._gathered.append([value.clone() for value in self._of_rollout()])
-        for i in range(self._spec.epochs):
-            if i and self._gathered:
-                index = self._chance.randrange(len(self._gathered))
-                copy_each(self._of_rollout(), self._gathered[index])
-                if self._spec.clip is not None and index < len(self._gathered) - 1:
-                    self._answered()
-            self._learned()
-        if self._gathered:
-            copy_each(self._of_rollout(), self._gathered[-1])
-        self._looked()
-        self.iteration += 1
-        self.samples += self._spec.steps * self.env.num_envs
+    def begin(self, ended: Bool[Tensor, " env"]) -> None:
+        """Forget what is remembered of episodes that have ended."""
+        for each in self.rollouts:
+            each.memory.copy_(forgotten(each.memory, each.split(ended)))
+        self._teacher.begin(ended)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is learned, and what learning goes on from."""
         return {"stacks": [rollout.stack.state_dict() for rollout in self.rollouts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved.
-
-        Raises:
-            RuntimeError: If networks are of other sizes; also ValueError and KeyError.
-        """
+        """Go on from what was saved: see `Learning`."""
         for rollout, saved in zip(self.rollouts, state["stacks"], strict=True):
             rollout.stack.load_state_dict(saved)
         for captured in (self._chosen, self._answered, self._learned, self._looked):
             captured.forget()
-
-    def go_on(self, steps: Tensor) -> None:
-        """Begin episodes that count as having lasted so many control steps, in place of any at random."""
-        self.go_on_from(self.env.reset())
-        self.env.steps.copy_(steps)
-
-    def go_on_from(self, obs: Mapping[str, Tensor]) -> None:
-        """Go on in environments that were put where others were; what was remembered of their episodes is forgotten."""
-        self._obs, self._is_begun = dict(obs), True
-        everyone = torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device)
-        self._forget(everyone)
 
     def student(self, index: int) -> Student:
         """Return a copy of a student, on the CPU, by its number among `keys`."""
@@ -196,7 +149,7 @@ class Distiller:
         self._asked[own.envs].copy_(action.action.flatten(0, 1))
 
     def _answer(self) -> None:
-        """Have the students say what they would ask for now in the rollout: an earlier one's a_0 bounds nothing any more."""
+        """Have the students say what they would ask for now: an earlier rollout's a_0 bounds nothing any more."""
         with torch.no_grad():
             self._beside([partial(self._answer_by, rollout) for rollout in self.rollouts])
 
@@ -208,7 +161,6 @@ class Distiller:
             memory = forgotten(action.memory, own.split(ended))
 
     def _epoch(self) -> None:
-        """Go through the rollout once."""
         each = self._losses.split([len(rollout.keys) for rollout in self.rollouts])
         self._beside([partial(self._pass, rollout, errors) for rollout, errors in zip(self.rollouts, each, strict=True)])
 
@@ -241,7 +193,6 @@ class Distiller:
         return detached, memory.detach()
 
     def _look(self) -> None:
-        """Take what was seen into account in the students' normalisation."""
         self._beside([partial(self._look_by, rollout) for rollout in self.rollouts])
 
     def _look_by(self, own: Rollout) -> None:
@@ -250,11 +201,40 @@ class Distiller:
 
     # The rest
 
-    def _rollout(self, networks: Architecture, keys: list[StudentKey], names: Sequence[str], rows: int) -> Rollout:
-        """Make a stack, and room for its rollout."""
-        first = self.rollouts[-1].envs.stop if self.rollouts else 0
-        seen = tuple(tuple(seen_by(key, names)) for key in keys)
-        return Rollout.made(networks, tuple(keys), seen, first, rows, self._spec, self.env.device)
+    def _start_rollout(self) -> None:
+        self._step = 0
+        for each in self.rollouts:
+            each.begun.copy_(each.memory)
+
+    def _keep(self, moment: Moment) -> None:
+        info = moment.step.info
+        self._ended[self._step].copy_(info.ended)
+        self._scores += torch.where(info.ended, torch.stack([torch.ones_like(info.score), info.score]).double(), 0.0)
+        self._step += 1
+
+    def _update(self) -> None:
+        self._losses.zero_()
+        if self._spec.aggregate > 1:
+            self._gathered.append([value.clone() for value in self._of_rollout()])
+        for i in range(self._spec.epochs):
+            if i and self._gathered:
+                index = self._chance.randrange(len(self._gathered))
+                copy_each(self._of_rollout(), self._gathered[index])
+                if self._spec.clip is not None and index < len(self._gathered) - 1:
+                    self._answered()
+            self._learned()
+        if self._gathered:
+            copy_each(self._of_rollout(), self._gathered[-1])
+        self._looked()
+
+    def _numbers(self) -> dict[str, Tensor]:
+        ended, score = self._scores.view(2, len(self.keys), -1).sum(dim=2)
+        self._scores.zero_()
+        updates = self._spec.epochs * self._spec.steps // self._spec.gradient_length
+        numbers = {"Loss/learning_rate": torch.tensor(self._rate, dtype=torch.float64, device=score.device)}
+        for key, mean, loss in zip(self.keys, score / ended, (self._losses / updates).double(), strict=True):
+            numbers |= {f"Score/{key.name}": mean, f"Loss/{key.name}": loss}
+        return numbers
 
     def _allocate(self) -> None:
         """Make room for a rollout, and what is captured."""
@@ -282,53 +262,11 @@ class Distiller:
         self._looked = Captured(self._look, device)
         self._gathered: deque[list[Tensor]] = deque(maxlen=spec.aggregate)
         self._chance = random.Random(0)
-        self._clock, self._tally, self._is_begun = Clock(device), EpisodeTally(), False
         self._rate = spec.learning_rate
 
-    def _begin(self) -> dict[str, Tensor]:
-        """Return the observations to act on; at the first call, begin episodes, the first of which end at random times."""
-        if not self._is_begun:
-            self.go_on_from(self.env.reset())
-            self.env.steps.copy_(torch.randint_like(self.env.steps, self.env.max_steps))
-        return self._obs
-
     def _of_rollout(self) -> list[Tensor]:
-        """Return what a pass reads of a rollout: live tensors."""
         buffers = [value for each in self.rollouts for value in (each.x, each.before, each.begun)]
         return [*buffers, self._labels, self._privileged, self._ended]
-
-    def _see(self, obs: Mapping[str, Tensor]) -> None:
-        copy_each(list(self._seen.values()), [obs[name] for name in self._seen])
-
-    def _keep(self, t: int) -> None:
-        """Keep what was seen, asked for and said."""
-        self._labels[t].copy_(self._label)
-        for rollout, x in zip(self.rollouts, self._inputs, strict=True):
-            rollout.x[t].copy_(x)
-            rollout.before[t].copy_(rollout.split(self._asked))
-        if self._targets:
-            privileged = self.env.task.decoded(self.env.now)
-            self._privileged[t].copy_(torch.stack([privileged[name] for name in self._targets], dim=1))
-
-    def _forget(self, ended: Bool[Tensor, " env"]) -> None:
-        for rollout in self.rollouts:
-            rollout.memory.copy_(forgotten(rollout.memory, rollout.split(ended)))
-        self._teacher.begin(ended)
-
-    def _told(self) -> Iteration:
-        """Return what the last iteration was: the host waits for the device here, and only here."""
-        sums, count = self._tally.taken(), len(self.keys)
-        scores = self._scores.view(2, count, -1).sum(dim=2).flatten()
-        updates = self._spec.epochs * self._spec.steps // self._spec.gradient_length
-        numbers = torch.cat([sums, scores, (self._losses / updates).double().to(sums.device)]).tolist()
-        self._scores.zero_()
-        rollout, update = self._clock.stop()
-        means = self._tally.means(numbers[: len(sums)]) | {"Loss/learning_rate": self._rate}
-        ended, score, loss = (numbers[len(sums) + i * count :][:count] for i in range(3))
-        for key, number, total, error in zip(self.keys, ended, score, loss, strict=True):
-            means |= {f"Score/{key.name}": total / number} if number else {}
-            means[f"Loss/{key.name}"] = error
-        return Iteration(round(numbers[0]), means, rollout, update)
 
     def _checked_targets(self, loaded: LoadedTask) -> list[str]:
         """Return the privileged numbers that decoders tell.
@@ -349,7 +287,6 @@ class ActingStudents(Actor):
     """All students, each in its block."""
 
     def __init__(self, distiller: Distiller):
-        """Begin episodes."""
         self._rollouts = distiller.rollouts
         self._memory = [torch.zeros_like(rollout.memory) for rollout in self._rollouts]
 

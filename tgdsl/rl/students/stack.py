@@ -145,17 +145,14 @@ class Stack:
         self._rated()  # it has copied it
 
     def _rated(self) -> None:
-        """Have Adam learn at the rate."""
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate
 
     def _normalise(self) -> None:
-        """Have the networks normalise by the moments, in place."""
         for name, value in self.moments.items():
             self.buffers[name].copy_(value)
 
     def _options(self) -> dict[str, Any]:
-        """Return what of Adam's groups depends on the device and the document."""
         return {"lr": self._rate, "capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
 
     def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:

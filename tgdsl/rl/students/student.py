@@ -67,7 +67,6 @@ class Student(nn.Module):
     """
 
     def __init__(self, architecture: Architecture):
-        """Draw weights from torch's generator."""
         super().__init__()
         self.architecture = architecture
         self.register_buffer("mean", torch.zeros(architecture.num_features))
@@ -104,7 +103,6 @@ class Deployed(nn.Module):
     """A student that acts: takes (env, feature) and returns (env, joint), as TorchScript."""
 
     def __init__(self, student: Student):
-        """Take a student's networks, without its decoders."""
         super().__init__()
         self.student = student
 
@@ -117,7 +115,6 @@ class Acting(nn.Module):
     """The networks of a student with memory, as a function."""
 
     def __init__(self, student: Student):
-        """Take a student's networks, without its decoders."""
         super().__init__()
         self.student = student
 
@@ -145,7 +142,6 @@ class Remembering(nn.Module):
     """The networks of a student with memory as TorchScript, and what it remembers."""
 
     def __init__(self, acting: torch.jit.ScriptModule, size: int):
-        """Take its networks, and how many numbers they remember."""
         super().__init__()
         self.acting, self.size, self.memory = acting, size, torch.zeros((0, size))
 

@@ -1,17 +1,11 @@
-"""The teacher: a learned policy with its card, which says what each student should have done.
-
-Shapes: `env` environments, `joint` joints that the policy moves.
-"""
+"""The teacher: a learned policy with its card, which says what each student should have done."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
@@ -39,9 +33,9 @@ class Teacher:
             PolicyError: If it cannot be read, has no card, or was learned in another task, with other joints or actions, or a
                 loss needs the deviations of its actions, which it does not tell.
         """
-        self.saved = read_policy(file)
+        self.saved, self._loaded = read_policy(file), loaded
         card = self.saved.card
-        if card is None or "spec" not in card:
+        if card is None:
             raise PolicyError(f"{file}: this policy has no card that says how it was learned, as `tgdsl train` writes it")
         check_learned(card, file, loaded.spec, "teacher")
         self.card, theirs, ours = card, card["spec"], loaded.spec.model_dump(mode="json")
@@ -49,15 +43,12 @@ class Teacher:
             raise PolicyError(f"{file}: its card has no spec.{missing[0]}: this is not what tgdsl train writes")
         self.felt = Felt(theirs["touch"], theirs["placement"], theirs["noise"]) if GROUP in card["groups"] else None
         if self.felt and theirs["resolution"] != ours["resolution"]:
-            their_resolution, our_resolution = theirs["resolution"], ours["resolution"]
-            raise PolicyError(
-                f"{file}: this teacher feels with other taxels: resolution {their_resolution}, here {our_resolution}"
-            )
+            resolutions = f"resolution {theirs['resolution']}, here {ours['resolution']}"
+            raise PolicyError(f"{file}: this teacher feels with other taxels: {resolutions}")
         if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
             problem = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
             raise PolicyError(f"{file}: {problem}; learn it again, or take distill.loss=mse")
         self.changes = changes_since(card, loaded.spec, OF_TOUCH)
-        self._loaded = loaded
 
     def check_taxels(self) -> None:
         """See that a teacher that feels does so with the taxels that there are now.
@@ -65,62 +56,49 @@ class Teacher:
         Raises:
             PolicyError: If they are others.
         """
-        if self.felt is None:
-            return
-        loaded = own_task(self._loaded, self.felt)
-        check_card(self.saved, self.card["joints"], compile_sensed(loaded, "cpu").touch)
+        if self.felt is not None:
+            touch = compile_sensed(own_task(self._loaded, self.felt), "cpu").touch
+            check_card(self.saved, self.card["joints"], touch)
 
     def bound(self, env: TouchEnv) -> BoundTeacher:
-        """Return it for some environments.
-
-        Raises:
-            PolicyError: If joints or groups of observations are others.
-        """
+        """Return it for some environments; raise `PolicyError` if joints or groups of observations are others."""
         return BoundTeacher(self, env)
 
 
-class BoundTeacher:
+class BoundTeacher(Policy):
     """A teacher in some environments.
 
     Attributes:
-        groups: Groups of observations that it takes, by their names in the environments.
         std: Standard deviation of its actions; None if it does not tell.
     """
 
     def __init__(self, teacher: Teacher, env: TouchEnv):
-        """See that it fits."""
+        """See that it fits.
+
+        Raises:
+            PolicyError: If joints or groups of observations are others.
+        """
         card, file = teacher.card, teacher.saved.file
         if list(env.joint_names) != list(card["joints"]):
             moved = (", ".join(names) for names in (card["joints"], env.joint_names))
             raise PolicyError("{}: this teacher moves {}, not {}".format(file, *moved))
-        names = {name: teacher.felt.group if name == GROUP and teacher.felt else name for name in card["groups"]}
+        groups = {}
         for name, size in card["groups"].items():
-            found = env.groups.get(names[name])
-            if found != size:
-                problem = "is not there" if found is None else f"has {found} numbers, not {size}: probes or objects are others"
+            group = teacher.felt.group if name == GROUP and teacher.felt else name
+            if env.groups.get(group) != size:
+                there = f"has {env.groups[group]} numbers, not {size}: probes or objects are others"
+                problem = there if group in env.groups else "is not there"
                 raise PolicyError(f'{file}: this teacher sees the group "{name}", which {problem}')
-        self.groups = tuple(names.values())
-        groups = {name: env.groups[name] for name in self.groups}
-        self._policy = Policy(teacher.saved, groups, env.num_envs, env.num_actions, env.device)
+            groups[group] = size
+        super().__init__(teacher.saved, groups, env.num_envs, env.num_actions, env.device)
         self.std = torch.tensor(card["std"], dtype=torch.float32, device=env.device) if card.get("std") else None
-        zeros = {
-            name: torch.zeros((env.num_envs, size), dtype=torch.float32, device=env.device) for name, size in groups.items()
-        }
+        zeros = {name: torch.zeros((env.num_envs, size), device=env.device) for name, size in groups.items()}
         for _ in range(WARM_CALLS):
             self(zeros)
         self.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-
-    def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return what should be done."""
-        return self._policy(obs)
-
-    def begin(self, ended: Tensor) -> None:
-        """Forget what is remembered of episodes that have ended."""
-        self._policy.begin(ended)
 
 
 def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:
     """Return the task of a policy that feels one thing, in environments of its own."""
     touch = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
-    spec = loaded.spec.model_copy(update=touch)
-    return dataclasses.replace(loaded, spec=spec)
+    return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=touch))

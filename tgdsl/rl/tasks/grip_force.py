@@ -39,8 +39,7 @@ ends the episode, since what is crushed stays so.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -86,38 +85,6 @@ class GripForceSpec(TaskSpec):
     """F_crush: a larger sum of normal forces crushes the object [N]."""
 
 
-def reference(spec: GripForceSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
-    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
-
-    Args:
-        spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m], `quat`, `normal_force` (step, link) [N], `command`,
-            as observed then [N], and `is_new`, whether that was drawn then.
-        dt: Δt [s].
-    """
-    since, squares = 0, []
-    for t in range(1, len(record["pos"])):
-        since += 1
-        force = float(np.sum(record["normal_force"][t]))
-        error = force / record["command"][t - 1] - 1.0
-        if since * dt > spec.settling - 0.5 * dt:
-            squares.append(error**2)
-        since = 0 if record["is_new"][t] else since
-        distance = float(np.linalg.norm(record["pos"][t] - record["pos"][0]))
-        alike = min(1.0, abs(float(np.dot(record["quat"][t], record["quat"][0]))))
-        is_dropped, is_crushed = distance > spec.drop_distance, force > spec.max_force
-        yield {
-            "force_near": math.exp(-((error / spec.force_width) ** 2)),
-            "force_far": max(0.0, 1.0 - abs(error)),
-            "object_distance": max(0.0, distance - spec.free_distance),
-            "object_angle": 2.0 * math.acos(alike),
-            "drop": is_dropped,
-            "crush": is_crushed,
-            "is_over": is_dropped or is_crushed,
-            "score": math.sqrt(np.mean(squares)) if squares else 1.0,
-        }
-
-
 class GripForce(Task[GripForceSpec]):
     """The task."""
 
@@ -126,6 +93,7 @@ class GripForce(Task[GripForceSpec]):
     wants_normal_force = True
     score_unit = "RMS of force error over command"
     is_less_better = True
+    constants = ("settling",)
     hand_groups = ("goal",)
     goal_units = ("N",)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from pydantic import Field, StrictInt
@@ -35,11 +34,14 @@ class HoldSpec(SpecModel):
 
 
 class Holding:
-    """Says where the object is held, and what its progress pays."""
+    """Says where the object is held, and what its progress pays.
+
+    Attributes:
+        pays_in_full: Whether progress always pays the same.
+    """
 
     def __init__(self, spec: HoldSpec, setup: Setup):
-        """Note which links are fingers."""
-        self.spec = spec
+        self.spec, self.pays_in_full = spec, isinstance(spec.coasting_pay, float) and spec.coasting_pay == 1.0
         self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(setup.device)
 
     def is_held(self, now: Now) -> Bool[Tensor, " env"]:
@@ -51,15 +53,3 @@ class Holding:
         """Return what progress pays: 1 where the object is held, else c."""
         held = self.is_held(now).to(now.joint_pos.dtype)
         return held + (1.0 - held) * self.spec.coasting_pay
-
-
-def reference(spec: HoldSpec, link_force: np.ndarray, fingers: np.ndarray) -> float:
-    """Return what progress pays at one instant of one environment.
-
-    Args:
-        spec: What progress pays.
-        link_force: The object's force on each link, (link, 3) [N].
-        fingers: Which links are fingers, (link,).
-    """
-    is_loaded = np.linalg.norm(link_force, axis=1) >= spec.load
-    return 1.0 if is_loaded.sum() >= spec.links and (is_loaded & fingers).any() else spec.coasting_pay

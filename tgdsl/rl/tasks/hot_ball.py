@@ -26,9 +26,7 @@ refused.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -83,35 +81,6 @@ class HotBallSpec(TaskSpec):
         if self.target <= self.ambient:
             raise ValueError(f"`target` is {self.target:g} °C, expected more than `ambient`, {self.ambient:g} °C")
         return self
-
-
-def reference(spec: HotBallSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
-    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
-
-    Args:
-        spec: The task's document.
-        record: One row per instant, the first that at the start: `pos`, of the hot ball [m], `link_force`, of it on fingertips
-            (step, link, 3) [N], `distance` [m], and `heat`, what grids read (step, cell) [°C].
-        dt: Δt [s].
-    """
-    is_latched, score = False, 0.0
-    for t in range(1, len(record["pos"])):
-        # The largest of clamped progresses is that of the hottest cell.
-        progress = (record["heat"][t].max() - spec.ambient) / (spec.target - spec.ambient)
-        progress = min(1.0, max(0.0, float(progress)))
-        is_latched = is_latched or progress >= 1.0 - spec.margin
-        is_touched = bool(np.linalg.norm(record["link_force"][t], axis=1).max() >= spec.min_force)
-        score += dt * (is_latched and is_touched)
-        is_over = bool(record["pos"][t][2] < spec.lost_height)
-        yield {
-            "approach": math.exp(-max(0.0, record["distance"][t].min()) / spec.near_width),
-            "contact": is_touched,
-            "progress": progress,
-            "latched": is_latched and is_touched,
-            "lost": is_over,
-            "is_over": is_over,
-            "score": score,
-        }
 
 
 class HotBall(Task[HotBallSpec]):

@@ -35,10 +35,8 @@ speaks of penalties of grip and slip, which its table does not have, and which a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import model_validator
@@ -114,58 +112,12 @@ class InHandReposeSpec(TaskSpec):
         return self
 
 
-def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
-    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
-
-    Args:
-        spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m] and `quat`; and `goal_axis` (goal, 3), axes of goals
-            in turn.
-        dt: Δt [s].
-    """
-    pos = record["pos"]
-    rot = [_matrix(quat) for quat in record["quat"]]
-    reached, near_since, goal_time = 0, 0, 0
-    goal = _turn(record["goal_axis"][0], spec.goal_step) @ rot[0]
-    for t in range(1, len(pos)):
-        error = _angle_between(goal, rot[t])
-        near_since = near_since + 1 if error < spec.goal_tolerance else 0
-        is_reached = near_since >= spec.goal_hold
-        is_late = not is_reached and t - goal_time >= round(spec.goal_timeout / dt)
-        is_dropped = np.linalg.norm(pos[t] - pos[0]) > spec.drop_distance
-        row = {
-            "success": is_reached,
-            "track_gaussian": math.exp(-0.5 * (error / spec.track_width) ** 2),
-            "track_inverse": 1 / (1 + (error / spec.track_half) ** 2),
-            "progress": min((_angle_between(goal, rot[t - 1]) - error) / dt, spec.max_spin),
-            "drop": is_dropped,
-            "goal_timeout": is_late,
-        }
-        if is_reached:
-            reached, near_since, goal_time = reached + 1, 0, t
-            goal = _turn(record["goal_axis"][reached], spec.goal_step) @ goal
-        yield row | {"is_over": is_dropped or is_late, "score": reached}
-
-
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    cross = np.cross(np.eye(3), axis)
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    angle = 2 * math.atan2(np.linalg.norm(quat[1:]), quat[0])
-    return _turn(quat[1:] / max(np.linalg.norm(quat[1:]), 1e-300), angle)
-
-
-def _angle_between(one: np.ndarray, other: np.ndarray) -> float:
-    return 2 * math.asin(min(1.0, np.linalg.norm(one - other) / math.sqrt(8)))
-
-
 class InHandRepose(Task[InHandReposeSpec]):
     """The task."""
 
     Spec = InHandReposeSpec
     senses = ("link_contact", "surface_distance")
+    constants = ("goal_step", "goal_timeout")
     score_unit = "goals in a row"
 
     @reward_term(500.0, "1/s")
@@ -206,7 +158,6 @@ class InHandRepose(Task[InHandReposeSpec]):
     work = terms.Work.of_task(-1e-3)
 
     def __init__(self, spec: InHandReposeSpec, setup: Setup):
-        """Begin with all objects where the keyframe has them."""
         super().__init__(spec, setup)
         self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.step = torch.full((setup.num_envs,), spec.goal_step, dtype=setup.dtype, device=setup.device)

@@ -26,10 +26,8 @@ that coasts; goals that were reached stay reached.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -40,7 +38,6 @@ from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks import holding
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
 from tgdsl.rl.tasks.placing import placed
 
@@ -86,50 +83,8 @@ class InPalmRotateSpec(TaskSpec):
     """ω_free: the same of its angular velocity, about whatever axis [rad/s]."""
 
 
-def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
-    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
-
-    Args:
-        spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m], `quat`, `link_force` (step, link, 3) [N]; and
-            `fingers`, which links are fingers.
-        dt: Δt [s].
-    """
-    way, pos, quat = _way(spec), record["pos"], record["quat"]
-    angle, reached, forth, paid = 0.0, 0, 0.0, 0.0
-    for t in range(1, len(pos)):
-        w, x, y, z = _quat_product(quat[t], quat[t - 1] * [1, -1, -1, -1])
-        step = 2.0 * way * math.atan2(z if w >= 0 else -z, abs(w))
-        angle += step
-        w, x, y, z = _quat_product(quat[t], quat[0] * [1, -1, -1, -1])
-        tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
-        is_reached = (reached + 1) * QUARTER - angle < spec.goal_tolerance and tilt < spec.max_tilt
-        reached += is_reached
-        pay = holding.reference(spec.hold, record["link_force"][t], record["fingers"])
-        forth, paid = forth + max(0.0, step), paid + pay * max(0.0, step)
-        share = paid / forth if forth else 1.0
-        forth, paid = (0.0, 0.0) if is_reached else (forth, paid)
-        distance = np.linalg.norm(pos[t] - pos[0])
-        is_over = distance > spec.drop_distance
-        yield {
-            "success": is_reached * share,
-            "spin": min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
-            "tilt": tilt,
-            "object_distance": max(0.0, distance - spec.free_distance),
-            "drop": is_over,
-            "is_over": is_over,
-            "score": reached,
-        }
-
-
 def _way(spec: InPalmRotateSpec) -> float:
-    """Return the axis' component along the vertical."""
     return 1.0 if spec.direction == "counterclockwise" else -1.0
-
-
-def _quat_product(left: np.ndarray, right: np.ndarray) -> Any:
-    (a, *v), (b, *u) = left, right
-    return np.concatenate([[a * b - np.dot(v, u)], a * np.array(u) + b * np.array(v) + np.cross(v, u)])
 
 
 class InPalmRotate(Task[InPalmRotateSpec]):
@@ -175,7 +130,6 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     object_speed = terms.ObjectSpeed.of_task(0.0, free_speed="free_speed", free_spin="free_spin")
 
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
-        """Begin with all objects where the keyframe has them."""
         super().__init__(spec, setup)
         self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.holding = Holding(spec.hold, setup)
@@ -204,7 +158,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.is_reached.copy_((self._goal() - self.angle < self.spec.goal_tolerance) & (self.tilt < self.spec.max_tilt))
         self.reached += self.is_reached
         self.quat.copy_(quat)
-        if self.spec.hold.coasting_pay < 1.0:
+        if not self.holding.pays_in_full:
             self._note_pay(now, step)
 
     def _note_pay(self, now: Now, step: Float[Tensor, " env"]) -> None:
@@ -244,9 +198,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         return self.reached
 
     def _distance(self, now: Now) -> Float[Tensor, " env"]:
-        """Return how far the object is from where it started [m]."""
         return vector_norm(now.object.pos - self.start_pos, dim=1)
 
     def _goal(self) -> Float[Tensor, " env"]:
-        """Return the angle of the next goal [rad]."""
         return (self.reached + 1.0) * QUARTER

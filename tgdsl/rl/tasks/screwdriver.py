@@ -32,11 +32,9 @@ alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import mujoco
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -48,7 +46,6 @@ from tgdsl.rl.grasps.spec import GraspSpec
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec, Loss
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks import holding
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
 from tgdsl.rl.train.spec import Share, TrainSpec, Whole
 from tgdsl.runtime.simulators.watch import Watch
@@ -123,50 +120,12 @@ class ScrewdriverSpec(TaskSpec):
     """Further from where it was, the tip is out of the screw [m]."""
 
 
-def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float) -> Iterator[dict[str, Any]]:
-    """Yield the task's own terms without weights, `is_over` and `score` of each step of one environment, in float64.
-
-    Args:
-        spec: The task's document.
-        record: One row per instant, the first that at the start: `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `link_force`
-            (step, link, 3) [N]; `upright_pos`, `upright_tip` [m], where body and tip are in the keyframe; and `fingers`, which
-            links are fingers.
-        dt: Δt [s].
-    """
-    quat, turned = record["quat"], 0.0
-    for t in range(1, len(quat)):
-        step = -_turned_about_z(quat[t - 1], quat[t])
-        _, x, y, _ = quat[t]
-        tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
-        turned += step * (tilt < UPRIGHT)
-        distance = np.linalg.norm(record["pos"][t] - record["upright_pos"])
-        away = np.linalg.norm(record["tip"][t] - record["upright_tip"])
-        is_over = tilt > spec.drop_tilt or away > spec.engagement
-        pay = holding.reference(spec.hold, record["link_force"][t], record["fingers"])
-        yield {
-            "spin": min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
-            "alignment": 1.0 - math.cos(tilt),
-            "object_distance": max(0.0, distance - spec.free_distance),
-            "hand_pose": np.sum((record["joint_pos"][t] - record["joint_pos"][0]) ** 2),
-            "drop": is_over,
-            "is_over": is_over,
-            "score": turned / spec.episode,
-        }
-
-
-def _turned_about_z(before: np.ndarray, after: np.ndarray) -> float:
-    """Return by how much a body has turned about its own z between two orientations [rad]."""
-    a, b, c, d = before
-    w, x, y, z = after
-    scalar, along = a * w + b * x + c * y + d * z, a * z - d * w - b * y + c * x  # of the conjugate of `before` times `after`
-    return 2.0 * math.atan2(along if scalar >= 0 else -along, abs(scalar))
-
-
 class Screwdriver(Task[ScrewdriverSpec]):
     """The task."""
 
     Spec = ScrewdriverSpec
     senses = ("link_contact", "surface_distance")
+    constants = ("grasps",)
     score_unit = "rad/s"
 
     @reward_term(10.0, "1/rad")
@@ -266,13 +225,11 @@ class Screwdriver(Task[ScrewdriverSpec]):
         return self.turned / self.spec.episode
 
     def _pay(self, now: Now) -> Float[Tensor, " env"]:
-        """Return what turning pays: c; turning back costs the same whether the object is held or not."""
-        if self.spec.hold.coasting_pay == 1.0:
+        if self.holding.pays_in_full:
             return torch.ones_like(self.rate)
         return torch.where(self.rate > 0, self.holding.pay(now), 1.0)
 
     def _tip_distance(self, now: Now) -> Float[Tensor, " env"]:
-        """Return how far the tip is from where it was [m]."""
         return (now.watched.site_pos[:, 0] - self.upright_tip).norm(dim=1)
 
 

@@ -59,16 +59,13 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
     }
 
 
-def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False) -> int:
+def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False) -> None:
     """Write a checkpoint, to the disk.
 
     Args:
         state: What `state_of` returned.
         file: The file; one that is there is replaced.
         is_slim: Whether the optimisers' moments, two thirds of it, are rounded to bfloat16.
-
-    Returns:
-        Its size [byte].
 
     Raises:
         FileError: If it cannot be written; then the file that was there is as it was.
@@ -79,7 +76,6 @@ def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False
         opened.write(content.getbuffer())
         opened.flush()
         os.fsync(opened.fileno())
-    return content.tell()
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:
@@ -110,7 +106,6 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
 
 
 def _no_checkpoint(file: Path, found: str) -> CheckpointError:
-    """Return the error of a file from which no run can go on."""
     hint = "put back a copy of one, or begin again with another --out"
     return CheckpointError(f"{file}: found {found}, expected a checkpoint of `tgdsl train` or `tgdsl distill`; {hint}")
 

@@ -21,10 +21,8 @@ import json
 import os
 import platform
 import re
-import shutil
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -32,13 +30,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from tgdsl.errors import FileError, TgdslError
+from tgdsl.errors import TgdslError
 from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, new_folder, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.differences import differences, spec_differences
-from tgdsl.rl.playing.provenance import provenance
+from tgdsl.rl.playing.provenance import differences, provenance, spec_differences
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
@@ -46,44 +43,25 @@ COLUMNS = ("iteration", "samples", "seconds")
 """First columns of a curve."""
 ASKED = frozenset({"spec", "seed", "envs", "module", "taxels"})
 """What of a start is asked when the run goes on."""
-COPIES = 3
-"""How many checkpoints must find room on the disk before a run begins: the old one, the new one, and what else is written."""
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """The files of a run.
 
     Attributes:
         path: The folder.
+        run: What the run was made from.
+        curve: What each iteration was.
+        checkpoint: What the run goes on from.
+        policy: What it has learned.
+        evaluation: How good that is.
     """
 
-    path: Path
-
-    @property
-    def run(self) -> Path:
-        """What the run was made from."""
-        return self.path / "run.json"
-
-    @property
-    def curve(self) -> Path:
-        """What each iteration was."""
-        return self.path / "curve.csv"
-
-    @property
-    def checkpoint(self) -> Path:
-        """What the run goes on from."""
-        return self.path / "checkpoint.pt"
-
-    @property
-    def policy(self) -> Path:
-        """What it has learned."""
-        return self.path / "policy.pt"
-
-    @property
-    def evaluation(self) -> Path:
-        """How good that is."""
-        return self.path / "evaluation.json"
+    def __init__(self, path: Path):
+        self.path, self.run, self.curve = path, path / "run.json", path / "curve.csv"
+        self.checkpoint, self.policy, self.evaluation = (
+            path / name for name in ("checkpoint.pt", "policy.pt", "evaluation.json")
+        )
 
     @property
     def has_run(self) -> bool:
@@ -117,22 +95,10 @@ class RunFolder:
         with new_folder(check_writable(self.run)):
             folder = os.open(self.path, os.O_RDONLY)
             try:
-                with contextlib.suppress(OSError):  # of a file system that has no locks
-                    self._lock(folder)
+                self._lock(folder)
                 yield
             finally:
                 os.close(folder)
-
-    def check_room(self, size: int) -> None:
-        """See that checkpoints of a size find room.
-
-        Raises:
-            FileError: If not.
-        """
-        free = shutil.disk_usage(self.path).free
-        if free < COPIES * size:
-            problem = f"{free / 2**20:.2f} MiB are free on the disk, checkpoints take {COPIES * size / 2**20:.2f} MiB"
-            raise FileError(self.checkpoint, problem)
 
     def begin(self, made_from: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
         """Write what a run is made from, or that it is made to go on; starts that made no run are discarded.
@@ -141,7 +107,9 @@ class RunFolder:
             FileError: If it cannot be written.
         """
         with_folder(self.run)
-        self._clean()
+        for file in self.path.iterdir():  # temporary files that a run which was killed has left
+            if re.fullmatch(TEMPORARY.pattern + r"\.\w+", file.name):
+                file.unlink(missing_ok=True)
         starts = [*(self._read()["starts"] if self.has_run else []), dict(made_from)]
         atomic_write(self.run, (json.dumps({"starts": starts}, indent=2, ensure_ascii=False) + "\n").encode())
         for name, file in documents(loaded).items():
@@ -212,7 +180,6 @@ class RunFolder:
             writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
 
     def _no_curve(self, line: int, found: list[str], expected: str) -> TgdslError:
-        """Return the error of a file that is no curve."""
         first, hint = ",".join(found[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
         return TgdslError(f"{self.curve}:{line}: found {len(found)} values, {first!r}, expected {expected}; {hint}")
 
@@ -222,6 +189,8 @@ class RunFolder:
         except BlockingIOError as error:
             problem = "another process runs in this folder; wait until it has ended, or give another --out"
             raise TgdslError(f"{self.path}: {problem}") from error
+        except OSError:  # of a file system that has no locks
+            return
 
     def _read(self) -> dict[str, Any]:
         try:
@@ -234,12 +203,6 @@ class RunFolder:
                 f"{self.run}: expected what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ASKED))}"
             )
         return result
-
-    def _clean(self) -> None:
-        """Remove temporary files that a run which was killed has left."""
-        for file in self.path.iterdir():
-            if re.fullmatch(TEMPORARY.pattern + r"\.\w+", file.name):
-                file.unlink(missing_ok=True)
 
 
 def documents(loaded: LoadedTask) -> dict[str, Path]:

@@ -87,7 +87,6 @@ class SideBySide:
     """
 
     def __init__(self, count: int, device: torch.device | str):
-        """Take how many there are at most, and where their tensors are."""
         is_cuda = torch.device(device).type == "cuda"
         self._streams = [torch.cuda.Stream(device) for _ in range(count)] if is_cuda else None
 

@@ -5,15 +5,19 @@ Shapes: `env` environments.
 
 from __future__ import annotations
 
+import math
 import time
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from tgdsl.rl.env import Step, TouchEnv
+from tgdsl.rl.playing.rollout import Actor, Moment, rollout
 from tgdsl.rl.train.ranks import Ranks, summed
 
 OWN = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
@@ -28,7 +32,6 @@ class EpisodeTally:
     """
 
     def __init__(self):
-        """Begin."""
         self.names: list[str] = []
         self._sums: Tensor | None = None
 
@@ -81,57 +84,10 @@ class Iteration:
     update: float
 
 
-@runtime_checkable
-class Learning(Protocol):
-    """Who learns: what a run and its checkpoints ask for.
-
-    Attributes:
-        env: The environments.
-        ranks: The processes.
-        groups: Groups of observations of each network.
-        iteration: Number of iterations so far.
-        samples: How many control steps these took, over all processes and environments.
-        rates: What of the document makes smaller steps.
-    """
-
-    env: TouchEnv
-    ranks: Ranks
-    groups: dict[str, list[str]]
-    iteration: int
-    samples: int
-    rates: str
-
-    @property
-    def episode_names(self) -> list[str]:
-        """Numbers of the episodes that ended, from iterations in which any did."""
-        ...
-
-    def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it.
-
-        Args:
-            share: How much of the run is over, 0 to 1: some learn in smaller and smaller steps.
-        """
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what is learned, and what learning goes on from."""
-        ...
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved; it may hold more than `state_dict` returned."""
-        ...
-
-    def go_on(self, steps: Tensor) -> None:
-        """Begin episodes that count as having lasted so many control steps."""
-        ...
-
-
 class Clock:
     """Measures rollout and update; on a GPU by events, which nobody waits for."""
 
     def __init__(self, device: torch.device):
-        """Begin."""
         self._is_gpu, self._marks = device.type == "cuda", []
 
     def start(self) -> None:
@@ -156,3 +112,114 @@ class Clock:
         event = torch.cuda.Event(enable_timing=True)
         event.record()
         return event
+
+
+class Learning(Actor):
+    """Environments and who learns in them, iteration by iteration: a rollout in which it acts, and an update.
+
+    On a GPU the host waits once per iteration, but for captures at the first ones.
+
+    Attributes:
+        env: The environments.
+        ranks: The processes.
+        groups: Groups of observations of each network.
+        iteration: Number of iterations so far.
+        samples: How many control steps these took, over all processes and environments.
+        rates: What of the document makes smaller steps.
+    """
+
+    rates: ClassVar[str]
+    groups: dict[str, list[str]]
+
+    def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
+        """Begin.
+
+        Args:
+            env: The environments of this process.
+            ranks: The processes.
+            steps: Control steps of a rollout.
+            desynchronise: Whether first episodes end at random times.
+        """
+        self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
+        self._num_steps, self._desynchronise, self._is_begun = steps, desynchronise, False
+        self._clock, self._tally = Clock(env.device), EpisodeTally()
+
+    @property
+    def episode_names(self) -> list[str]:
+        """Numbers of the episodes that ended, from iterations in which any did."""
+        return self._tally.names
+
+    def iterate(self, share: float = 0.0) -> Iteration:
+        """Make a rollout, and learn from it.
+
+        Args:
+            share: How much of the run is over, 0 to 1: some learn in smaller and smaller steps.
+        """
+        self.set_rate(share)
+        self.roll()
+        self.learn()
+        sums, numbers = self._tally.taken(), self._numbers()
+        values = torch.cat([sums, torch.stack(list(numbers.values())).double().to(sums.device)]).tolist()  # here the host waits
+        durations, own = self._clock.stop(), dict(zip(numbers, values[len(sums) :], strict=True))
+        own = {name: value for name, value in own.items() if not (name.startswith("Score/") and math.isnan(value))}
+        return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | own, *durations)
+
+    def set_rate(self, share: float) -> None:
+        """Learn at the rate that stands when a share of the run is over; by default it stays."""
+
+    def roll(self) -> None:
+        """Make a rollout."""
+        if not self._is_begun:
+            at_random = torch.randint_like(self.env.steps, self.env.max_steps) if self._desynchronise else None
+            self.go_on(at_random)
+        self._start_rollout()
+        self._clock.start()
+        for moment in rollout(self, self.env, self._num_steps):
+            self._keep(moment)
+            self._tally.add(moment.step)
+        self._clock.split()
+
+    def learn(self) -> None:
+        """Learn from the rollout."""
+        self._update()
+        self.iteration += 1
+        self.samples += self._num_steps * self.env.num_envs * self.ranks.size
+
+    def go_on(self, steps: Int[Tensor, " env"] | None = None) -> None:
+        """Begin episodes that count as having lasted so many control steps; default: as new ones."""
+        self.env.reset()
+        if steps is not None:
+            self.env.steps.copy_(steps)
+        self.go_on_here()
+
+    def go_on_here(self) -> None:
+        """Go on from where the environments are; what was remembered of their episodes is forgotten."""
+        self._is_begun = True
+        self.begin(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return what is learned, and what learning goes on from."""
+
+    @abstractmethod
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what was saved; it may hold more than `state_dict` returned.
+
+        Raises:
+            RuntimeError: If networks are of other sizes; also ValueError and KeyError.
+        """
+
+    def _start_rollout(self) -> None:
+        """Prepare for a rollout."""
+
+    @abstractmethod
+    def _keep(self, moment: Moment) -> None:
+        """Keep a control step of the rollout."""
+
+    @abstractmethod
+    def _update(self) -> None:
+        """Learn from the rollout."""
+
+    @abstractmethod
+    def _numbers(self) -> dict[str, Tensor]:
+        """Return what else there is to tell of the iteration, on the device; a score of no episode is not a number."""

@@ -64,7 +64,6 @@ class Board:
     """TensorBoard's file of a run, if TensorBoard is installed."""
 
     def __init__(self, folder: Path, done: int):
-        """Begin, or go on after some iterations."""
         self._writer: Any = None
         self._file = folder / "events.out.tfevents"
         try:

@@ -112,7 +112,6 @@ class Exported(nn.Module):
     output_names = ("actions",)
 
     def __init__(self, model: EncodedModel):
-        """Copy a model."""
         super().__init__()
         distribution = model.distribution
         if distribution is not None:

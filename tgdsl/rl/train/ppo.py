@@ -238,7 +238,6 @@ class CapturedPPO(PPO):
         return actor.distribution
 
     def _judge(self, obs: TensorDict) -> Tensor:
-        """Return the critic's values, (row, 1)."""
         with torch.autocast(**self._autocast):
             return self.critic(obs).to(self._flat.dtype)
 

@@ -34,7 +34,6 @@ class StopRequest:
     """
 
     def __init__(self) -> None:
-        """Note nothing yet."""
         self.signal: signal.Signals | None = None
         self._before: dict[signal.Signals, Any] = {}
 
@@ -70,7 +69,7 @@ class Run:
             seconds: How long it has learned before [s].
 
         Raises:
-            FileError: If no checkpoint can be written, or the disk has no room for others.
+            FileError: If no checkpoint can be written.
         """
         self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
         self._rate, self._samples = 0.0, learner.samples
@@ -79,9 +78,7 @@ class Run:
         self._writes = learner.ranks.is_first
         if self._writes:
             folder.keep_rows(learner.iteration)
-        size = self.save()
-        if self._writes:
-            folder.check_room(size)
+        self.save()
         self._board = Board(folder.path, learner.iteration) if self._writes else None
 
     @property
@@ -94,8 +91,8 @@ class Run:
         """Whether this process writes for TensorBoard."""
         return self._board is not None and self._board.is_there
 
-    def save(self) -> int:
-        """Write a checkpoint; return its size [byte], 0 of a process that writes none.
+    def save(self) -> None:
+        """Write a checkpoint; of several processes the first one does.
 
         Raises:
             DivergedError: If something of it is no finite number; the checkpoint that is there stays.
@@ -108,9 +105,9 @@ class Run:
                 f"iteration {learner.iteration}: {wrong} is not finite: something that the environments return was not, or it "
                 f"grew beyond all bounds; {self._folder.checkpoint} is from before"
             )
-        size = write_checkpoint(state, self._folder.checkpoint) if self._writes else 0
+        if self._writes:
+            write_checkpoint(state, self._folder.checkpoint)
         self._saved = learner.iteration
-        return size
 
     def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
         """Learn. Ctrl-C and SIGTERM end it after the iteration under way, with a checkpoint.
