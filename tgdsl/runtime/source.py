@@ -54,6 +54,11 @@ class Simulator(Source, Protocol):
 
     model: mujoco.MjModel
 
+    @property
+    def qpos(self) -> Float[Tensor, "env nq"]:
+        """MuJoCo's generalised positions, after the last step."""
+        ...
+
     def state(self) -> SceneState:
         """Return what the module wants, all of it from one instant; its `dt` is that of a control step."""
         ...

@@ -17,8 +17,10 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from io import StringIO
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -39,10 +41,7 @@ from tgdsl.view.meshes import body_triangles, robot_bodies
 from tgdsl.view.overview import drawn_outputs
 from tgdsl.view.stages import SimStage, Stage
 from tgdsl.view.style import HEAT, WARMTH
-from tgdsl.view.taxels import Pose, in_world
-
-if TYPE_CHECKING:
-    import viser
+from tgdsl.view.taxels import Pose
 
 Array = np.ndarray
 LOCAL = "127.0.0.1"
@@ -53,12 +52,13 @@ PLOT_SECONDS = 10.0
 """How much of the past the plot shows [s]."""
 MAX_STEPS = 5
 """Most control steps per frame: a scene slower than that runs behind real time."""
-_CARRIER, _ROBOT, _OBJECT = (208, 211, 216), (150, 155, 165), (84, 140, 212)
+_CARRIER, _ROBOT, _OBJECT, _REST = (176, 181, 190), (128, 134, 145), (60, 112, 186), (62, 72, 88)
 _DISC_RADIUS = (0.0006, 0.0022)
 _LIFT = 2e-4
 """How far discs and arrows begin above the surface [m]."""
 _ARROW = 0.03
 """Length of the arrow of the largest vector [m]."""
+_HEAT = HEAT.with_extremes(under=np.divide(_REST, 255))
 _SIGNED = matplotlib.colormaps["coolwarm"]
 MAGNITUDE = "magnitude"
 
@@ -75,7 +75,8 @@ class Page:
     """
 
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
-        self.server = _viser().ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
+        with redirect_stdout(StringIO()):  # viser prints its address
+            self.server = _viser().ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
         if host != LOCAL:
             warnings.warn(f"the page is served at {host}: whoever reaches this machine can see and control it", stacklevel=2)
         self._clicks: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -146,7 +147,8 @@ class Page:
 
     def close(self) -> None:
         """Stop serving."""
-        self.server.stop()
+        with redirect_stdout(StringIO()):
+            self.server.stop()
 
     def draw(self) -> None:
         """Draw the stage as it is now."""
@@ -192,16 +194,15 @@ class Page:
         faces = np.array([[0, 1 + i, 1 + (i + 1) % 16] for i in range(16)])
         for body in np.unique(table.body):
             rows = np.flatnonzero(table.body == body)
-            tilt = Rotation.align_vectors  # named for what follows: each disc's z axis becomes its normal
-            turns = np.array([tilt(normal[None], [[0, 0, 1]])[0].as_quat(scalar_first=True) for normal in table.normal[rows]])
+            turns = [Rotation.align_vectors(normal[None], [[0, 0, 1]])[0] for normal in table.normal[rows]]
             handle = self.server.scene.add_batched_meshes_simple(
                 f"/body{body}/taxels",
                 corners,
                 faces,
-                turns,
+                np.array([turn.as_quat(scalar_first=True) for turn in turns]),
                 table.pos[rows] + _LIFT * table.normal[rows],
                 batched_scales=np.clip(0.45 * table.size[rows], *_DISC_RADIUS),
-                batched_colors=np.full((len(rows), 3), 200, dtype=np.uint8),
+                batched_colors=np.tile(np.uint8(_REST), (len(rows), 1)),
                 side="double",
                 lod="off",
                 cast_shadow=False,
@@ -213,14 +214,11 @@ class Page:
 
     def _table(self) -> _Rows:
         """Return where the chosen reading's rows are in the frames of their bodies."""
-        model, still = self.stage.model, Pose(np.zeros((self.stage.model.nbody, 3)), np.tile([1.0, 0, 0, 0], (self.stage.model.nbody, 1)))
-        output = self._output
-        touch = self.stage.touch
+        model, touch, output = self.stage.model, self.stage.touch, self._output
         if is_boxed(touch, output):
             layout = boxes_of(touch, output, self.stage.readings[output.name], 0).layout
             names = [layout.links[i].body for i in layout.link_id]
-            pos, normal = in_world(model, still, names, layout.pos, layout.normal)
-            normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+            pos, normal = layout.pos, layout.normal / np.linalg.norm(layout.normal, axis=1, keepdims=True)
             size, labels = np.sqrt(layout.area), [f"{name}, cell {i}" for i, name in enumerate(names)]
         else:
             table = touch.taxels[output.sensor]
@@ -243,7 +241,7 @@ class Page:
         centre = 0.5 * (pos.min(axis=0) + pos.max(axis=0))
         reach = max(0.03, float(np.linalg.norm(pos - centre, axis=1).max()))
         initial = self.server.initial_camera
-        initial.position, initial.look_at, initial.up = centre + 3.2 * reach * camera.toward, centre, camera.up
+        initial.position, initial.look_at, initial.up = centre + 2.4 * reach * camera.toward, centre, camera.up
         initial.near = 0.1 * reach
 
     # Touch -----------------------------------------------------------------------------------------------------------------
@@ -267,7 +265,7 @@ class Page:
             norm, label = boxes.norm, boxes.label
         elif channel == MAGNITUDE:
             markers = markers_of(self.stage.touch, _Fixed(self.stage.model, pose), output, readings, env)
-            value, unit, colours, vector = markers.value / markers.scale, _unit(output.units[0]), HEAT, markers.vector
+            value, unit, colours, vector = markers.value / markers.scale, _unit(output.units[0]), _HEAT, markers.vector
             norm, label = Normalize(1e-12, self._widened(output, channel, value), clip=False), f"{markers.quantity} [{unit}]"
         else:
             i = output.channels.index(channel)
@@ -315,8 +313,12 @@ class Page:
 
     def _draw_text(self) -> None:
         """Write the time, and what the stage notes."""
-        notes = "".join(f"\n\n**{title}**\n\n{text}" for title, text in self.stage.notes.items())
-        self._status.content = f"t = {self.stage.time:.2f} s · {len(self._table_now.body)} taxels{notes}"
+        notes = self.stage.notes(self._env_index)
+        rows = "".join(
+            f"\n| {name} | {f'{value:.4g}' if isinstance(value, float) else value} |" for name, value in notes.items()
+        )
+        self._notes.content = f"| | |\n|---|---|{rows}" if rows else ""
+        self._status.content = f"t = {self.stage.time:.2f} s · {len(self._table_now.body)} taxels"
         if self._instant is not None and self.stage.step_index != int(self._instant.value):
             self._instant.value = self._seen_instant = self.stage.step_index
 
@@ -348,6 +350,7 @@ class Page:
             series = (uplot.Series(label="t [s]"), uplot.Series(label="reading", stroke="#c2410c", width=2))
             data = (np.array([0.0, 1.0]), np.array([0.0, 0.0]))
             self._plot = gui.add_uplot(data, series, scales={"x": uplot.Scale(time=False)}, aspect=2.0)
+        self._notes = gui.add_markdown("")
         with gui.add_folder("show", expand_by_default=False):
             self._shown = {name: gui.add_checkbox(name, True) for name in ("robot", "objects", "taxels")}
         self._sliders: list[Any] = []

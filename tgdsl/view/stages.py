@@ -71,13 +71,12 @@ class Stage(ABC):
         """Which instant of a recorded run this is."""
         return 0
 
-    @property
-    def notes(self) -> Mapping[str, str]:
-        """Lines of text about this instant, by their titles, such as a task's reward terms."""
+    def notes(self, env: int) -> Mapping[str, float]:
+        """Return what else there is to say of this instant in one environment, by name, such as a task's reward terms."""
         return {}
 
-    def close(self) -> None:
-        """Release the simulator or the file."""
+    def close(self) -> None:  # noqa: B027
+        """Release the simulator; of a recorded run, nothing."""
 
 
 class SimStage(Stage):
