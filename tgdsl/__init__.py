@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from tgdsl.runtime.simulate import simulate as simulate
     from tgdsl.runtime.warp import WarpSimulation
     from tgdsl.tuning.compile import compile as compile
+    from tgdsl.view.page import show as show
 
 _PLACES = {
     "ArtifactError": "errors",
@@ -71,6 +72,7 @@ _PLACES = {
     "read_mujoco": "runtime.read",
     "read_warp": "runtime.read",
     "save": "module.artifact",
+    "show": "view.page",
     "simulate": "runtime.simulate",
 }
 
@@ -101,6 +103,7 @@ __all__ = [
     "read_mujoco",
     "read_warp",
     "save",
+    "show",
     "simulate",
     "testing",
 ]

@@ -34,6 +34,7 @@ from tgdsl.commands.report.doctor import Doctor
 from tgdsl.commands.run import Run
 from tgdsl.commands.schema import Schema
 from tgdsl.commands.verify import Verify
+from tgdsl.commands.view import View
 from tgdsl.errors import SpecError, TgdslError
 
 Command = (
@@ -50,6 +51,7 @@ Command = (
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Deploy, tyro.conf.subcommand("deploy")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Links, tyro.conf.subcommand("links")]
     | Annotated[Layout, tyro.conf.subcommand("layout")]

@@ -76,7 +76,7 @@ class Run:
             problem = f'an object touches {listed(bodies)}, and "{name}" is 0 on all taxels'
             print(f"at the end {problem}: do they face it? A grid along [0, 0, -1] is on the side that faces +z")
         print("".join(f"at the end {problem}: see {name}\n" for name, problem in missed_loads(touch, readings).items()), end="")
-        recorder.write(with_folder(files["readings"]), controls)
+        recorder.write(with_folder(files["readings"]), controls, self.document)
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)
 

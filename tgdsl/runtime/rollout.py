@@ -35,11 +35,12 @@ Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actu
 
 @dataclass(frozen=True)
 class Step:
-    """One control step of a rollout: its number, the time after it [s], and the readings."""
+    """One control step of a rollout: its number, and the time [s], the readings and MuJoCo's positions after it."""
 
     index: int
     time: float
     readings: dict[str, Tensor]
+    qpos: Float[Tensor, "env nq"]
 
 
 def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds: float, control_step: float) -> Controls:
@@ -104,7 +105,7 @@ def rollout(touch: TactileModule, sim: Simulation, controls: Controls) -> Iterat
             sim.step(control)
         except SimulationError as error:
             raise SimulationError(f"control step {index} of {len(controls)}: {error}") from error
-        yield Step(index, (index + 1) * sim.control_step, touch(sim.state()))
+        yield Step(index, (index + 1) * sim.control_step, touch(sim.state()), sim.qpos)
 
 
 def touching_bodies(touch: TactileModule, sim: BatchSimulation) -> set[int]:
@@ -171,7 +172,8 @@ def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[s
 class Recorder:
     """Keeps the readings of a rollout and writes them as one `.npz` file.
 
-    The file holds `time` (step,) [s], `ctrl` (step, …, actuator), each reading by its name (step, env, taxel, channel) as
+    The file holds `time` (step,) [s], `ctrl` (step, …, actuator), MuJoCo's `qpos` (step, env, nq) after the step, the path of
+    the `document`, each reading by its name (step, env, taxel, channel) as
     float32, and its channels' names and units under `<name>:channels` and `<name>:units`. Where its taxels are is under
     `<name>:link`, `<name>:body`, `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings
     of bodies there is `<name>:body` alone, of those with rows of their own the columns of `touch.rows[<name>]`.
@@ -185,16 +187,25 @@ class Recorder:
             output.name: np.empty((num_steps, num_envs, *output.shape), dtype=np.float32) for output in self._outputs
         }
         self._time = np.empty(num_steps)
+        self._qpos: list[np.ndarray] = []
 
     def add(self, step: Step) -> None:
         """Keep one step."""
         self._time[step.index] = step.time
+        self._qpos.append(step.qpos.detach().cpu().numpy().copy())
         for name, kept in self._readings.items():
             kept[step.index] = step.readings[name].detach().cpu().numpy()
 
-    def write(self, path: Path, controls: Controls) -> None:
-        """Write the file; it appears whole or not at all."""
+    def write(self, path: Path, controls: Controls, document: Path) -> None:
+        """Write the file; it appears whole or not at all.
+
+        Args:
+            path: The file.
+            controls: What the scene was stepped through.
+            document: The document or artefact of the scene, by which `tgdsl view` finds it again.
+        """
         arrays: dict[str, np.ndarray] = {"time": self._time, "ctrl": controls, **self._readings}
+        arrays |= {"qpos": np.array(self._qpos), "document": np.array(str(document.resolve()))}
         for output in self._outputs:
             arrays[f"{output.name}:channels"] = np.array(output.channels)
             arrays[f"{output.name}:units"] = np.array(output.units)

@@ -18,7 +18,7 @@ from tgdsl.module.memory.memory import Memory
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.view.taxels import Pose, Taxels, in_world
+from tgdsl.view.taxels import Pose, Posed, Taxels, in_world
 
 Array = np.ndarray
 THRESHOLDS = {"N": 1e-3, "N·m": 1e-6, "m": 1e-6, "Pa": 1.0}
@@ -110,21 +110,21 @@ def _number(number: float) -> str:
     return f"{number:.{3 if number >= 0.1 else 2}g}"
 
 
-def markers_of(touch: TactileModule, sim: Simulation, output: Output, values: Tensor, env: int) -> Markers:
+def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tensor, env: int) -> Markers:
     """Return where the taxels of a reading are in one environment, and what they read.
 
     A reading of bodies has one marker for each, amid its taxels.
 
     Args:
         touch: The module.
-        sim: The scene, at the instant of the reading.
+        scene: The scene, at the instant of the reading.
         output: Which reading; its magnitude is the norm over the channels that share the first one's unit.
         values: The reading of all environments; of stacked calls the last one is shown.
         env: Which environment.
     """
     table = touch.taxels[output.sensor]
-    pose = Pose(*sim.body_poses(env))
-    pos, normal = in_world(sim.model, pose, table["body"], table["pos"], table["normal"])
+    pose = Pose(*scene.body_poses(env))
+    pos, normal = in_world(scene.model, pose, table["body"], table["pos"], table["normal"])
     size = np.sqrt(table["area"]) * (table["radius"] > 0)
     bodies = np.array(table["body"])
     if output.rows == "body":
@@ -145,7 +145,7 @@ def markers_of(touch: TactileModule, sim: Simulation, output: Output, values: Te
         size=size,
         value=scale * value,
         scale=scale,
-        vector=in_world(sim.model, pose, bodies, np.zeros_like(pos), read[:, same])[1] if is_vector else None,
+        vector=in_world(scene.model, pose, bodies, np.zeros_like(pos), read[:, same])[1] if is_vector else None,
         quantity=f"|{stem}|" if len(same) > 1 else stem,
         unit=unit,
         threshold=THRESHOLDS.get(output.units[0], 0.0),

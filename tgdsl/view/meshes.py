@@ -50,20 +50,30 @@ def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int], links: Iterable
         links: What carries taxels: bodies that have theirs on a geom or mesh that does not collide show those that do not.
     """
     parts = [Mesh(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
-    names = {link.name for link in links}
+    links = list(links)
     for body in sorted(bodies):
-        own = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
-        colliding = [i for i in own if model.geom_contype[i] or model.geom_conaffinity[i]]
-        others = [i for i in own if i not in colliding]
-        is_on_others = any(names & _names(model, i) for i in others) and not any(names & _names(model, i) for i in colliding)
-        for geom in (others if is_on_others else colliding) or own:
-            corners, normals = _triangles(model, geom)
-            in_body = Rotation.from_quat(model.geom_quat[geom], scalar_first=True)
-            in_world = Rotation.from_quat(pose.quat[body], scalar_first=True)
-            centre = pose.pos[body] + in_world.apply(model.geom_pos[geom])
-            matrix = (in_world * in_body).as_matrix().T
-            parts.append(Mesh(corners @ matrix + centre, normals @ matrix, np.full(len(corners), body)))
+        corners, normals = body_triangles(model, body, links)
+        rotation = Rotation.from_quat(pose.quat[body], scalar_first=True).as_matrix().T
+        parts.append(Mesh(corners @ rotation + pose.pos[body], normals @ rotation, np.full(len(corners), body)))
     return Mesh(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def body_triangles(
+    model: mujoco.MjModel, body: int, links: Iterable[Link] = ()
+) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
+    """Return corners and normals of a body's triangles in its own frame: see `mesh_of`."""
+    names = {link.name for link in links}
+    geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
+    colliding = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
+    others = [i for i in geoms if i not in colliding]
+    is_on_others = any(names & _names(model, i) for i in others) and not any(names & _names(model, i) for i in colliding)
+    corners, normals = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3))]
+    for geom in (others if is_on_others else colliding) or geoms:
+        rotation = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).as_matrix().T
+        corner, normal = _triangles(model, geom)
+        corners.append(corner @ rotation + model.geom_pos[geom])
+        normals.append(normal @ rotation)
+    return np.concatenate(corners), np.concatenate(normals)
 
 
 def _names(model: mujoco.MjModel, geom: int) -> set[str]:

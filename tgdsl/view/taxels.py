@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -25,6 +25,20 @@ class Pose(NamedTuple):
 
     pos: Float[Array, "body 3"]
     quat: Float[Array, "body 4"]
+
+
+class Posed(Protocol):
+    """A model whose bodies are somewhere: a simulator's, or a recorded run's.
+
+    Attributes:
+        model: The compiled scene.
+    """
+
+    model: mujoco.MjModel
+
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return origins [m] and quaternions w, x, y, z of all bodies in one environment, in the world."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,345 @@
+"""The live page: what its handles are set to, and, in a real browser, what is seen and what its controls do."""
+
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import tgdsl
+from tgdsl.commands.view import View
+from tgdsl.errors import SimulationError, TgdslError
+from tgdsl.view.page import Page
+from tgdsl.view.stages import RunStage, SceneStage, SimStage, Stage
+
+ROOT = Path(__file__).parents[2]
+SCENE = """
+<mujoco model="press"><option timestep="0.002"/><worldbody>
+<body name="pad" pos="0 0 0.05"><geom name="pad" type="box" size=".03 .03 .005" density="800"/></body>
+<body name="ball" pos=".01 0 .0749"><joint name="lift" type="slide" axis="0 0 1" damping="2"/>
+<geom name="ball" type="sphere" size=".02" mass="0.2"/></body>
+</worldbody><actuator><position name="lift" joint="lift" kp="400" ctrlrange="-0.02 0.02"/></actuator>
+<keyframe><key name="up" qpos="0.01" ctrl="0.01"/></keyframe></mujoco>
+"""
+DOCUMENT = """
+tgdsl: 1
+robot:
+  model: press.xml
+  layout:
+    resolutions: {low: {pad: {method: grid, rows: 4, columns: 4, direction: [0, 0, -1], radius: 6 mm}}}
+    groups: {all: [pad]}
+resolution: low
+objects: {ball: {body: ball}}
+sensors:
+  touch: {kind: kinematic_taxel, links: all, feels: [ball]}
+  near: {kind: proximity, links: all, feels: [ball]}
+"""
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("page")
+    (folder / "press.xml").write_text(SCENE)
+    (folder / "press.yaml").write_text(DOCUMENT)
+    return folder / "press.yaml"
+
+
+@contextmanager
+def opened(stage: Stage) -> Iterator[Page]:
+    page = Page(stage, port=8300)
+    try:
+        yield page
+    finally:
+        page.close()
+        stage.close()
+
+
+def test_discs_are_at_the_taxels_in_the_frame_of_their_body(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch)) as page:
+        table, model = touch.taxels["touch"], page.stage.model
+        (body,) = {model.body(name).id for name in table["body"]}
+        disc = page._discs[body]
+        apart = np.linalg.norm(disc.batched_positions - table["pos"], axis=1)
+        assert apart.max() < 3e-4  # lifted off the surface
+        turned = Rotation.from_quat(disc.batched_wxyzs, scalar_first=True).apply([0, 0, 1])
+        np.testing.assert_allclose(turned, table["normal"], atol=1e-6)
+        np.testing.assert_allclose(page._frames[body].position, model.body("pad").pos, atol=1e-9)
+
+
+def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_written(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch)) as page:
+        for _ in range(100):
+            page.stage.advance()
+        page.draw()
+        force = page.stage.readings["touch"][0].norm(dim=-1)
+        (disc,) = page._discs.values()
+        most = int(force.argmax())
+        assert force[most] > 0.01
+        blue = disc.batched_colors[:, 2].astype(int)
+        assert blue[most] == blue[force.numpy() > 0].min()
+        page._pick(most)
+        page.draw()
+        assert f"taxel {most}" in page._reads.content
+        shown = float(re.search(r"([\d.e-]+) N", page._reads.content)[1])
+        assert shown == pytest.approx(float(force[most]), rel=1e-3)
+
+
+def test_a_slider_moves_its_actuator_and_a_keyframe_moves_the_sliders(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch)) as page:
+        page._sliders[0].value = -0.015
+        page.run(seconds=0.5)
+        low = page.stage.body_poses(0)[0][2, 2]
+        page._keyframe.value = "up"
+        page.run(seconds=0.7)
+        assert page._sliders[0].value == pytest.approx(0.01)
+        assert page.stage.body_poses(0)[0][2, 2] > low + 0.004
+
+
+def test_another_reading_has_its_own_channels(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch)) as page:
+        page._channel.value = "force_x"
+        page._reading.value = "near"
+        page._react()
+        page.draw()
+        channels = next(output.channels for output in touch.outputs if output.name == "near")
+        assert page._channel.options == ("magnitude", *channels)
+        assert page._channel.value == "magnitude"
+
+
+def test_pause_stops_and_step_once_makes_one_step(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch)) as page:
+        page._paused.value = True
+        page.run(seconds=0.2)
+        assert page.stage.time == 0
+        page._step_once()
+        assert page.stage.time == pytest.approx(page.stage.control_step)
+
+
+def test_a_loop_of_ones_own_is_drawn_at_most_thirty_times_a_second(document):
+    touch = tgdsl.compile(document)
+    sim = tgdsl.simulate(touch, num_envs=2)
+    page = tgdsl.show(touch, sim, port=8310)
+    drawn = []
+    draw = page.draw
+    page.draw = lambda: (drawn.append(time.monotonic()), draw())
+    begin = time.monotonic()
+    while time.monotonic() - begin < 0.5:
+        sim.step()
+        page.update(touch(sim.state()))
+    page.close()
+    assert 2 <= len(drawn) <= 16
+    assert isinstance(page.stage, SimStage)
+    assert page.stage.time > 0
+
+
+def recorded(document: Path, folder: Path) -> Path:
+    from tgdsl.commands.run import Run
+
+    Run(document, keyframes=("up",), seconds=0.3, out=folder).run()
+    return folder / "readings.npz"
+
+
+def test_a_recorded_run_is_where_mujoco_had_it(document, tmp_path):
+    path = recorded(document, tmp_path)
+    touch = tgdsl.compile(document)
+    stage = RunStage(touch, path)
+    with np.load(path) as arrays:
+        qpos, readings = arrays["qpos"], arrays["touch"]
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos[7, 0]
+    mujoco.mj_kinematics(model, data)
+    stage.seek(7)
+    np.testing.assert_allclose(stage.body_poses(0)[0], data.xpos, atol=1e-12)
+    assert np.array_equal(stage.readings["touch"].numpy(), readings[7])
+    with opened(stage) as page:
+        page._instant.value = 3
+        page._react()
+        assert stage.step_index == 3
+
+
+def test_a_run_of_another_document_is_refused_by_name(document, tmp_path):
+    path = recorded(document, tmp_path)
+    other = document.with_name("other.yaml")
+    other.write_text(DOCUMENT.replace("near:", "close:"))
+    with pytest.raises(SimulationError, match=r'no reading "close"'):
+        RunStage(tgdsl.compile(other), path)
+
+
+def test_what_is_no_run_is_refused_with_what_it_lacks(tmp_path):
+    np.savez(tmp_path / "log.npz", time=np.zeros(3))
+    with pytest.raises(SimulationError, match="it has no `qpos`"):
+        View(tmp_path / "log.npz")._stage()
+
+
+def test_a_policy_needs_a_task(document):
+    with pytest.raises(TgdslError, match=r"press\.yaml is no task's document"):
+        View(document, policy=Path("policy.pt"))._stage()
+
+
+def test_what_is_saved_is_shown_and_mistakes_have_their_line(document):
+    command = View(document)
+    watch = command._watch()
+    assert watch() is None
+    document.write_text(DOCUMENT.replace("rows: 4", "rows: 5"))
+    stage = watch()
+    assert isinstance(stage, Stage)
+    assert len(stage.touch.taxels["touch"]["pos"]) == 20
+    stage.close()
+    document.write_text(DOCUMENT.replace("kind: proximity", "kind: proximty"))
+    problem = watch()
+    assert isinstance(problem, str)
+    assert "press.yaml:12" in problem
+    assert "proximity" in problem
+    document.write_text(DOCUMENT)
+
+
+# In a browser ------------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def serving(command: View) -> Iterator[Page]:
+    """Serve a command's page in this process, stepped by a thread, and yield it."""
+    stage = command._stage()
+    page = Page(stage, port=8320)
+    is_over = threading.Event()
+    watch = command._watch()
+
+    def loop() -> None:
+        while not is_over.is_set():
+            page.run(watch, seconds=0.5)
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        yield page
+    finally:
+        is_over.set()
+        thread.join()
+        page.close()
+        page.stage.close()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed (apt-get install chromium): the live page is not opened in a browser")
+    from playwright.sync_api import sync_playwright
+
+    options = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=chromium, args=list(options))
+        yield opened
+        opened.close()
+
+
+def soon(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
+    """Return whether something comes true before long."""
+    begin = time.monotonic()
+    while time.monotonic() - begin < seconds:
+        if condition():
+            return True
+        time.sleep(0.3)
+    return False
+
+
+def drawn_share(view) -> float:
+    """Return the share of the picture's left half that is not background."""
+    import io
+
+    from matplotlib.image import imread
+
+    pixels = imread(io.BytesIO(view.screenshot()))[:, :600, :3]
+    return float((np.abs(pixels - pixels[5, 400]) > 0.05).any(axis=2).mean())
+
+
+def open_page(browser, page: Page):
+    view = browser.new_page(viewport={"width": 960, "height": 640})
+    view.set_default_timeout(120_000)  # WebGL in software
+    view.goto(page.url)
+    view.get_by_text("taxels").first.wait_for()
+    return view
+
+
+def write(view, label: str, text: str) -> None:
+    """Write a number beside a slider, as typing does; events are sent by hand, as typing waits for frames of the picture."""
+    field = view.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator("input").last
+    field.focus()
+    field.evaluate(
+        """(field, text) => {
+            Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, text);
+            field.dispatchEvent(new Event("input", {bubbles: true}));
+            field.blur();
+        }""",
+        text,
+    )
+
+
+def total(view) -> float:
+    """Return the number that the page writes beside "sum"."""
+    text = view.get_by_text("sum").first.locator("xpath=..").inner_text()
+    return float(re.search(r"(-?[\d.]+(?:e-?\d+)?) N", text)[1])
+
+
+@pytest.mark.slow
+def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
+    with serving(View(document, envs=2)) as page:
+        view = open_page(browser, page)
+        assert soon(lambda: drawn_share(view) > 0.02)
+        assert soon(lambda: total(view) > 0)
+        before = total(view)
+        write(view, "lift", "-0.02")
+        assert soon(lambda: page._sliders[0].value == pytest.approx(-0.02))
+        assert soon(lambda: abs(total(view) - before) > 0.1 * before)
+        view.locator("input[value='magnitude']").first.dispatch_event("click")
+        view.get_by_role("option", name="force_z").dispatch_event("click")
+        assert soon(lambda: view.get_by_text("force_z [N]").count() > 0)
+        view.context.set_offline(True)
+        view.context.set_offline(False)
+        view.reload()
+        view.get_by_text("16 taxels").wait_for()
+        document.write_text(DOCUMENT.replace("rows: 4", "rows: 3"))
+        view.get_by_text("12 taxels").wait_for()
+        document.write_text(DOCUMENT.replace("kind: proximity", "kind: proximty"))
+        view.get_by_text("press.yaml:12").first.wait_for()
+        document.write_text(DOCUMENT)
+        view.get_by_text("16 taxels").wait_for()
+        view.close()
+
+
+@pytest.mark.slow
+def test_a_browser_shows_a_run_and_scrubs_it(browser, document, tmp_path):
+    with serving(View(recorded(document, tmp_path))) as page:
+        view = open_page(browser, page)
+        assert soon(lambda: drawn_share(view) > 0.02)
+        view.get_by_text("pause").locator("xpath=ancestor::*[.//input][1]").locator("input").dispatch_event("click")
+        assert soon(lambda: page._paused.value)
+        write(view, "step", "2")
+        with np.load(tmp_path / "readings.npz") as arrays:
+            time_then = arrays["time"][2]
+        view.get_by_text(f"t = {time_then:.2f} s").wait_for()
+        view.close()
+
+
+@pytest.mark.slow
+def test_a_browser_shows_a_task_with_its_policy_and_reward_terms(browser):
+    task, policy = ROOT / "examples/tasks/in_palm_rotate_cube.yaml", ROOT / "policies/in_palm_rotate_cube.pt"
+    with serving(View(task, policy=policy, envs=2)) as page:
+        view = open_page(browser, page)
+        assert soon(lambda: drawn_share(view) > 0.02)
+        assert view.get_by_text("object_distance").count() > 0
+        assert view.get_by_text("199 taxels").count() > 0
+        view.close()

@@ -1,0 +1,122 @@
+"""`tgdsl view`: a live page in the browser of a document, a task or a recorded run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from tgdsl.commands.arguments import OptionalFile, Overrides, module_of, parsed_overrides
+from tgdsl.console.progress import StatusLine
+from tgdsl.errors import TgdslError
+
+if TYPE_CHECKING:
+    from tgdsl.view.stages import Stage
+
+HANDS = ("xhand1", "emulator")
+
+
+@dataclass(frozen=True)
+class View:
+    """Open a live page in the browser: robot and objects, taxels coloured by what they read, sliders of the actuators.
+
+    The page of a document follows the file: what is saved is shown within seconds, mistakes with their lines.
+    """
+
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
+    """A document or a task (.yaml), an artefact (.safetensors), or a run that `tgdsl run` recorded (.npz)."""
+    policy: OptionalFile = None
+    """A task's policy; default: zero actions."""
+    envs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
+    """Environments; the page shows one at a time."""
+    port: int = 8080
+    """Port of the page; where it is taken, the next free one."""
+    address: str = "127.0.0.1"
+    """Address to serve at; 0.0.0.0 lets others in the network see and control the scene."""
+    seed: int = 0
+    """What all that is random in a task follows from."""
+    seconds: float | None = None
+    """When to stop [s]; default: at Ctrl-C."""
+    set: Overrides = ()
+
+    def run(self) -> None:
+        """Serve the page until Ctrl-C."""
+        import math
+
+        from tgdsl.view.page import Page
+
+        if str(self.source).partition(":")[0] in HANDS:
+            raise TgdslError(f"{self.source}: a hand is shown in the terminal: tgdsl hand monitor")
+        with StatusLine() as progress:
+            stage = self._stage(progress)
+            progress("starting the page")
+            page = Page(stage, self.address, self.port)
+        print(f"{self.source}: {page.url}   (Ctrl-C ends it)", flush=True)
+        try:
+            page.run(self._watch(), math.inf if self.seconds is None else self.seconds)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            page.close()
+            page.stage.close()
+
+    def _stage(self, progress: StatusLine | None = None) -> Stage:
+        """Return what the source is shown as."""
+        from tgdsl.view.stages import RunStage, SceneStage, read_run
+
+        if self.source.suffix == ".npz":
+            document = Path(str(read_run(self.source)["document"]))
+            return RunStage(module_of(document, self.set, progress), self.source)
+        if self._is_task():
+            return self._task_stage(progress)
+        if self.policy is not None:
+            raise TgdslError(f"--policy {self.policy}: {self.source} is no task's document")
+        return SceneStage(module_of(self.source, self.set, progress), self.envs)
+
+    def _is_task(self) -> bool:
+        """Return whether the file is a task's document; one with a mistake in its YAML is reported by who compiles it."""
+        from ruamel.yaml import YAML, YAMLError
+
+        if self.source.suffix not in (".yaml", ".yml") or not self.source.is_file():
+            return False
+        try:
+            values = YAML(typ="safe").load(self.source)
+        except YAMLError:
+            return False
+        return isinstance(values, dict) and "task" in values
+
+    def _task_stage(self, progress: StatusLine | None) -> Stage:
+        from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.playing.actions import actor_of
+        from tgdsl.rl.playing.policy import policy_for, read_policy
+        from tgdsl.rl.playing.stage import TaskStage
+
+        saved = None if self.policy is None else read_policy(self.policy)
+        env = TouchEnv(self.source, self.envs, seed=self.seed, overrides=parsed_overrides(self.set), progress=progress)
+        return TaskStage(env, actor_of(env, "zero", self.seed) if saved is None else policy_for(env, saved), self.seed)
+
+    def _watch(self) -> Callable[[], Stage | str | None]:
+        """Return what looks whether the source's file has been saved since, and compiles it then."""
+        seen = self._saved()
+
+        def watch() -> Stage | str | None:
+            nonlocal seen
+            if (saved := self._saved()) == seen or saved is None:
+                return None
+            seen = saved
+            try:
+                return self._stage()
+            except TgdslError as error:  # a document's mistakes, each with its line
+                return str(error)
+
+        return watch
+
+    def _saved(self) -> int | None:
+        """Return when the file was saved; None while an editor replaces it."""
+        try:
+            return self.source.stat().st_mtime_ns
+        except FileNotFoundError:
+            return None

@@ -1,0 +1,56 @@
+"""A task's environments on the live page: an actor acts, and reward terms are written beside what is felt."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.playing.rollout import Actor, Moment, rollout
+from tgdsl.view.stages import Stage
+
+Array = np.ndarray
+
+
+class TaskStage(Stage):
+    """Environments of a task in which an actor acts, episode after episode."""
+
+    def __init__(self, env: TouchEnv, actor: Actor, seed: int = 0):
+        self.env, self._actor, self._seed = env, actor, seed
+        self.touch, self.model = env.touch, env.sim.model
+        self.num_envs, self.control_step = env.num_envs, env.control_step
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin the first episode of all environments again."""
+        self.env.reset(self._seed)
+        self._actor.begin(torch.ones(self.num_envs, dtype=torch.bool, device=self.env.sim.qpos.device))
+        self._moments, self._moment = rollout(self._actor, self.env), None
+        self.time, self.readings = 0.0, self.env.now.readings
+
+    _moment: Moment | None
+
+    def advance(self) -> None:
+        """Let the actor act once."""
+        self._moment = next(self._moments)
+        self.time += self.control_step
+        self.readings = self.env.now.readings
+
+    def notes(self, env: int) -> Mapping[str, float]:
+        """Return the score, and each reward term of this step [1/s]."""
+        if self._moment is None:
+            return {}
+        info = self._moment.step.info
+        terms = {name: float(value[env]) / self.control_step for name, value in info.terms.items()}
+        return {f"score [{self.env.task.score_unit}]": float(info.score[env]), **terms}
+
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return where the simulator has the bodies."""
+        return self.env.sim.body_poses(env)
+
+    def close(self) -> None:
+        """Release the simulator."""
+        self.env.close()

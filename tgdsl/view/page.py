@@ -1,0 +1,498 @@
+"""A live page in the browser: robot and objects, taxels coloured by what they read, and the controls of a scene.
+
+    page = tgdsl.show(touch, sim)            # a loop of one's own
+    for control in controls:
+        sim.step(control)
+        page.update(touch(sim.state()))
+
+The page is served by viser, an optional package: `pip install tgdsl[view]`.
+
+Shapes: `taxel` taxels of the chosen reading.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from io import StringIO
+from queue import SimpleQueue
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from matplotlib.colors import Colormap, Normalize
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from tgdsl.errors import TgdslError
+from tgdsl.module.memory.history import last_step
+from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
+from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.view.boxes import boxes_of, is_boxed
+from tgdsl.view.cameras import facing_camera
+from tgdsl.view.markers import Markers, markers_of
+from tgdsl.view.meshes import body_triangles, robot_bodies
+from tgdsl.view.overview import drawn_outputs
+from tgdsl.view.stages import SimStage, Stage
+from tgdsl.view.style import HEAT, WARMTH
+from tgdsl.view.taxels import Pose
+
+Array = np.ndarray
+LOCAL = "127.0.0.1"
+PORT = 8080
+FRAME = 1 / 30
+"""Least time between two frames [s]."""
+PLOT_SECONDS = 10.0
+"""How much of the past the plot shows [s]."""
+MAX_STEPS = 5
+"""Most control steps per frame: a scene slower than that runs behind real time."""
+_CARRIER, _ROBOT, _OBJECT, _REST = (176, 181, 190), (128, 134, 145), (60, 112, 186), (62, 72, 88)
+_DISC_RADIUS = (0.0006, 0.0022)
+_LIFT = 2e-4
+"""How far discs and arrows begin above the surface [m]."""
+_ARROW = 0.03
+"""Length of the arrow of the largest vector [m]."""
+_HEAT = HEAT.with_extremes(under=np.divide(_REST, 255))
+_SIGNED = matplotlib.colormaps["coolwarm"]
+MAGNITUDE = "magnitude"
+
+
+class Page:
+    """A page that shows a stage, and whose controls act on it.
+
+    Open it in any number of browsers; closing or reloading one changes nothing.
+
+    Args:
+        stage: The scene; see `show` for another.
+        host: Address to serve at; any but the local one lets others in the network see and control the scene.
+        port: Port; where it is taken, the next free one.
+    """
+
+    def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
+        with redirect_stdout(StringIO()):  # viser prints its address
+            self.server = _viser().ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
+        if host != LOCAL:
+            warnings.warn(f"the page is served at {host}: whoever reaches this machine can see and control it", stacklevel=2)
+        self._clicks: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._last_draw = -math.inf
+        self.show(stage)
+
+    @property
+    def url(self) -> str:
+        """The page's address."""
+        host = self.server.get_host()
+        return f"http://{'localhost' if host == LOCAL else host}:{self.server.get_port()}"
+
+    def show(self, stage: Stage) -> None:
+        """Show a stage in place of the one before; its camera stays."""
+        is_first = not hasattr(self, "stage")
+        chosen = None if is_first else self._reading.value
+        self.stage = stage
+        self._outputs = {output.name: output for output in drawn_outputs(stage.touch)}
+        if not self._outputs:
+            raise TgdslError("no sensor of this document has taxels, bodies or cells to draw")
+        self._picked: int | None = None
+        self._range: dict[tuple[str, str], float] = {}
+        self._history: deque[tuple[float, float]] = deque()
+        with self.server.atomic():
+            self.server.scene.reset()
+            self.server.gui.reset()
+            self._add_bodies()
+            self._add_controls(chosen)
+            self._add_discs()
+        self.draw()
+        if is_first:
+            self._place_camera()
+
+    def update(self, readings: Mapping[str, Tensor]) -> None:
+        """Take the readings of a loop of one's own, and draw them if the last frame is long enough ago."""
+        assert isinstance(self.stage, SimStage)
+        self.stage.update(readings)
+        if time.monotonic() - self._last_draw >= FRAME:
+            self._react()
+            self.draw()
+
+    def run(self, watch: Callable[[], Stage | str | None] = lambda: None, seconds: float = math.inf) -> None:
+        """Step the stage in real time and draw it, until interrupted.
+
+        Args:
+            watch: Asked before each frame for another stage to show, or for text of what is wrong with it; None: nothing new.
+            seconds: When to stop.
+        """
+        begin = before = time.monotonic()
+        due = 0.0
+        while time.monotonic() - begin < seconds:
+            start = time.monotonic()
+            change = watch()
+            if isinstance(change, Stage):
+                self.stage.close()
+                self.show(change)
+            elif change is not None:
+                self._problem.content = f"```\n{change}\n```" if change else ""
+            self._react()
+            due = 0.0 if self._paused.value else due + self._speed.value * (start - before)
+            before = start
+            steps = min(MAX_STEPS, int(due / self.stage.control_step))
+            due = min(due - steps * self.stage.control_step, self.stage.control_step)
+            for _ in range(steps):
+                self.stage.advance()
+            self.draw()
+            time.sleep(max(0.0, FRAME - (time.monotonic() - start)))
+
+    def close(self) -> None:
+        """Stop serving."""
+        with redirect_stdout(StringIO()):
+            self.server.stop()
+
+    def draw(self) -> None:
+        """Draw the stage as it is now."""
+        self._last_draw = time.monotonic()
+        env = self._env_index
+        pos, quat = self.stage.body_poses(env)
+        with self.server.atomic():
+            for body, frame in self._frames.items():
+                frame.position, frame.wxyz = pos[body], quat[body]
+            if self.stage.readings:
+                self._draw_touch(env, Pose(pos, quat))
+            self._draw_text()
+
+    # The scene -------------------------------------------------------------------------------------------------------------
+
+    def _add_bodies(self) -> None:
+        """Add a frame and a mesh for each body."""
+        model, links = self.stage.model, self.stage.touch.plan.layout.links
+        carriers = {model.body(link.body).id for link in links}
+        carriers |= {model.body(name).id for output in self._outputs.values() for name in output.bodies}
+        self._near, robot = robot_bodies(model, carriers)
+        scene = self.server.scene
+        scene.set_up_direction("+z")
+        self._frames, self._meshes = {}, {"robot": [], "objects": []}
+        for body in range(model.nbody):
+            self._frames[body] = scene.add_frame(f"/body{body}", show_axes=False)
+            corners, normals = body_triangles(model, body, links)
+            if not len(corners):
+                continue
+            colour = _CARRIER if body in carriers else _ROBOT if body in robot or body == 0 else _OBJECT
+            vertices, faces = _joined(corners, normals)
+            mesh = scene.add_mesh_simple(f"/body{body}/mesh", vertices, faces, color=colour)
+            self._meshes["robot" if body in robot or body == 0 else "objects"].append(mesh)
+
+    def _add_discs(self) -> None:
+        """Add a disc for each row of the chosen reading, in the frame of its body."""
+        for handle in getattr(self, "_discs", {}).values():
+            handle.remove()
+        self._discs: dict[int, Any] = {}
+        table = self._table()
+        angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])
+        faces = np.array([[0, 1 + i, 1 + (i + 1) % 16] for i in range(16)])
+        for body in np.unique(table.body):
+            rows = np.flatnonzero(table.body == body)
+            turns = [Rotation.align_vectors(normal[None], [[0, 0, 1]])[0] for normal in table.normal[rows]]
+            handle = self.server.scene.add_batched_meshes_simple(
+                f"/body{body}/taxels",
+                corners,
+                faces,
+                np.array([turn.as_quat(scalar_first=True) for turn in turns]),
+                table.pos[rows] + _LIFT * table.normal[rows],
+                batched_scales=np.clip(0.45 * table.size[rows], *_DISC_RADIUS),
+                batched_colors=np.tile(np.uint8(_REST), (len(rows), 1)),
+                side="double",
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            handle.on_click(lambda event, rows=rows: self._clicks.put(lambda: self._pick(int(rows[event.instance_index]))))
+            self._discs[int(body)] = handle
+        self._table_now, self._rows_of = table, {int(b): np.flatnonzero(table.body == b) for b in np.unique(table.body)}
+
+    def _table(self) -> _Rows:
+        """Return where the chosen reading's rows are in the frames of their bodies."""
+        model, touch, output = self.stage.model, self.stage.touch, self._output
+        if is_boxed(touch, output):
+            layout = boxes_of(touch, output, self.stage.readings[output.name], 0).layout
+            names = [layout.links[i].body for i in layout.link_id]
+            pos, normal = layout.pos, layout.normal / np.linalg.norm(layout.normal, axis=1, keepdims=True)
+            size, labels = np.sqrt(layout.area), [f"{name}, cell {i}" for i, name in enumerate(names)]
+        else:
+            table = touch.taxels[output.sensor]
+            pos, normal, size = table["pos"], table["normal"], np.sqrt(table["area"]) * (table["radius"] > 0)
+            names, labels = list(table["body"]), [f"{link}, taxel {i}" for i, link in enumerate(table["link"])]
+            if output.rows == "body":
+                member = np.array([table["body"] == name for name in output.bodies])
+                pos, normal, size = (np.array([part[rows].mean(axis=0) for rows in member]) for part in (pos, normal, 3 * size))
+                normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+                names = labels = list(output.bodies)
+        return _Rows(np.array([model.body(name).id for name in names]), np.array(pos), np.array(normal), np.array(size), labels)
+
+    def _place_camera(self) -> None:
+        """Look at what carries taxels, from where most of these face."""
+        pose = Pose(*self.stage.body_poses(0))
+        table = self._table_now
+        turn = Rotation.from_quat(pose.quat[table.body], scalar_first=True)
+        pos, normal = pose.pos[table.body] + turn.apply(table.pos), turn.apply(table.normal)
+        camera = facing_camera(Markers(pos, normal, table.size, np.zeros(len(pos)), "", ""), pose.pos[min(self._near)])
+        centre = 0.5 * (pos.min(axis=0) + pos.max(axis=0))
+        reach = max(0.03, float(np.linalg.norm(pos - centre, axis=1).max()))
+        initial = self.server.initial_camera
+        initial.position, initial.look_at, initial.up = centre + 2.4 * reach * camera.toward, centre, camera.up
+        initial.near = 0.1 * reach
+
+    # Touch -----------------------------------------------------------------------------------------------------------------
+
+    @property
+    def _output(self) -> Output:
+        return self._outputs[self._reading.value]
+
+    @property
+    def _env_index(self) -> int:
+        return int(self._env.value) if self._env is not None else 0
+
+    def _draw_touch(self, env: int, pose: Pose) -> None:
+        """Colour the discs, and draw arrows, the legend and the plot."""
+        output, channel = self._output, self._channel.value
+        readings = self.stage.readings[output.name]
+        vector, markers = None, None
+        if is_boxed(self.stage.touch, output):
+            boxes = boxes_of(self.stage.touch, output, readings, env)
+            value, unit, colours = boxes.value[boxes.chosen], boxes.unit, WARMTH
+            norm, label = boxes.norm, boxes.label
+        elif channel == MAGNITUDE:
+            markers = markers_of(self.stage.touch, _Fixed(self.stage.model, pose), output, readings, env)
+            value, unit, colours, vector = markers.value / markers.scale, _unit(output.units[0]), _HEAT, markers.vector
+            norm, label = Normalize(1e-12, self._widened(output, channel, value), clip=False), f"{markers.quantity} [{unit}]"
+        else:
+            i = output.channels.index(channel)
+            value = last_step(readings)[env, ..., i].detach().cpu().double().numpy().reshape(-1)
+            unit, colours, most = _unit(output.units[i]), _SIGNED, self._widened(output, channel, value)
+            norm, label = Normalize(-most, most, clip=True), f"{channel} [{unit}]"
+        colour = _rgb(colours, norm, value)
+        for body, rows in self._rows_of.items():
+            self._discs[body].batched_colors = colour[rows]
+        self._draw_arrows(markers, vector)
+        self._legend.content = _legend(colours, norm, label)
+        picked = self._picked
+        shown = value.mean() if is_boxed(self.stage.touch, output) else value.sum()
+        self._history.append((self.stage.time, float(shown if picked is None else value[picked])))
+        while self._history and not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
+            self._history.popleft()
+        name = ("mean" if is_boxed(self.stage.touch, output) else "sum") if picked is None else self._table_now.labels[picked]
+        reads = f"{self._history[-1][1]:.4g} {unit}" if self._history else ""
+        self._reads.content = f"**{name}**: {label.split(' [')[0]} {reads}"
+        if len(self._history) > 1:
+            times, values = np.array(self._history).T
+            self._plot.data = (times, values)
+
+    def _widened(self, output: Output, channel: str, value: Float[Array, " taxel"]) -> float:
+        """Return the largest size that was read so far: the end of the colours."""
+        key = (output.name, channel)
+        most = float(np.abs(value[np.isfinite(value)]).max(initial=0.0))
+        self._range[key] = max(self._range.get(key, 1e-9), most)
+        return self._range[key]
+
+    def _draw_arrows(self, markers: Markers | None, vector: Float[Array, "taxel 3"] | None) -> None:
+        """Draw vectors from the taxels where the reading is a vector and arrows are asked for."""
+        points = np.zeros((0, 2, 3), dtype=np.float32)
+        if markers is not None and vector is not None and self._arrows.value and markers.is_read.any():
+            longest = self._range[self._output.name, MAGNITUDE]
+            begin = markers.pos[markers.is_read] + _LIFT * markers.normal[markers.is_read]
+            points = np.stack([begin, begin + _ARROW / longest * vector[markers.is_read]], axis=1).astype(np.float32)
+        if self._arrow_handle is not None:
+            self._arrow_handle.remove()
+            self._arrow_handle = None
+        if len(points):
+            self._arrow_handle = self.server.scene.add_line_segments(
+                "/arrows", points, (30, 30, 30), thickness=2.0, thickness_units="screen"
+            )
+
+    def _draw_text(self) -> None:
+        """Write the time, and what the stage notes."""
+        notes = self.stage.notes(self._env_index)
+        rows = "".join(
+            f"\n| {name} | {f'{value:.4g}' if isinstance(value, float) else value} |" for name, value in notes.items()
+        )
+        self._notes.content = f"| | |\n|---|---|{rows}" if rows else ""
+        self._status.content = f"t = {self.stage.time:.2f} s · {len(self._table_now.body)} taxels"
+        if self._instant is not None and self.stage.step_index != int(self._instant.value):
+            self._instant.value = self._seen_instant = self.stage.step_index
+
+    # Controls --------------------------------------------------------------------------------------------------------------
+
+    def _add_controls(self, reading: str | None) -> None:
+        """Add the page's panel; what it is set to is read before each frame."""
+        import viser.uplot as uplot
+
+        gui, stage = self.server.gui, self.stage
+        self._problem = gui.add_markdown("")
+        self._status = gui.add_markdown("")
+        self._env = gui.add_slider("environment", 0, stage.num_envs - 1, 1, 0) if stage.num_envs > 1 else None
+        self._instant = gui.add_slider("step", 0, max(1, (stage.num_steps or 2) - 1), 1, 0) if stage.num_steps else None
+        self._seen_instant = 0
+        self._paused = gui.add_checkbox("pause", False)
+        self._speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
+        gui.add_button("step once").on_click(lambda _: self._clicks.put(self._step_once))
+        gui.add_button("restart").on_click(lambda _: self._clicks.put(self._restart))
+        with gui.add_folder("touch"):
+            names = list(self._outputs)
+            self._reading = gui.add_dropdown("reading", names, initial_value=reading if reading in names else names[0])
+            self._seen_reading = self._reading.value
+            self._channel = gui.add_dropdown("channel", self._channels())
+            self._arrows = gui.add_checkbox("arrows", True)
+            self._arrow_handle: Any = None
+            self._legend = gui.add_html("")
+            self._reads = gui.add_markdown("")
+            series = (uplot.Series(label="t [s]"), uplot.Series(label="reading", stroke="#c2410c", width=2))
+            data = (np.array([0.0, 1.0]), np.array([0.0, 0.0]))
+            self._plot = gui.add_uplot(data, series, scales={"x": uplot.Scale(time=False)}, aspect=2.0)
+        self._notes = gui.add_markdown("")
+        with gui.add_folder("show", expand_by_default=False):
+            self._shown = {name: gui.add_checkbox(name, True) for name in ("robot", "objects", "taxels")}
+        self._sliders: list[Any] = []
+        if stage.control is not None and len(stage.control):
+            with gui.add_folder("actuators"):
+                self._keyframe = gui.add_dropdown("keyframe", self._keyframes())
+                self._seen_keyframe = self._keyframe.value
+                for i, (low, high) in enumerate(stage.model.actuator_ctrlrange):
+                    low, high = (float(low), float(high)) if stage.model.actuator_ctrllimited[i] else (-1.0, 1.0)
+                    value = float(np.clip(stage.control[i], low, high))
+                    name = stage.model.actuator(i).name or f"actuator {i}"
+                    self._sliders.append(gui.add_slider(name, low, high, (high - low) / 200, value))
+
+    def _channels(self) -> tuple[str, ...]:
+        output = self._output
+        return (output.channels[0],) if is_boxed(self.stage.touch, output) else (MAGNITUDE, *output.channels)
+
+    def _keyframes(self) -> tuple[str, ...]:
+        model = self.stage.model
+        return ("", *(model.key(i).name for i in range(model.nkey) if model.key(i).name))
+
+    def _react(self) -> None:
+        """Do what was clicked and set since the last frame."""
+        while not self._clicks.empty():
+            self._clicks.get()()
+        if self._reading.value != self._seen_reading:
+            self._seen_reading, self._picked = self._reading.value, None
+            self._history.clear()
+            self._channel.options = self._channels()
+            self._channel.value = self._channels()[0]
+            self._add_discs()
+        elif self._channel.value not in self._channels():
+            self._channel.value = self._channels()[0]
+        if self._instant is not None and int(self._instant.value) != self._seen_instant:
+            self._seen_instant = int(self._instant.value)
+            self.stage.seek(self._seen_instant)
+        for name, meshes in self._meshes.items():
+            for mesh in meshes:
+                mesh.visible = self._shown[name].value
+        for disc in self._discs.values():
+            disc.visible = self._shown["taxels"].value
+        if self._sliders:
+            self._read_actuators()
+
+    def _read_actuators(self) -> None:
+        """Take the actuators' values from their sliders, or these from a keyframe that was chosen."""
+        assert self.stage.control is not None
+        if self._keyframe.value != self._seen_keyframe:
+            self._seen_keyframe = self._keyframe.value
+            if self._keyframe.value:
+                self._set_sliders(self.stage.model.key(self._keyframe.value).ctrl)
+        self.stage.control[:] = [slider.value for slider in self._sliders]
+
+    def _set_sliders(self, control: Float[Array, " actuator"]) -> None:
+        for slider, value in zip(self._sliders, control, strict=True):
+            slider.value = float(np.clip(value, slider.min, slider.max))
+
+    def _step_once(self) -> None:
+        self._paused.value = True
+        self.stage.advance()
+
+    def _restart(self) -> None:
+        self.stage.restart()
+        self._history.clear()
+        if self._sliders and self.stage.control is not None:
+            self._set_sliders(self.stage.control)
+
+    def _pick(self, row: int) -> None:
+        """Show one taxel's name and reading; a second click on it shows all again."""
+        self._picked = None if self._picked == row else row
+        self._history.clear()
+
+
+class _Rows:
+    """Rows of a reading in the frames of their bodies: body, position [m], normal, width [m] and a label."""
+
+    def __init__(
+        self, body: Int[Array, " taxel"], pos: Float[Array, "taxel 3"], normal: Float[Array, "taxel 3"],
+        size: Float[Array, " taxel"], labels: list[str],
+    ):  # fmt: skip
+        self.body, self.pos, self.normal, self.size, self.labels = body, pos, normal, size, labels
+
+
+class _Fixed:
+    """A model and the pose that its bodies have in a frame."""
+
+    def __init__(self, model: Any, pose: Pose):
+        self.model, self._pose = model, pose
+
+    def body_poses(self, env: int) -> Pose:
+        """Return the pose."""
+        return self._pose
+
+
+def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int = PORT) -> Page:
+    """Show a simulation that a loop of one's own steps, in the browser; call the page's `update` with each step's readings.
+
+    Args:
+        touch: The module.
+        sim: The simulation.
+        host: Address to serve at: see `Page`.
+        port: Port to serve at.
+
+    Raises:
+        TgdslError: If viser is not installed, or the module has nothing to draw.
+    """
+    stage = SimStage(touch, sim)
+    page = Page(stage, host, port)
+    print(f"tgdsl view: {page.url}")
+    return page
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise TgdslError("the live page needs viser: pip install 'tgdsl[view]'") from error
+    return viser
+
+
+def _joined(corners: Float[Array, "face 3 3"], normals: Float[Array, "face 3 3"]) -> tuple[Array, Array]:
+    """Return vertices and faces; corners are one vertex where place and normal agree, so that edges stay sharp."""
+    both = np.concatenate([corners.reshape(-1, 3) * 1e6, normals.reshape(-1, 3) * 1e3], axis=1).round().astype(np.int64)
+    _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    return corners.reshape(-1, 3)[first].astype(np.float32), inverse.reshape(-1, 3).astype(np.uint32)
+
+
+def _rgb(colours: Colormap, norm: Normalize, value: Float[Array, " taxel"]) -> UInt8[Array, "taxel 3"]:
+    return (255 * np.asarray(colours(norm(value)))[:, :3]).astype(np.uint8)
+
+
+def _unit(unit: str) -> str:
+    return {"1": "", "degC": "°C"}.get(unit, unit)
+
+
+def _legend(colours: Colormap, norm: Normalize, label: str) -> str:
+    """Return the colour bar as HTML."""
+    low, high = float(norm.vmin or 0.0), float(norm.vmax or 1.0)
+    stops = ", ".join(matplotlib.colors.to_hex(colours(x)) for x in np.linspace(0, 1, 9))
+    low_text = "0" if abs(low) < 1e-11 else f"{low:.3g}"
+    return (
+        f'<div style="padding:0 0.75em"><div>{label}</div>'
+        f'<div style="height:0.7em;background:linear-gradient(to right, {stops})"></div>'
+        f'<div style="display:flex;justify-content:space-between"><span>{low_text}</span><span>{high:.3g}</span></div></div>'
+    )

@@ -1,0 +1,202 @@
+"""Stages that a page shows: a scene at one instant, how it goes on, and what its taxels read.
+
+Shapes: `env` environments, `step` control steps, `actuator` actuators.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.scripted import substeps_of
+from tgdsl.runtime.simulate import simulate
+from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.scene.scene import scene_model
+
+Array = np.ndarray
+
+
+class Stage(ABC):
+    """A scene at one instant.
+
+    Attributes:
+        touch: The module whose taxels are shown.
+        model: The compiled scene.
+        num_envs: Number of environments.
+        control_step: Duration of one step [s].
+        time: The instant [s].
+        readings: What the taxels read then.
+        control: Values that a user may set, one per actuator; None where something else acts.
+        num_steps: Number of instants of a recorded run; None: the scene goes on without end.
+    """
+
+    touch: TactileModule
+    model: mujoco.MjModel
+    num_envs: int
+    control_step: float
+    time: float
+    readings: Mapping[str, Tensor]
+    control: Float[Array, " actuator"] | None = None
+    num_steps: int | None = None
+
+    @abstractmethod
+    def advance(self) -> None:
+        """Go on by one control step; at the end of a recorded run, stay."""
+
+    @abstractmethod
+    def restart(self) -> None:
+        """Begin again."""
+
+    @abstractmethod
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return origins [m] and quaternions w, x, y, z of all bodies in one environment, in the world."""
+
+    def seek(self, step: int) -> None:
+        """Go to an instant of a recorded run."""
+        raise NotImplementedError(f"{type(self).__name__} is not recorded")
+
+    @property
+    def step_index(self) -> int:
+        """Which instant of a recorded run this is."""
+        return 0
+
+    def notes(self, env: int) -> Mapping[str, float]:
+        """Return what else there is to say of this instant in one environment, by name, such as a task's reward terms."""
+        return {}
+
+    def close(self) -> None:  # noqa: B027
+        """Release the simulator; of a recorded run, nothing."""
+
+
+class SimStage(Stage):
+    """A simulation that its user steps; `update` says what the module has read."""
+
+    def __init__(self, touch: TactileModule, sim: Simulation):
+        self.touch, self.sim, self.model = touch, sim, sim.model
+        self.num_envs, self.control_step = sim.num_envs, sim.control_step
+        self.time = 0.0
+        self.readings: Mapping[str, Tensor] = {}
+
+    def update(self, readings: Mapping[str, Tensor]) -> None:
+        """Take the readings of the simulator's instant."""
+        self.readings = readings
+        self.time += self.control_step
+
+    def advance(self) -> None:
+        """Leave the steps to the user's loop."""
+
+    def restart(self) -> None:
+        """Leave resets to the user's loop."""
+
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return where the bodies are."""
+        return self.sim.body_poses(env)
+
+
+class SceneStage(SimStage):
+    """A document's scene in MuJoCo, whose actuators follow `control`."""
+
+    def __init__(self, touch: TactileModule, num_envs: int = 1):
+        super().__init__(touch, simulate(touch, num_envs, substeps=substeps_of(touch, 5), on_fault="reset"))
+        self.control = self._start_control()
+        self.readings = touch(self.sim.state())
+
+    def advance(self) -> None:
+        """Step the scene."""
+        self.sim.step(self.control)
+        self.update(self.touch(self.sim.state()))
+
+    def restart(self) -> None:
+        """Begin from the model's initial state."""
+        self.sim.reset()
+        self.touch.reset()
+        self.control, self.time = self._start_control(), 0.0
+        self.readings = self.touch(self.sim.state())
+
+    def close(self) -> None:
+        """Release the simulator."""
+        self.sim.close()
+
+    def _start_control(self) -> Float[Array, " actuator"]:
+        """Return the controls of the first keyframe that holds the initial pose; else zero."""
+        for key in range(self.model.nkey):
+            if np.array_equal(self.model.key_qpos[key], self.model.qpos0):
+                return self.model.key_ctrl[key].copy()
+        return np.zeros(self.model.nu)
+
+
+class RunStage(Stage):
+    """A run that `tgdsl run` recorded, instant by instant."""
+
+    def __init__(self, touch: TactileModule, path: Path):
+        """Read a run.
+
+        Raises:
+            SimulationError: If the file holds no positions, or is of another scene or other sensors.
+        """
+        self.touch, self.model = touch, scene_model(touch.plan.scene)
+        arrays = read_run(path)
+        self._qpos, self._times = arrays["qpos"], arrays["time"]
+        self._readings = {output.name: arrays.get(output.name) for output in touch.outputs}
+        missing = [name for name, values in self._readings.items() if values is None]
+        if missing or self._qpos.shape[-1] != self.model.nq:
+            has = f'has no reading "{missing[0]}"' if missing else f"has {self._qpos.shape[-1]} numbers in `qpos`"
+            raise SimulationError(f"{path}: the run {has}, and the scene has {self.model.nq}: was the document changed since?")
+        self.num_steps, self.num_envs = self._qpos.shape[:2]
+        self.control_step = float(self._times[0])
+        self._data = mujoco.MjData(self.model)
+        self.seek(0)
+
+    def seek(self, step: int) -> None:
+        """Go to an instant."""
+        self._index = int(np.clip(step, 0, len(self._times) - 1))
+        self.time = float(self._times[self._index])
+        self.readings = {
+            name: torch.from_numpy(values[self._index]) for name, values in self._readings.items() if values is not None
+        }
+
+    @property
+    def step_index(self) -> int:
+        """Which instant this is."""
+        return self._index
+
+    def advance(self) -> None:
+        """Go to the next instant."""
+        self.seek(self._index + 1)
+
+    def restart(self) -> None:
+        """Go to the first instant."""
+        self.seek(0)
+
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return where MuJoCo's kinematics put the bodies."""
+        self._data.qpos[:] = self._qpos[self._index, env]
+        mujoco.mj_kinematics(self.model, self._data)
+        return self._data.xpos.copy(), self._data.xquat.copy()
+
+
+def read_run(path: Path) -> dict[str, Any]:
+    """Return the arrays of a run that `tgdsl run` recorded.
+
+    Raises:
+        SimulationError: If it is none.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, EOFError, ValueError, BadZipFile) as error:
+        raise SimulationError(f"{path}: expected a run, as `tgdsl run` writes it: {error}") from error
+    if missing := [name for name in ("time", "qpos", "document") if name not in arrays]:
+        raise SimulationError(f"{path}: expected a run, as `tgdsl run` writes it; it has no `{missing[0]}`")
+    return arrays
