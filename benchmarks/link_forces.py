@@ -16,23 +16,21 @@ import torch
 from tgdsl.commands.arguments import parsed_overrides
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.policy import policy_for, read_policy
+from tgdsl.rl.playing.rollout import rollout
 
 
 def link_forces(options: argparse.Namespace) -> tuple[torch.Tensor, torch.Tensor]:
     """Return forces [N] and depths [mm], of all links, instants and environments in one row, until episodes end."""
     env = TouchEnv(options.task, options.envs, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
-    policy, obs, found, depths = policy_for(env, read_policy(options.policy)), env.reset(), [], []
-    going_on = torch.ones(options.envs, dtype=torch.bool)
-    for _ in range(env.max_steps):
-        made = env.step(policy(obs))
-        obs = made.obs
-        going_on &= ~made.info.ended
+    found, depths, going_on = [], [], torch.ones(options.envs, dtype=torch.bool)
+    env.reset()
+    for moment in rollout(policy_for(env, read_policy(options.policy)), env, env.max_steps):
+        going_on &= ~moment.step.info.ended
         force = torch.linalg.vector_norm(env.now.link_force[going_on], dim=2).flatten()
         found.append(force[force > 0])
         depth = -1e3 * env.now.distance[going_on].flatten(1)
         depth = depth.amax(dim=1) if depth.shape[1] else depth.flatten()  # of a task without such probes
         depths.append(depth[depth > 0])
-        policy.begin(made.info.ended)
     env.close()
     return torch.cat(found).double(), torch.cat(depths).double()
 

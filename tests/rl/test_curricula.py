@@ -138,7 +138,7 @@ def test_a_curriculum_of_ones_own_and_its_state(tmp_path):
         ),
         (("rewards.effort", "terms.more.end"), "terms.more.of", 'there is no number "terms.more.end" that can change'),
         (("rewards.effort", "episode"), "terms.more.of", 'there is no number "episode" that can change'),
-        (("rewards.effort", "max_force"), "terms.more", "max_force would be 0: "),
+        (("rewards.effort", "max_force"), "terms.more", "max_force would be -0.5: -0.5 is out of range, expected more than 0"),
         (("rewards.effort", "hold.coasting_pay"), "terms.more", "hold.coasting_pay would be -0.5: "),
         (("last: 30", "last: 10"), "terms.more", "first and last are both 10"),
     ],

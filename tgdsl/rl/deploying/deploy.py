@@ -284,7 +284,8 @@ class Deployment:
             sums.seconds += hand.seconds
             sums.ages.append(hand.age_s)
             sums.inferences.append(hand.inference_s)
-            yield HandMoment(*vars(moment).values(), episode, hand.target, hand.age_s, hand.inference_s)
+            asked = {"episode": episode, "target": hand.target, "age_s": hand.age_s, "inference_s": hand.inference_s}
+            yield HandMoment(**vars(moment), **asked)
             if info.ended or connection.is_over:
                 break
         sums.late_steps += getattr(connection.source, "num_late_steps", 0) - late
