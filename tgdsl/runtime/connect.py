@@ -292,6 +292,6 @@ def _read(calibration: Calibration | str | Path | None) -> Calibration | None:
 def _only_port() -> str:
     ports = [port.device for port in list_ports() if port.device.startswith(_USB_PORTS)]
     if len(ports) != 1:
-        found = listed(ports) or "none"
-        raise HandError(f'expected one USB serial port, found {found}; name the hand\'s: source="xhand1:/dev/ttyUSB0"')
+        port_names = listed(ports) or "none"
+        raise HandError(f'expected one USB serial port, found {port_names}; name the hand\'s: source="xhand1:/dev/ttyUSB0"')
     return ports[0]

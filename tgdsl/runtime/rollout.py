@@ -189,8 +189,8 @@ class Recorder:
     def add(self, step: Step) -> None:
         """Keep one step."""
         self._time[step.index] = step.time
-        for name, kept in self._readings.items():
-            kept[step.index] = step.readings[name].detach().cpu().numpy()
+        for name, column in self._readings.items():
+            column[step.index] = step.readings[name].detach().cpu().numpy()
 
     def write(self, path: Path, controls: Controls) -> None:
         """Write the file; it appears whole or not at all."""

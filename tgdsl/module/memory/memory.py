@@ -36,9 +36,9 @@ class StateWatch:
         """Note what is to be looked at."""
         rows = {sensor.name: [f"{sensor.sensor}[{i}]" for i in range(sensor.readings[0].num_rows)] for sensor in sensors}
         self._watched = [
-            (f"{own.name}:{state}", own, tuple(row for name in own.upstream for row in rows[name]), warn)
-            for own in sensors
-            for state, warn in (kinds[own.name].warns if own.name in kinds else ())
+            (f"{sensor.name}:{state}", sensor, tuple(row for name in sensor.upstream for row in rows[name]), warn)
+            for sensor in sensors
+            for state, warn in (kinds[sensor.name].warns if sensor.name in kinds else ())
         ]
         self._said: set[str] = set()
         self._num_calls = 0

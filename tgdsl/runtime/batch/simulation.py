@@ -107,9 +107,9 @@ class BatchProperties(ObjectProperties):
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
-        for env, wanted in zip(ids.tolist(), mass.numpy()[ids], strict=True):
+        for env, new_mass in zip(ids.tolist(), mass.numpy()[ids], strict=True):
             model, bodies = self._chosen[env], target.bodies  # not of what it has now: rounding would add up
-            factor = wanted / model.body_mass[bodies].sum()
+            factor = new_mass / model.body_mass[bodies].sum()
             self._row("body_mass", env)[bodies] = factor * model.body_mass[bodies]
             self._row("body_inertia", env)[bodies] = factor * model.body_inertia[bodies]
         self._derive(ids)
@@ -127,8 +127,8 @@ class BatchProperties(ObjectProperties):
 
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
-        for env, wanted in zip(ids.tolist(), friction.numpy()[ids], strict=True):
-            self._row("geom_friction", env)[target.geoms, 0] = wanted
+        for env, coefficient in zip(ids.tolist(), friction.numpy()[ids], strict=True):
+            self._row("geom_friction", env)[target.geoms, 0] = coefficient
         if self._models is not None:
             self._batch.set_models(self._models)
 
@@ -226,8 +226,8 @@ class _PointSensor:
             if bits >> int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{quantity.upper()}")) & 1:
                 columns[quantity] = list(itertools.islice(end, width))
         self._margin = _least_margin(model, sensor)
-        wanted = [*(_OF_SLOTS if num_slots else ()), *(() if self._margin is None else ("dist", "force"))]
-        if missing := [quantity for quantity in ("found", *wanted) if quantity not in columns]:
+        required = [*(_OF_SLOTS if num_slots else ()), *(() if self._margin is None else ("dist", "force"))]
+        if missing := [quantity for quantity in ("found", *required) if quantity not in columns]:
             raise SimulationError(f'the contact sensor "{name}" does not show {listed(missing)}; {_ADVICE}')
         if self._num < num_slots:
             raise SimulationError(f'the contact sensor "{name}" shows {self._num} contacts, expected {num_slots}; {_ADVICE}')
@@ -358,9 +358,9 @@ class BatchReader:
 
     def read(self, rows: SomeRows = None) -> dict[str, torch.Tensor]:
         """Return the fields of some environments (default: all), (env, …), each an array of its own."""
-        chosen = slice(None) if rows is None else rows
-        live = {name: getattr(self._batch, name)[chosen] for name in self._reader.names}
-        return self._reader.read(live, {name: kept[chosen].copy() for name, kept in self._kept.items()})
+        envs = slice(None) if rows is None else rows
+        live = {name: getattr(self._batch, name)[envs] for name in self._reader.names}
+        return self._reader.read(live, {name: kept[envs].copy() for name, kept in self._kept.items()})
 
     def _joints_now(self, name: str, rows: SomeRows = None) -> Array:
         array = getattr(self._batch, self._reader.joints.fields[name])

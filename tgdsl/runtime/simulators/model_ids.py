@@ -39,14 +39,14 @@ def element_id(model: mujoco.MjModel, kind: str, name: str) -> int:
         return int(element(name).id)
     except KeyError as error:
         count, one, several = _ELEMENTS[kind]
-        known = [element(i).name for i in range(getattr(model, count))]
-        nested = [i for i, path in enumerate(known) if path.endswith(f"/{name}")]
+        paths = [element(i).name for i in range(getattr(model, count))]
+        nested = [i for i, path in enumerate(paths) if path.endswith(f"/{name}")]
         if len(nested) == 1:
             return nested[0]
         if nested:
-            what = f'"{name}" may be any of the {several} {listed([known[i] for i in nested])}'
-            raise SimulationError(f"{what}; say which: touch.inputs.renamed({{{name!r}: {known[nested[0]]!r}}})") from error
-        raise SimulationError(f'the scene has no {one} "{name}"; {did_you_mean(name, known, several)}') from error
+            problem = f'"{name}" may be any of the {several} {listed([paths[i] for i in nested])}'
+            raise SimulationError(f"{problem}; say which: touch.inputs.renamed({{{name!r}: {paths[nested[0]]!r}}})") from error
+        raise SimulationError(f'the scene has no {one} "{name}"; {did_you_mean(name, paths, several)}') from error
 
 
 def keyframe_id(model: mujoco.MjModel, name: str | None) -> int:

@@ -485,13 +485,13 @@ class Simulation(ABC):
         if self._objects is None and (variants or sizes or not (temperatures or materials)):
             raise SimulationError("no object of this module differs between environments")
         ids = env_indices(env_ids, self.num_envs)
-        chosen = self.heat.choose(ids, temperatures or {}, materials or {})
+        heat = self.heat.choose(ids, temperatures or {}, materials or {})
         if self._objects is not None and (variants or sizes):
             self._objects.choose(ids, variants or {}, sizes or {})
             self._use_objects(self._objects)
             self._object_fields["variant"].copy_(torch.from_numpy(self._objects.variant))
             self._object_fields["object_size"].copy_(torch.from_numpy(self._objects.object_size))
-        self.heat.write(ids, chosen)
+        self.heat.write(ids, heat)
         self.reset(ids)
 
     def repeated(self, body: Callable[[], T]) -> Callable[[], T]:

@@ -498,8 +498,8 @@ class WarpSimulation(Simulation):
     def _give_back(self, is_new: Bool[Tensor, " env"], earlier: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
         """Give environments that are not new back what they had, and take the joints of those that are."""
         is_old = ~is_new
-        for name, before in earlier.items():
-            put_rows(arrays[name], is_old, before)
+        for name, old in earlier.items():
+            put_rows(arrays[name], is_old, old)
         for name, kept in self._kept.items():
             put_rows(kept, is_new, self._arrays[name])
 
@@ -507,8 +507,8 @@ class WarpSimulation(Simulation):
         """Keep MuJoCo Warp from evaluating the sensors that `contacts` stands in for; with no others, from looking for any."""
         foreign = foreign_sensors(model, inputs)
         for name in ("sensor_contact_pos_adr", "sensor_contact_acc_adr"):  # of the stages of positions and of forces
-            kept = np.intersect1d(getattr(self.warp_model, name).numpy(), foreign)
-            setattr(self.warp_model, name, wp.array(kept, dtype=int))
+            addresses = np.intersect1d(getattr(self.warp_model, name).numpy(), foreign)
+            setattr(self.warp_model, name, wp.array(addresses, dtype=int))
         if not len(foreign):
             self.warp_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 

@@ -156,17 +156,17 @@ def _joint_of(name: str) -> int:
 def _fingers(plan: Plan, sensor: PlannedSensor) -> tuple[int, ...]:
     links = plan.layout_of(sensor).links
     fingers = [finger_of(link.body) for link in links]
-    others = [link.name for link, finger in zip(links, fingers, strict=True) if finger is None]
-    if others:
-        raise ObservationError(f'"{sensor.sensor}" is on {", ".join(others)}, where it has no sensor')
-    known = [finger for finger in fingers if finger is not None]
-    twice = sorted({FINGERS[finger] for finger in known if known.count(finger) > 1})
+    bare_links = [link.name for link, finger in zip(links, fingers, strict=True) if finger is None]
+    if bare_links:
+        raise ObservationError(f'"{sensor.sensor}" is on {", ".join(bare_links)}, where it has no sensor')
+    finger_ids = [finger for finger in fingers if finger is not None]
+    twice = sorted({FINGERS[finger] for finger in finger_ids if finger_ids.count(finger) > 1})
     if twice:
         raise ObservationError(f'"{sensor.sensor}" has several links on one fingertip: {", ".join(twice)}')
     sides = {link.body.split("_hand_")[0].endswith("right") for link in links}
     if len(sides) > 1:
         raise ObservationError(f'"{sensor.sensor}" is on two hands')
-    return tuple(known)
+    return tuple(finger_ids)
 
 
 class HandObserver:
