@@ -34,7 +34,7 @@ class SlotWatch:
     """Looks at states for contacts beyond the slots. Each pair is warned of once."""
 
     def __init__(self, inputs: Inputs):
-        """Begin; nothing has been seen."""
+        """Begin; no state has come yet."""
         self._inputs = inputs
         fields = {"contact_found", "contact_force", "contact_netforce"}
         self._num_pairs = len(inputs.pairs) if inputs.slots and fields <= set(inputs.fields) else 0

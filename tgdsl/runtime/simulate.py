@@ -1,4 +1,4 @@
-"""Simulation of a module's scene, by the simulator that is taken for a device."""
+"""Simulation of a module's scene by a device's default simulator."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def simulate(
 
 
 def simulator_for(device: str, name: str | None = None) -> SimulatorKind:
-    """Return a simulator: by its name, or the one that is taken for a device.
+    """Return a simulator: by its name, or the default of a device.
 
     Args:
         device: Where physics runs.

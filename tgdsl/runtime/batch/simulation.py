@@ -166,7 +166,7 @@ CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")
 _WIDTH = {"found": 1, "force": 3, "torque": 3, "dist": 1, "pos": 3, "normal": 3, "tangent": 3}
 """How many numbers each quantity has that a contact sensor may show, in MuJoCo's order."""
 _OF_SLOTS = ("force", "torque", "pos", "normal", "tangent")
-"""What a contact in a slot is made of, three numbers each."""
+"""The vectors of a contact in a slot, three numbers each."""
 _ADVICE = "add them with tgdsl.instrument(spec, touch.inputs) before compiling"
 
 

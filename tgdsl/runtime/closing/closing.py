@@ -490,7 +490,7 @@ def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
     """Return the pairs of the robot's bodies that could collide.
 
     Fingers that meet before they meet the object would hold each other off it; and MuJoCo collides a link with its parent
-    where that is fixed to the world, although both are made to overlap at the joint.
+    where that is fixed to the world, although both overlap at the joint by design.
     """
     model = moving.model
     excluded = {int(signature) for signature in model.exclude_signature}

@@ -68,7 +68,7 @@ class SimOptions(TypedDict, total=False):
     njmax: int | None
     """On a GPU, capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make."""
     model: mujoco.MjModel | None
-    """A model of one's own in place of the artefact's scene; its objects are the same in all environments. On the CPU it has to
+    """A model that replaces the artefact's scene; its objects are the same in all environments. On the CPU it has to
     hold the contact sensors that `tgdsl.instrument` adds."""
     prepare: Callable[[mujoco.MjSpec], None] | None
     """On the CPU, changes the artefact's scene before it is compiled; bodies and contact sensors must stay."""

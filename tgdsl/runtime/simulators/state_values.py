@@ -169,7 +169,7 @@ FIELDS = (
 )
 """Fields of a state that follow from forces."""
 Contacts = str | Mapping[str, Tensor]
-"""How the contacts of a start are found, "evaluate" or "none", or what they are: see `Simulation.reset`."""
+"""The contacts of a start, or how to get them, "evaluate" or "none": see `Simulation.reset`."""
 
 
 class StartContacts:

@@ -1,4 +1,4 @@
-"""What a task looks at besides touch: bodies, sites, joints and pairs by name, all of the instant that readings are of.
+"""What a task reads in addition to touch: bodies, sites, joints and pairs by name, at the instant of the readings.
 
 Shapes: `env` environments, `body`, `site`, `joint`, `actuator` and `pair` as a `Watch` lists them.
 """

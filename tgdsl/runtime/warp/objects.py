@@ -59,7 +59,7 @@ class WorldObjects:
     """What the objects of `inputs.objects` are like in each environment, as MuJoCo Warp's model has it.
 
     Types of geoms are shared by all environments: of the geoms that an object has in any variant, those that an environment
-    lacks weigh nothing and are kept out of its collisions.
+    lacks weigh nothing and do not collide.
 
     Attributes:
         model: The model that all environments share.

@@ -103,7 +103,7 @@ class Faults(EnvFaults):
 
 
 def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
-    """Return how many rows of constraints a number of contacts makes at most, and all limits and equalities besides."""
+    """Return the most rows of constraints that a number of contacts, all limits and all equalities can take."""
     dim = max([1, *model.geom_condim.tolist(), *model.pair_dim.tolist()])
     is_pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     per_contact = 2 * (dim - 1) if is_pyramidal and dim > 1 else dim
@@ -321,7 +321,7 @@ class WarpSimulation(Simulation):
         if keyframe >= 0:
             mujoco.mj_resetDataKeyframe(model, start, keyframe)
         inputs, stream = self._touch.inputs, self._stream
-        if self._watch is not None:  # its joints too are kept from before a physics step
+        if self._watch is not None:  # its joints are copied before a physics step too
             inputs = replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *self._watch.inputs.fields))))
         with stream.scope():
             try:

@@ -17,7 +17,7 @@ from tgdsl.runtime.xhand1.wire.payloads import JOINTS, NUM_JOINTS, PASSIVE, Join
 
 JointArray = Float[np.ndarray, " joint"]
 ROUNDING = 1e-6
-"""How far a target may lie beyond its range and is taken for its end [rad]: float32 angles are rounded by less."""
+"""How far a target may lie beyond its range to count as its end [rad]: float32 angles are rounded by less."""
 _LONGEST_STEP_S = 0.05
 """Set-points move no further in one exchange than in this time, however long it took [s]."""
 

@@ -149,10 +149,10 @@ _BYTES = ("version", "side", "serial_number", "name")
 
 @dataclass(frozen=True)
 class HandIdentity:
-    """What a hand tells of itself; bytes as they came, for the layout of these replies is unverified.
+    """What a hand says about itself; bytes as they came, for the layout of these replies is unverified.
 
     Attributes:
-        device: The serial port that it was found on.
+        device: The serial port that it answers on.
         hand_id: Its id.
         version: Its version; empty if it was not asked.
         side: Register 20, which hand it is; None if it does not tell.
