@@ -129,15 +129,15 @@ def _of_reading(
         return []
     reading, layout = found[spec.of]
     if isinstance(spec, ReadingObservation):
-        wanted = _channels(loaded, path, spec, reading)
+        channel_names = _channels(loaded, path, spec, reading)
     else:
-        wanted, rows = observations.WANTED[spec.type]
-        if reading.rows != rows or not set(wanted) <= set(reading.channels):
-            problem = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
+        channel_names, rows = observations.WANTED[spec.type]
+        if reading.rows != rows or not set(channel_names) <= set(reading.channels):
+            problem = f'"{spec.type}" needs {", ".join(channel_names)} of each {rows}, which "{spec.of}" does not read'
             loaded.note(path, problem, f"it reads {', '.join(reading.channels)} of each {reading.rows}")
             return []
     constants = observations.lower(spec, layout)
-    channels = tuple(reading.channels.index(channel) for channel in wanted)
+    channels = tuple(reading.channels.index(channel) for channel in channel_names)
     per_call = observations.num_features(spec.type, len(channels), reading.num_rows, len(layout.links))
     axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
     count = max(reading.steps, 1) * per_call
@@ -348,8 +348,8 @@ def _link_parts(
         def report(what: str, hint: str, at: Path = at, link: str = link) -> None:
             loaded.note(at, f'body "{link}" and what is welded to it: {what}', hint)
 
-        own = link_parts(resolved.scene, resolved.link_bodies[link], report)
-        parts |= {link: own} if own else {}
+        contact_geoms = link_parts(resolved.scene, resolved.link_bodies[link], report)
+        parts |= {link: contact_geoms} if contact_geoms else {}
     return parts
 
 

@@ -139,17 +139,17 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
         RobotError: If a file is missing, or differs from the one that was loaded.
     """
     own = OwnObjects() if own is None else own
-    kept = _Kept(start_qpos(own.bodies))
-    kept.assets |= own.meshes.assets
-    kept.contents |= own.meshes.contents
+    copy = _Kept(start_qpos(own.bodies))
+    copy.assets |= own.meshes.assets
+    copy.contents |= own.meshes.contents
     if model.mjcf:
         root = ET.fromstring(model.mjcf)
         for mesh in root.iter("mesh"):
             if (name := mesh.get("file", "")) in model.rewritten:
                 mesh.set("file", str(model.rewritten[name]))
-        main = kept.rewritten(root, model.file, [model.file.parent])
+        main = copy.rewritten(root, model.file, [model.file.parent])
     else:
-        main = kept.rewritten(ET.parse(model.file).getroot(), model.file, [model.file.parent])
+        main = copy.rewritten(ET.parse(model.file).getroot(), model.file, [model.file.parent])
     if own.bodies:
         main.append(as_worldbody(own.bodies))
     sensors = ET.SubElement(main, "sensor")
@@ -160,13 +160,13 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
         ET.SubElement(sensors, "contact", {"name": sensor.name, **ends, **attributes})
     scene = SceneFile(
         mjcf=ET.tostring(main, encoding="unicode"),
-        parts=dict(sorted(kept.parts.items())),
-        assets=tuple(sorted(kept.assets.values(), key=lambda asset: asset.key)),
+        parts=dict(sorted(copy.parts.items())),
+        assets=tuple(sorted(copy.assets.values(), key=lambda asset: asset.key)),
         objects=own.objects,
         colliders=colliders,
     )
     try:
-        again = compiled(scene, kept.contents)
+        again = compiled(scene, copy.contents)
     except ValueError as error:
         raise RobotError(f"{model.file}: MuJoCo cannot read what is kept of this scene: {error}") from error
     _compare(model, inputs, again)
@@ -209,10 +209,10 @@ class _Kept:
             elif element.tag in ASSET_TAGS:
                 if name:
                     element.set("name", element.get("name", Path(name).stem))
-                own = [settings.get(subfolders[element.tag], settings.get("assetdir", "")), ""]
+                subdirs = [settings.get(subfolders[element.tag], settings.get("assetdir", "")), ""]
                 for attribute in FILE_ATTRIBUTES:
                     if element.get(attribute):
-                        element.set(attribute, self._asset(_found(element.get(attribute, ""), own, folders, file)))
+                        element.set(attribute, self._asset(_found(element.get(attribute, ""), subdirs, folders, file)))
         return root
 
     def _part(self, path: Path, folders: list[Path], tag: str, settings: dict[str, str]) -> str:

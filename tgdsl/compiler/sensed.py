@@ -76,7 +76,7 @@ def sensed_object(
 
 
 def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, report: Report) -> ObjectHeat | None:
-    """Return what the flow of heat needs to know of an object; None if the document does not say what it is made of."""
+    """Return what the flow of heat needs to know of an object; None if the document gives it no material."""
     if target.material is None or not all(felt):
         return None
     for geom in itertools.chain(*felt):

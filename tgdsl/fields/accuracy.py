@@ -44,8 +44,8 @@ class Accuracy:
 
     def of(self, quantity: str) -> Bound | None:
         """Return the bound of a quantity."""
-        own = dict(self.bounds)
-        return own.get(quantity, own.get(""))
+        bounds = dict(self.bounds)
+        return bounds.get(quantity, bounds.get(""))
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {bound.text}".strip() for name, bound in self.bounds)
@@ -72,8 +72,8 @@ def parse_bound(value: object) -> Bound:
         try:
             number = units.parse(value, "number")
         except ValueError:
-            known = ", ".join(unit for dimension in DIMENSIONS for unit in units.UNITS[dimension])
-            raise ValueError(f'"{value}" is no accuracy, expected {EXPECTED}; units: %, {known}') from None
+            unit_names = ", ".join(unit for dimension in DIMENSIONS for unit in units.UNITS[dimension])
+            raise ValueError(f'"{value}" is no accuracy, expected {EXPECTED}; units: %, {unit_names}') from None
         bound = Bound(number, "", f"{100 * number:g} %")
     if not bound.value > 0 or (not bound.unit and bound.value >= 1):
         raise ValueError(f"{text} is out of range, expected {EXPECTED}, more than 0 and less than 100 %")

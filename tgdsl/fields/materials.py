@@ -172,14 +172,14 @@ class OwnMaterial(SpecModel):
 
     def resolved(self) -> Material:
         """Return the material."""
-        own = {f.name: getattr(self, f.name) for f in fields(Material) if f.name in OwnMaterial.model_fields}
-        own = {name: value for name, value in own.items() if value is not None}
+        properties = {f.name: getattr(self, f.name) for f in fields(Material) if f.name in OwnMaterial.model_fields}
+        properties = {name: value for name, value in properties.items() if value is not None}
         if self.like is None:
             elastic = {"youngs_modulus": None, "poissons_ratio": None}
-            return Material(**{"name": "own", "source": "the document", **elastic, **own})
+            return Material(**{"name": "own", "source": "the document", **elastic, **properties})
         base = known_material(self.like)
-        changed = {"name": f"like {base.name}", "source": f"the document; {base.source}"} if own else {}
-        return replace(base, **changed, **own)
+        changed = {"name": f"like {base.name}", "source": f"the document; {base.source}"} if properties else {}
+        return replace(base, **changed, **properties)
 
 
 class _AsWritten:

@@ -76,29 +76,29 @@ def parse(value: object, dimension: str | Dimension) -> float:
     Raises:
         ValueError: If the value is no finite number, or its unit is not one of the dimension.
     """
-    known = units_of(dimension)
-    wanted = f'a number in {next(iter(known))} or a string such as "4 {_example(known)}"' if known else "a number"
+    factors = units_of(dimension)
+    expected = f'a number in {next(iter(factors))} or a string such as "4 {_example(factors)}"' if factors else "a number"
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise ValueError(f"{value!r} is not a quantity, expected {wanted}")
+        raise ValueError(f"{value!r} is not a quantity, expected {expected}")
     if isinstance(value, str):
         plain = value.translate(_SPELLINGS)
-        if plain != value and (match := _QUANTITY.match(plain)) and match[2] in known:
+        if plain != value and (match := _QUANTITY.match(plain)) and match[2] in factors:
             raise ValueError(f'"{value}" is not a quantity; did you mean "{plain.strip()}"?')
         match = _QUANTITY.match(value)
-        if match and match[2] and not known:
+        if match and match[2] and not factors:
             raise ValueError(f'"{value}" has a unit, {_without_unit(float(match[1]), match[2])}')
         if not match:
-            raise ValueError(f'"{value}" is not a quantity, expected {wanted}')
-        if match[2] and match[2] not in known:
+            raise ValueError(f'"{value}" is not a quantity, expected {expected}')
+        if match[2] and match[2] not in factors:
             name = dimension.name if isinstance(dimension, Dimension) else dimension
-            raise ValueError(f'"{match[2]}" is not a unit of {name}, expected one of {", ".join(known)}')
-        value = float(match[1]) * known.get(match[2] or "", 1.0) + ZEROS.get(match[2] or "", 0.0)
+            raise ValueError(f'"{match[2]}" is not a unit of {name}, expected one of {", ".join(factors)}')
+        value = float(match[1]) * factors.get(match[2] or "", 1.0) + ZEROS.get(match[2] or "", 0.0)
     try:
         value = float(value)
     except OverflowError:  # a whole number of more than 308 digits
         value = math.inf
     if not math.isfinite(value):
-        raise ValueError(f"{value} is not finite, expected {wanted}")
+        raise ValueError(f"{value} is not finite, expected {expected}")
     return value
 
 
@@ -116,9 +116,11 @@ def dimension_of(value: str, dimensions: Sequence[str]) -> str | None:
 
 def _without_unit(number: float, unit: str) -> str:
     """Return what is expected where a plain number is, if one with a unit was found: in SI, if the unit is known."""
-    for known in UNITS.values():
-        if unit in known:
-            return f"expected a plain number: {number * known[unit] + ZEROS.get(unit, 0.0):g}, if {next(iter(known))} is meant"
+    for factors in UNITS.values():
+        if unit in factors:
+            return (
+                f"expected a plain number: {number * factors[unit] + ZEROS.get(unit, 0.0):g}, if {next(iter(factors))} is meant"
+            )
     return "expected a plain number"
 
 
@@ -130,10 +132,10 @@ def doubt(value: float, dimension: str | Dimension, low: float, high: float) -> 
     """Return why a quantity [SI] was most likely meant in another unit, and in which; None of usual magnitudes, and of 0."""
     if value == 0 or low <= abs(value) <= high:
         return None
-    known = units_of(dimension)
-    si = f" {next(iter(known))}" if known else ""
+    factors = units_of(dimension)
+    si = f" {next(iter(factors))}" if factors else ""
     bound = f"usually at least {low:g}{si}" if abs(value) < low else f"usually at most {high:g}{si}"
-    scales = {(factor, ZEROS.get(unit, 0.0)): unit for unit, factor in known.items()}
+    scales = {(factor, ZEROS.get(unit, 0.0)): unit for unit, factor in factors.items()}
     units = {scale: unit for scale, unit in scales.items() if low <= abs(value * scale[0] + scale[1]) <= high}
     meant = " or ".join(f'"{value:g} {unit}"' for unit in units.values())
     return f"found {value:g}{si}, {bound}", f"was {meant} meant?" if meant else ""

@@ -140,7 +140,7 @@ def explain(touch: Explained) -> str:
 
 
 def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:
-    """Return what a sensor asks of the scene; what is asked alike is found once."""
+    """Return what a sensor asks of the scene, equal questions once."""
     lines = []
     for requested in (each for each in touch.quantities if each.name in sensor.uses):
         use = sensor.uses[requested.name]
@@ -197,7 +197,7 @@ def _remembers(touch: Explained, sensor: PlannedSensor) -> str:
 
 
 def _sizes(touch: Explained, sensor: PlannedSensor) -> tuple[int, int]:
-    """Return what a sensor remembers of each environment, and of each call of its delay beside [bytes]."""
+    """Return what a sensor remembers of each environment, and of each call of its delay in addition [bytes]."""
     size = torch.finfo(touch.constants.dtype).bits // 8
     fixed = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if not memory.past)
     ring = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if memory.past)
@@ -274,7 +274,7 @@ def _inputs(touch: Explained) -> list[str]:
 
 
 _CLOCK_BYTES = 24
-"""What the clock holds of each environment beside the ages of calls: three int64, see `clock.Clock`."""
+"""What the clock holds of each environment in addition to the ages of calls: three int64, see `clock.Clock`."""
 
 
 def _costs(touch: Explained) -> list[str]:

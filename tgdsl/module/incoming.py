@@ -34,7 +34,7 @@ class SlotWatch:
     """Looks at states for contacts beyond the slots. Each pair is warned of once."""
 
     def __init__(self, inputs: Inputs):
-        """Begin; nothing has been seen."""
+        """Begin; no state has come yet."""
         self._inputs = inputs
         fields = {"contact_found", "contact_force", "contact_netforce"}
         self._num_pairs = len(inputs.pairs) if inputs.slots and fields <= set(inputs.fields) else 0
@@ -50,7 +50,7 @@ class SlotWatch:
 
     def note(self, tensors: Mapping[str, Tensor]) -> None:
         """Look at a state, on its device."""
-        whole, force, found = (tensors[f"contact_{name}"] for name in ("netforce", "force", "found"))
+        whole, force, count = (tensors[f"contact_{name}"] for name in ("netforce", "force", "found"))
         self._num_calls += 1
         if whole.is_cuda and self._num_calls % EVERY != 1 and not torch.cuda.is_current_stream_capturing():
             return
@@ -61,21 +61,21 @@ class SlotWatch:
         with torch.no_grad():
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
             size = whole.abs().amax(dim=-1) + force.abs().amax(dim=(2, 3))
-            slots = found.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
-            is_crowded = (found > self._inputs.slots) & (force.abs().amax(dim=(2, 3)) > 0)
+            slots = count.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
+            is_crowded = (count > self._inputs.slots) & (force.abs().amax(dim=(2, 3)) > 0)
             slots = torch.where((lacking > TOLERANCE * size) | is_crowded, slots, 0.0)
             self._wanted.copy_(torch.cat([self._wanted[None], slots]).amax(dim=0))
 
     def warn(self) -> None:
         """Warn of what has been noted. A GPU is not waited for: what it notes may be seen a call or more later."""
-        wanted = None if self._wanted is None else self._copy.poll(self._wanted)
-        if wanted is None:
+        num_contacts = None if self._wanted is None else self._copy.poll(self._wanted)
+        if num_contacts is None:
             return
-        new = [i for i, number in enumerate(wanted.tolist()) if number and i not in self._warned]
+        new = [i for i, number in enumerate(num_contacts.tolist()) if number and i not in self._warned]
         if not new:
             return
         self._warned.update(new)
-        slots, most = self._inputs.slots, max(float(wanted[i]) for i in new)
+        slots, most = self._inputs.slots, max(float(num_contacts[i]) for i in new)
         which = listed([f"{self._inputs.pairs[i].link} – {self._inputs.pairs[i].object}" for i in new])
         enough = f"slots: {int(most)}" if most > slots + 0.5 else "more slots"
         warnings.warn(

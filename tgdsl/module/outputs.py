@@ -1,4 +1,4 @@
-"""What a module's readings and observations are, and the observations that are made of readings.
+"""What a module's readings and observations are, and how observations follow from readings.
 
 Shapes: `env` environments, `step` stacked calls, `row` taxels, bodies, joints or actuators, `channel` numbers per row,
 `feature` numbers of an observation.

@@ -116,9 +116,9 @@ class Inputs:
         names = names or {}
         parts = [part for own in (*self.contacts_of.values(), *self.link_parts.values()) for part in own]
         bodies = {*self.bodies, *self.bodies_of.values(), *(pair.link for pair in self.pairs)}
-        known = {*bodies, *self.joints, *self.actuators, *(part.name for part in parts)}
-        if unknown := [name for name in names if name not in known]:
-            hint = did_you_mean(unknown[0], known)
+        names_here = {*bodies, *self.joints, *self.actuators, *(part.name for part in parts)}
+        if unknown := [name for name in names if name not in names_here]:
+            hint = did_you_mean(unknown[0], names_here)
             raise StateError(f'this module reads no body, geom, joint or actuator "{unknown[0]}"; {hint}')
 
         def there(name: str) -> str:

@@ -100,8 +100,8 @@ class Plan:
 
     def readings(self) -> dict[str, PlannedReading]:
         """Return all readings by name, in the order in which they are handed out."""
-        own = {reading.name: reading for sensor in self.sensors for reading in sensor.readings}
-        return own | {reading.name: reading for reading in self.proprioception}
+        readings = {reading.name: reading for sensor in self.sensors for reading in sensor.readings}
+        return readings | {reading.name: reading for reading in self.proprioception}
 
     def sensor_of(self, reading: str) -> PlannedSensor[np.ndarray]:
         """Return the sensor that makes a reading."""

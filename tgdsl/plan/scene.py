@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Asset:
-    """A file that the scene needs: its name in the MJCF, where it was found, and what it held."""
+    """A file that the scene needs: its name in the MJCF, its path, and its bytes."""
 
     key: str
     path: str
@@ -59,7 +59,7 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Collider:
-    """A primitive that a link of the robot collides with in place of the scene's own geoms.
+    """A primitive that a link of the robot collides with instead of the scene's geoms.
 
     Attributes:
         body: The link's body in the scene.
@@ -87,7 +87,7 @@ class SceneFile:
         parts: The MJCF files that it includes or attaches, by the names it has for them.
         assets: The meshes, textures and other files that they or the objects name.
         objects: Objects that differ between environments.
-        colliders: What links collide with in place of their own geoms: see `scene.colliders`.
+        colliders: What links collide with instead of their geoms: see `scene.colliders`.
     """
 
     mjcf: str

@@ -80,7 +80,7 @@ class PlannedNoise(Generic[Array]):
 
 @dataclass(frozen=True)
 class PlannedHistory:
-    """How many calls a reading holds or is made of, how, and whether a stack of them is handed out as a view of the memory."""
+    """How many calls a reading holds or combines, how, and whether a stack of them is a view of the memory."""
 
     length: int
     reduce: Literal["stack", "last", "median", "mean"]
@@ -145,7 +145,7 @@ class PlannedSensor(Generic[Array]):
 
     @property
     def wants_clock(self) -> bool:
-        """Whether it wants to know when a reading is made: for chance, noise with memory, its rate or its kind."""
+        """Whether it needs the time of a reading: for chance, noise with memory, its rate or its kind."""
         return (
             self.is_timed
             or self.is_random

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import types
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -48,13 +48,13 @@ def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[A
 
     What has no array stays as it is. An array that stands in several places is changed once.
     """
-    made: dict[int, Any] = {}
+    results: dict[int, Any] = {}
 
     def walk(value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            if id(value) not in made:
-                made[id(value)] = change(value)
-            return made[id(value)]
+            if id(value) not in results:
+                results[id(value)] = change(value)
+            return results[id(value)]
         if _is_record(value):
             if is_kept(value):
                 return value
@@ -74,8 +74,8 @@ def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[A
 
 def frozen(array: np.ndarray) -> np.ndarray:
     """Return an array in one of the Plan's dtypes, row by row in memory and read-only: float64 or float32, int64 or int32."""
-    kept = (np.float32, np.int32)
-    kind = array.dtype if array.dtype in kept else np.int64 if array.dtype.kind in "iub" else np.float64
+    narrow = (np.float32, np.int32)
+    kind = array.dtype if array.dtype in narrow else np.int64 if array.dtype.kind in "iub" else np.float64
     array = np.ascontiguousarray(array, dtype=kind).reshape(array.shape)
     array.flags.writeable = False
     return array
@@ -105,7 +105,7 @@ def restored(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         return restored(one, plain, arrays)
     if dataclasses.is_dataclass(origin):
         hints = get_type_hints(origin)
-        return origin(**{name: restored(hints[name], part, arrays) for name, part in plain.items()})
+        return cast(Any, origin)(**{name: restored(hints[name], part, arrays) for name, part in plain.items()})
     if origin is tuple:
         first, *rest = get_args(kind)
         each = [first] * len(plain) if rest[-1:] == [Ellipsis] else [first, *rest]

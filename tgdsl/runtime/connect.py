@@ -74,8 +74,8 @@ def connect(
             simulation is always so, a real hand never.
         taxels: The taxels that the module shall have, such as those that a policy learned with: another module, its tables, an
             artefact, a rollout or an id, see `module.taxels.identity.check_taxels`.
-        scene: A scene of one's own, such as a task's, that a simulation or an emulator steps in place of the module's; it is
-            closed with the connection, and brings its own start in place of the keyframe.
+        scene: A scene, such as a task's, that a simulation or an emulator steps instead of the module's; it is
+            closed with the connection, and starts where it says, not at the keyframe.
         **options: Options of this kind of source alone, such as the `nconmax` and `njmax` of `warp`. Those above are left out
             where a source has no use for them, so that one script serves all.
 
@@ -222,7 +222,7 @@ SOURCES: tuple[SourceKind, ...] = (
 def known_sources() -> tuple[SourceKind, ...]:
     """Return all kinds of sources: tgdsl's, then installed ones by package and name.
 
-    An installed kind that cannot be had is left out, with a warning, the first time.
+    An installed kind that cannot be imported is left out, with a warning the first time.
 
     Raises:
         TgdslError: If two kinds have one name.
@@ -292,6 +292,6 @@ def _read(calibration: Calibration | str | Path | None) -> Calibration | None:
 def _only_port() -> str:
     ports = [port.device for port in list_ports() if port.device.startswith(_USB_PORTS)]
     if len(ports) != 1:
-        found = listed(ports) or "none"
-        raise HandError(f'expected one USB serial port, found {found}; name the hand\'s: source="xhand1:/dev/ttyUSB0"')
+        port_names = listed(ports) or "none"
+        raise HandError(f'expected one USB serial port, found {port_names}; name the hand\'s: source="xhand1:/dev/ttyUSB0"')
     return ports[0]

@@ -115,7 +115,7 @@ class Connection(ABC):
         self._is_read = True
 
     def resume(self) -> None:
-        """Allow a hand that was made passive by an error to move again; for other sources, nothing."""
+        """Allow a hand that an error made passive to move again; other sources do nothing."""
         return
 
     def close(self) -> None:
@@ -177,7 +177,7 @@ class SimulatorKind(SourceKind):
     """A kind of source that `tgdsl.simulate` can make too.
 
     Attributes:
-        devices: Types of torch devices whose physics it is taken for: "cpu", "cuda".
+        devices: Types of torch devices that it is the default simulator of: "cpu", "cuda".
         simulate: Makes a simulation: `simulate(touch, num_envs, *, device, option, …)`.
     """
 

@@ -193,8 +193,8 @@ class Recorder:
         """Keep one step."""
         self._time[step.index] = step.time
         self._qpos.append(step.qpos.detach().cpu().numpy().copy())
-        for name, kept in self._readings.items():
-            kept[step.index] = step.readings[name].detach().cpu().numpy()
+        for name, column in self._readings.items():
+            column[step.index] = step.readings[name].detach().cpu().numpy()
 
     def write(self, path: Path, controls: Controls, document: Path) -> None:
         """Write the file; it appears whole or not at all.

@@ -1,4 +1,4 @@
-"""The script that a scene is run by where nothing else is said: keyframes in turn, or the hand closes on an object."""
+"""The default script of a scene: keyframes in turn, or the hand closes on an object."""
 
 from __future__ import annotations
 

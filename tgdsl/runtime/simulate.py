@@ -1,4 +1,4 @@
-"""Simulation of a module's scene, by the simulator that is taken for a device."""
+"""Simulation of a module's scene by a device's default simulator."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ def simulate(
             wants.
     """
     if not isinstance(touch, TactileModule):
-        made = f"tgdsl.compile({touch!r})" if isinstance(touch, (str, PathLike)) else "tgdsl.compile(document)"
-        raise SimulationError(f"found a {type(touch).__name__}, expected a module: {made}")
+        example = f"tgdsl.compile({touch!r})" if isinstance(touch, (str, PathLike)) else "tgdsl.compile(document)"
+        raise SimulationError(f"found a {type(touch).__name__}, expected a module: {example}")
     if misspelt := [name for name in options if name not in SimOptions.__annotations__]:
         hint = did_you_mean(misspelt[0], SimOptions.__annotations__, "options")
         raise SimulationError(f'simulate has no option "{misspelt[0]}"; {hint}')
     kind = simulator_for(device)
-    known = keyword_options(kind.simulate)
-    if unknown := [name for name, value in options.items() if name not in known and value]:
+    kind_options = keyword_options(kind.simulate)
+    if unknown := [name for name, value in options.items() if name not in kind_options and value]:
         problem = f'"{kind.name}", which simulates on "{device}", has no option {listed(unknown)}'
-        raise SimulationError(f"{problem}; it knows {listed(known)}")
-    return kind.simulate(touch, num_envs, **{n: v for n, v in {**options, "device": device}.items() if n in known})
+        raise SimulationError(f"{problem}; it knows {listed(kind_options)}")
+    return kind.simulate(touch, num_envs, **{n: v for n, v in {**options, "device": device}.items() if n in kind_options})
 
 
 def simulator_for(device: str, name: str | None = None) -> SimulatorKind:
-    """Return a simulator: by its name, or the one that is taken for a device.
+    """Return a simulator: by its name, or the default of a device.
 
     Args:
         device: Where physics runs.

@@ -84,11 +84,11 @@ class Constants(HookedModule):
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
         """Move or cast all buffers, from the Plan's float64 where nobody has changed them."""
         held = buffers_of(self)
-        before = dict(held)
+        old_buffers = dict(held)
         self._like = fn(self._like)
         move()
         for name, exact in self._exact.items():
-            old, new = before[name], held[name]
+            old, new = old_buffers[name], held[name]
             assert old is not None and new is not None
             is_untouched = new.dtype != old.dtype and torch.equal(old.detach().cpu(), exact.to(old.dtype))
             if is_untouched:

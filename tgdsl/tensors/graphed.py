@@ -28,8 +28,8 @@ def captured(call: Callable[[], Tensors]) -> tuple[Replay, Tensors]:
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-        made = call()
-    return graph.replay, made
+        outputs = call()
+    return graph.replay, outputs
 
 
 class Graphed:
@@ -64,11 +64,11 @@ class Graphed:
     def _start(self, tensors: Tensors, memory: Tensors) -> None:
         """Capture a call on inputs of its own; memory is then as it was before."""
         with torch.inference_mode(False), torch.no_grad():
-            own = {name: value.clone() for name, value in tensors.items()}
-            before = {name: value.clone() for name, value in memory.items()}
-            self._replay, self._made = self._capture(lambda: self._function(own, memory))
-            for name, value in before.items():
+            inputs = {name: value.clone() for name, value in tensors.items()}
+            old_memory = {name: value.clone() for name, value in memory.items()}
+            self._replay, self._made = self._capture(lambda: self._function(inputs, memory))
+            for name, value in old_memory.items():
                 memory[name].copy_(value)
-        kinds = {value.dtype for value in own.values()}
-        names = [[name for name, value in own.items() if value.dtype == kind] for kind in kinds]
-        self._groups = [([own[name] for name in group], group) for group in names]
+        kinds = {value.dtype for value in inputs.values()}
+        names = [[name for name, value in inputs.items() if value.dtype == kind] for kind in kinds]
+        self._groups = [([inputs[name] for name in group], group) for group in names]

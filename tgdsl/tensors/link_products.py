@@ -22,7 +22,7 @@ Matrices = Sequence[Float[Tensor, "_from plane _to"]]
 def products(lines: Float[Tensor, "line row"], matrices: Matrices) -> Float[Tensor, "plane line row"]:
     """Return Σ_from line[from] matrix[from] of each link."""
     parts = lines.split([len(matrix) for matrix in matrices], dim=1)
-    results = [(own @ matrix.flatten(1)).unflatten(1, matrix.shape[1:]) for own, matrix in zip(parts, matrices, strict=True)]
+    results = [(part @ matrix.flatten(1)).unflatten(1, matrix.shape[1:]) for part, matrix in zip(parts, matrices, strict=True)]
     return torch.cat(results, dim=-1).transpose(0, 1)
 
 

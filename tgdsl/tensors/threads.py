@@ -19,9 +19,9 @@ def one_thread() -> Iterator[None]:
     The number is the calling thread's, and that which Python threads begin with: one whose first work in torch falls into this
     block keeps one thread, until it calls `torch.set_num_threads`.
     """
-    before = torch.get_num_threads()
+    num_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(num_threads)

@@ -140,9 +140,11 @@ def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:
     these at each call, and refuses to compile for more than eight objects (`recompile_limit`).
     """
     assert isinstance(method, MethodType)
-    known = method.__func__
-    own = FunctionType(known.__code__.replace(), known.__globals__, known.__name__, known.__defaults__, known.__closure__)
-    return MethodType(own, method.__self__)
+    function = method.__func__
+    copy = FunctionType(
+        function.__code__.replace(), function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    return MethodType(copy, method.__self__)
 
 
 MOST_FUSED = 1024

@@ -41,8 +41,8 @@ def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:
 def only(state: SceneState, envs: Any) -> SceneState:
     """Return some of the environments of a state."""
     values: dict[str, Any] = {name: getattr(state, name) for name in (*SHAPES, "dt")}
-    chosen: dict[str, Any] = {name: value[envs] if isinstance(value, Tensor) else value for name, value in values.items()}
-    return SceneState(**chosen, substeps=tuple(only(part, envs) for part in state.substeps))
+    selected: dict[str, Any] = {name: value[envs] if isinstance(value, Tensor) else value for name, value in values.items()}
+    return SceneState(**selected, substeps=tuple(only(part, envs) for part in state.substeps))
 
 
 TOGETHER = 1e-6

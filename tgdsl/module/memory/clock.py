@@ -1,4 +1,4 @@
-"""When a reading is made, and with which random numbers: what a module counts where its sensors are imperfect or have rates.
+"""The time of a reading and its random numbers: what a module counts where its sensors are imperfect or have rates.
 
 Shapes: `env` environments.
 """
@@ -98,7 +98,7 @@ class Clock(HookedModule):
             raise TgdslError(f"seed is {seed!r}, expected an integer")
         if first_env is not None and not (isinstance(first_env, Integral) and 0 <= first_env < _INT64):
             raise TgdslError(f"first_env is {first_env!r}, expected an integer from 0 to 2**63 - 1")
-        # It is kept as an int64: whoever loads a state dict draws the same numbers.
+        # An int64 in the state dict: whoever loads it draws the same numbers.
         self._seed, self._first_env = (int(seed) + _INT64) % (2 * _INT64) - _INT64, first_env
         if self.num_envs is not None:
             self._count_anew()

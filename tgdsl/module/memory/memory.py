@@ -36,9 +36,9 @@ class StateWatch:
         """Note what is to be looked at."""
         rows = {sensor.name: [f"{sensor.sensor}[{i}]" for i in range(sensor.readings[0].num_rows)] for sensor in sensors}
         self._watched = [
-            (f"{own.name}:{state}", own, tuple(row for name in own.upstream for row in rows[name]), warn)
-            for own in sensors
-            for state, warn in (kinds[own.name].warns if own.name in kinds else ())
+            (f"{sensor.name}:{state}", sensor, tuple(row for name in sensor.upstream for row in rows[name]), warn)
+            for sensor in sensors
+            for state, warn in (kinds[sensor.name].warns if sensor.name in kinds else ())
         ]
         self._said: set[str] = set()
         self._num_calls = 0
@@ -68,7 +68,7 @@ class Memory(HookedModule):
 
     Attributes:
         home: Has device and dtype of state that is loaded before the first call.
-        keeps_last: Whether the last readings are kept from the first call on, and not only once some environments are read
+        keeps_last: Whether it stores the last readings from the first call on, and not only once some environments are read
             alone, which needs them: code that is compiled for the first call then serves all later ones.
     """
 
@@ -97,7 +97,7 @@ class Memory(HookedModule):
         }
         self._views = [reading.name for s in sensors if s.history and s.history.view for reading in s.windows]
         self._last: dict[str, tuple[Tensor, int]] = {}
-        self._is_filled = False  # whether what is kept was handed out
+        self._is_filled = False  # whether the stored readings were handed out
         self.keeps_last = False
         self.clock = Clock(sensors)
         self.home = torch.empty(0)
@@ -163,7 +163,7 @@ class Memory(HookedModule):
 
     @property
     def num_kept(self) -> int | None:
-        """Number of environments whose last readings are kept; None if none are."""
+        """Number of environments whose last readings it stores; None if it stores none."""
         return next((buffer.shape[0] for name, buffer in held_buffers(self).items() if name.startswith(KEPT)), None)
 
     def cache_readings(self, readings: Mapping[str, Tensor]) -> None:

@@ -107,9 +107,9 @@ class BatchProperties(ObjectProperties):
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
-        for env, wanted in zip(ids.tolist(), mass.numpy()[ids], strict=True):
+        for env, new_mass in zip(ids.tolist(), mass.numpy()[ids], strict=True):
             model, bodies = self._chosen[env], target.bodies  # not of what it has now: rounding would add up
-            factor = wanted / model.body_mass[bodies].sum()
+            factor = new_mass / model.body_mass[bodies].sum()
             self._row("body_mass", env)[bodies] = factor * model.body_mass[bodies]
             self._row("body_inertia", env)[bodies] = factor * model.body_inertia[bodies]
         self._derive(ids)
@@ -127,8 +127,8 @@ class BatchProperties(ObjectProperties):
 
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
-        for env, wanted in zip(ids.tolist(), friction.numpy()[ids], strict=True):
-            self._row("geom_friction", env)[target.geoms, 0] = wanted
+        for env, coefficient in zip(ids.tolist(), friction.numpy()[ids], strict=True):
+            self._row("geom_friction", env)[target.geoms, 0] = coefficient
         if self._models is not None:
             self._batch.set_models(self._models)
 
@@ -166,7 +166,7 @@ CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")
 _WIDTH = {"found": 1, "force": 3, "torque": 3, "dist": 1, "pos": 3, "normal": 3, "tangent": 3}
 """How many numbers each quantity has that a contact sensor may show, in MuJoCo's order."""
 _OF_SLOTS = ("force", "torque", "pos", "normal", "tangent")
-"""What a contact in a slot is made of, three numbers each."""
+"""The vectors of a contact in a slot, three numbers each."""
 _ADVICE = "add them with tgdsl.instrument(spec, touch.inputs) before compiling"
 
 
@@ -226,8 +226,8 @@ class _PointSensor:
             if bits >> int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{quantity.upper()}")) & 1:
                 columns[quantity] = list(itertools.islice(end, width))
         self._margin = _least_margin(model, sensor)
-        wanted = [*(_OF_SLOTS if num_slots else ()), *(() if self._margin is None else ("dist", "force"))]
-        if missing := [quantity for quantity in ("found", *wanted) if quantity not in columns]:
+        required = [*(_OF_SLOTS if num_slots else ()), *(() if self._margin is None else ("dist", "force"))]
+        if missing := [quantity for quantity in ("found", *required) if quantity not in columns]:
             raise SimulationError(f'the contact sensor "{name}" does not show {listed(missing)}; {_ADVICE}')
         if self._num < num_slots:
             raise SimulationError(f'the contact sensor "{name}" shows {self._num} contacts, expected {num_slots}; {_ADVICE}')
@@ -357,9 +357,9 @@ class BatchReader:
 
     def read(self, rows: SomeRows = None) -> dict[str, torch.Tensor]:
         """Return the fields of some environments (default: all), (env, …), each an array of its own."""
-        chosen = slice(None) if rows is None else rows
-        live = {name: getattr(self._batch, name)[chosen] for name in self._reader.names}
-        kept = {name: kept[chosen].copy() for name, kept in self._kept.items()}
+        envs = slice(None) if rows is None else rows
+        live = {name: getattr(self._batch, name)[envs] for name in self._reader.names}
+        kept = {name: kept[envs].copy() for name, kept in self._kept.items()}
         return self._reader.read(live, self._contacts.read(live["sensordata"]) | kept)
 
     def _joints_now(self, name: str, rows: SomeRows = None) -> Array:

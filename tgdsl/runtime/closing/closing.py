@@ -71,8 +71,8 @@ class Movement:
     @cached_property
     def num_joints(self) -> int:
         """Number of the hand's hinges and slides, of those that follow another only the ones that close it."""
-        wanted = [joint for joint in self.joints if joint in self.ends or joint not in self.follows]
-        return sum(self.is_scalar(joint) and int(self.model.jnt_bodyid[joint]) in self.hand for joint in wanted)
+        counted_joints = [joint for joint in self.joints if joint in self.ends or joint not in self.follows]
+        return sum(self.is_scalar(joint) and int(self.model.jnt_bodyid[joint]) in self.hand for joint in counted_joints)
 
     @cached_property
     def joints(self) -> tuple[int, ...]:
@@ -394,8 +394,8 @@ class Closing:
     def _rest(self, spec: mujoco.MjSpec) -> None:
         """Have actuators of the hand give no force, nor tendons that are sprung."""
         if self.resting:
-            others = {int(actuator.group) for i, actuator in enumerate(spec.actuators) if i not in self.resting}
-            group = _resting_group(int(spec.option.disableactuator), others)
+            groups_in_use = {int(actuator.group) for i, actuator in enumerate(spec.actuators) if i not in self.resting}
+            group = _resting_group(int(spec.option.disableactuator), groups_in_use)
             for i in self.resting:
                 spec.actuators[i].group = group
             spec.option.disableactuator = int(spec.option.disableactuator) | 1 << group
@@ -490,12 +490,12 @@ def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
     """Return the pairs of the robot's bodies that could collide.
 
     Fingers that meet before they meet the object would hold each other off it; and MuJoCo collides a link with its parent
-    where that is fixed to the world, although both are made to overlap at the joint.
+    where that is fixed to the world, although both overlap at the joint by design.
     """
     model = moving.model
-    known = {int(signature) for signature in model.exclude_signature}
+    excluded = {int(signature) for signature in model.exclude_signature}
     bodies = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees and model.body_geomnum[b]]
-    pairs = [(a, b) for a, b in combinations(bodies, 2) if (a << 16) + b not in known]
+    pairs = [(a, b) for a, b in combinations(bodies, 2) if (a << 16) + b not in excluded]
     return tuple((model.body(a).name, model.body(b).name) for a, b in pairs if model.body_weldid[a] != model.body_weldid[b])
 
 

@@ -100,7 +100,7 @@ class JointColumns:
 
     @property
     def moved(self) -> dict[str, str]:
-        """Those fields that are to be kept from before the last physics step, and the array of each."""
+        """The fields whose values before the last physics step are needed, and the array of each."""
         return {name: array for name, array in self.fields.items() if name in MOVED}
 
 

@@ -1,4 +1,4 @@
-"""The machine that physics runs on: its devices, and its memory, looked at before any of it is taken."""
+"""The machine that physics runs on: its devices, and the memory that is free before a simulation allocates any."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class SimOptions(TypedDict, total=False):
     njmax: int | None
     """On a GPU, capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make."""
     model: mujoco.MjModel | None
-    """A model of one's own in place of the artefact's scene; its objects are the same in all environments. On the CPU it has to
+    """A model that replaces the artefact's scene; its objects are the same in all environments. On the CPU it has to
     hold the contact sensors that `tgdsl.instrument` adds."""
     prepare: Callable[[mujoco.MjSpec], None] | None
     """On the CPU, changes the artefact's scene before it is compiled; bodies and contact sensors must stay."""
@@ -485,13 +485,13 @@ class Simulation(ABC):
         if self._objects is None and (variants or sizes or not (temperatures or materials)):
             raise SimulationError("no object of this module differs between environments")
         ids = env_indices(env_ids, self.num_envs)
-        chosen = self.heat.choose(ids, temperatures or {}, materials or {})
+        heat = self.heat.choose(ids, temperatures or {}, materials or {})
         if self._objects is not None and (variants or sizes):
             self._objects.choose(ids, variants or {}, sizes or {})
             self._use_objects(self._objects)
             self._object_fields["variant"].copy_(torch.from_numpy(self._objects.variant))
             self._object_fields["object_size"].copy_(torch.from_numpy(self._objects.object_size))
-        self.heat.write(ids, chosen)
+        self.heat.write(ids, heat)
         self.reset(ids)
 
     def repeated(self, body: Callable[[], T]) -> Callable[[], T]:

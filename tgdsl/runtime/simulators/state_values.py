@@ -155,9 +155,9 @@ class StateTable:
     def _refuse(self, name: str, bad: Bool[Tensor, "2 env"], env_ids: EnvIds | None) -> None:
         if not bad.any():
             return
-        chosen = torch.zeros(self._num_envs, dtype=torch.bool)
-        chosen[torch.from_numpy(env_indices(env_ids, self._num_envs))] = True
-        for problem, where in zip(("is not finite", "holds a quaternion of length 0"), bad.cpu() & chosen, strict=True):
+        is_named = torch.zeros(self._num_envs, dtype=torch.bool)
+        is_named[torch.from_numpy(env_indices(env_ids, self._num_envs))] = True
+        for problem, where in zip(("is not finite", "holds a quaternion of length 0"), bad.cpu() & is_named, strict=True):
             if where.any():
                 envs = listed([str(env) for env in torch.nonzero(where).flatten().tolist()])
                 raise SimulationError(f"{name} {problem} in environments {envs}")
@@ -169,7 +169,7 @@ FIELDS = (
 )
 """Fields of a state that follow from forces."""
 Contacts = str | Mapping[str, Tensor]
-"""How the contacts of a start are found, "evaluate" or "none", or what they are: see `Simulation.reset`."""
+"""The contacts of a start, or how to get them, "evaluate" or "none": see `Simulation.reset`."""
 
 
 class StartContacts:
@@ -231,9 +231,9 @@ class StartContacts:
         return {}
 
     def _fitting(self, name: str, value: Tensor, chosen: Bool[Tensor, " env"]) -> Tensor:
-        known = [field for field in FIELDS if field in self._inputs.fields]
-        if name not in known:
-            raise SimulationError(f'contacts: this module wants no "{name}"; {did_you_mean(name, known, "fields")}')
+        field_names = [field for field in FIELDS if field in self._inputs.fields]
+        if name not in field_names:
+            raise SimulationError(f'contacts: this module wants no "{name}"; {did_you_mean(name, field_names, "fields")}')
         shape = (len(chosen), *shape_of(name, self._inputs))
         if tuple(value.shape) not in (shape, shape[1:]):
             raise SimulationError(f"contacts: {name} has shape {tuple(value.shape)}, expected {shape} or {shape[1:]}")

@@ -1,4 +1,4 @@
-"""What a task looks at besides touch: bodies, sites, joints and pairs by name, all of the instant that readings are of.
+"""What a task reads in addition to touch: bodies, sites, joints and pairs by name, at the instant of the readings.
 
 Shapes: `env` environments, `body`, `site`, `joint`, `actuator` and `pair` as a `Watch` lists them.
 """
@@ -154,8 +154,8 @@ def _carrier(model: mujoco.MjModel, site: int) -> str:
 
 
 def _pair(inputs: Inputs, wanted: tuple[str, str]) -> int:
-    known = [(pair.link, pair.object) for pair in inputs.pairs]
-    if "contact_netforce" not in inputs.fields or wanted not in known:
+    pairs = [(pair.link, pair.object) for pair in inputs.pairs]
+    if "contact_netforce" not in inputs.fields or wanted not in pairs:
         problem = f"no sensor of this module reads the whole force of {wanted[1]} on {wanted[0]}"
         raise SimulationError(f"{problem}; add one of kind link_contact on {wanted[0]} that feels {wanted[1]}")
-    return known.index(wanted)
+    return pairs.index(wanted)

@@ -66,9 +66,9 @@ _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", 
 
 
 class PairContacts:
-    """Contacts of the pairs that a module wants, on the device. Only what the module wants is found and kept.
+    """Contacts of the pairs that a module needs, on the device, with the fields that it needs.
 
-    Pairs of the same link whose objects have the same geoms are found once. Contacts fill slots in no certain order; if there
+    Pairs of the same link whose objects have the same geoms share one search. Contacts fill slots in no certain order; if there
     are more than slots, which are kept is not certain either, but the net force is that of all. Contacts that a `gap` adds
     beyond the margin carry no force, and are none.
 

@@ -59,7 +59,7 @@ class WorldObjects:
     """What the objects of `inputs.objects` are like in each environment, as MuJoCo Warp's model has it.
 
     Types of geoms are shared by all environments: of the geoms that an object has in any variant, those that an environment
-    lacks weigh nothing and are kept out of its collisions.
+    lacks weigh nothing and do not collide.
 
     Attributes:
         model: The model that all environments share.
@@ -74,9 +74,9 @@ class WorldObjects:
     def write_to(self, parameters: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
         """Write the fields of environments whose objects were chosen again, in place; the others keep their masses."""
         choices = [self._choices(env) for env in range(len(self._chosen.variant))]
-        before, self._written = self._written or [None] * len(choices), choices
+        old_choices, self._written = self._written or [None] * len(choices), choices
         device = arrays["qpos"].device
-        changed = torch.tensor([old != new for old, new in zip(before, choices, strict=True)], device=device)
+        changed = torch.tensor([old != new for old, new in zip(old_choices, choices, strict=True)], device=device)
         distinct = list(dict.fromkeys(choices))
         self._rows = {key: self._rows[key] if key in self._rows else self._row(key) for key in distinct}
         number = {key: i for i, key in enumerate(distinct)}
@@ -183,13 +183,13 @@ class WorldProperties(ObjectProperties):
         if target.name not in self._plain:  # what masses are changed from each time: rounding would add up
             self._plain[target.name] = [(array, columns, array[:, columns].clone()) for array, columns in parts]
         plain = [value for _, _, value in self._plain[target.name]]
-        before = mass_field[:, bodies].sum(dim=1)
+        old_mass = mass_field[:, bodies].sum(dim=1)
         factor = mass.to(mass_field.dtype) / plain[0].sum(dim=1)
         scales = (factor, factor, factor, 1.0 / factor, 1.0 / factor)
         for (array, columns), value, scale in zip(parts, plain, scales, strict=True):
             new = value * scale.view(-1, *[1] * (value.ndim - 1))
             array[:, columns] = torch.where(broadcast_over(mask, new), new, array[:, columns])
-        subtree[:, above] = subtree[:, above] + (mass_field[:, bodies].sum(dim=1) - before)[:, None]
+        subtree[:, above] = subtree[:, above] + (mass_field[:, bodies].sum(dim=1) - old_mass)[:, None]
 
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         self._check("friction")

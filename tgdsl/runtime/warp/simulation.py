@@ -103,7 +103,7 @@ class Faults(EnvFaults):
 
 
 def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
-    """Return how many rows of constraints a number of contacts makes at most, and all limits and equalities besides."""
+    """Return the most rows of constraints that a number of contacts, all limits and all equalities can take."""
     dim = max([1, *model.geom_condim.tolist(), *model.pair_dim.tolist()])
     is_pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     per_contact = 2 * (dim - 1) if is_pyramidal and dim > 1 else dim
@@ -321,7 +321,7 @@ class WarpSimulation(Simulation):
         if keyframe >= 0:
             mujoco.mj_resetDataKeyframe(model, start, keyframe)
         inputs, stream = self._touch.inputs, self._stream
-        if self._watch is not None:  # its joints too are kept from before a physics step
+        if self._watch is not None:  # its joints are copied before a physics step too
             inputs = replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *self._watch.inputs.fields))))
         with stream.scope():
             try:
@@ -498,8 +498,8 @@ class WarpSimulation(Simulation):
     def _give_back(self, is_new: Bool[Tensor, " env"], earlier: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
         """Give environments that are not new back what they had, and take the joints of those that are."""
         is_old = ~is_new
-        for name, before in earlier.items():
-            put_rows(arrays[name], is_old, before)
+        for name, old in earlier.items():
+            put_rows(arrays[name], is_old, old)
         for name, kept in self._kept.items():
             put_rows(kept, is_new, self._arrays[name])
 
@@ -507,8 +507,8 @@ class WarpSimulation(Simulation):
         """Keep MuJoCo Warp from evaluating the sensors that `contacts` stands in for; with no others, from looking for any."""
         foreign = foreign_sensors(model, inputs)
         for name in ("sensor_contact_pos_adr", "sensor_contact_acc_adr"):  # of the stages of positions and of forces
-            kept = np.intersect1d(getattr(self.warp_model, name).numpy(), foreign)
-            setattr(self.warp_model, name, wp.array(kept, dtype=int))
+            addresses = np.intersect1d(getattr(self.warp_model, name).numpy(), foreign)
+            setattr(self.warp_model, name, wp.array(addresses, dtype=int))
         if not len(foreign):
             self.warp_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 

@@ -118,12 +118,12 @@ class WarpStream:
     @contextlib.contextmanager
     def _quiet(self) -> Iterator[None]:
         """Keep Warp from announcing itself and the kernels that it loads."""
-        before = self._warp.config.log_level
-        self._warp.config.log_level = max(before, self._warp.LOG_ERROR)
+        log_level = self._warp.config.log_level
+        self._warp.config.log_level = max(log_level, self._warp.LOG_ERROR)
         try:
             yield
         finally:
-            self._warp.config.log_level = before
+            self._warp.config.log_level = log_level
 
 
 @contextlib.contextmanager

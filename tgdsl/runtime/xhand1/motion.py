@@ -17,7 +17,7 @@ from tgdsl.runtime.xhand1.wire.payloads import JOINTS, NUM_JOINTS, PASSIVE, Join
 
 JointArray = Float[np.ndarray, " joint"]
 ROUNDING = 1e-6
-"""How far a target may lie beyond its range and is taken for its end [rad]: float32 angles are rounded by less."""
+"""How far a target may lie beyond its range to count as its end [rad]: float32 angles are rounded by less."""
 _LONGEST_STEP_S = 0.05
 """Set-points move no further in one exchange than in this time, however long it took [s]."""
 
@@ -132,9 +132,9 @@ class JointControls:
         """
         joints = joint_ids(model)
         actuators = [_actuator(model, name, int(joint)) for name, joint in zip(JOINTS, joints, strict=True)]
-        others = [model.actuator(i).name or str(i) for i in range(model.nu) if i not in actuators]
-        if others:
-            raise MotionError(f"the actuators {listed(others)} are not of the hand's joints, so a hand cannot do what they do")
+        foreign = [model.actuator(i).name or str(i) for i in range(model.nu) if i not in actuators]
+        if foreign:
+            raise MotionError(f"the actuators {listed(foreign)} are not of the hand's joints, so a hand cannot do what they do")
         return cls(np.array(actuators), model.jnt_qposadr[joints].astype(np.int64))
 
     def targets(self, control: np.ndarray) -> Float[np.ndarray, " joint"]:

@@ -2,7 +2,7 @@
 
 `agg_force` is the calibrated force on each fingertip [unit of the calibration]; the simulation's `scale` is the factor from
 summed depth to that unit. `agg_bool` is whether that force is larger than the calibration's `contact_threshold`, where the
-simulation counts taxels. A sensor's `rate` and `history` are kept as the module keeps them; its noise is not added.
+simulation counts taxels. A sensor's `rate` and `history` are those of the module; its noise is not added.
 
 `joint_pos` is what the hand says, `joint_vel` its difference in time (see `velocity`). `last_action` is what the policy last
 gave, whether or not the hand was allowed to follow; before that, the angles at which the joints were.
@@ -156,17 +156,17 @@ def _joint_of(name: str) -> int:
 def _fingers(plan: Plan, sensor: PlannedSensor) -> tuple[int, ...]:
     links = plan.layout_of(sensor).links
     fingers = [finger_of(link.body) for link in links]
-    others = [link.name for link, finger in zip(links, fingers, strict=True) if finger is None]
-    if others:
-        raise ObservationError(f'"{sensor.sensor}" is on {", ".join(others)}, where it has no sensor')
-    known = [finger for finger in fingers if finger is not None]
-    twice = sorted({FINGERS[finger] for finger in known if known.count(finger) > 1})
+    bare_links = [link.name for link, finger in zip(links, fingers, strict=True) if finger is None]
+    if bare_links:
+        raise ObservationError(f'"{sensor.sensor}" is on {", ".join(bare_links)}, where it has no sensor')
+    finger_ids = [finger for finger in fingers if finger is not None]
+    twice = sorted({FINGERS[finger] for finger in finger_ids if finger_ids.count(finger) > 1})
     if twice:
         raise ObservationError(f'"{sensor.sensor}" has several links on one fingertip: {", ".join(twice)}')
     sides = {link.body.split("_hand_")[0].endswith("right") for link in links}
     if len(sides) > 1:
         raise ObservationError(f'"{sensor.sensor}" is on two hands')
-    return tuple(known)
+    return tuple(finger_ids)
 
 
 class HandObserver:
@@ -229,7 +229,7 @@ def _features(term: HandTerm, sample: HandSample, threshold: float | None, actio
 class _Past:
     """The samples of one observation: taken when the sensor's rate says so, held until the next, stacked as its history says.
 
-    When a sample is due is found by the module's own arithmetic, in its dtype: see `clock.Clock.now` and `reading.read`.
+    The module's own arithmetic, in its dtype, says when a sample is due: see `clock.Clock.now` and `reading.read`.
     """
 
     def __init__(self, term: HandTerm, control_step: float, dtype: torch.dtype):
@@ -279,7 +279,7 @@ class HandConnection(Connection):
         return self._observer.observe(self._hand.sample())
 
     def send(self, control: Control) -> None:
-        """Send the joints where the controls say, and take note of the controls once the step is made.
+        """Send the joints to the controls' targets, and record the controls after the step.
 
         Raises:
             MotionError: If there are not as many controls as joints.

@@ -78,20 +78,20 @@ class EnvObjects:
 
     def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
         """Say what objects are like in some environments: see `Simulation.set_objects`."""
-        chosen = [dict(self._choices[env]) for env in ids]
+        env_choices = [dict(self._choices[env]) for env in ids]
         for name, value in variants.items():
             self._check_known(name)
             numbers = checked_numbers(f"variants of object {name}", value, len(ids), self._num_variants[name])
-            for choices, variant in zip(chosen, numbers, strict=True):
+            for choices, variant in zip(env_choices, numbers, strict=True):
                 choices[name] = Choice(int(variant))
         for name, value in sizes.items():
-            for choices, size in zip(chosen, self._sizes(name, value, len(ids)), strict=True):
+            for choices, size in zip(env_choices, self._sizes(name, value, len(ids)), strict=True):
                 num = NUM_SIZES[self.scenes.type(name, choices[name].variant)]
                 if len(size) < num or not (size[:num] > 0).all():
                     raise SimulationError(f"size of object {name} is {size.tolist()}, expected {num} positive lengths")
                 x, y, z = [*size[:num].tolist(), 0.0, 0.0][:3]
                 choices[name] = replace(choices[name], size=(x, y, z))
-        for env, choices in zip(ids, chosen, strict=True):
+        for env, choices in zip(ids, env_choices, strict=True):
             self._choices[env] = choices
         self._tabulate()
 
@@ -101,10 +101,10 @@ class EnvObjects:
 
     def variants(self) -> tuple[list[mujoco.MjModel], bool]:
         """Return a model with each variant that an object may have, and whether a compound's sizes may make further ones."""
-        chosen = [(name, v) for name, num in self._num_variants.items() for v in range(num)]
+        each_variant = [(name, v) for name, num in self._num_variants.items() for v in range(num)]
         objects = self.scenes.objects.values()
         is_open = any(target.is_sized and len(target.types) > 1 for target in objects)
-        return [self.scenes.model({name: Choice(v)}) for name, v in chosen], is_open
+        return [self.scenes.model({name: Choice(v)}) for name, v in each_variant], is_open
 
     def models(self) -> list[mujoco.MjModel]:
         """Return each environment's model; those that are alike share one."""

@@ -140,9 +140,9 @@ def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str])
     try:
         body = int(model.body(bodies_of.get(name, name)).id)
     except KeyError as error:
-        known = [*bodies_of, *(model.body(i).name for i in range(1, model.nbody))]
+        names = [*bodies_of, *(model.body(i).name for i in range(1, model.nbody))]
         raise SimulationError(
-            f'there is no object or body "{name}"; {did_you_mean(name, known, "objects and bodies")}'
+            f'there is no object or body "{name}"; {did_you_mean(name, names, "objects and bodies")}'
         ) from error
     bodies = [body]
     for i in range(body + 1, model.nbody):

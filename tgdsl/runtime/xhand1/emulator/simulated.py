@@ -58,7 +58,7 @@ class _Place:
         return by_axis[np.argsort(self.term.axes)]
 
     def operator(self, plan: Plan) -> tuple[str | None, bytes]:
-        """Return the reading and the matrix that the force is made with, to compare."""
+        """Return the reading and the matrix that gave the force, to compare."""
         planned = self.term.planned
         matrix = plan.arrays[f"observations/{planned.group}/{planned.index}/operator"]
         columns = matrix.reshape(len(matrix), 3, len(self.term.fingers))[:, np.argsort(self.term.axes), self.link]
@@ -286,7 +286,7 @@ class EmulatedSource(XHand1Source):
         return self.body.time if self._is_lockstep else super()._time_of(reading)
 
     def _check_threads(self) -> None:
-        """Raise the error that ended a thread, in place of what follows from it."""
+        """Raise the error that ended a thread, not what follows from it."""
         if self.body.failure is not None:
             raise SimulationError(f"the emulated hand's simulation ended: {self.body.failure}") from self.body.failure
         self.emulator.check()

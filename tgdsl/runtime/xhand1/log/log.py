@@ -259,7 +259,7 @@ class LogWriter:
 
         Raises:
             LogError: If the log is closed.
-            FileError: If it cannot be kept.
+            FileError: If it cannot be written.
         """
         if self._spool is None:
             raise LogError(f"{self._path}: this log is closed")

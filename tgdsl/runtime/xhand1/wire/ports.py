@@ -101,15 +101,15 @@ def ask_ports(device: str | None = None, hand_id: int | None = None) -> tuple[As
         HandError: If pyserial is not installed.
     """
     if device is not None:
-        known = {port.device: port for port in list_ports()}
-        return (AskedPort(known.get(device, PortInfo(device, "", "")), _hands(device, hand_id)),)
-    asked = []
+        by_device = {port.device: port for port in list_ports()}
+        return (AskedPort(by_device.get(device, PortInfo(device, "", "")), _hands(device, hand_id)),)
+    results = []
     for port in list_ports():
         try:
-            asked.append(AskedPort(port, _hands(port.device, hand_id)))
+            results.append(AskedPort(port, _hands(port.device, hand_id)))
         except HandError as error:
-            asked.append(AskedPort(port, (), str(error)))
-    return tuple(asked)
+            results.append(AskedPort(port, (), str(error)))
+    return tuple(results)
 
 
 def the_hand(device: str | None = None, hand_id: int | None = None) -> FoundHand:
@@ -123,18 +123,18 @@ def the_hand(device: str | None = None, hand_id: int | None = None) -> FoundHand
         HandError: If there is none or more than one; it lists the ports, or the hands.
         HandDisconnectedError: If the port that was named cannot be opened.
     """
-    asked = ask_ports(device, hand_id)
-    hands = [hand for port in asked for hand in port.hands]
+    ports = ask_ports(device, hand_id)
+    hands = [hand for port in ports for hand in port.hands]
     if len(hands) == 1:
         return hands[0]
     if hands:
-        found = ", ".join(f"{hand.device} (id {hand.addresses.hand_id})" for hand in hands)
-        raise HandError(f"{len(hands)} hands answer: {found}; choose one with --port or --hand-id")
-    wanted = "no hand answers" if hand_id is None else f"no hand with id {hand_id} answers"
+        candidates = ", ".join(f"{hand.device} (id {hand.addresses.hand_id})" for hand in hands)
+        raise HandError(f"{len(hands)} hands answer: {candidates}; choose one with --port or --hand-id")
+    problem = "no hand answers" if hand_id is None else f"no hand with id {hand_id} answers"
     if device is not None:
-        raise HandDisconnectedError(f"{wanted} on {device}; is it switched on, and is this its port?")
-    listed = "; ".join(map(str, asked)) or "this computer has no serial port"
-    raise HandDisconnectedError(f"{wanted}; {listed}")
+        raise HandDisconnectedError(f"{problem} on {device}; is it switched on, and is this its port?")
+    listed = "; ".join(map(str, ports)) or "this computer has no serial port"
+    raise HandDisconnectedError(f"{problem}; {listed}")
 
 
 def _hands(device: str, hand_id: int | None) -> tuple[FoundHand, ...]:
@@ -149,10 +149,10 @@ _BYTES = ("version", "side", "serial_number", "name")
 
 @dataclass(frozen=True)
 class HandIdentity:
-    """What a hand tells of itself; bytes as they came, for the layout of these replies is unverified.
+    """What a hand says about itself; bytes as they came, for the layout of these replies is unverified.
 
     Attributes:
-        device: The serial port that it was found on.
+        device: The serial port that it answers on.
         hand_id: Its id.
         version: Its version; empty if it was not asked.
         side: Register 20, which hand it is; None if it does not tell.

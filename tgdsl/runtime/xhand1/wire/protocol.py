@@ -1,4 +1,4 @@
-"""The XHand1's serial protocol: frames, their checksum, and how they are found in a stream of bytes.
+"""The XHand1's serial protocol: frames, their checksum, and the search for them in a stream of bytes.
 
 A frame is `55 AA | source | destination | command | length u16 | payload | crc u16`, all little-endian; the checksum is
 CRC-16/XMODEM over all that stands before it. Source: the facts that a republished vendor header, a PNDbotics wiki and an open
@@ -110,8 +110,8 @@ _SLICE = 4096
 class FrameParser:
     """Takes bytes as they come and gives the frames whose checksum is right.
 
-    What is found depends on the bytes alone, not on how they were cut. A header that leads to no frame costs one byte: the
-    search goes on right behind it, so that a frame that hides in what looked like another is found. At most one frame of the
+    The frames depend on the bytes alone, not on how they were cut. A header that leads to no frame costs one byte: the
+    search goes on right behind it, so that it finds a frame inside what looked like another. At most one frame of the
     largest size and one slice of 4 KiB are kept.
 
     Attributes:
