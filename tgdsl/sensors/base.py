@@ -390,9 +390,9 @@ class Kind:
 
     spec: type[AnySensorSpec]
     lower: Callable[[Any, Layout, SurfaceOf], Lowered]
-    forward: Callable[[Gathered, Context, Any, State], tuple[Planes, State]]
+    forward: Callable[[Gathered, Context, Any, Any], tuple[Planes, Any]]
     reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], ReferenceAnswer]
-    decide: Callable[[Planes, Any, State], tuple[Planes, State]] | None = None
+    decide: Callable[[Planes, Any, Any], tuple[Planes, Any]] | None = None
     knobs: frozenset[str] = BASE
     gains_depth: bool = False
     idle_knobs: frozenset[str] = frozenset()
