@@ -34,7 +34,7 @@ from tgdsl.quantities.contact_depth import ReferencePenetration
 from tgdsl.sensors.elastomer import blocks, operators
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance_reference
 from tgdsl.sensors.elastomer.kernels import LinkTaxels
-from tgdsl.sensors.elastomer.operators import OperatorForm
+from tgdsl.sensors.elastomer.operators import Operator, OperatorForm
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -81,23 +81,25 @@ def presses(taxels: LinkTaxels, num_envs: int, seed: int = 0) -> dict[str, Tenso
     return {name: torch.from_numpy(value) for name, value in {"spread": h, "bulge": h**1.2, "drag": slip * h}.items()}
 
 
-def constants_of(taxels: LinkTaxels, surface: Surface, fields: dict[str, Any]) -> dict[str, np.ndarray]:
+Operators = dict[str, Operator[Tensor]]
+
+
+def folded(taxels: LinkTaxels, surface: Surface, fields: dict[str, Any]) -> dict[str, Operator[np.ndarray]]:
     """Return the folded operators of one form."""
     spec = spec_of(**fields)
     pad = surface if spec.boundary is not None else None
-    found = {}
-    for name, response in blocks.responses(spec, taxels, pad).items():
-        is_alike = not (name == "spread" and pad is not None)
-        folded = operators.fold(response, blocks.PLANES[name], taxels, OperatorForm(spec.operator, spec.tolerance), is_alike)
-        found |= {f"{name}/0/{key}": value for key, value in folded.items()}
-    return found
+    form = OperatorForm(spec.operator, spec.tolerance)
+    return {
+        name: operators.fold(response, blocks.PLANES[name], taxels, form, is_alike=pad is None or name != "spread")
+        for name, response in blocks.responses(spec, taxels, pad).items()
+    }
 
 
-def displacement(constants: dict[str, Tensor], inputs: dict[str, Tensor]) -> Tensor:
+def displacement(link: Operators, inputs: dict[str, Tensor]) -> Tensor:
     """Return the displacement planes (3, env, taxel) on a flat pad that looks along z, strengths 1."""
-    x, y, z = operators.apply(constants, "spread", [inputs["spread"]])
-    (bulge,) = operators.apply(constants, "bulge", [inputs["bulge"]])
-    (drag,) = operators.apply(constants, "drag", [inputs["drag"]])
+    x, y, z = operators.apply([link["spread"]], [inputs["spread"]])
+    (bulge,) = operators.apply([link["bulge"]], [inputs["bulge"]])
+    (drag,) = operators.apply([link["drag"]], [inputs["drag"]])
     return torch.stack([x + drag[0], y + drag[1], z + bulge])
 
 
@@ -132,18 +134,16 @@ class Forms:
         inputs = {name: value.float() for name, value in exact.items()}
         calls, errors, bytes_of = {}, {}, {}
         for form, fields in FORMS.items():
-            made = constants_of(taxels, surface, fields)
-            dense = constants_of(
-                taxels, surface, {**fields, "operator": "dense", "tolerance": None} if "svd" in form else fields
-            )
+            arrays = folded(taxels, surface, fields)
+            dense = folded(taxels, surface, {**fields, "operator": "dense", "tolerance": None} if "svd" in form else fields)
             truth = displacement(on(dense, self.device, torch.float64), exact)
-            constants = on(made, self.device, torch.float32)
-            found = displacement(constants, inputs)
-            errors[form] = float((found.double() - truth).abs().max() / truth.abs().max())
-            bytes_of[form] = sum(value.size for value in made.values())
+            link = on(arrays, self.device, torch.float32)
+            result = displacement(link, inputs)
+            errors[form] = float((result.double() - truth).abs().max() / truth.abs().max())
+            bytes_of[form] = sum(value.size for operator in arrays.values() for value in vars(operator).values())
             torch.compiler.reset()
             compiled = torch.compile(displacement, fullgraph=True, dynamic=False) if form != "fft" else displacement
-            calls[form] = captured(lambda c=constants, f=compiled: f(c, inputs), self.device)
+            calls[form] = captured(lambda c=link, f=compiled: f(c, inputs), self.device)
         times = median_ms(calls, self.repeats, self.device)
         rows = []
         for form in FORMS:
@@ -153,10 +153,17 @@ class Forms:
         return rows
 
 
-def on(constants: dict[str, np.ndarray], device: str, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return constants as tensors; floats in `dtype`."""
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(value)).to(device) for name, value in constants.items()}
-    return {name: value.to(dtype) if value.is_floating_point() else value for name, value in tensors.items()}
+def on(link: dict[str, Operator[np.ndarray]], device: str, dtype: torch.dtype) -> Operators:
+    """Return operators of tensors; floats in `dtype`."""
+
+    def tensor(value: np.ndarray) -> Tensor:
+        result = torch.from_numpy(np.ascontiguousarray(value)).to(device)
+        return result.to(dtype) if result.is_floating_point() else result
+
+    return {
+        name: operators.operator_of({key: tensor(value) for key, value in vars(operator).items()})
+        for name, operator in link.items()
+    }
 
 
 def captured(call: Callable[[], Any], device: str) -> Callable[[], Any]:
@@ -239,9 +246,9 @@ def responses_of(taxels: LinkTaxels) -> np.ndarray:
 def in_float32(taxels: LinkTaxels, h: np.ndarray) -> np.ndarray:
     """Return what a module's dense operator makes of depths (press, taxel), in float32."""
     response = blocks.responses(spec_of(), taxels, None)["spread"]
-    made = operators.fold(response, blocks.PLANES["spread"], taxels, OperatorForm("dense", None))
-    constants = on({f"spread/0/{key}": value for key, value in made.items()}, "cpu", torch.float32)
-    return torch.stack(operators.apply(constants, "spread", [torch.from_numpy(h).float()]), dim=1).double().numpy()
+    spread = operators.fold(response, blocks.PLANES["spread"], taxels, OperatorForm("dense", None))
+    link = on({"spread": spread}, "cpu", torch.float32)
+    return torch.stack(operators.apply([link["spread"]], [torch.from_numpy(h).float()]), dim=1).double().numpy()
 
 
 def flattened(taxels: LinkTaxels) -> LinkTaxels:

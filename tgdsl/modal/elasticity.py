@@ -5,7 +5,7 @@
 The displacement is triquadratic in each cell (27 nodes) and continuous. Both integrals run over the part of each cell that the
 body fills, so the surface need not run along the cells: the finite cell method (Parvizian, Düster, Rank, *Finite cell method*,
 Computational Mechanics 41, 2007), without its fictitious material around the body, since a free surface needs none. It is
-Ritz's method on the body itself: but for what `cells.py` says of the integrals, no frequency comes out lower than it is, and
+Ritz's method on the body itself: apart from errors of the integrals (`cells.py`), no frequency is below the exact one, and
 rigid motions are exact. The mass is consistent.
 
 A mesh of tetrahedra, which thin walls make large or flat, is not needed. fTetWild was tried (pytetwild 0.4.2, MPL-2.0): it

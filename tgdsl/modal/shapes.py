@@ -3,7 +3,7 @@
 Displacement is smooth within a body, from one side of a wall to the other too, so eight nodes around a point do, and a
 direction says which side it is of. A node outside the body has what the nearest point of its surface has. The spacing is the
 first of `ALONG` nodes on the longest side with which the largest of the fields' errors is within `TOLERANCE`, or the finest of
-at most `MAX_NODES` nodes. Errors are those of the component along the normal, root mean squares over points of the surface that
+at most `MAX_NODES` nodes. Errors are of the component along the normal, root mean squares over points of the surface that
 are no nodes.
 
 Everything is in the grid's axes, and in units of the body's size. Shapes: `node` nodes of the grid, z running fastest, `dof`

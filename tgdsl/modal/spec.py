@@ -14,6 +14,6 @@ class ShapeModes(SpecModel):
     """Modes by modal analysis of a body's shape."""
 
     material: MaterialField
-    """What it is made of: a material by name, or by its numbers."""
+    """Its material, by name or by numbers."""
     count: Annotated[StrictInt, Field(ge=1)] = 32
-    """Most modes that are kept, from the lowest on."""
+    """Number of modes, from the lowest on, at most."""

@@ -40,13 +40,13 @@ class AnySensorSpec(SpecModel):
     readout: Literal["clean", "measured", "both"] = "measured"
     """`measured` with the imperfections of `noise`, `clean` without, or `both`: `<name>` and `<name>/clean`."""
     rate: Annotated[Frequency | None, Usual("frequency", low=0.1, high=1e5)] = None
-    """How often the sensor takes a sample, which it reads until the next one [Hz]; default: at every call."""
+    """Sample rate [Hz]; between samples it reads the last one; default: a sample at every call."""
     history: History | None = None
-    """How many calls are read, `stack`ed or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
+    """Calls in a reading, stacked or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
     accuracy: AccuracyField = None
-    """RMS error that its reading may have on states of the scene, before noise: a fraction of the largest change, `1 %`, an
-    amount, `0.02 mm`, or one of each quantity, `{force: 5 mN, torque: 1 %}`. The cheapest fields that hold it are then chosen
-    among those that nobody wrote, here and in the objects that it feels."""
+    """Largest RMS error of its reading on states of the scene, before noise: a fraction of the largest change, `1 %`, an
+    amount, `0.02 mm`, or one of each quantity, `{force: 5 mN, torque: 1 %}`. Fields that the document leaves out, here and in
+    the objects that it feels, then get the cheapest values that meet it."""
     is_on_taxels: ClassVar[bool] = True
     """Whether `links` chooses among the links that the layout gives taxels; else among all bodies of the robot."""
     needs_taxels: ClassVar[bool] = True
@@ -107,8 +107,8 @@ class ContactProbeSpec(ProbeSpec):
     """Probes that feel objects in contact with their link."""
 
     gate: Literal["contact_pair", "geometric"] = "contact_pair"
-    """When an object is felt: `contact_pair` only while the simulator has it in contact with the taxel's link (the paper);
-    `geometric` whenever a probe's sphere reaches into it, so a 4 mm probe feels it 4 mm before it touches."""
+    """When probes feel an object: `contact_pair` only while the simulator has it in contact with the taxel's link (the paper);
+    `geometric` whenever a probe's sphere reaches into it, so a 4 mm probe feels it 4 mm before the touch."""
 
     @property
     def is_gated(self) -> bool:
@@ -178,7 +178,7 @@ def body_axis(layout: Layout) -> Axis:
 
 
 def _named(constants: Any, path: str = "") -> dict[str, Any]:
-    """Return the arrays of dataclasses, mappings and tuples by their paths, without those that are None."""
+    """Return the arrays of dataclasses, mappings and tuples by their paths, without None."""
     if dataclasses.is_dataclass(constants):
         constants = {part.name: getattr(constants, part.name) for part in dataclasses.fields(constants)}
     elif isinstance(constants, tuple):
@@ -307,7 +307,7 @@ class SurfaceOf(Protocol):
 
 
 Array = TypeVar("Array")
-"""`np.ndarray` where constants are made, `Tensor` where they are read."""
+"""`np.ndarray` in `lower`, `Tensor` in `forward`."""
 Constants = Mapping[str, Tensor]
 """Constants of a kind without a dataclass for them."""
 State = Mapping[str, Tensor]
@@ -359,7 +359,7 @@ class Kind:
         decide: `(planes, constants, state) → (planes, new state)`, if the reading is a threshold of a signal: `forward` then
             returns the signal, and noise acts on that.
         knobs: Names of its noise knobs.
-        gains_depth: Whether the noise stage `gain` scales the depth that `forward` gets, in place of the reading.
+        gains_depth: Whether the noise stage `gain` scales the depth that `forward` gets, instead of the reading.
         idle_knobs: Knobs that do not change its reading; a document that sets one gets a warning.
         is_pointwise: Whether each row of its planes depends on one taxel alone. Sensors without state on different taxels are
             then evaluated together, and scalar constants are passed as (taxel,).
@@ -371,7 +371,7 @@ class Kind:
         alternatives: `(spec) → alternatives`, from coarse to fine. Errors are measured against the last one that can be
             compiled; one that the spec or its links do not allow is left out.
         provides: Planes that `forward` and `reference` (as a third value, by name) can return for other sensors, see
-            `sensors.upstream`. `Lowered.provides` has those of one sensor.
+            `sensors.upstream`; `Lowered.provides` lists them for one sensor.
         reads: The field of its spec that names the sensors it reads; "": none.
         warns: Pairs of a state's name and `(sensor's name, constants, rows of the sensors that it reads, maxima over
             environments) → messages`, each shown once.
@@ -384,9 +384,9 @@ class Kind:
 
     spec: type[AnySensorSpec]
     lower: Callable[[Any, Layout, SurfaceOf], Lowered]
-    forward: Callable[[Gathered, Context, Any, State], tuple[Planes, State]]
+    forward: Callable[[Gathered, Context, Any, Any], tuple[Planes, Any]]
     reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], ReferenceAnswer]
-    decide: Callable[[Planes, Any, State], tuple[Planes, State]] | None = None
+    decide: Callable[[Planes, Any, Any], tuple[Planes, Any]] | None = None
     knobs: frozenset[str] = BASE
     gains_depth: bool = False
     idle_knobs: frozenset[str] = frozenset()

@@ -33,7 +33,7 @@ force of contacts beyond `slots` is included, at the centre of the others. The l
 Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults.
 
 Departures: the paper's tangential and spin terms have the opposite sign, −k_t v_t and −k_ω (ω · m) m, which is the force on
-the object while its normal force is the one on the sensor; `model: paper` keeps them. Velocities are those of the material at
+the object while its normal force is the one on the sensor; `model: paper` keeps them. Velocities are of the material at
 the probe from the velocities of body frame origins, which equals the paper's form from centres of mass. As in the paper the
 force follows depth, not load, unless balanced: its sum over a pad is not the weight of an object at rest. The options are ours.
 """
@@ -78,7 +78,7 @@ class KinematicTaxelSpec(ContactProbeSpec):
     kind: Literal["kinematic_taxel"]
     """Force [N] and torque [N·m] of each taxel from depth, normal and velocity."""
     outputs: Annotated[tuple[Literal["force", "torque"], ...], Field(min_length=1)] = ("force", "torque")
-    """What a reading holds; what is not listed is not computed."""
+    """Quantities of a reading; others are not computed."""
     normal_stiffness: Annotated[NonNegative, Usual("number", high=1e7)] = 500.0
     """k_n, force per depth^α [N/m^α]."""
     normal_damping: NonNegative = 1.0

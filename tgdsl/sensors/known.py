@@ -41,7 +41,7 @@ def known_kinds(given: Sequence[Kind] = ()) -> tuple[Kind, ...]:
     An installed kind that cannot be imported is left out, with one warning.
 
     Args:
-        given: Kinds of the caller, which may repeat those of installed packages.
+        given: Kinds of the caller, which installed packages may provide too.
 
     Raises:
         TgdslError: If two kinds have one name, or one of `given` is not a kind.
@@ -185,5 +185,5 @@ def _wrong_call(kind: str, name: str, call: Any) -> str:
     if fits and not FORMER & set(list(signature.parameters)[: len(arguments)]):
         return ""
     result = ", ".join(signature.parameters)
-    hint = "the CHANGELOG says what was renamed when kinds began to make requests"
+    hint = "the CHANGELOG has the names from when kinds began to make requests"
     return f'kind "{kind}": found `{name}({result})`, expected `{name}({", ".join(arguments)})`; {hint}'

@@ -58,7 +58,7 @@ class LinkContactSpec(ProbeSpec):
     kind: Literal["link_contact"]
     """Contact bit [1] and the solver's force [N] of each body."""
     outputs: Annotated[tuple[Literal["contact", "force", "normal_force"], ...], Field(min_length=1)] = ("contact", "force")
-    """What a reading holds: the bit, then the force, then the sum of the contacts' normal forces."""
+    """Quantities of a reading: the bit, then the force, then the sum of the contacts' normal forces."""
     threshold: NonNegative = 0.0
     """Force above which a body counts as touched [N]."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8

@@ -61,7 +61,7 @@ class ProximitySpec(ProbeSpec):
     kind: Literal["proximity"]
     """Force [N] and torque [N·m] of each taxel from the surfaces near it."""
     radius: Annotated[PositiveLength | None, Usual("length", low=1e-5, high=0.1)] = None
-    """R, sensing radius of all of the sensor's taxels [m]; default: that of each taxel in the layout."""
+    """R, sensing radius of all of the sensor's taxels [m]; default: each taxel's radius in the layout."""
     backend: Literal["field", "points"] = "field"
     """`field`: interpolated from a field that is computed beforehand; `points`: a sum over sampled points (the paper). Planes
     are exact in both."""
@@ -75,17 +75,17 @@ class ProximitySpec(ProbeSpec):
     max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
     """Largest size of an object's fields, or of its lists of points [bytes]."""
     outputs: Annotated[tuple[Literal["force", "torque"], ...], Field(min_length=1)] = ("force", "torque")
-    """What a reading holds; what is not listed is not computed."""
+    """Quantities of a reading; others are not computed."""
     normal_stiffness: Annotated[NonNegative, Usual("number", high=1e7)] = 300.0
     """k, force per depth [N/m]."""
     shear_damping: NonNegative = 10.0
     """k_s, force per depth and velocity [N·s/m²]."""
     density: Positive = 100.0
-    """Weight of all that is felt: what the points' weights add up to [1]."""
+    """Total weight of the felt surface, or of its points [1]."""
     reference_area: Area | None = None
-    """A, area that the density is spread over [m²]; default: that of all felt objects but for planes."""
+    """A, area that the density is spread over [m²]; default: the area of all felt objects except planes."""
     torque_about: Literal["taxel", "link"] = "taxel"
-    """What the torque is about: the taxel (the paper), or the link's origin."""
+    """Point that the torque is about: the taxel (the paper), or the link's origin."""
     model: Literal["tgdsl", "paper"] = "tgdsl"
     """`paper` keeps the paper's sign of the normal part, and its slip with the object's absolute angular velocity."""
 
@@ -170,7 +170,7 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
 def forward(
     gathered: Gathered, context: Context, constants: ProximityConstants[Tensor], state: State
 ) -> tuple[dict[str, Tensor], State]:
-    """Return the force planes [N] and the torque planes [N·m]; the module drops those that are not read."""
+    """Return the force planes [N] and the torque planes [N·m]; planes that are not read cost nothing once compiled."""
     normal = planes.split(constants.normal.T)
     surfaces = gathered[MomentsRequest]
     zero = surfaces.none

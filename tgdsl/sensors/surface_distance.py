@@ -53,9 +53,9 @@ class SurfaceDistanceSpec(ProbeSpec):
     kind: Literal["surface_distance"]
     """Distance of each probe's centre to each object's surface, negative inside [m]."""
     max_range: Annotated[PositiveLength, Usual("length", high=5.0)] = 0.05
-    """Largest distance that is told apart, r_max [m]."""
+    """r_max, distance beyond which the reading is constant [m]."""
     nearest: bool = False
-    """Whether to read the vectors from the probe to the nearest points too, in the link's frame [m]."""
+    """Whether to read the vectors from the probe to the nearest points, in the link's frame [m]."""
 
 
 def reference(

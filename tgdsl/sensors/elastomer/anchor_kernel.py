@@ -9,7 +9,7 @@ Shapes: `env` environments, `link` links that may meet the object, `point` its p
 """
 
 # Only Triton's compiler knows the types in a kernel.
-# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations
 

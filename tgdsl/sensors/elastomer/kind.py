@@ -170,7 +170,7 @@ def forward(
     move = _gaussian if constants.normal_stiffness is None else _elastic
     result = move(touch.depth, shear, normal, constants)
     if loads is not None and constants.shear_falloff is not None:
-        assert constants.shear_strength is not None
+        assert constants.shear_strength is not None and constants.is_active is not None
         flat = frozenset(int(first) for first in constants.flat)
         markers = Markers(touch.pos, normal, constants.shear_falloff, constants.reference_area, flat)
         dragged = point_anchors.drag(loads, markers, touch.depth.shape[0])

@@ -45,7 +45,7 @@ class Dense(Generic[Array]):
     matrix: Array
 
     @property
-    def num_taxels(self) -> int:
+    def num_taxels(self: Dense[Tensor]) -> int:
         """Number of taxels of the link."""
         return self.matrix.shape[1]
 
@@ -63,7 +63,7 @@ class Truncated(Generic[Array]):
     right: Array
 
     @property
-    def num_taxels(self) -> int:
+    def num_taxels(self: Truncated[Tensor]) -> int:
         """Number of taxels of the link."""
         return self.left.shape[1]
 
@@ -83,7 +83,7 @@ class Convolution(Generic[Array]):
     places: Array
 
     @property
-    def num_taxels(self) -> int:
+    def num_taxels(self: Convolution[Tensor]) -> int:
         """Number of taxels of the link."""
         return self.places.shape[0]
 

@@ -48,7 +48,7 @@ class ElastomerSpec(ContactProbeSpec):
     kind: Literal["elastomer"]
     """Displacement of the markers in a soft skin [m]."""
     like: Annotated[str | None, AfterValidator(skins.checked_skin), WithJsonSchema({"enum": [*skins.SKINS]})] = None
-    """Skin whose values hold where none is given here: paper_gel, soft_gel or firm_rubber, see `elastomer.skins`."""
+    """Skin that gives the default of each field: paper_gel, soft_gel or firm_rubber, see `elastomer.skins`."""
     kernel: Literal["gaussian", "half_space", "bonded_layer"] = "gaussian"
     """How a load spreads: the paper's Gaussian, or an elastic half-space or layer bonded to a rigid base."""
     model: Literal["tgdsl", "paper"] = "tgdsl"
@@ -80,12 +80,12 @@ class ElastomerSpec(ContactProbeSpec):
     marker_depth: Annotated[Radius, Usual("length", high=0.1)] = 0.0
     """Depth of the markers below the skin's surface [m] (half_space, bonded_layer)."""
     standoff: Annotated[Radius, Usual("length", high=0.1)] = 0.0
-    """s, height of the undeformed skin above the taxels [m]. Above 0 it is felt before the link itself touches: `gate` is then
+    """s, height of the undeformed skin above the taxels [m]. Above 0 it touches before the link does, and `gate` is
     `geometric`."""
     friction: NonNegative | None = None
     """μ, friction coefficient of the skin [1]; null: it never slides, as in the paper."""
     anchors: Literal["taxels", "points"] | None = None
-    """What sticks by an anchor: each taxel to the object that it touches, or `points` sampled on each object to the skin
+    """What carries an anchor: each taxel, on the object that it touches, or `points` sampled on each object, on the skin
     (the paper; gaussian); default: `taxels`, under `model: paper` `points`."""
     points: Annotated[StrictInt, Field(ge=1)] = 1000
     """Points of each object, for `anchors: points`."""

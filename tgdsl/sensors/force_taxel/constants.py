@@ -1,7 +1,7 @@
 """Numbers that `footprint`, its float64 reference and its Triton kernel share.
 
 Functions, not a module's floats: torch.compile for dynamic shapes makes graph inputs of those. A kernel takes them as
-`tl.constexpr` of its own file.
+`tl.constexpr` of its file.
 """
 
 

@@ -72,7 +72,7 @@ class ForceTaxelSpec(ContactProbeSpec):
     kind: Literal["force_taxel"]
     """Force [N] or pressure [Pa] of each taxel, which sum to the solver's contact force."""
     outputs: Annotated[tuple[Literal["force", "pressure"], ...], Field(min_length=1)] = ("force",)
-    """What a reading holds, force before pressure."""
+    """Quantities of a reading, force before pressure."""
     footprint: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
     """Radius r_f around a contact in which taxels carry it [m]; a contact further than r_f/2 from the nearest taxel is partly
     missed. Default: on each body 3 times the taxels' spacing, the root of their mean area."""

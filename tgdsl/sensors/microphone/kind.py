@@ -3,7 +3,7 @@
     p(t) = Σ_i l_i s_i(t − a_i(t)) / max(r_i, r_min)^p,   r_i = c a_i,   a_i = |m(t) − x_i(t − a_i)|/c          [Pa]
 
 with s_i the sound pressure at 1 m from row i of a sensor that makes sound [Pa], l_i a factor for that sensor; r_i the distance
-in metres from where the source was when it emitted what is heard to where the microphone is, and c the speed of sound
+in metres from the source, at the instant of emission, to the microphone, and c the speed of sound
 [m/s]. The sources that it hears are sensors of the document; it reads what they find at the same physics step, see
 `sensors.upstream`: K samples, the last one at the step's end. So it reads a block of K samples, of each step of a call.
 
@@ -11,13 +11,13 @@ in metres from where the source was when it emitted what is heard to where the m
   step. So a tone of frequency f is heard at f (1 − v_m/c)/(1 + v_s/c), with the speeds v_m and v_s of microphone and source
   away from one another.
 - Between samples it is interpolated by 24 of them (`interpolation`), exact up to 0.4 of the sample rate. These look ahead, so
-  that no sound is heard sooner than 12 samples after it was made: what is nearer than 12 c/f_s is so late, and as loud as its
-  distance says.
+  that sound arrives at least 12 samples after its emission: from sources nearer than 12 c/f_s it is late, but as loud as at
+  their distance.
 - Level is linear within a step.
 - A source farther than `reach` is not heard, and a warning says so. After a reset there has been no sound, and all stood still.
 
 Source: the paper, appendix on audio (1/r^p and r/c); Pierce, *Acoustics*, 4.1 and 11.5, for the retarded time of a source that
-moves. Departures: the paper says nothing of motion, nor of what is between samples.
+moves. Departures: the paper specifies neither motion nor interpolation between samples.
 
 Limits: free field. There is neither reflection nor obstacle, directivity, absorption by air, nor the factor of a fast source's
 level.
@@ -126,7 +126,7 @@ def fit(spec: MicrophoneSpec, lowered: Lowered, fitting: Fitting) -> Lowered:
     rate, least = samples / timestep, LEAST_DELAY * timestep / samples
     notes = (
         f"hears {', '.join(fitting.upstream)} up to {spec.reach:g} m at {rate:g} Hz",
-        f"no sound sooner than {1e3 * least:.3g} ms after it was made: all within {spec.speed * least:.3g} m",
+        f"no sound sooner than {1e3 * least:.3g} ms after its emission: all within {spec.speed * least:.3g} m",
     )
     constants = MicrophoneConstants(
         falloff=scalar(spec.falloff),

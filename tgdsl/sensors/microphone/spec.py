@@ -27,13 +27,13 @@ class MicrophoneSpec(AnySensorSpec):
     levels: dict[str, Positive] = {}
     """By what the sound of a sensor is multiplied [1], by its name; default: 1."""
     falloff: NonNegative = 1.0
-    """Exponent p of the level 1/r^p, r in metres [1]; 1 is that of a point in a free field."""
+    """Exponent p of the level 1/r^p, r in metres [1]; 1 for a point source in a free field."""
     nearest: Annotated[PositiveLength, Usual("length", low=1e-3, high=1.0)] = 0.01
     """Distance below which a source gets no louder [m]."""
     reach: Annotated[PositiveLength, Usual("length", low=0.05, high=100.0)] = 10.0
     """Distance beyond which nothing is heard [m]: sound is remembered for as long as it travels so far."""
     speed: Annotated[Speed, Usual("speed", high=7000.0)] = 343.0
-    """Speed of sound, c [m/s]; the default is that of air at 20 °C."""
+    """Speed of sound, c [m/s]; default: air at 20 °C."""
     is_on_taxels: ClassVar[bool] = False
     needs_taxels: ClassVar[bool] = False
 

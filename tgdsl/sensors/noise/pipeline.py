@@ -69,7 +69,7 @@ def more_knobs() -> tuple[type[Any], ...]:
 
 
 def knobs_of(knobs: frozenset[str]) -> frozenset[str]:
-    """Return the knobs of a kind with those of `more_stages`; none if it has none."""
+    """Return the knobs of a kind and of `more_stages`; none if the kind has none."""
     return knobs.union(*(model.model_fields for model in more_knobs())) if knobs else knobs
 
 

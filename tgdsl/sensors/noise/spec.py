@@ -90,7 +90,7 @@ class Knobs(SpecModel):
     crosstalk: Crosstalk | None = None
     """Mixing of neighbouring taxels."""
     read_delay: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
-    """Age of what is read [s]; between two calls the signal counts as linear."""
+    """Age of the signal that is read [s]; between two calls the signal counts as linear."""
     jitter: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
     """Largest additional age, drawn uniformly at each reading for all taxels together [s]."""
     bias: AnyAmplitude = NO_AMPLITUDE
@@ -142,10 +142,10 @@ Knobs.plain = Knobs
 
 
 class NoiseSpec(Knobs):
-    """Knobs of a sensor, those of some links apart, upon those of a profile."""
+    """Knobs of a sensor on top of a profile, and other knobs on some links."""
 
     like: Text = "clean"
-    """Profile whose knobs hold where none is given here."""
+    """Profile that gives the default of each knob."""
     links: dict[str, Knobs] = {}
     """Knobs of some links, by name, wildcard or group; of several that match, the later one counts."""
 

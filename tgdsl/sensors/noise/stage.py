@@ -138,7 +138,7 @@ class Stage:
         """Return its numbers of some knobs."""
         result = {}
         for name, number in cls.numbers.items():
-            value = knobs
+            value: Any = knobs
             for part in () if number.knob is None else (number.knob or name).split("."):
                 value = value[int(part)] if part.isdigit() else getattr(value, part, None)
             result |= {} if number.knob is None else {name: number.absent if value is None else value}
