@@ -93,7 +93,7 @@ EXAMPLES = {
         (1e-5, 1e-5, 1e-7),
     ),
     "heat_step": Example(
-        lambda dtype: heat_steps.arguments("five objects", dtype),
+        lambda dtype: heat_steps.arguments("one object", dtype),
         lambda found, _: [found.cells, found.nodes, torch.stack(found.got), torch.stack(found.nodes_got)],
         (2e-5, 2e-5, 1e-5, 1e-5),
     ),

@@ -19,7 +19,7 @@ or temperatures in the mean over the step, then those at its end.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import torch
@@ -28,6 +28,9 @@ from torch import Tensor
 
 from tgdsl.sensors.temperature_grid.diffusion import Modes
 from tgdsl.sensors.temperature_grid.response import Four, Response, impulsiveness, of_cells, of_sides, response
+
+MOST_UNROLLED = 8
+"""Sides of a row, or nodes, up to which their system is solved number by number, which compiles to one kernel."""
 
 
 class Sides(NamedTuple):
@@ -181,23 +184,19 @@ def _nodes(
     """Return the temperatures of the nodes in the mean over the step and at its end (env, node)."""
     num_bodies, num_nodes = nodes.shape[-1], sides.tables["at_node"].shape[0]
     num = pulled.shape[-1] // 2
-    mean_of_heat, mean_of_rate = (part[..., None] for part in lump[:2])
 
-    def equations(of_heat: Tensor, of_rate: Tensor, join) -> Tensor:  # type: ignore[no-untyped-def]
-        lumped = join(mean_of_heat * of_heat + mean_of_rate * of_rate), join(of_heat)
+    def equations(of_heat: Tensor, of_rate: Tensor, join: Callable[[Sides, Tensor], Tensor]) -> Tensor:
+        """Return what bodies get for their means and ends, of interfaces H and J, joined over sides."""
+        mean_of_heat, mean_of_rate = (part.reshape(*part.shape, *[1] * (of_heat.ndim - 2)) for part in lump[:2])
+        heat, mean = join(sides, of_heat), join(sides, mean_of_heat * of_heat + mean_of_rate * of_rate)
         if num_nodes == num_bodies:
-            return torch.cat(lumped, dim=1)
-        faces = join(of_heat), join(of_rate)
-        return torch.cat(
-            [torch.cat([a[:, :num_bodies], b[:, num_bodies:]], dim=1) for a, b in zip(lumped, faces, strict=True)], dim=1
-        )
+            return torch.cat([mean, heat], dim=1)
+        rate = join(sides, of_rate)
+        return torch.cat([mean[:, :num_bodies], heat[:, num_bodies:], heat[:, :num_bodies], rate[:, num_bodies:]], dim=1)
 
-    right = equations(*pulled.unflatten(-1, (2, num)).unbind(2), lambda part: _at_nodes(sides, part))
-    columns = []
-    for column in range(2):
-        block = coupled[..., column * num : (column + 1) * num]
-        mean_of_heat, mean_of_rate = (part[..., None, None] for part in lump[:2])
-        columns.append(equations(block[..., :num, :], block[..., num:, :], lambda part: _between_nodes(sides, part)))
+    right = equations(pulled[..., :num], pulled[..., num:], _at_nodes)
+    blocks = coupled[..., :num], coupled[..., num:]
+    columns = [equations(block[..., :num, :], block[..., num:, :], _between_nodes) for block in blocks]
     matrix = torch.cat(columns, dim=-1)
     is_idle = (matrix.diagonal(dim1=-2, dim2=-1) == 0).to(nodes.dtype)
     stores, gain, before = is_idle, torch.ones_like(is_idle), torch.zeros_like(right)
@@ -221,13 +220,21 @@ def _between_nodes(sides: Sides, values: Float[Tensor, "env row side side"]) -> 
     return between + torch.diag_embed(_at_nodes(sides, values.diagonal(dim1=-2, dim2=-1)))
 
 
-def _solved(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return the solution of systems (…, row, row) for some right sides (…, row, column)."""
-    if matrix.shape[-1] != 2:
+def _solved(matrix: Float[Tensor, "*rest both both"], right: Float[Tensor, "*rest both column"]) -> Tensor:
+    """Return the solutions of some right sides, by Gauss-Jordan steps with pivots of two by two where they are few."""
+    num = matrix.shape[-1] // 2
+    if num > MOST_UNROLLED:
         return torch.linalg.solve_ex(matrix, right)[0]
-    (a, b), (c, d) = ([part[..., None] for part in row.unbind(-1)] for row in matrix.unbind(-2))
-    one, other = right.unbind(-2)
-    return torch.stack([d * one - b * other, a * other - c * one], dim=-2) / (a * d - b * c)[..., None]
+    parts = torch.cat([matrix, right], dim=-1)
+    rows = [[parts[..., n, :], parts[..., num + n, :]] for n in range(num)]
+    for n in range(num):
+        one, other = rows[n]
+        (a, b), (c, d) = ((part[..., n, None], part[..., num + n, None]) for part in (one, other))
+        over = 1.0 / (a * d - b * c)
+        one, other = over * (d * one - b * other), over * (a * other - c * one)
+        rows = [[part - part[..., n, None] * one - part[..., num + n, None] * other for part in row] for row in rows]
+        rows[n] = [one, other]
+    return torch.stack([row[k][..., 2 * num :] for k in range(2) for row in rows], dim=-2)
 
 
 def _times(one: Tensor, other: Tensor) -> Tensor:

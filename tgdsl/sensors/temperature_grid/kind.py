@@ -3,20 +3,20 @@
 The box of each link is nx × ny × nz cells of one material, and θ_i = T_i − T_a the temperature of one above ambient [K]. A step
 of Δt does, one after the other:
 
-1. contact: C_i θ̇_i = Σ_n g_in (φ_n − θ_i) with the bodies and links that it touches, implicit and for all of them at once
-   (`conduction`), of cells that show in a step what they conduct to those around (`response`); g_in from the patches' areas,
-   both conductivities and the constriction of heat to a small spot (`shares`);
-2. radiation beyond its tangent at ambient, εσ (T⁴ − T_a⁴ − 4 T_a³ θ), from the surfaces of cells (`losses`);
-3. at once and exact in time: conduction within the link, θ̇ = α ∇²θ with α = k/(ρc), the losses (h + 4εσ T_a³) θ from its faces,
-   and a source, P/N in each cell or q A_i at a face (`diffusion`).
+1. radiation beyond its tangent at ambient, εσ (T⁴ − T_a⁴ − 4 T_a³ θ), from the surfaces of cells (`losses`);
+2. at once: conduction within the link, θ̇ = α ∇²θ with α = k/(ρc), the losses (h + 4εσ T_a³) θ from its faces, a source, P/N in
+   each cell or q A_i at a face, all exact in time (`diffusion`), and contact with bodies and links for all of them at once,
+   C_i θ̇_i = Σ_n g_in (φ_n − θ_i) (`conduction`): exact for steady flows and between bodies of one temperature, else with two
+   numbers for a flow's course in the step (`response`); g_in from the patches' areas, both conductivities and the constriction
+   of heat to a small spot (`shares`).
 
     y ← T + (y − T_before) e^(−Δt/τ) − (T − T_before)(1 − e^(−Δt/τ)) τ/Δt                                  [°C]
 
 is what a sensing element of time constant τ reads of it, exact where T is linear between calls. C_i = ρcV_i is the heat
-capacity of a cell [J/K]. Steps 2 and 3 without a source leave no temperature beyond those of links and surroundings before,
-however long Δt is; nor does 1 where cells that touch differ little from those around. The splitting between them is of first
-order in Δt. Objects with cells have their losses in 2, all of them. The patch of a contact has the area of the convex
-hull of contact points, or that of a Hertzian contact under their normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
+capacity of a cell [J/K]. Losses and conduction without a source leave no temperature beyond those of links and surroundings
+before, however long Δt is. The splitting between 1 and 2 is of first order in Δt. Objects with cells have their losses in 1,
+all of them. The patch of a contact has the area of the convex hull of contact points, or that of a Hertzian contact under their
+normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
 
 What the objects hold is part of the sensor's state: one temperature each, of a body that conducts from the patch to its middle
 as a cube of its volume would, or a grid of their own with `cells`. A new episode begins at the temperatures that the document

@@ -345,7 +345,7 @@ def _touch(
             weight @ part @ flow[at] / block.capacity + weight @ (inverse * of_node)[node[at]] for part in mine[:2]
         )
         sigma[r] = 0.0 if spec.scheme == "semi_implicit" else _impulsiveness(start, constant)
-        for k, part in enumerate(_responses(mine, sigma[r])):
+        for k, part in enumerate(_responses(mine, float(sigma[r]))):
             # Of others a cell shows what all of its side does in the mean.
             result = np.where(cell[at][:, None] == cell[at][None], part, 0.0)
             for s, t in itertools.product(set(side[at]), set(side[at])):
@@ -355,7 +355,7 @@ def _touch(
             shows[k][np.ix_(at, at)] = result / block.capacity
     size, i, j = 2 * num + 2 * len(faces), np.arange(num), num + np.arange(num)
     matrix, right = np.eye(size), np.zeros(size)
-    lump = np.array([_responses([1.0, 1.0, 0.5, 1.0 / 6.0], sigma[r]) for r in row]).reshape(num, 4)
+    lump = np.array([_responses([1.0, 1.0, 0.5, 1.0 / 6.0], float(sigma[r])) for r in row]).reshape(num, 4)
     is_same = (node[:, None] == node[None]) * inverse[node][:, None] if num else np.zeros((0, 0))
     for k, (at, to) in enumerate(itertools.product((i, j), (i, j))):
         matrix[np.ix_(at, to)] += flow[:, None] * (shows[k] + is_same * lump[None, :, k])

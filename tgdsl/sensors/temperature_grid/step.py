@@ -70,14 +70,18 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
     if "source" in constants:
         made = dt * _made(rows, patches, constants) / rows.capacity[..., None, None, None]
         source = source + made.sum(dim=(-3, -2, -1)) * rows.capacity
-    if made is None and not patches.topology.met:
-        spread, entered = diffused(cells + gained, rows, constants, dt)
-    else:
+    if patches.topology.met:
         spread, entered, heat, got = _in_modes(
             cells + gained, nodes + nodes_gained, rows, patches, constants, dt, inverse, made
         )
         touched, nodes_gained = touched + heat, nodes_gained + inverse * got
         touched_nodes = torch.where(inverse > 0, got, 0.0)
+    else:
+        spread, entered = diffused(cells + gained, rows, constants, dt)
+        if made is not None:
+            late = decays(_exponents(rows, dt), "is_semi_implicit" in constants)[1]
+            more = diffusion.from_modes(diffusion.to_modes(made, rows.modes) * late, rows.modes)
+            spread, entered = spread + (made + more.gained), entered + more.entered
     if rows.film_radiated is not None:
         linear = entered * rows.capacity
         radiated, blown = radiated + linear * rows.film_radiated, blown + linear * (1.0 - rows.film_radiated)
@@ -105,27 +109,22 @@ def _in_modes(
     is_implicit = "is_semi_implicit" in constants
     less, capacity = decays(_exponents(rows, dt), is_implicit), rows.capacity[..., None, None, None]
     phi, parts = whole(less), diffusion.to_modes(cells, rows.modes)
-    change, total = parts * less[0], torch.zeros_like(cells)
-    touched, got = torch.zeros_like(cells[:, :, 0, 0, 0]), torch.zeros_like(nodes)
-    warmed = None if made is None else diffusion.to_modes(made, rows.modes)
-    if made is not None and warmed is not None:
-        change, total = change + warmed * less[1], total + made
-    if patches.topology.met:
-        mean, end = parts * less[1], change
-        if made is not None and warmed is not None:
-            mean = mean + warmed * less[2]
-        free = cells + diffusion.from_modes(mean, rows.modes).gained, cells + diffusion.from_modes(end, rows.modes).gained
-        if made is not None:
-            free = free[0] + 0.5 * made, free[1] + made
-        sides, flow = conduction.Sides(patches.sides, patches.topology.is_plain), dt * patch_flow(patches, rows, constants)
-        flows = conduction.step(free, nodes, rows.capacity, inverse, flow, sides, phi, rows.modes, is_implicit)
-        shows = response(less, flows.sigma[..., None, None, None])  # without what does not decay: 1 and 0
-        heat, rate = flows.heat / capacity, flows.rate / capacity
-        change = change + diffusion.to_modes(heat, rows.modes) * shows.end_of_heat
-        change = change + diffusion.to_modes(rate, rows.modes) * shows.end_of_rate
-        touched, got, total = flows.heat.sum(dim=(-3, -2, -1)), flows.nodes, total + heat
+    mean, change = parts * less[1], parts * less[0]
+    if made is not None:
+        warmed = diffusion.to_modes(made, rows.modes)
+        mean, change = mean + warmed * less[2], change + warmed * less[1]
+    free = [cells + diffusion.from_modes(part, rows.modes).gained for part in (mean, change)]
+    if made is not None:
+        free = [free[0] + 0.5 * made, free[1] + made]
+    sides, flow = conduction.Sides(patches.sides, patches.topology.is_plain), dt * patch_flow(patches, rows, constants)
+    flows = conduction.step((free[0], free[1]), nodes, rows.capacity, inverse, flow, sides, phi, rows.modes, is_implicit)
+    shows = response(less, flows.sigma[..., None, None, None])  # without what does not decay: 1 and 0
+    heat, rate = flows.heat / capacity, flows.rate / capacity
+    change = change + diffusion.to_modes(heat, rows.modes) * shows.end_of_heat
+    change = change + diffusion.to_modes(rate, rows.modes) * shows.end_of_rate
+    total = heat if made is None else heat + made
     spread, entered = diffusion.from_modes(change, rows.modes)
-    return total + spread, entered, touched, got
+    return total + spread, entered, flows.heat.sum(dim=(-3, -2, -1)), flows.nodes
 
 
 def _surfaces(
