@@ -72,8 +72,8 @@ class SensorTactile:
         first = {name: getattr(model, f"joint_{name}_start").numpy() for name in ("q", "qd")}
         if (first["q"][chosen + 1] - first["q"][chosen] != 1).any():
             raise SimulationError(f"of the joints {listed(self._inputs.joints)}, some are no hinges or slides")
-        columns = {"joint_pos": first["q"][chosen], "joint_vel": first["qd"][chosen]}
-        self._joints = {name: self._tensor(ids) for name, ids in columns.items() if name in self._inputs.fields}
+        ends = {"joint_pos": "q", "joint_vel": "qd"}.items()
+        self._joints = {name: (end, self._tensor(first[end][chosen])) for name, end in ends if name in self._inputs.fields}
         pair_rows(self._inputs, self._geoms)
         self._kinematics(model)
 
@@ -105,8 +105,7 @@ class SensorTactile:
         pose, twist = (wp.to_torch(values)[self._bodies] for values in (state.body_q, state.body_qd))
         parts = (pose[..., :3], pose[..., 3:], twist[..., :3], twist[..., 3:])
         fields = bodies_by_name(self._inputs, self._labels, *parts, quat_order="xyzw", linvel_at=self._com)
-        sources = {"joint_pos": state.joint_q, "joint_vel": state.joint_qd}
-        return fields | {name: wp.to_torch(sources[name])[self._joints[name]] for name in self._joints}
+        return fields | {name: wp.to_torch(getattr(state, f"joint_{end}"))[ids] for name, (end, ids) in self._joints.items()}
 
     def _contacts(self, state: Any, contacts: Any, observables: Any) -> dict[str, Tensor]:
         acting = getattr(contacts, "force", None) if observables is None else observables.contact_f
@@ -131,8 +130,8 @@ class SensorTactile:
         return contacts_by_pair(self._inputs, self._geoms, place, **columns, **settings)
 
     def _mask(self, worlds: Worlds) -> Bool[Tensor, " world"]:
-        mask = torch.zeros_like(self.is_new)
-        mask[slice(None) if worlds is None else worlds] = True
+        mask = torch.full_like(self.is_new, worlds is None)
+        mask[[] if worlds is None else worlds] = True
         return mask
 
     def _tensor(self, ids: np.ndarray) -> Tensor:

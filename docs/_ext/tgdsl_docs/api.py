@@ -12,6 +12,7 @@ MORE = {
     "TactileModule": ("tgdsl.module.outputs.Output", "tgdsl.plan.inputs.Inputs"),
     "TouchEnv": ("tgdsl.rl.env.Step", "tgdsl.rl.env.StepInfo", "tgdsl.rl.task.Task"),
     "SceneState": (),
+    "Geoms": (),
     "BatchSimulation": (
         "tgdsl.runtime.simulators.simulation.Simulation",
         "tgdsl.runtime.simulators.simulation.SimOptions",
