@@ -5,7 +5,6 @@ Shapes: `env` environments.
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from tgdsl.module.export.signature import Port, Signature
 from tgdsl.module.memory.clock import SHARED
 from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
-from tgdsl.tensors.torch_internals import assert_dtype
+from tgdsl.tensors.torch_internals import ASSERT_DTYPE, assert_dtype
 
 Tensors = Mapping[str, Tensor]
 EXAMPLE_ENVS = 3
@@ -124,7 +123,7 @@ def traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
     for node in list(program.graph.nodes):
         if node.target is torch.ops.aten.unbind.int and not node.users:  # of no rows: torch writes it and cannot read it
             program.graph.erase_node(node)
-        elif isinstance(node.target, torch._ops.OpOverload) and node.target.namespace not in ("aten", "prims"):
+        elif getattr(node.target, "namespace", "aten") not in ("aten", "prims"):
             raise _refused(node.target.name().split(".")[0], plan)
     return program
 
@@ -148,12 +147,10 @@ def _is_on_host(part: Any) -> bool:
 def without_strides(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:
     """Return a graph less views by strides of whole tensors, hints for Inductor, and less asserts: ONNX has neither."""
     for node in list(program.graph.nodes):
-        if node.target is torch.ops.aten.as_strided.default:
-            value, result = (n.meta["val"] for n in (node.args[0], node))
-            if all(map(operator.is_, value.shape, result.shape)) or value.shape == result.shape:
-                node.replace_all_uses_with(node.args[0])
-                program.graph.erase_node(node)
-        elif node.target is torch.ops.aten._assert_tensor_metadata.default:
+        if node.target is torch.ops.aten.as_strided.default and node.args[0].meta["val"].shape == node.meta["val"].shape:
+            node.replace_all_uses_with(node.args[0])
+            program.graph.erase_node(node)
+        elif str(node.target) == ASSERT_DTYPE:
             program.graph.erase_node(node)
     program.graph_module.recompile()
     return program
