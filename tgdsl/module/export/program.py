@@ -99,8 +99,11 @@ def signature_of(flat: FlatStep, step: Step, source: str, overrides: Sequence[st
     def port(name: str, tensor: Tensor, rest: float | None = None) -> Port:
         return Port(name, tuple(tensor.shape[1:]), str(tensor.dtype).removeprefix("torch."), rest)
 
+    def rest(name: str, tensor: Tensor) -> float | None:
+        return next(iter(tensor.flatten().tolist()), 0.0) if name.startswith("memory/") else None
+
     return Signature(
-        tuple(port(n, t, t.flatten()[0].item() if n.startswith("memory/") and t.numel() else None) for n, t in inputs.items()),
+        tuple(port(name, tensor, rest(name, tensor)) for name, tensor in inputs.items()),
         tuple(port(name, tensor) for name, tensor in outputs.items()),
         step.dt,
         step.plan.taxels_id,
@@ -137,10 +140,13 @@ def _refused(operation: str, plan: Plan) -> TgdslError:
 
 def _is_on_host(part: Any) -> bool:
     """Return whether triangles are searched for some use of a quantity."""
-    found: list[Any] = []
-    tree.mapped(
-        part, lambda array: array, lambda record: found.append(record) if getattr(record, "stays_on_host", False) else None
-    )
+    found = []
+
+    def is_host(record: Any) -> bool:
+        found.extend([record] if getattr(record, "stays_on_host", False) else [])
+        return False
+
+    tree.mapped(part, lambda array: array, is_host)
     return bool(found)
 
 
