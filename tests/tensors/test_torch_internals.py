@@ -67,6 +67,8 @@ def test_nothing_else_touches_what_is_private_in_torch():
     found = {
         path.relative_to(PACKAGE).as_posix(): private_parts(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")
     }
+    alone = "module/export/standalone.py"  # runs where tgdsl is not
+    assert found.pop(alone) == {"torch._inductor", "torch._inductor.aoti_load_package"}
     assert found.pop("tensors/torch_internals.py") > {
         "torch._foreach_copy_",
         "_apply",

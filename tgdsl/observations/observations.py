@@ -256,8 +256,9 @@ def observe(
     if type_ == "agg_force":
         return reading[:, :, channels[0]] @ constants["operator"]
     if type_ == "cop":
-        force = reading[:, :, list(channels)].unbind(2)
-        pressing = -sum(part * normal for part, normal in zip(force, constants["normal"], strict=True)).clamp(max=0)
+        x, y, z = force = [reading[:, :, channel] for channel in channels]
+        normal_x, normal_y, normal_z = constants["normal"].unbind()
+        pressing = (-(x * normal_x + y * normal_y + z * normal_z)).clamp(min=0)
         total = pressing @ constants["operator"]
         is_free = (total <= constants["threshold"]).repeat(1, 3)
         centre = pressing @ constants["moment"] / torch.where(is_free, 1.0, total.repeat(1, 3))

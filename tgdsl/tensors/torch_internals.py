@@ -179,13 +179,25 @@ def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:
     return size
 
 
+ASSERT_DTYPE = "aten._assert_tensor_metadata.default"
+"""The operation that `assert_dtype` makes."""
+
+
 def assert_dtype(tensor: Tensor, dtype: torch.dtype) -> None:
     """Have a graph of torch.export refuse tensors of another dtype: it looks at shapes by itself, and at nothing else."""
     torch.ops.aten._assert_tensor_metadata(tensor, None, None, dtype)
 
 
+def write_package(program: torch.export.ExportedProgram, path: Path, options: Mapping[str, Any]) -> None:
+    """Write AOTInductor's package of a graph; it looks at its inputs at each call, see `_checked`."""
+    from torch._inductor import aoti_compile_and_package
+
+    with _checked():
+        aoti_compile_and_package(program, package_path=str(path), inductor_configs=dict(options))
+
+
 @contextmanager
-def checked_packages() -> Iterator[None]:
+def _checked() -> Iterator[None]:
     """Have AOTInductor's packages refuse inputs of a wrong dtype, shape, stride or device, or of unlike numbers of rows.
 
     Inductor writes such checks, but for the last, and has them done only where AOTI_RUNTIME_CHECK_INPUTS is set; else wrong

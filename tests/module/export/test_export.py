@@ -83,6 +83,7 @@ def test_inputs_that_do_not_fit_are_refused(noisy, tmp_path):
                 program(*given[:i], wrong, *given[i + 1 :])
 
 
+@pytest.mark.slow
 def test_states_in_double_precision(noisy, tmp_path):
     signature = noisy.export(tmp_path / "hand.pt2", dt=0.01, state_dtype="float64")
     assert {port.name: port.dtype for port in signature.inputs}["body_pos"] == "float64"
@@ -138,7 +139,7 @@ def test_the_commands_export_and_verify(tmp_path, capsys, monkeypatch):
 def test_every_kind_is_exported(name, tmp_path):
     touch = of_kind(name)
     touch.export(tmp_path / "hand.pt2", dt=0.01)
-    assert verify(tmp_path / "hand.pt2", touch).worst <= 1e-6
+    assert verify(tmp_path / "hand.pt2", touch, num_calls=20).worst <= 1e-6
 
 
 @pytest.mark.slow

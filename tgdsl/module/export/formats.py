@@ -13,7 +13,7 @@ from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_path
 from tgdsl.module.export.program import without_strides
 from tgdsl.module.export.signature import ENTRY, Signature
-from tgdsl.tensors.torch_internals import checked_packages
+from tgdsl.tensors.torch_internals import write_package
 
 Format = Literal["pt2", "aoti", "onnx"]
 ENDINGS: dict[Format, str] = {"pt2": ".pt2", "aoti": ".aoti.pt2", "onnx": ".onnx"}
@@ -29,7 +29,7 @@ def format_of(path: Path, to: str | None) -> Format:
     result = to or next((name for name in reversed(ENDINGS) if path.name.endswith(ENDINGS[name])), None)
     if result not in ENDINGS:
         raise TgdslError(
-            f"found {to or path.name!r}, expected one of {', '.join(ENDINGS)}, or a file's name with {'.pt2 or .onnx'}"
+            f"found {to or path.name!r}, expected one of {', '.join(ENDINGS)}, or a file's name with .pt2 or .onnx"
         )
     ending = ".onnx" if result == "onnx" else ".pt2"
     if path.suffix != ending:
@@ -58,9 +58,8 @@ def write(program: torch.export.ExportedProgram, signature: Signature, path: Pat
         elif to == "pt2":
             torch.export.save(program, str(temporary), extra_files={ENTRY: signature.to_json()})
         else:
-            with checked_packages():
-                configs = {**options, "aot_inductor.metadata": {Path(ENTRY).stem: signature.to_json()}}
-                torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=configs)
+            metadata = {Path(ENTRY).stem: signature.to_json()}
+            write_package(program, temporary, {**options, "aot_inductor.metadata": metadata})
             with zipfile.ZipFile(temporary, "a") as archive:
                 folder = archive.namelist()[0].partition("/")[0]
                 archive.writestr(f"{folder}/extra/{ENTRY}", signature.to_json())

@@ -5,7 +5,6 @@ Shapes: `env` environments.
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from tgdsl.module.export.signature import Port, Signature
 from tgdsl.module.memory.clock import SHARED
 from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
-from tgdsl.tensors.torch_internals import assert_dtype
+from tgdsl.tensors.torch_internals import ASSERT_DTYPE, assert_dtype
 
 Tensors = Mapping[str, Tensor]
 EXAMPLE_ENVS = 3
@@ -100,8 +99,11 @@ def signature_of(flat: FlatStep, step: Step, source: str, overrides: Sequence[st
     def port(name: str, tensor: Tensor, rest: float | None = None) -> Port:
         return Port(name, tuple(tensor.shape[1:]), str(tensor.dtype).removeprefix("torch."), rest)
 
+    def rest(name: str, tensor: Tensor) -> float | None:
+        return next(iter(tensor.flatten().tolist()), 0.0) if name.startswith("memory/") else None
+
     return Signature(
-        tuple(port(n, t, t.flatten()[0].item() if n.startswith("memory/") and t.numel() else None) for n, t in inputs.items()),
+        tuple(port(name, tensor, rest(name, tensor)) for name, tensor in inputs.items()),
         tuple(port(name, tensor) for name, tensor in outputs.items()),
         step.dt,
         step.plan.taxels_id,
@@ -124,7 +126,7 @@ def traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
     for node in list(program.graph.nodes):
         if node.target is torch.ops.aten.unbind.int and not node.users:  # of no rows: torch writes it and cannot read it
             program.graph.erase_node(node)
-        elif isinstance(node.target, torch._ops.OpOverload) and node.target.namespace not in ("aten", "prims"):
+        elif getattr(node.target, "namespace", "aten") not in ("aten", "prims"):
             raise _refused(node.target.name().split(".")[0], plan)
     return program
 
@@ -138,22 +140,23 @@ def _refused(operation: str, plan: Plan) -> TgdslError:
 
 def _is_on_host(part: Any) -> bool:
     """Return whether triangles are searched for some use of a quantity."""
-    found: list[Any] = []
-    tree.mapped(
-        part, lambda array: array, lambda record: found.append(record) if getattr(record, "stays_on_host", False) else None
-    )
+    found = []
+
+    def is_host(record: Any) -> bool:
+        found.extend([record] if getattr(record, "stays_on_host", False) else [])
+        return False
+
+    tree.mapped(part, lambda array: array, is_host)
     return bool(found)
 
 
 def without_strides(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:
     """Return a graph less views by strides of whole tensors, hints for Inductor, and less asserts: ONNX has neither."""
     for node in list(program.graph.nodes):
-        if node.target is torch.ops.aten.as_strided.default:
-            value, result = (n.meta["val"] for n in (node.args[0], node))
-            if all(map(operator.is_, value.shape, result.shape)) or value.shape == result.shape:
-                node.replace_all_uses_with(node.args[0])
-                program.graph.erase_node(node)
-        elif node.target is torch.ops.aten._assert_tensor_metadata.default:
+        if node.target is torch.ops.aten.as_strided.default and node.args[0].meta["val"].shape == node.meta["val"].shape:
+            node.replace_all_uses_with(node.args[0])
+            program.graph.erase_node(node)
+        elif str(node.target) == ASSERT_DTYPE:
             program.graph.erase_node(node)
     program.graph_module.recompile()
     return program

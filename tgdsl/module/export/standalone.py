@@ -17,7 +17,7 @@ Arrays = list[np.ndarray]
 def signature_text(file: str) -> str:
     """Return the text that says what goes in and comes out."""
     if file.endswith(".onnx"):
-        import onnxruntime
+        import onnxruntime  # pyright: ignore[reportMissingImports]
 
         return onnxruntime.InferenceSession(file).get_modelmeta().custom_metadata_map["tgdsl"]
     with zipfile.ZipFile(file) as archive:
@@ -27,7 +27,7 @@ def signature_text(file: str) -> str:
 def loaded(file: str, inputs: Sequence[str]) -> Callable[[Arrays], Arrays]:
     """Return a function of an exported file: inputs in order to outputs in order."""
     if file.endswith(".onnx"):
-        import onnxruntime
+        import onnxruntime  # pyright: ignore[reportMissingImports]
 
         session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
         return lambda arrays: session.run(None, dict(zip(inputs, arrays, strict=True)))
@@ -74,11 +74,10 @@ def differences(program: Callable[[Arrays], Arrays], signature: dict, record: st
 
 def refuses_other_dtypes(program: Callable[[Arrays], Arrays], signature: dict) -> bool:
     """Return whether the first input is refused in double or single precision, whichever is not its own."""
-    ports = signature["inputs"]
-    arrays = [np.zeros((2, *port["shape"]), port["dtype"]) for port in ports]
-    arrays[0] = arrays[0].astype(np.float32 if arrays[0].dtype == np.float64 else np.float64)
+    first, *others = [np.zeros((2, *port["shape"]), port["dtype"]) for port in signature["inputs"]]
+    wrong = first.astype(np.float32 if first.dtype == np.float64 else np.float64)
     try:
-        program(arrays)
+        program([wrong, *others])
     except Exception:  # each runtime raises its own
         return True
     return False

@@ -99,5 +99,5 @@ def _record(signature: Signature, touch: TactileModule, num_envs: int, num_calls
         values |= {f"observation/{name}": value for name, value in observations.items()}
         arrays |= {f"{call}/{name}": value.numpy() for name, value in values.items()}
     file = folder / f"{num_envs}.npz"
-    np.savez(file, **arrays)
+    np.savez(file, allow_pickle=False, **arrays)
     return file
