@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tgdsl import testing
+    from tgdsl.calibration.fit import calibrate as calibrate
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import (
         ArtifactError,
@@ -57,6 +58,7 @@ _PLACES = {
     "TgdslError": "errors",
     "TouchEnv": "rl.env",
     "WarpSimulation": "runtime.warp",
+    "calibrate": "calibration.fit",
     "check_taxels": "module.taxels.identity",
     "compile": "tuning.compile",
     "connect": "runtime.connect",
@@ -84,6 +86,7 @@ __all__ = [
     "TgdslError",
     "TouchEnv",
     "WarpSimulation",
+    "calibrate",
     "check_taxels",
     "compile",
     "connect",

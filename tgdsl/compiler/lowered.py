@@ -219,7 +219,7 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
     for name, spec in loaded.spec.sensors.items():
         progress(f"lowering sensor {name}")
         try:
-            sensors += _ways(loaded, resolved, name, by_name[spec.kind], progress)  # type: ignore[attr-defined]
+            sensors += ways(loaded, resolved, name, by_name[spec.kind], progress)  # type: ignore[attr-defined]
         except LowerError as error:
             path: Path = ("sensors", name, *([error.field] if error.field else []))
             loaded.problems.append(loaded.problem(path, error.what, error.hint))
@@ -345,7 +345,7 @@ def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
     return spec.model_copy(update={field: float(resolved.scene.compiled.opt.timestep)})
 
 
-def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: Progress) -> list[LoweredSensor]:
+def ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: Progress) -> list[LoweredSensor]:
     """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
     spec = _with_timestep(loaded.spec.sensors[name], resolved)
     taxels, layout = resolved.layout_on(name)

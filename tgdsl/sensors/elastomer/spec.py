@@ -7,22 +7,21 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StrictInt, WithJsonSchema, model_validator
 
-from tgdsl.fields.models import Area, NonNegative, Number, Positive, PositiveLength, Pressure, Radius, SpecModel, Usual
+from tgdsl.fields.models import (
+    Area,
+    NonNegative,
+    Number,
+    Positive,
+    PositiveLength,
+    Pressure,
+    Quantity,
+    Radius,
+    SpecModel,
+    Usual,
+)
 from tgdsl.fields.regions import Region
 from tgdsl.sensors.base import ContactProbeSpec
 from tgdsl.sensors.elastomer import skins
-
-
-def _at_most_half(value: float) -> float:
-    if value > 0.5:
-        raise ValueError(f"{value:g} is out of range, expected at most 0.5")
-    return value
-
-
-def _at_most_one(value: float) -> float:
-    if value > 1.0:
-        raise ValueError(f"{value:g} is out of range, expected at most 1")
-    return value
 
 
 def _is_fraction(value: float) -> float:
@@ -66,13 +65,13 @@ class ElastomerSpec(ContactProbeSpec):
     """λ_s, falloff of the shear [1/m²] (gaussian)."""
     depth_exponent: Positive = 1.2
     """α, power of the depth in the bulge [1] (gaussian)."""
-    compressibility: Annotated[NonNegative, AfterValidator(_at_most_one)] = 1.0
+    compressibility: Annotated[float, Quantity("number", ge=0.0, le=1.0)] = 1.0
     """c, 1 for a local Gaussian spread, 0 for one that falls off as 1/r [1] (gaussian)."""
     reference_area: Annotated[Area, Usual("area", high=0.01)] = 6e-6
     """Area of a taxel that counts once [m²] (gaussian)."""
     thickness: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
     """Thickness of the elastomer [m] (gaussian: length ε, default the taxel spacing; bonded_layer)."""
-    poissons_ratio: Annotated[NonNegative, AfterValidator(_at_most_half)] = 0.5
+    poissons_ratio: Annotated[float, Quantity("number", ge=0.0, le=0.5)] = 0.5
     """ν [1]; for the Gaussian it only sets the tangential against the normal stiffness under friction."""
     youngs_modulus: Annotated[Pressure | None, Usual("pressure", low=1e3, high=5e8)] = None
     """E [Pa], also as `0.2 MPa` (half_space, bonded_layer)."""
