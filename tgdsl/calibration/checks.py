@@ -30,6 +30,31 @@ WORSE = 1.2
 RESAMPLES = 100
 
 
+@dataclass(frozen=True)
+class TargetErrors:
+    """Relative RMSE of a target: the RMS of the residuals over that of the target.
+
+    Attributes:
+        recording: Name of the recording.
+        reading: The reading.
+        error: In-sample.
+        held_out: On numbers that were held out; None: none were.
+        floor: Of the target's noise; None: unknown.
+        alone: Of the reading's own map without any sensor.
+        rms: RMS of the target, in its unit.
+        unit: Unit of the reading.
+    """
+
+    recording: str
+    reading: str
+    error: float
+    held_out: float | None
+    floor: float | None
+    alone: float
+    rms: float
+    unit: str
+
+
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """How well the unknowns are known, from the derivatives at the optimum.
@@ -100,7 +125,7 @@ def bootstrap_intervals(problem: Problem, solution: Solution, seed: int) -> Floa
     for _ in range(RESAMPLES):
         weights = []
         for part in problem.parts:
-            samples, rows, channels = part.target.value.shape
+            samples, rows, _ = part.target.value.shape
             by_row = rows >= samples
             counts = np.bincount(rng.integers(0, max(rows, samples), max(rows, samples)), minlength=max(rows, samples))
             shape = (1, rows, 1) if by_row else (samples, 1, 1)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from tgdsl.calibration import checks
-from tgdsl.calibration.checks import CORRELATED, UNKNOWN, WORSE, HoldOut, Intervals, Uncertainty
+from tgdsl.calibration.checks import CORRELATED, UNKNOWN, WORSE, HoldOut, Intervals, TargetErrors, Uncertainty
 from tgdsl.calibration.model import Model, Parameter
 from tgdsl.calibration.problem import Problem, ReadingMap, Solution
 from tgdsl.calibration.recordings import Arrays, load_recording
@@ -48,31 +48,6 @@ class FittedParameter:
     def path(self) -> str:
         """Sensor and field."""
         return self.parameter.path
-
-
-@dataclass(frozen=True)
-class TargetErrors:
-    """Relative RMSE of a target: the RMS of the residuals over that of the target.
-
-    Attributes:
-        recording: Name of the recording.
-        reading: The reading.
-        error: In-sample.
-        held_out: On numbers that were held out; None: none were.
-        floor: Of the target's noise; None: unknown.
-        alone: Of the reading's own map without any sensor.
-        rms: RMS of the target, in its unit.
-        unit: Unit of the reading.
-    """
-
-    recording: str
-    reading: str
-    error: float
-    held_out: float | None
-    floor: float | None
-    alone: float
-    rms: float
-    unit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +97,7 @@ class Fit:
         """Write the document with the fitted values, its comments kept; return its path.
 
         Raises:
-            TgdslError: If the document is a mapping, or the file would be in another folder, from which its own paths lead nowhere.
+            TgdslError: If the document is a mapping, or the file would be in another folder, where its paths lead nowhere.
         """
         from tgdsl.files.write import atomic_write
         from tgdsl.schema.rewrite import with_values
@@ -162,10 +137,10 @@ def calibrate(
     Args:
         document: A YAML file, or the same as a mapping. Its values are where the search starts.
         recordings: `.npz` files, or their arrays; `tgdsl.calibration.recordings` describes the format.
-        fit: Parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`. Without any, only the nuisances
-            are fitted: the document predicts the recordings.
+        fit: Parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`. Without any, only
+            nuisances are fitted: the document predicts the recordings.
         reading: Map of its own that each recording's reading may have: an `offset` of each channel (the camera moved); also a
-            `scale` about the middle of the rows; or an `affine` function of the rows' places. Of all readings, or by their names.
+            `scale` about the middle of the rows; or an `affine` function of the rows' places. Of all, or by their names.
         gain: Whether each recording may have a gain of its own.
         robust: Whether rows far off, such as lost markers, count less (Huber's loss).
         hold_out: What is left out in turn to measure the error on it: rows at random (`taxel`), `blocks` of neighbouring rows,

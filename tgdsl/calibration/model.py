@@ -216,10 +216,8 @@ class Model:
         sensor, *fields = path.split(".")
         specs = self._loaded.spec.sensors
         if sensor not in specs or not fields:
-            names = [f"{name}.<field>" for name in specs]
-            raise TgdslError(
-                f"{path}: expected a sensor and a field; {did_you_mean(sensor, specs, 'sensors') if sensor not in specs else names[0]}"
-            )
+            hint = did_you_mean(sensor, specs, "sensors") if sensor not in specs else "such as skin.thickness"
+            raise TgdslError(f"{path}: expected a sensor and a field; {hint}")
         value: Any = specs[sensor]
         annotation, metadata = None, ()
         for name in fields:

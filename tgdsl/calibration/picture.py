@@ -7,19 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from tgdsl.calibration.checks import TargetErrors
 from tgdsl.calibration.problem import Part, Problem, Solution
 from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.view.style import DPI, FAINT, INK
-
-if TYPE_CHECKING:
-    from tgdsl.calibration.fit import TargetErrors
 
 MEASURED, FITTED, RESIDUAL = "#3d5a80", "#c8553d", "#588157"
 _PANEL = (5.0, 4.4)
@@ -45,7 +42,7 @@ def picture(problem: Problem, solution: Solution, errors: Sequence[TargetErrors]
 
 
 def _field(panels: Sequence[Axes], part: Part, fitted: np.ndarray, places: np.ndarray | None, unit: str) -> None:
-    """Draw arrows at the rows' places, in the plane in which these spread; residuals are drawn larger, by as much as is said."""
+    """Draw arrows at the rows' places, in the plane in which these spread; those of residuals are magnified."""
     assert places is not None
     centred = places - places.mean(axis=0)
     axes = np.sort(np.argsort(np.ptp(centred, axis=0))[-2:])

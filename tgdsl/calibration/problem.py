@@ -1,7 +1,7 @@
 """Least squares between a model's readings and recordings: parameters, nuisances, weights.
 
-The unknowns x are the parameters, each from 0 to 1 in its range, then the nuisances of the recordings in units of their standard
-deviations: offsets of state fields and of clocks, each with a normal prior. What is linear is solved for at each x (variable
+The unknowns x are the parameters, each from 0 to 1 in its range, then the nuisances of the recordings in units of their
+standard deviations: offsets of state fields and of clocks, each with a normal prior. What is linear is solved for at each x (variable
 projection: Golub and Pereyra, *SIAM Journal on Numerical Analysis* 10, 1973, 413): the reading's own offset or affine map, its
 gain, and the parameters in which all readings are linear.
 
@@ -256,7 +256,7 @@ class Problem:
 
     def jacobian(self, x: np.ndarray, weights: Weights, free: Sequence[int], are_fixed: bool = False) -> np.ndarray:
         """Return the derivatives of the residuals by some unknowns, by forward differences within the bounds."""
-        low, high = self.bounds
+        _, high = self.bounds
         base, columns = self.solve(x, weights, are_fixed).residual, []
         for j in free:
             beside = x.copy()
@@ -317,7 +317,7 @@ class Problem:
         return _rms(self.parts[i].value, self.parts[i].weight)
 
     def estimate(self, solution: Solution, huber: float | None) -> None:
-        """Estimate the noise of each part from its residuals, no less than its floor; with Huber's constant also rows' weights."""
+        """Estimate the noise of each part, no less than its floor, and with Huber's constant the weights of rows."""
         for i, (part, predicted) in enumerate(zip(self.parts, solution.predicted, strict=True)):
             error = part.value - predicted
             if huber is not None:

@@ -5,7 +5,7 @@
 | `time` | (step,) | clock of the states [s], ascending |
 | a field of `SceneState` | (step, …) | as the simulator would give it; `body_pos` and `body_quat` are needed |
 | `bodies`, `pairs`, `joints`, … | names | what stands along the axis of such a field; default: the order of `touch.inputs` |
-| `width:<field>` | as one step, or as all | standard deviation of the field's unknown offset, of the recording or of each step; 0: none |
+| `width:<field>` | as one step, or as all | standard deviation of the field's offset, at all steps or at each; 0: none |
 | `target:<reading>` | (sample, row, channel) | what the sensor read |
 | `unit:<reading>` | text | unit of the target |
 | `clock:<reading>` | (sample,) | clock of the target [s], ascending |
@@ -15,7 +15,8 @@
 | `floor:<reading>` | () | RMS noise of the target, in its unit |
 | `zero:<reading>` | () | time on the target's clock at which the sensor was set to zero |
 
-Velocities that a module reads and a recording lacks are derivatives of the poses. States are interpolated at the target's times.
+Velocities that a module reads and a recording lacks are derivatives of the poses. States are interpolated at the target's
+times.
 
 Shapes: `step` states, `sample` times of a target, `row` taxels (or markers, bodies, …), `channel` numbers of a row.
 """
@@ -36,14 +37,7 @@ from tgdsl.module.outputs import Output
 from tgdsl.module.state import CHOICES, SHAPES
 from tgdsl.plan.inputs import Inputs
 
-NAMES_OF = {
-    "body": "bodies",
-    "pair": "pairs",
-    "object": "objects",
-    "heated": "heated",
-    "joint": "joints",
-    "actuator": "actuators",
-}
+NAMES_OF = {axis: f"{axis}s" for axis in ("pair", "object", "joint", "actuator")} | {"body": "bodies", "heated": "heated"}
 """Key of the names along each axis of the state."""
 OF_TARGET = ("target", "unit", "clock", "clock_width", "channels", "weight", "floor", "zero")
 DERIVED = {"body_linvel": "body_pos", "body_angvel": "body_quat"}
