@@ -163,6 +163,7 @@ class Resolved:
         joints: The robot's joints and actuators.
         on_joints: Names of the joints of each sensor that is on joints.
         primitives: Collision shapes of links, instead of their own geoms.
+        layouts: Taxels of all links at other resolutions that were asked for.
     """
 
     layout: Layout
@@ -180,6 +181,7 @@ class Resolved:
     joints: RobotJoints
     on_joints: Mapping[str, tuple[str, ...]]
     primitives: tuple[Collider, ...] = ()
+    layouts: dict[str, Layout] = field(default_factory=dict)
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame.
@@ -304,14 +306,18 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     return Resolved(layout, links, objects, new_objects, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
 
 
-def taxels_of_all_links(loaded: Loaded) -> Layout:
+def taxels_of_all_links(loaded: Loaded, models: Models | None = None) -> Layout:
     """Return where a document's layout puts taxels, on links that no sensor has too.
+
+    Args:
+        loaded: The document.
+        models: Robot and scene of the same document, read before; default: they are read.
 
     Raises:
         SpecError: All mistakes found so far, those of reading included.
         RobotError: If a model file cannot be read.
     """
-    models = models_of(loaded)
+    models = models_of(loaded) if models is None else models
     robot = models.robot
     patches: list[Patch] = []
     if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):

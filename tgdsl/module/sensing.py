@@ -86,7 +86,7 @@ def read(
         now: When it is read.
         joined: Its signal, if that was computed with others'.
     """
-    if GAIN in stages and kind.gains_depth:
+    if GAIN in stages and kind.gains_depth and sensor.readings[0].rows == "taxel":
         felt, gains = gathered[ContactDepth], drawn[GAIN.name]
         gathered = gathered.replaced(ContactDepth, felt._replace(depth=GAIN.of_taxels(gains, now, felt.depth) * felt.depth))
         stages = [stage for stage in stages if stage is not GAIN]

@@ -49,8 +49,8 @@ def weights(spec: ElastomerSpec, part: LinkTaxels) -> Float[np.ndarray, " taxel"
     return np.where(part.is_active, area, 0.0)
 
 
-def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
-    """Return the constants of all operators of all links, `<operator>/<link>/<constant>`.
+def fold_links(spec: ElastomerSpec, layout: Layout, markers: Layout | None, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
+    """Return the constants of all operators of all links, `<operator>/<link>/<constant>`; without markers, taxels are these.
 
     Raises:
         LowerError: If a convolution is asked for where it cannot be, or the pad's edge cannot be clamped.
@@ -58,53 +58,60 @@ def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> di
     constants = {}
     for i, link in enumerate(layout.links):
         try:
-            constants |= _fold_link(spec, layout, i, surface_of)
+            constants |= _fold_link(spec, layout, markers, i, surface_of)
         except LowerError as error:
             field = error.field or "boundary"  # what a surface says knows no field
             raise LowerError(f'link "{link.name}": {error.what}', field, error.hint) from error
     return constants
 
 
-def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
+def _fold_link(
+    spec: ElastomerSpec, layout: Layout, markers: Layout | None, link: int, surface_of: SurfaceOf
+) -> dict[str, np.ndarray]:
     """Return the constants of one link's operators, `<operator>/<link>/<constant>`."""
-    part = link_taxels(layout, link)
+    part, targets = link_taxels(layout, link), None if markers is None else link_taxels(markers, link)
     pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
     wanted, constants = OperatorForm(spec.operator, spec.tolerance), {}
-    for name, response in responses(spec, part, pad).items():
-        is_alike = not (name == "spread" and pad is not None)
+    for name, response in responses(spec, part, pad, targets).items():
+        is_alike = targets is None and not (name == "spread" and pad is not None)
         folded = fold(response, PLANES[name], part, wanted, is_alike)
         constants |= {f"{name}/{link}/{key}": value for key, value in folded.items()}
     return constants
 
 
-def responses(spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None) -> dict[str, Response]:
-    """Return the operators of one link by name."""
-    is_active = part.is_active.astype(np.float64)[:, None]
+def responses(
+    spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None, targets: LinkTaxels | None = None
+) -> dict[str, Response]:
+    """Return the operators of one link by name, from its taxels to its markers; by default the same."""
+    targets = part if targets is None else targets
+    is_active = targets.is_active.astype(np.float64)[:, None]
     if spec.kernel != "gaussian":
-        return _elastic_responses(spec, part, is_active)
+        return _elastic_responses(spec, part, targets, is_active)
     kernel, weight = gaussian(spec, part), weights(spec, part)
     clamped = None
     if pad is not None:
         clamped = kernel.spread(part.pos, part.normal, part.pos) + clamping(spec, part, pad)
 
     def spread(source: np.ndarray) -> np.ndarray:
-        own = kernel.spread(part.pos, part.normal, part.pos[source]) if clamped is None else clamped[..., source]
+        own = kernel.spread(targets.pos, targets.normal, part.pos[source]) if clamped is None else clamped[..., source]
         return is_active * own * weight[source]
 
     def bulge(source: np.ndarray) -> np.ndarray:
-        return is_active * kernel.bulge(part, source) * weight[source]
+        return is_active * kernel.bulge(targets, part.pos[source]) * weight[source]
 
     def drag(source: np.ndarray) -> np.ndarray:
-        return is_active * kernel.drag(part, source) * weight[source]
+        return is_active * kernel.drag(targets, part.pos[source]) * weight[source]
 
     return {"spread": spread, "bulge": bulge, **({"drag": drag} if spec.anchored == "taxels" else {})}
 
 
-def _elastic_responses(spec: ElastomerSpec, part: LinkTaxels, is_active: Float[np.ndarray, "taxel 1"]) -> dict[str, Response]:
+def _elastic_responses(
+    spec: ElastomerSpec, part: LinkTaxels, targets: LinkTaxels, is_active: Float[np.ndarray, "target 1"]
+) -> dict[str, Response]:
     material = elastic(spec)
 
     def traction(source: np.ndarray) -> np.ndarray:
-        return is_active * material.displacement(part, source) * is_active[source, 0]
+        return is_active * material.displacement(part, source, targets) * part.is_active[source]
 
     def pressure(source: np.ndarray) -> np.ndarray:
         return -np.einsum("klji,il->kji", traction(source), part.normal[source])[:, None]

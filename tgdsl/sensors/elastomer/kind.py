@@ -1,6 +1,7 @@
 """Elastomer: displacement of the markers in a soft skin that is pressed and dragged, as a vision-based sensor sees them.
 
-Taxels are markers and sources alike; those of one link act on each other. With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
+Taxels are markers and sources alike, unless `markers` are given, at places of their own; those of one link act on each other.
+With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
 r_ij = Π_nj(x_j − x_i), depth h_i = max(0, s − min_o φ_o(x_i)) of the felt objects o under the skin's height s [m], and t_i
 the tangential displacement of the object's material since the taxel stuck to it [m] (`anchors`), the Gaussian kernel gives
 
@@ -46,7 +47,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.points import Points
-from tgdsl.sensors.base import Alternative, Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
+from tgdsl.sensors.base import Alternative, Axis, Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links
 from tgdsl.sensors.elastomer.point_anchors import Markers
@@ -65,7 +66,13 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     Raises:
         LowerError: If the operator or the clamped boundary cannot be had on these links.
     """
-    constants = {**fold_links(spec, layout, surface_of), "normal": layout.normal.T}
+    markers = None if spec.markers is None else surface_of.taxels(spec.markers, layout)
+    constants = {**fold_links(spec, layout, markers, surface_of), "normal": layout.normal.T}
+    rows = None
+    if markers is not None:
+        constants |= {"marker_pos": markers.pos.T, "marker_normal": markers.normal.T}
+        table = {"link": [markers.links[i].name for i in markers.link_id], "pos": markers.pos, "normal": markers.normal}
+        rows = Axis("marker", markers.num_taxels, table, markers.link_id)
     if spec.normal_stiffness is not None:
         constants["normal_stiffness"] = scalar(spec.normal_stiffness)
     else:
@@ -73,7 +80,7 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     standoff = np.full(layout.num_taxels, spec.standoff)
     if spec.anchored is None:
         depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff)
-        return Lowered(CHANNELS, constants, requests=(depth,), notes=spec.notes)
+        return Lowered(CHANNELS, constants, requests=(depth,), notes=spec.notes, rows=rows)
     constants |= {"standoff": scalar(spec.standoff), "enter": scalar(spec.enter), "exit": scalar(spec.exit)}
     if spec.slip is not None:
         constants["slip"] = scalar(spec.slip)
@@ -83,17 +90,18 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants["shear_strength"] = scalar(spec.shear_strength)
     max_distance = spec.standoff + spec.exit
     if spec.anchored == "taxels":
-        state = {name: Memory() for name in anchors.PLANES}
+        state = {name: Memory(shape=(layout.num_taxels,)) for name in anchors.PLANES}
         depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff, range=max_distance, distance=True, frame=True)
-        return Lowered(CHANNELS, constants, state, requests=(depth,), notes=spec.notes)
-    constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (layout.radius > 0).astype(np.float64)}
-    constants |= {f"{FLAT}{first}": np.asarray(1) for first in _flat_links(layout)}
+        return Lowered(CHANNELS, constants, state, requests=(depth,), notes=spec.notes, rows=rows)
+    seen = layout if markers is None else markers
+    constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (seen.radius > 0).astype(np.float64)}
+    constants |= {f"{FLAT}{first}": np.asarray(1) for first in _flat_links(seen)}
     if spec.model != "paper":
         constants["reference_area"] = scalar(spec.reference_area)
     state = {name: Memory(shape=Points, overwritten=True) for name in point_anchors.PLANES}
     depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff, range=max_distance)
     points = Points(spec.objects, spec.is_gated, num_points=spec.points, range=max_distance)
-    return Lowered(CHANNELS, constants, state, requests=(depth, points), notes=spec.notes)
+    return Lowered(CHANNELS, constants, state, requests=(depth, points), notes=spec.notes, rows=rows)
 
 
 def _flat_links(layout: Layout) -> list[int]:
@@ -114,11 +122,15 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
             loads, after = point_anchors.SHEAR_LOADS(list(gathered[Points].values()), stick_slip, state)
         else:
             shear, after = anchors.advance(felt, felt.pos, normal, stick_slip, state)
-    move = _elastic if "normal_stiffness" in constants else _gaussian
-    result = move(felt.depth, shear, normal, constants)
+    marker_normal = planes.split(constants["marker_normal"].T) if "marker_normal" in constants else normal
+    if "normal_stiffness" in constants:
+        result = _elastic(felt.depth, shear, normal, constants)
+    else:
+        result = _gaussian(felt.depth, shear, marker_normal, constants)
     if loads is not None:
         flat = frozenset(int(name.removeprefix(FLAT)) for name in constants if name.startswith(FLAT))
-        markers = Markers(felt.pos, normal, constants["shear_falloff"], constants.get("reference_area"), flat)
+        pos = planes.split(constants["marker_pos"].T) if "marker_pos" in constants else felt.pos
+        markers = Markers(pos, marker_normal, constants["shear_falloff"], constants.get("reference_area"), flat)
         dragged = point_anchors.drag(loads, markers, felt.depth.shape[0])
         result = planes.add(result, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
     return {channel.name: plane for channel, plane in zip(CHANNELS, result, strict=True)}, after
@@ -149,7 +161,8 @@ def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants
 def alternatives(spec: ElastomerSpec) -> list[Alternative]:
     """Return the forms of the operator; with anchors of points, fewer points or more."""
     forms = [Alternative(f"svd, {100 * error:g} %", {"operator": "svd", "tolerance": error}) for error in (0.1, 1e-2, 1e-3)]
-    forms += [Alternative(form, {"operator": form, "tolerance": None}, is_exact=True) for form in ("fft", "dense")]
+    exact_forms = ("dense",) if spec.markers is not None else ("fft", "dense")
+    forms += [Alternative(form, {"operator": form, "tolerance": None}, is_exact=True) for form in exact_forms]
     if spec.anchored != "points":
         return forms
     exact = {"operator": "dense", "tolerance": None}

@@ -58,7 +58,8 @@ def fold(
         planes: Numbers of planes that go out and in.
         taxels: The link's taxels.
         wanted: The form and its error.
-        is_alike: Whether the response depends on nothing but the way from source to target where the taxels are alike.
+        is_alike: Whether the targets are the taxels, and the response depends on nothing but the way from source to target where
+            these are alike.
 
     Raises:
         LowerError: If a convolution is asked for where the taxels are no regular grid.
@@ -110,7 +111,9 @@ def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Ten
         name: The operator's name.
         planes: What goes in: any number of leading axes, taxels last.
     """
-    if (matrices := _matrices(constants, name)) and LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
+    matrices = _matrices(constants, name)
+    is_square = all(matrix.shape[0] == matrix.shape[2] for each in matrices for matrix in each)  # markers may be others
+    if matrices and is_square and LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
         lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
         result = reduce(torch.add, [LINK_PRODUCTS(own, each) for own, each in zip(lines, matrices, strict=True)])
         return tuple(result.unflatten(1, planes[0].shape[:-1]).unbind())
