@@ -1,9 +1,9 @@
 """Least squares between a model's readings and recordings: parameters, nuisances, weights.
 
 The unknowns x are the parameters, each from 0 to 1 in its range, then the nuisances of the recordings in units of their
-standard deviations: offsets of state fields and of clocks, each with a normal prior. What is linear is solved for at each
-x (variable projection: Golub and Pereyra, *SIAM Journal on Numerical Analysis* 10, 1973, 413): the reading's own offset or affine map, its
-gain, and the parameters in which all readings are linear.
+standard deviations: offsets of state fields and of clocks, each with a normal prior. What is linear is solved for at each x:
+the reading's own offset or affine map, its gain, and the parameters in which all readings are linear (variable projection:
+Golub and Pereyra, *SIAM Journal on Numerical Analysis* 10, 1973, 413).
 
 Shapes: `unknown` entries of x, `number` numbers of a target, flat.
 """

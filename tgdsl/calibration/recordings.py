@@ -215,6 +215,9 @@ class _Reader:
         if value is None:
             return np.zeros(0)
         sizes = [self.inputs.sizes[part] if isinstance(part, str) else part for part in shape]
+        if (bad := np.argwhere(~np.isfinite(value))).size:
+            place = ", ".join(map(str, bad[0]))
+            self.note(name, f"[{place}] is {value[tuple(bad[0])]}", "expected a finite number: leave the step out")
         axis = shape[0]
         order = self._order(str(axis), NAMES_OF[str(axis)])
         if order is not None and value.ndim > 1 and value.shape[1] == len(self.arrays[NAMES_OF[str(axis)]]):
@@ -223,9 +226,6 @@ class _Reader:
             expected = ", ".join(map(str, (num_steps, *sizes)))
             names = f"; {axis}: {listed(self.inputs.names[str(axis)])}"
             self.note(name, f"found shape {value.shape}, expected ({expected}){names}")
-        elif (bad := np.argwhere(~np.isfinite(value))).size:
-            place = ", ".join(map(str, bad[0]))
-            self.note(name, f"[{place}] is {value[tuple(bad[0])]}", "expected a finite number: leave the step out")
         return value
 
     def _order(self, axis: str, key: str) -> list[int] | None:
@@ -260,9 +260,11 @@ class _Reader:
         output, value = self.outputs.get(name), self._numbers(key)
         time = self._clock(f"clock:{name}", "clock of the target")
         if output is None or value is None:
-            return None  # noted as an unknown key
+            return None  # which is noted
         channels = self._channels(name, output)
         factor, unit = self._unit(name, output)
+        if not len(time):
+            return None
         if len(output.shape) > 2:
             self.note(key, "this reading stacks calls", "fit it with `history: null`")
             return None

@@ -58,7 +58,7 @@ def fold(
         planes: Numbers of planes that go out and in.
         taxels: The link's taxels.
         wanted: The form and its error.
-        is_alike: Whether the targets are the taxels, and the response depends on nothing but the way from source to target where
+        is_alike: Whether targets are the taxels, and the response depends on nothing but the way from source to target where
             these are alike.
 
     Raises:
