@@ -2,7 +2,6 @@
 
     python benchmarks/reality.py gelsight DATA_FOLDER [--out docs/images]
     python benchmarks/reality.py eflesh DATA_FOLDER
-    python benchmarks/reality.py dome DATA_FOLDER
 
 The data are not part of tgdsl. `gelsight/subpixel.npz` (FOTS, places of markers found again from its images), `eflesh/normal`
 (eFlesh) and `gel_dome_fem.npz` (Taxim) are expected in DATA_FOLDER. Each row is one call of `tgdsl.calibrate` with the document
@@ -12,6 +11,7 @@ and the recordings that this script writes into a temporary folder.
 from __future__ import annotations
 
 import json
+import lzma
 import tempfile
 import time
 from pathlib import Path
@@ -31,8 +31,11 @@ CENTRE = np.array([137.0, 126.0])
 BALL = 3e-3
 """Radius of the ball that presses it [m]."""
 LAYER = {"kernel": "bonded_layer", "youngs_modulus": 1e5, "normal_stiffness": 1e7, "thickness": 7e-3, "poissons_ratio": 0.38}
+LAYER |= {"marker_depth": 3e-4}
 HALF_SPACE = {"kernel": "half_space", "youngs_modulus": 1e5, "normal_stiffness": 1e7, "poissons_ratio": 0.45}
 GAUSSIAN = {"kernel": "gaussian", "dilation_falloff": 8e4, "shear_falloff": 8e4}
+PRESSED = {**LAYER, "thickness": 6.85e-3, "poissons_ratio": 0.374, "marker_depth": 3.4e-4}
+"""The layer as fitted to the press alone."""
 OF_LAYER = ["skin.thickness=2 mm:20 mm", "skin.poissons_ratio", "skin.marker_depth=0 mm:2 mm"]
 OF_HALF_SPACE = ["skin.poissons_ratio", "skin.marker_depth=0 mm:2 mm"]
 FRICTION = "skin.friction=0.02:3"
@@ -131,6 +134,7 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
             ("gaussian, drag, offset", {**GAUSSIAN, "dilation_strength": 0}, [drag], ["skin.shear_falloff=1e4:1e6"], "offset"),
             ("half_space, drag, offset", {**HALF_SPACE, "friction": 0.3}, [drag], [*OF_HALF_SPACE, FRICTION], "offset"),
             ("layer, drag, offset", {**LAYER, "friction": 0.3}, [drag], [*OF_LAYER, FRICTION], "offset"),
+            ("press's layer, drag, offset", {**PRESSED, "friction": 0.3}, [drag], [FRICTION], "offset"),
             ("half_space, raw drag, offset", {**HALF_SPACE, "friction": 0.3}, [raw], [*OF_HALF_SPACE, FRICTION], "offset"),
             ("layer, both, offset", {**LAYER, "friction": 0.3}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
         ]  # fmt: skip
@@ -159,14 +163,72 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
         show(rows)
 
 
+def eflesh(data: Path, out: Path | None, only: str) -> None:
+    """Print the table of the eFlesh under a probe: its load by the robot's pose."""
+    with lzma.open(data / "eflesh" / "normal" / "states.csv.xz") as file:
+        states = np.genfromtxt(file, delimiter=",")
+    time_s, height, load = states[:, 0] - states[0, 0], 1e-3 * states[:, 3], states[:, 4]
+    is_valid = load >= 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sheet = probe_document(folder)
+        # The ball touches the probe at 0.034 m; the robot at some height below its highest, which is fitted.
+        ball = 0.034 + height - (height.max() - CONTACT)
+        keep = np.arange(0, len(time_s), 2)
+        np.savez(
+            folder / "normal.npz",
+            **{**poses(*[(0.0, 0.0, z) for z in ball]), "time": time_s},
+            **{"target:load": -9.81e-3 * load[keep, None, None], "weight:load": is_valid[keep, None, None].astype(float)},
+            **{"clock:load": time_s[keep], "clock_width:load": 0.5, "unit:load": "N", "channels:load": ["force_z"]},
+            **{"width:body_pos": np.array([[0, 0, 0], [0, 0, 2e-3]])},
+        )
+        rows = []
+        law = ["load.normal_stiffness=1e2:1e8", "load.depth_exponent=0.5:4"]
+        cases = {"power law": law, "power law, damping": [*law, "load.normal_damping=0:1e6"]}
+        for label, fit in cases.items():
+            if only not in label:
+                continue
+            start = time.perf_counter()
+            result = tgdsl.calibrate(sheet, folder / "normal.npz", fit, hold_out="time", intervals="none", starts=4)
+            rows.append((label, result, time.perf_counter() - start))
+            print(result, flush=True)
+            if out is not None:
+                result.plot(out / f"reality-eflesh-{label.replace(', ', '-').replace(' ', '-')}.png")
+        show(rows)
+
+
+CONTACT = 0.75e-3
+"""Height of the eFlesh's first contact below the robot's highest pose, roughly [m]."""
+
+
+def probe_document(folder: Path) -> Path:
+    """Write one probe under a ball, whose force is the load; return the document."""
+    (folder / "scene.xml").write_text(
+        '<mujoco><worldbody><body name="pad"><geom type="box" size=".02 .02 .01" pos="0 0 -.01"/></body>'
+        '<body name="ball" pos="0 0 .05"><freejoint/><geom type="sphere" size=".02"/></body></worldbody></mujoco>'
+    )
+    probe = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 0.014}
+    layout = {"resolutions": {"r": {"pad": {"method": "points", "points": [probe]}}}}
+    sensor = {"kind": "kinematic_taxel", "links": "pad", "feels": ["ball"], "gate": "geometric", "outputs": ["force"]}
+    sensor |= {"normal_stiffness": 1e4, "depth_exponent": 1.5, "normal_damping": 0, "shear_damping": 0}
+    content = {
+        "tgdsl": 1,
+        "robot": {"model": "scene.xml", "layout": layout},
+        "objects": {"ball": {"body": "ball"}},
+        "sensors": {"load": sensor},
+    }
+    (folder / "load.yaml").write_text(json.dumps(content))
+    return folder / "load.yaml"
+
+
 def main(
-    which: Annotated[Literal["gelsight", "eflesh", "dome"], tyro.conf.arg(help="The data.")],
+    which: Annotated[Literal["gelsight", "eflesh"], tyro.conf.arg(help="The data.")],
     data: Path,
     out: Path | None = None,
     only: str = "",
 ) -> None:
     """Fit sensors to recordings and print the errors."""
-    {"gelsight": gelsight}[which](data, out, only)
+    {"gelsight": gelsight, "eflesh": eflesh}[which](data, out, only)
 
 
 if __name__ == "__main__":

@@ -36,8 +36,9 @@ def test_a_linear_parameter_is_solved_for(fitted):
     problem, solution = fitted.problem, fitted.solution
     assert problem.linear == (0,)
     plain = problem.minimise(solution.x, are_fixed=True)
-    assert plain.cost == pytest.approx(solution.cost, rel=1e-6)
-    assert plain.x == pytest.approx(solution.x, abs=2e-4)
+    assert solution.cost < plain.cost * (1 + 1e-6)
+    assert plain.cost == pytest.approx(solution.cost, rel=1e-3)
+    assert plain.x == pytest.approx(solution.x, abs=5e-3)
 
 
 def test_jacobian_of_the_projected_residual(fitted):
@@ -55,7 +56,7 @@ def test_jacobian_of_the_projected_residual(fitted):
 def test_the_document_is_written_and_predicts(path, fitted):
     out = fitted.document(path.parent / "fitted.yaml")
     text = out.read_text()
-    assert "# a guess" not in text and "normal_stiffness: 9" in text and "# fitted, 95 %: " in text
+    assert f"normal_stiffness: {fitted.parameters[FIT[0]].value:.6g}  # fitted, 95 %: " in text
     again = tgdsl.calibrate(out, recording(path, seed=1))
     assert again.errors[0].error == pytest.approx(again.errors[0].floor, rel=0.1)
     assert not again.parameters
@@ -153,8 +154,8 @@ def test_what_the_data_cannot_tell_is_named(path):
 def test_a_pose_offset_within_its_prior(path):
     """The ball was 0.3 mm lower than was recorded."""
     arrays = recording(path, lag=0.0)
-    arrays["body_pos"] = arrays["body_pos"] + np.array([[0, 0, 0], [0, 0, 3e-4]])
-    arrays["width:body_pos"] = np.array([[0, 0, 0], [0, 0, 5e-4]])
+    arrays["body_pos"] = arrays["body_pos"] + np.array([[0, 0, 3e-4], [0, 0, 0]])
+    arrays["width:body_pos"] = np.array([[0, 0, 5e-4], [0, 0, 0]])
     fit = tgdsl.calibrate(path, arrays, FIT, starts=4)
     assert fit.nuisances["<arrays>: body_pos ball.z"] == pytest.approx(-3e-4, abs=3e-5)
     assert fit.parameters["touch.depth_exponent"].low < 1.3 < fit.parameters["touch.depth_exponent"].high
@@ -186,14 +187,14 @@ def test_other_ways_to_hold_out(path, by):
 def test_a_wrong_model_is_worse_on_what_was_held_out(path):
     """The truth has damping, which the fit cannot have: no warning of noise fitted, and the error is above the floor."""
     arrays = recording(path)
-    true = TRUE | {"sensors.touch.normal_damping": 300.0}
+    true = TRUE | {"sensors.touch.normal_damping": 3e4}
     states = motion(1200)
     values = readings(path, states, true).reshape(1200, -1)
     clock = arrays["clock:touch"] - LAG
     arrays["target:touch"] = np.stack([np.interp(clock, states["time"], c) for c in values.T], axis=1).reshape(60, 3, 3)
     fit = tgdsl.calibrate(path, arrays, FIT, starts=2)
     assert fit.errors[0].error > 2 * fit.errors[0].floor
-    better = tgdsl.calibrate(path, arrays, [*FIT, "touch.normal_damping=0:900"], starts=2)
+    better = tgdsl.calibrate(path, arrays, [*FIT, "touch.normal_damping=0:1e5"], starts=2)
     assert better.errors[0].error < 0.2 * fit.errors[0].error
 
 

@@ -44,7 +44,7 @@ BAD = {
         lambda a: a.update({"clock:touch": a["clock:touch"][::-1]}),
         r"clock:touch: \[1\] is 2\.\d+ s after 2\.72 s; expected ascending times",
     ),
-    "another name": (lambda a: a.update({"bodies": np.array(["pad", "bal"])}), 'bodies: "ball" is missing; did you mean "bal"'),
+    "another name": (lambda a: a.update({"bodies": np.array(["bal", "pad"])}), 'bodies: "ball" is missing; did you mean "bal"'),
     "unknown key": (lambda a: a.update({"targt:touch": np.zeros(3)}), 'targt:touch: unknown key; did you mean "target:touch"'),
     "another shape": (
         lambda a: a.update({"target:touch": a["target:touch"][:, :2]}),
@@ -89,14 +89,14 @@ def test_fewer_numbers_than_unknowns_are_refused(pressed):
     path, _, arrays = pressed
     few = arrays | {"target:touch": arrays["target:touch"][:1], "clock:touch": arrays["clock:touch"][:1]}
     few["weight:touch"] = with_value(np.zeros((1, 3, 3)), (0, 0, 2), 1.0)
-    with pytest.raises(TgdslError, match="1 numbers in all, expected more than the 2 unknowns: touch.normal_stiffness"):
+    with pytest.raises(TgdslError, match=r"1 numbers in all, expected more than the 2 unknowns: touch\.normal_stiffness"):
         tgdsl.calibrate(path, few, ["touch.normal_stiffness"])
 
 
 def test_units_weights_and_order_of_names(pressed):
     _, touch, arrays = pressed
     other = arrays | {"unit:touch": np.array("mN"), "target:touch": 1e3 * arrays["target:touch"], "floor:touch": np.array(2.0)}
-    other |= {"bodies": np.array(["ball", "pad"]), "body_pos": arrays["body_pos"][:, ::-1]}
+    other |= {"bodies": np.array(["pad", "ball"]), "body_pos": arrays["body_pos"][:, ::-1]}
     other["target:touch"] = with_value(other["target:touch"], (0, 0, 0), np.nan)
     other["weight:touch"] = with_value(np.ones((60, 3, 3)), (0, 0, 0), 0.0)
     found, plain = read(touch, other), read(touch, arrays)
@@ -117,9 +117,8 @@ def test_states_between_steps_and_velocities_of_a_turning_body(pressed):
 
     _, touch, arrays = pressed
     states = motion(401)
-    states["body_quat"][:, 1] = quat
+    states["body_quat"][:, 0] = quat
     turning = read(touch, arrays | states)
-    ball = touch.inputs.bodies.index("ball")
-    at = turning.state_at(np.array([1.00001, 2.3]), turning.fields)["body_quat"][:, ball]
+    at = turning.state_at(np.array([1.00001, 2.3]), turning.fields)["body_quat"][:, 0]
     exact = Rotation.from_rotvec(np.array([[1.00001], [2.3]]) / 3.0 * rate).as_quat()[:, [3, 0, 1, 2]]
     assert abs((at * exact).sum(axis=1)) == pytest.approx(1.0, abs=1e-9)

@@ -54,13 +54,13 @@ def document(folder: Path) -> Path:
 
 
 def motion(num: int = 120) -> dict[str, np.ndarray]:
-    """Presses of different depths and speeds, and a bit of sideways motion."""
+    """Presses of different depths and speeds, and a bit of sideways motion; bodies in the order of the module's inputs."""
     time = np.linspace(0.0, 3.0, num)
     pos, quat = np.zeros((num, 2, 3)), np.zeros((num, 2, 4))
-    pos[:, 1, 0] = 1e-3 * np.sin(2 * time)
-    pos[:, 1, 2] = 0.034 - 1.2e-3 * (1 - np.cos(4 * time)) - 4e-4 * np.sin(9 * time)
+    pos[:, 0, 0] = 1e-3 * np.sin(2 * time)
+    pos[:, 0, 2] = 0.034 - 1.2e-3 * (1 - np.cos(4 * time)) - 4e-4 * np.sin(9 * time)
     quat[..., 0] = 1.0
-    return {"time": time, "body_pos": pos, "body_quat": quat, "bodies": np.array(["pad", "ball"])}
+    return {"time": time, "body_pos": pos, "body_quat": quat, "bodies": np.array(["ball", "pad"])}
 
 
 def readings(path: Path, states: dict[str, np.ndarray], true: dict[str, float] = TRUE) -> np.ndarray:

@@ -159,7 +159,8 @@ def calibrate(
     model = Model(document, fit, overrides, kinds)
     sources = [recordings] if isinstance(recordings, (str, Path, Mapping)) else list(recordings)
     outputs = {output.name: output for output in model.module.outputs}
-    loaded = [load_recording(source, model.module.inputs, outputs) for source in sources]
+    names = ["<arrays>"] if len(sources) == 1 else [f"<arrays {i}>" for i in range(1, len(sources) + 1)]
+    loaded = [load_recording(source, model.module.inputs, outputs, name) for source, name in zip(sources, names, strict=True)]
     problem = Problem(model, loaded, reading, gain)
     solution = _best(problem, starts, seed, robust)
     out = None if hold_out == "none" else checks.held_out(problem, solution, hold_out, folds, seed)

@@ -26,10 +26,11 @@ from tgdsl.fields import units
 from tgdsl.fields.models import Quantity, Usual
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import CHOICES, SceneState
+from tgdsl.quantities.base import Request
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 
-DECADES = 2.0
+DECADES = 1.0
 """How far a positive parameter without bounds is searched from where it starts, either way."""
 LOGARITHMIC = 20.0
 """Ratio of bounds from which a positive parameter is searched by its logarithm."""
@@ -288,7 +289,7 @@ def _are_alike(one: Sequence[LoweredSensor], two: Sequence[LoweredSensor], kind:
 
 def _shape(sensor: LoweredSensor) -> object:
     lowered = sensor.lowered
-    requests = [request.key() for request in lowered.requests]
+    requests = [Request.key(request) for request in lowered.requests]  # all of it, also what may differ in a shared use
     noise = None if sensor.noise is None else (sensor.noise.terms, sensor.noise.streams, sensor.noise.memory)
     constants = {name: value.shape for name, value in _constants(sensor).items()}
     return requests, lowered.state, lowered.timestep, noise, constants

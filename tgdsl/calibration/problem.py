@@ -232,9 +232,10 @@ class Problem:
             left = [self._projected(i, part.value - base[i], root[i]) for i, part in enumerate(self.parts)]
             right = [[self._projected(i, slope[i], root[i]) for i in range(len(self.parts))] for slope in slopes]
             matrix = np.stack([np.concatenate(column) for column in right], axis=1)
-            size = np.linalg.norm(matrix, axis=0) + 1e-300
+            size = np.linalg.norm(matrix, axis=0)
+            size = np.where(size > 1e-12 * np.linalg.norm(np.concatenate(left)), size, np.inf)  # of no effect: no step
             limits = np.array([[p.low - p.start, p.high - p.start] for p in (self.model.parameters[j] for j in solved)]).T
-            steps = lsq_linear(matrix / size, np.concatenate(left), limits * size).x / size
+            steps = lsq_linear(matrix / size, np.concatenate(left), limits * np.where(np.isinf(size), 1.0, size)).x / size
             for j, step, slope in zip(solved, steps, slopes, strict=True):
                 x[j] = self.model.parameters[j].place(self.model.parameters[j].start + step)
                 base = [value + step * part for value, part in zip(base, slope, strict=True)]

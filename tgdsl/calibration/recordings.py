@@ -121,18 +121,21 @@ def velocities(time: np.ndarray, fields: Arrays) -> dict[str, np.ndarray]:
     return {"body_linvel": np.gradient(pos, time, axis=0), "body_angvel": 2.0 * (w * dv - dw * v - np.cross(dv, v))}
 
 
-def load_recording(source: str | Path | Arrays, inputs: Inputs, outputs: Mapping[str, Output]) -> Recording:
+def load_recording(
+    source: str | Path | Arrays, inputs: Inputs, outputs: Mapping[str, Output], name: str = "<arrays>"
+) -> Recording:
     """Read a recording for a module.
 
     Args:
         source: A `.npz` file, or its arrays.
         inputs: What the module reads.
         outputs: The module's readings, by name.
+        name: What to call arrays.
 
     Raises:
         SpecError: All that is wrong with it, by its keys.
     """
-    name = "<arrays>" if isinstance(source, Mapping) else str(source)
+    name = name if isinstance(source, Mapping) else str(source)
     reader = _Reader(name, _arrays(source, name), inputs, outputs)
     recording = reader.recording()
     if reader.problems:

@@ -344,7 +344,7 @@ class Kind:
         decide: `(planes, constants, state) → (planes, new state)`, if the reading is made of the signal by a threshold: what
             `forward` returns is then the signal, which noise disturbs first.
         knobs: Names of the noise knobs that it has.
-        gains_depth: Whether a taxel's gain is of the depth that `forward` gets rather than of the reading, where rows are taxels.
+        gains_depth: Whether a gain is of the depth that `forward` gets rather than of the reading; of rows that are taxels.
         idle_knobs: Those of its knobs that change nothing in what it reads.
         is_pointwise: Whether each row of what `forward` returns is of one taxel alone. Sensors on different taxels may then be
             computed as one, where they have no state, and parameters that are scalars are given as (taxel,).
