@@ -52,7 +52,8 @@ def _field(panels: Sequence[Axes], part: Part, fitted: np.ndarray, places: np.nd
     vectors = [np.pad(value[:, :num], ((0, 0), (0, 2 - num))) for value in (measured, fitted[0], fitted[0] - measured)]
     spread = np.ptp(centred[:, axes], axis=0).max() or 1.0
     scale = np.linalg.norm(vectors[0][shown], axis=1).max() / (0.12 * spread) or 1.0
-    larger = max(1.0, 10 ** np.floor(np.log10(scale * 0.12 * spread / np.linalg.norm(vectors[2][shown], axis=1).max())))
+    typical = 3 * np.linalg.norm(vectors[2][shown], axis=1).mean()
+    larger = max(1.0, 10 ** np.floor(np.log10(scale * 0.12 * spread / typical))) if typical > 0 else 1.0
     at = 1e3 * places[:, axes][shown].T
     style = {"angles": "xy", "scale_units": "xy", "width": 0.004}
     panels[0].quiver(*at, *vectors[0][shown].T, color=MEASURED, scale=scale / 1e3, label="measured", **style)
