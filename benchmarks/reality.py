@@ -22,6 +22,7 @@ import tyro
 
 import tgdsl
 from tgdsl.calibration.fit import Fit
+from tgdsl.calibration.problem import ReadingMap
 from tgdsl.console.tables import text_table
 
 PX = 18.8e3
@@ -71,6 +72,11 @@ def poses(*places: tuple[float, float, float]) -> dict[str, Any]:
     return {"time": np.arange(len(places)), "body_pos": pos, "body_quat": quat, "bodies": ["pad", "ball"]}
 
 
+def width(value: np.ndarray) -> dict[str, Any]:
+    """Return standard deviations of the poses' offsets [m]."""
+    return {"width:body_pos": value}
+
+
 def target(time_s: list[float], value: np.ndarray, kept: np.ndarray, floor: float) -> dict[str, Any]:
     """Return a target of in-plane displacements [m] of the markers that were kept."""
     return {
@@ -88,10 +94,7 @@ def gelsight_recordings(data: Path, folder: Path) -> np.ndarray:
     still[0, 1] = wide
     size = np.sqrt((press[found["press_kept"]] ** 2).mean())
     np.savez(
-        folder / "press.npz",
-        **poses((0, 0, deep)),
-        **target([0], press, found["press_kept"], 0.105 * size),
-        **{"width:body_pos": still},
+        folder / "press.npz", **poses((0, 0, deep)), **target([0], press, found["press_kept"], 0.105 * size), **width(still)
     )
     moved = np.zeros((2, 2, 3))
     moved[0, 1], moved[1, 1] = wide, [1e-3, 1e-3, 4e-4]
@@ -125,7 +128,7 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
         folder = Path(name)
         places = gelsight_recordings(data, folder)
         press, drag, raw = (folder / f"{which}.npz" for which in ("press", "drag", "raw"))
-        cases: list[tuple[str, dict[str, Any], list[Path], list[str], str]] = [
+        cases: list[tuple[str, dict[str, Any], list[Path], list[str], ReadingMap]] = [
             ("gaussian, press, offset", GAUSSIAN, [press], ["skin.dilation_falloff=1e4:1e7"], "offset"),
             ("half_space, press, offset", HALF_SPACE, [press], OF_HALF_SPACE, "offset"),
             ("layer, press, offset", LAYER, [press], OF_LAYER, "offset"),
@@ -152,7 +155,7 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
                 gain=True,
                 hold_out="taxel",
                 intervals="none",
-                starts=4,  # type: ignore[arg-type]
+                starts=4,
             )
             rows.append((label, result, time.perf_counter() - start))
             show(rows[-1:])
@@ -180,7 +183,7 @@ def eflesh(data: Path, out: Path | None, only: str) -> None:
             **{**poses(*[(0.0, 0.0, z) for z in ball]), "time": time_s},
             **{"target:load": -9.81e-3 * load[keep, None, None], "weight:load": is_valid[keep, None, None].astype(float)},
             **{"clock:load": time_s[keep], "clock_width:load": 0.5, "unit:load": "N", "channels:load": ["force_z"]},
-            **{"width:body_pos": np.array([[0, 0, 0], [0, 0, 2e-3]])},
+            **width(np.array([[0, 0, 0], [0, 0, 2e-3]])),
         )
         rows = []
         law = ["load.normal_stiffness=1e2:1e8", "load.depth_exponent=0.5:4"]

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 from recorded_presses import LAG, TRUE, document, motion, readings, recording
 
 import tgdsl
 from tgdsl.calibration.model import InfeasibleError, Model
+from tgdsl.calibration.recordings import velocities
 from tgdsl.errors import TgdslError
 
 FIT = ["touch.normal_stiffness", "touch.depth_exponent"]
@@ -78,20 +80,15 @@ def test_lowered_again_is_compiled_again(path):
     assert model.module is before
     states = motion(40)
     fields = {name: states[name] for name in ("body_pos", "body_quat")}
-    fields = fields | model._with_velocities(_Times(states["time"]), fields)  # type: ignore[arg-type]
+    fields |= velocities(states["time"], fields)
     found = model._read("touch", fields, states["time"])
     assert np.array_equal(found, readings(path, states))
     model.set(model.start)
     assert np.array_equal(model._read("touch", fields, states["time"]), readings(path, states, {}))
 
 
-class _Times:
-    def __init__(self, time):
-        self.time = time
-
-
 def test_what_changes_requests_is_compiled_again(path):
-    """`radius` of an elastomer's skin, `standoff`, is part of what is requested of the scene."""
+    """An elastomer's `standoff` is part of what is requested of the scene."""
     skin = {
         "sensors": {"touch": {"kind": "elastomer", "links": "pad", "feels": ["ball"], "standoff": 0.001, "shear_strength": 0}}
     }
@@ -102,8 +99,6 @@ def test_what_changes_requests_is_compiled_again(path):
     states = motion(20)
     found = model._read("touch", states, states["time"])
     touch = tgdsl.compile(path, overrides={"sensors.touch": {**skin["sensors"]["touch"], "standoff": 0.002}}, dtype="float64")
-    import torch
-
     state = tgdsl.SceneState(**{name: torch.from_numpy(states[name]) for name in ("body_pos", "body_quat")})
     assert np.array_equal(found, touch(state)["touch"].numpy())
 

@@ -157,15 +157,16 @@ class Model:
 
     def _read(self, reading: str, states: Mapping[str, np.ndarray], time: np.ndarray) -> np.ndarray:
         wanted = self.module.inputs.fields
-        tensors = {n: torch.from_numpy(v.astype(np.int64) if n in CHOICES else v) for n, v in states.items() if n in wanted}
+        used = {name: value for name, value in states.items() if name in wanted}
+        tensors: dict[str, Any] = {n: torch.from_numpy(v.astype(np.int64) if n in CHOICES else v) for n, v in used.items()}
         self.module.free()
         if not self.module.has_state and "dt" not in wanted:
             return self.module(SceneState(**tensors))[reading].numpy()
         steps = np.diff(time, prepend=2 * time[0] - time[1] if len(time) > 1 else time[0] - 1.0)
         each = []
         for i, dt in enumerate(steps):
-            state = SceneState(**{name: value[i : i + 1] for name, value in tensors.items()}, dt=float(dt))
-            each.append(self.module(state)[reading])
+            now: dict[str, Any] = {name: value[i : i + 1] for name, value in tensors.items()}
+            each.append(self.module(SceneState(**now, dt=float(dt)))[reading])
         return torch.cat(each).numpy()
 
     def _compile(self, changes: Mapping[str, Any]) -> None:
