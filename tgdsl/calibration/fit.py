@@ -177,9 +177,8 @@ def _best(problem: Problem, starts: int, seed: int, robust: bool) -> Solution:
     problem.find_linear()
     places, num = [problem.start], problem.num_parameters - len(problem.linear)
     if num and starts > 1:
-        drawn = qmc.Sobol(problem.num_parameters, rng=np.random.default_rng(seed)).random(1 << (starts - 1).bit_length())[
-            : starts - 1
-        ]
+        sobol = qmc.Sobol(problem.num_parameters, seed=seed)  # pyright: ignore[reportCallIssue]
+        drawn = sobol.random(1 << (starts - 1).bit_length())[: starts - 1]
         places += [np.concatenate([0.02 + 0.96 * u, np.zeros(len(problem.nuisances))]) for u in drawn]
     weights = problem.weights()
     ranked = sorted(places, key=lambda x: problem.solve(x, weights).cost)
