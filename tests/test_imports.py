@@ -18,7 +18,7 @@ FLOORS = (
     ("placement",),
     ("compiler", "runtime"),
     ("tuning", "view"),
-    ("adapters", "calibrate", "rl"),
+    ("adapters", "calibration", "rl"),
     ("report",),
     ("commands",),
 )

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tgdsl import testing
+    from tgdsl.calibration.fit import calibrate as calibrate
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import (
         ArtifactError,
@@ -63,6 +64,7 @@ _PLACES = {
     "TouchEnv": "rl.env",
     "WarpSimulation": "runtime.warp",
     "bodies_by_name": "runtime.by_name",
+    "calibrate": "calibration.fit",
     "check_taxels": "module.taxels.identity",
     "compile": "tuning.compile",
     "connect": "runtime.connect",
@@ -94,6 +96,7 @@ __all__ = [
     "TouchEnv",
     "WarpSimulation",
     "bodies_by_name",
+    "calibrate",
     "check_taxels",
     "compile",
     "connect",

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from tgdsl.commands.cache import Cache
-from tgdsl.commands.calibrate import Calibrate
+from tgdsl.commands.calibrate.calibrate import Calibrate
 from tgdsl.commands.compile import Compile
 from tgdsl.commands.explain import Explain
 from tgdsl.commands.export import Export

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tgdsl.compiler.resolve import Resolved
+from tgdsl.compiler.resolve import Models, Resolved, taxels_of_all_links
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, TgdslError, did_you_mean, listed
 from tgdsl.fields.models import Selection
@@ -177,9 +177,9 @@ class LoweredSensor:
 class Surfaces:
     """The triangles of a document's links and objects: a `sensors.base.SurfaceOf`."""
 
-    def __init__(self, resolved: Resolved, progress: Progress):
+    def __init__(self, loaded: Loaded, resolved: Resolved, progress: Progress):
         """Be those of a document; `progress` is told what kinds do with them that takes long."""
-        self._resolved, self.progress = resolved, progress
+        self._loaded, self._resolved, self.progress = loaded, resolved, progress
 
     def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame [m]."""
@@ -188,6 +188,26 @@ class Surfaces:
     def of_object(self, name: str) -> Surface:
         """Return the triangles of an object's geoms in its body's frame [m]."""
         return self._resolved.surface_of_object(name)
+
+    def taxels(self, resolution: str, layout: Layout) -> Layout:
+        """Return the taxels that another resolution of the layout puts on a sensor's links.
+
+        Raises:
+            LowerError: If there is no such resolution, or it has none on one of the links.
+        """
+        assert self._loaded.layout is not None
+        names = self._loaded.layout.spec.resolutions
+        if resolution not in names:
+            hint = did_you_mean(resolution, names, "resolutions")
+            raise LowerError(f'the layout has no resolution "{resolution}"', "markers", hint)
+        if resolution not in self._resolved.layouts:
+            spec = self._loaded.spec.model_copy(update={"resolution": resolution})
+            models = Models(self._resolved.robot, self._resolved.scene)
+            self._resolved.layouts[resolution] = taxels_of_all_links(dataclasses.replace(self._loaded, spec=spec), models)
+        every, links = self._resolved.layouts[resolution], [link.name for link in layout.links]
+        if missing := [name for name in links if name not in {link.name for link in every.links}]:
+            raise LowerError(f'the resolution "{resolution}" has no taxels on {listed(missing)}', "markers")
+        return every.take(every.taxels_of(tuple(links)))
 
 
 def rows_of(lowered: Lowered, layout: Layout, spec: AnySensorSpec) -> Axis:
@@ -208,7 +228,7 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
     for name, spec in loaded.spec.sensors.items():
         progress(f"lowering sensor {name}")
         try:
-            sensors += _ways(loaded, resolved, name, by_name[spec.kind], progress)  # type: ignore[attr-defined]
+            sensors += ways(loaded, resolved, name, by_name[spec.kind], progress)  # type: ignore[attr-defined]
         except LowerError as error:
             loaded.note(("sensors", name), error)
     loaded.raise_problems()
@@ -325,11 +345,11 @@ def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
     return spec.model_copy(update={field: float(resolved.scene.compiled.opt.timestep)})
 
 
-def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: Progress) -> list[LoweredSensor]:
+def ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: Progress) -> list[LoweredSensor]:
     """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
     spec = _with_timestep(loaded.spec.sensors[name], resolved)
     taxels, layout = resolved.layout_on(name)
-    surfaces = Surfaces(resolved, progress)
+    surfaces = Surfaces(loaded, resolved, progress)
     clean = kind.lower(spec, layout, surfaces)
     check_lowered(kind, clean, spec)
     _check_accuracy(loaded, name, clean)

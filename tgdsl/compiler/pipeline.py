@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import mujoco
 
 from tgdsl.compiler import lower
-from tgdsl.compiler.resolve import models_of, resolve
+from tgdsl.compiler.resolve import Resolved, models_of, resolve
 from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SpecError, TgdslError, did_you_mean, listed
@@ -84,6 +84,27 @@ def compile_plan(
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
         TgdslError: If a sensor has an `accuracy` and nothing was chosen.
     """
+    return compiled(document, overrides, kinds, progress, sensors, choice, scene).plan
+
+
+class Compiled(NamedTuple):
+    """A document on the way: as read, as resolved on its robot, and its Plan."""
+
+    loaded: Loaded
+    resolved: Resolved
+    plan: Plan
+
+
+def compiled(
+    document: Document,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+    progress: Progress | None = None,
+    sensors: Collection[str] | None = None,
+    choice: Choice = UNCHOSEN,
+    scene: Model | None = None,
+) -> Compiled:
+    """Return what `compile_plan` does, with the values before the Plan."""
     all_kinds, tell = known_kinds(kinds), progress or silent
     loaded = load(document, {**(overrides or {}), **choice.changes}, all_kinds, sensors=sensors, has_scene=scene is not None)
     resolved = resolve(loaded, tell, None if scene is None else models_of(loaded, scene))
@@ -91,8 +112,8 @@ def compile_plan(
     written = _written(document, overrides, all_kinds, sensors) if choice.changes else loaded
     plan = lower.plan(loaded, resolved, all_kinds, _origin(written, scene), tell)
     tell("compiling the scene")
-    kept = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
-    return choice.noted(dataclasses.replace(plan, scene=kept))
+    file = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
+    return Compiled(loaded, resolved, choice.noted(dataclasses.replace(plan, scene=file)))
 
 
 def _check_chosen(loaded: Loaded, choice: Choice, scene: Model | None) -> None:

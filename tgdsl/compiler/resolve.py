@@ -154,6 +154,7 @@ class Resolved:
         joints: The robot's joints and actuators.
         on_joints: Names of the joints of each sensor that is on joints.
         primitives: Collision shapes of links, instead of their own geoms.
+        layouts: Taxels of all links at other resolutions that were asked for.
     """
 
     layout: Layout
@@ -171,6 +172,7 @@ class Resolved:
     joints: RobotJoints
     on_joints: Mapping[str, tuple[str, ...]]
     primitives: tuple[Collider, ...] = ()
+    layouts: dict[str, Layout] = field(default_factory=dict)
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame.
@@ -286,6 +288,19 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     by_link, within = {p.link.name: p for p in patches}, reach(colliders, layout, felt)
     own_links = (on_links, parts_of, joints, on_joints, primitives)
     return Resolved(layout, links, objects, new_objects, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
+
+
+def taxels_of_all_links(loaded: Loaded, models: Models) -> Layout:
+    """Return where a document's resolution puts taxels, on links without sensors too.
+
+    Raises:
+        SpecError: All mistakes found so far.
+    """
+    robot, layout = models.robot, loaded.layout
+    assert robot is not None and layout is not None
+    patches = patches_of(loaded, layout, robot, layout.spec.resolutions[loaded.resolution or ""])
+    loaded.raise_problems()
+    return sampled(loaded, layout, models.colliders, patches, _object_bodies(loaded, robot), models.pools, silent)
 
 
 def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:

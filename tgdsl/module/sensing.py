@@ -151,7 +151,7 @@ def read(
     fuses then has the equation write all channels side by side, and would else form them again for each number of the noise.
     """
     gain = next((stage for stage in stages if isinstance(stage, Gain)), None)
-    if gain is not None and kind.gains_depth:
+    if gain is not None and kind.gains_depth and sensor.readings[0].rows == "taxel":
         felt = gathered[ContactDepth]
         gathered = gathered.replaced(ContactDepth, felt._replace(depth=gain.of_taxels(now, felt.depth) * felt.depth))
         stages = [stage for stage in stages if stage is not gain]

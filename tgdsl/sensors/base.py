@@ -300,6 +300,10 @@ class SurfaceOf(Protocol):
         """Return the triangles of an object's geoms, by its name, in its body's frame [m]; of several variants the first."""
         ...
 
+    def taxels(self, resolution: str, layout: Layout) -> Layout:
+        """Return the taxels that another resolution of the document's layout puts on the links of a sensor's layout."""
+        ...
+
     @property
     def progress(self) -> Progress:
         """Receives messages during long jobs."""
@@ -359,7 +363,8 @@ class Kind:
         decide: `(planes, constants, state) → (planes, new state)`, if the reading is a threshold of a signal: `forward` then
             returns the signal, and noise acts on that.
         knobs: Names of its noise knobs.
-        gains_depth: Whether the noise stage `gain` scales the depth that `forward` gets, instead of the reading.
+        gains_depth: Whether the noise stage `gain` scales the depth that `forward` gets, instead of the reading, if its
+            rows are taxels.
         idle_knobs: Knobs that do not change its reading; a document that sets one gets a warning.
         is_pointwise: Whether each row of its planes depends on one taxel alone. Sensors without state on different taxels are
             then evaluated together, and scalar constants are passed as (taxel,).

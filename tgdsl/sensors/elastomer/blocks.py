@@ -49,8 +49,10 @@ def weights(spec: ElastomerSpec, part: LinkTaxels) -> Float[np.ndarray, " taxel"
     return np.where(part.is_active, area, 0.0)
 
 
-def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> dict[str, tuple[Operator[np.ndarray], ...]]:
-    """Return the operators of all links by name.
+def fold_links(
+    spec: ElastomerSpec, layout: Layout, markers: Layout | None, surface_of: SurfaceOf
+) -> dict[str, tuple[Operator[np.ndarray], ...]]:
+    """Return the operators of all links by name, from taxels to markers; None: taxels are markers.
 
     Raises:
         LowerError: If a convolution is asked for where it cannot be, or the pad's edge cannot be clamped.
@@ -58,51 +60,58 @@ def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> di
     of_links = []
     for i, link in enumerate(layout.links):
         try:
-            of_links.append(_fold_link(spec, layout, i, surface_of))
+            of_links.append(_fold_link(spec, layout, markers, i, surface_of))
         except LowerError as error:
             field = error.field or "boundary"  # what a surface says knows no field
             raise LowerError(f'link "{link.name}": {error.what}', field, error.hint) from error
     return {name: tuple(operators[name] for operators in of_links) for name in of_links[0]}
 
 
-def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, Operator[np.ndarray]]:
-    part = link_taxels(layout, link)
+def _fold_link(
+    spec: ElastomerSpec, layout: Layout, markers: Layout | None, link: int, surface_of: SurfaceOf
+) -> dict[str, Operator[np.ndarray]]:
+    part, targets = link_taxels(layout, link), None if markers is None else link_taxels(markers, link)
     pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
     form = OperatorForm(spec.operator, spec.tolerance)
     return {
-        name: fold(response, PLANES[name], part, form, is_alike=pad is None or name != "spread")
-        for name, response in responses(spec, part, pad).items()
+        name: fold(response, PLANES[name], part, form, is_alike=targets is None and (pad is None or name != "spread"))
+        for name, response in responses(spec, part, pad, targets).items()
     }
 
 
-def responses(spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None) -> dict[str, Response]:
-    """Return the operators of one link by name."""
-    is_active = part.is_active.astype(np.float64)[:, None]
+def responses(
+    spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None, targets: LinkTaxels | None = None
+) -> dict[str, Response]:
+    """Return the operators of one link by name, from its taxels to its markers; by default the same."""
+    targets = part if targets is None else targets
+    is_active = targets.is_active.astype(np.float64)[:, None]
     if spec.kernel != "gaussian":
-        return _elastic_responses(spec, part, is_active)
+        return _elastic_responses(spec, part, targets, is_active)
     kernel, weight = gaussian(spec, part), weights(spec, part)
     clamped = None
     if pad is not None:
         clamped = kernel.spread(part.pos, part.normal, part.pos) + clamping(spec, part, pad)
 
     def spread(source: np.ndarray) -> np.ndarray:
-        response = kernel.spread(part.pos, part.normal, part.pos[source]) if clamped is None else clamped[..., source]
+        response = kernel.spread(targets.pos, targets.normal, part.pos[source]) if clamped is None else clamped[..., source]
         return is_active * response * weight[source]
 
     def bulge(source: np.ndarray) -> np.ndarray:
-        return is_active * kernel.bulge(part, source) * weight[source]
+        return is_active * kernel.bulge(targets, part.pos[source]) * weight[source]
 
     def drag(source: np.ndarray) -> np.ndarray:
-        return is_active * kernel.drag(part, source) * weight[source]
+        return is_active * kernel.drag(targets, part.pos[source]) * weight[source]
 
     return {"spread": spread, "bulge": bulge, **({"drag": drag} if spec.anchored == "taxels" else {})}
 
 
-def _elastic_responses(spec: ElastomerSpec, part: LinkTaxels, is_active: Float[np.ndarray, "taxel 1"]) -> dict[str, Response]:
+def _elastic_responses(
+    spec: ElastomerSpec, part: LinkTaxels, targets: LinkTaxels, is_active: Float[np.ndarray, "target 1"]
+) -> dict[str, Response]:
     material = elastic(spec)
 
     def traction(source: np.ndarray) -> np.ndarray:
-        return is_active * material.displacement(part, source) * is_active[source, 0]
+        return is_active * material.displacement(part, source, targets) * part.is_active[source]
 
     def pressure(source: np.ndarray) -> np.ndarray:
         return -np.einsum("klji,il->kji", traction(source), part.normal[source])[:, None]

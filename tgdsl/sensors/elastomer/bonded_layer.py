@@ -27,7 +27,11 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
 CUTOFF = 45.0
 """Wavenumbers go up to CUTOFF/b, b of the patch: φ there is 1e-16."""
 STEPS_PER_PATCH = 32
-"""Distances in the table per b: cubic splines then err by some 1e-6 of the largest value."""
+"""Distances in the table per b, next to the patch: cubic splines then err by some 1e-6 of the largest value."""
+GRADED = 4.0
+"""Distance over b from which steps in the table grow with the distance."""
+DEEP = 40.0
+"""kt from which the base is not felt: its part is exp(−2kt), and the response is smooth over wavenumbers far beyond 1/t."""
 BATCH = 4_000_000
 """Bessel functions that are formed at once."""
 
@@ -105,18 +109,23 @@ def tabulated(r: np.ndarray, layer: Layer, patch: float) -> Profiles:
     from scipy.interpolate import CubicSpline
 
     b = (1.0 + QUADRATIC) * patch
-    last = float(np.max(r, initial=0.0)) + b
-    knots = np.linspace(0.0, last, max(8, int(np.ceil(STEPS_PER_PATCH * last / b))) + 1)
-    table = np.stack(profiles(knots, layer, patch), axis=1)
+    last, graded = float(np.max(r, initial=0.0)) + b, GRADED * b
+    knots = np.linspace(0.0, min(last, graded), max(8, int(np.ceil(STEPS_PER_PATCH * min(last, graded) / b))) + 1)
+    if last > graded:
+        num = int(np.ceil(STEPS_PER_PATCH * GRADED * np.log(last / graded)))
+        knots = np.concatenate([knots, graded * (last / graded) ** (np.arange(1, num + 1) / num)])
+    octaves = np.split(knots, np.searchsorted(knots, graded * 2.0 ** np.arange(max(1, int(np.ceil(np.log2(last / graded)))))))
+    table = np.concatenate([np.stack(profiles(octave, layer, patch), axis=1) for octave in octaves])
     return Profiles(*np.moveaxis(CubicSpline(knots, table)(r), -1, 0))
 
 
 def _quadrature(largest_distance: float, layer: Layer, patch: float) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes k [1/m] and weights of Gauss' rule on panels that follow both J(kr) and the response."""
     b = (1.0 + QUADRATIC) * patch
-    last = CUTOFF / b
-    panel = np.pi / max(largest_distance, 2.0 * layer.thickness, 4.0 * b)
-    edges = np.linspace(0.0, last, int(np.ceil(last / panel)) + 1)
+    last, reach = CUTOFF / b, max(largest_distance, 4.0 * b)
+    deep = min(last, DEEP / layer.thickness)
+    low = np.linspace(0.0, deep, int(np.ceil(deep * max(reach, 2.0 * layer.thickness) / np.pi)) + 1)
+    edges = np.concatenate([low, np.linspace(deep, last, int(np.ceil((last - deep) * reach / np.pi)) + 1)[1:]])
     half = 0.5 * np.diff(edges)[:, None]
     return (edges[:-1, None] + half * (1.0 + NODES)).reshape(-1), (half * WEIGHTS).reshape(-1)
 

@@ -68,16 +68,16 @@ class Gaussian:
         size = self.compressibility * local + (1.0 - self.compressibility) * stretch
         return (r * (size / peak if self.is_normalized else size))[:, None]
 
-    def bulge(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"]) -> Matrix:
+    def bulge(self, targets: LinkTaxels, source: Float[np.ndarray, "source 3"]) -> Matrix:
         """Return g of the dilation, (1, 1, target, source)."""
-        return self._fall(self.dilation_falloff, taxels, source)
+        return self._fall(self.dilation_falloff, targets, source)
 
-    def drag(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"]) -> Matrix:
+    def drag(self, targets: LinkTaxels, source: Float[np.ndarray, "source 3"]) -> Matrix:
         """Return g of the shear, (1, 1, target, source)."""
-        return self._fall(self.shear_falloff, taxels, source)
+        return self._fall(self.shear_falloff, targets, source)
 
-    def _fall(self, falloff: float, taxels: LinkTaxels, source: np.ndarray) -> Matrix:
-        r = offset(taxels.pos, taxels.normal, taxels.pos[source])
+    def _fall(self, falloff: float, targets: LinkTaxels, source: np.ndarray) -> Matrix:
+        r = offset(targets.pos, targets.normal, source)
         return np.exp(-falloff * np.einsum("kji,kji->ji", r, r))[None, None]
 
 
@@ -103,11 +103,18 @@ class Elastic:
         find = bonded_layer.profiles if is_exact else bonded_layer.tabulated
         return find(r, layer, float(patch_radius(mean_area)))
 
-    def displacement(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"]) -> Matrix:
-        """Return displacement per traction [m/Pa], (3, 3, target, source), both vectors in the body's frame."""
-        n, m = taxels.normal, taxels.normal[source]
+    def displacement(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"], targets: LinkTaxels | None = None) -> Matrix:
+        """Return displacement per traction [m/Pa], (3, 3, target, source), both vectors in the body's frame.
+
+        Args:
+            taxels: The taxels of a link, which press.
+            source: Which of them to take.
+            targets: Markers that move; default: the taxels.
+        """
+        targets = taxels if targets is None else targets
+        n, m = targets.normal, taxels.normal[source]
         area = taxels.area[source]
-        r = offset(taxels.pos, n, taxels.pos[source])
+        r = offset(targets.pos, n, taxels.pos[source])
         length = np.sqrt(np.einsum("kji,kji->ji", r, r))
         e = r / np.where(length > 0, length, 1.0)
         profiles = Profiles(*(part * area for part in self.profiles(length, area, float(taxels.spacing**2))))

@@ -1,6 +1,7 @@
 """Elastomer: displacement of the markers in a soft skin that is pressed and dragged, as a vision-based sensor sees them.
 
-Taxels are both markers and sources; taxels of one link act on each other. With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
+Taxels are both markers and sources, unless `markers` puts markers elsewhere; taxels of one link act on each other. With n_j the
+normal at x_j, Π_n(z) = z − (z · n) n,
 r_ij = Π_nj(x_j − x_i), depth h_i = max(0, s − min_o φ_o(x_i)) of the felt objects o under the skin's height s [m], and t_i
 the tangential displacement of the object's material since the taxel stuck to it [m] (`anchors`), the Gaussian kernel gives
 
@@ -50,7 +51,20 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.points import Points
-from tgdsl.sensors.base import Alternative, Array, Context, Kind, Lowered, Memory, State, SurfaceOf, components, scalar, vector
+from tgdsl.sensors.base import (
+    Alternative,
+    Array,
+    Axis,
+    Context,
+    Kind,
+    Lowered,
+    Memory,
+    State,
+    SurfaceOf,
+    components,
+    scalar,
+    vector,
+)
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links
 from tgdsl.sensors.elastomer.operators import Operator, operator_of
@@ -69,6 +83,8 @@ class ElastomerConstants(Generic[Array]):
 
     Attributes:
         normal: Normals (3, taxel).
+        marker_pos: Positions of the markers (3, marker) [m]; None: taxels are markers.
+        marker_normal: Normals of the markers (3, marker).
         slip: Largest tangential displacement per depth [1].
         shear_stiffness: K_t [Pa/m].
         is_active: 1 of taxels that are moved by points, else 0.
@@ -76,6 +92,8 @@ class ElastomerConstants(Generic[Array]):
     """
 
     normal: Array
+    marker_pos: Array | None = None
+    marker_normal: Array | None = None
     spread: Operators[Array] = None
     bulge: Operators[Array] = None
     drag: Operators[Array] = None
@@ -117,9 +135,16 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         LowerError: If these links do not allow the operator or the clamped boundary.
     """
     has_shear, on_points, is_elastic = spec.has_shear, spec.anchored == "points", spec.kernel != "gaussian"
+    markers = None if spec.markers is None else surface_of.taxels(spec.markers, layout)
+    seen, rows = layout, None
+    if markers is not None:
+        table = {"link": [markers.links[i].name for i in markers.link_id], "pos": markers.pos, "normal": markers.normal}
+        seen, rows = markers, Axis("marker", markers.num_taxels, table, markers.link_id)
     constants = ElastomerConstants(
         normal=layout.normal.T,
-        **fold_links(spec, layout, surface_of),
+        marker_pos=None if markers is None else markers.pos.T,
+        marker_normal=None if markers is None else markers.normal.T,
+        **fold_links(spec, layout, markers, surface_of),
         dilation_strength=None if is_elastic else scalar(spec.dilation_strength),
         depth_exponent=None if is_elastic else scalar(spec.depth_exponent),
         normal_stiffness=None if spec.normal_stiffness is None else scalar(spec.normal_stiffness),
@@ -130,21 +155,22 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         shear_strength=scalar(spec.shear_strength) if has_shear and not is_elastic else None,
         shear_stiffness=scalar(spec.shear_stiffness) if has_shear and is_elastic else None,
         shear_falloff=scalar(spec.shear_falloff) if on_points else None,
-        is_active=(layout.radius > 0).astype(np.float64) if on_points else None,
+        is_active=(seen.radius > 0).astype(np.float64) if on_points else None,
         reference_area=scalar(spec.reference_area) if on_points and spec.model != "paper" else None,
-        flat={str(first): np.asarray(1) for first in _flat_links(layout)} if on_points else {},
+        flat={str(first): np.asarray(1) for first in _flat_links(seen)} if on_points else {},
     )
     standoff, max_distance = np.full(layout.num_taxels, spec.standoff), spec.standoff + spec.exit
     depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff)
     state, points = {}, ()
     if spec.anchored == "taxels":
-        state = {name: Memory() for name in anchors.PLANES}
+        state = {name: Memory(shape=(layout.num_taxels,)) for name in anchors.PLANES}
         depth = replace(depth, range=max_distance, distance=True, frame=True)
     elif on_points:
         state = {name: Memory(shape=Points, overwritten=True) for name in point_anchors.PLANES}
         depth = replace(depth, range=max_distance)
         points = (Points(spec.objects, spec.is_gated, num_points=spec.points, range=max_distance),)
-    return Lowered(vector("displacement", "m"), constants, state, requests=(depth, *points), notes=spec.notes)
+    requests = (depth, *points)
+    return Lowered(vector("displacement", "m"), constants, state, requests=requests, notes=spec.notes, rows=rows)
 
 
 def _flat_links(layout: Layout) -> list[int]:
@@ -167,12 +193,16 @@ def forward(
             loads, after = point_anchors.SHEAR_LOADS(list(gathered[Points].values()), stick_slip, state)
         else:
             shear, after = anchors.advance(touch, touch.pos, normal, stick_slip, state)
-    move = _gaussian if constants.normal_stiffness is None else _elastic
-    result = move(touch.depth, shear, normal, constants)
+    marker_normal = normal if constants.marker_normal is None else planes.split(constants.marker_normal.T)
+    if constants.normal_stiffness is None:
+        result = _gaussian(touch.depth, shear, marker_normal, constants)
+    else:
+        result = _elastic(touch.depth, shear, normal, constants)
     if loads is not None and constants.shear_falloff is not None:
         assert constants.shear_strength is not None and constants.is_active is not None
         flat = frozenset(int(first) for first in constants.flat)
-        markers = Markers(touch.pos, normal, constants.shear_falloff, constants.reference_area, flat)
+        pos = touch.pos if constants.marker_pos is None else planes.split(constants.marker_pos.T)
+        markers = Markers(pos, marker_normal, constants.shear_falloff, constants.reference_area, flat)
         dragged = point_anchors.drag(loads, markers, touch.depth.shape[0])
         result = planes.add(result, planes.scale(constants.shear_strength * constants.is_active, dragged))
     return components("displacement", result), after
@@ -208,7 +238,8 @@ def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Elastomer
 def alternatives(spec: ElastomerSpec) -> list[Alternative]:
     """Return the forms of the operator; with anchors of points, fewer points or more."""
     forms = [Alternative(f"svd, {100 * error:g} %", {"operator": "svd", "tolerance": error}) for error in (0.1, 1e-2, 1e-3)]
-    forms += [Alternative(form, {"operator": form, "tolerance": None}, is_exact=True) for form in ("fft", "dense")]
+    exact_forms = ("dense",) if spec.markers is not None else ("fft", "dense")
+    forms += [Alternative(form, {"operator": form, "tolerance": None}, is_exact=True) for form in exact_forms]
     if spec.anchored != "points":
         return forms
     exact = {"operator": "dense", "tolerance": None}

@@ -134,7 +134,8 @@ def fold(
         planes: Numbers of output and input planes.
         taxels: The link's taxels.
         wanted: The form and its error.
-        is_alike: Whether, between equal taxels, the response depends only on the offset from source to target.
+        is_alike: Whether targets are the taxels, and the response depends on nothing but the way from source to target where
+            these are alike.
 
     Raises:
         LowerError: If a convolution is asked for where the taxels are no regular grid.
@@ -188,7 +189,8 @@ def apply(operators: Sequence[Operator[Tensor]], planes: Sequence[Float[Tensor, 
     dense = [operator.matrix for operator in operators if isinstance(operator, Dense)]
     if len(dense) == len(operators):
         matrices = [[matrix[i] for matrix in dense] for i in range(len(planes))]
-        if LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
+        is_square = all(matrix.shape[1] == matrix.shape[3] for matrix in dense)  # targets may be markers
+        if is_square and LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
             lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
             result = reduce(torch.add, [LINK_PRODUCTS(line, each) for line, each in zip(lines, matrices, strict=True)])
             return tuple(result.unflatten(1, planes[0].shape[:-1]).unbind())

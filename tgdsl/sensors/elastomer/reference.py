@@ -30,10 +30,12 @@ def reference(
     """Return the displacements [m] in the body's frame, without the boundary, and the anchors.
 
     Raises:
-        NotImplementedError: If the edge is clamped: that is a matrix, and tested as one.
+        NotImplementedError: If the edge is clamped or markers are not the taxels: those are matrices, and tested as such.
     """
     if spec.boundary is not None:
         raise NotImplementedError("the reference has no clamped boundary")
+    if spec.markers is not None:
+        raise NotImplementedError("the reference's markers are its taxels")
     touch = gathered[ContactDepth]
     shear, result, after = np.zeros((layout.num_taxels, 3)), np.zeros((layout.num_taxels, 3)), {}
     stick_slip = StickSlip(spec.standoff, spec.enter, spec.exit, spec.slip)

@@ -87,6 +87,9 @@ class ElastomerSpec(ContactProbeSpec):
     anchors: Literal["taxels", "points"] | None = None
     """What carries an anchor: each taxel, on the object that it touches, or `points` sampled on each object, on the skin
     (the paper; gaussian); default: `taxels`, under `model: paper` `points`."""
+    markers: str | None = None
+    """Resolution of the layout whose taxels on the sensor's links are the markers that are read, at places of their own; the
+    sensor's own taxels are then what presses. Default: the taxels are the markers."""
     points: Annotated[StrictInt, Field(ge=1)] = 1000
     """Points of each object, for `anchors: points`."""
     enter: Annotated[Radius, Usual("length", high=0.1)] = 1e-5
@@ -194,6 +197,10 @@ class ElastomerSpec(ContactProbeSpec):
             )
         if self.boundary is not None and self.thickness is None:
             raise ValueError("`thickness` is missing, a clamped `boundary` needs it")
+        if self.markers is not None and self.boundary is not None:
+            raise ValueError("a clamped `boundary` is of markers that are the taxels, expected no `markers`")
+        if self.markers is not None and self.operator == "fft":
+            raise ValueError("`operator: fft` is of markers that are the taxels, expected dense, svd or auto with `markers`")
         if self.boundary is not None and self.operator == "fft":
             raise ValueError("`operator: fft` cannot hold a clamped `boundary`, expected dense, svd or auto")
         if self.tolerance is not None and self.operator in ("dense", "fft"):

@@ -14,7 +14,7 @@ from tgdsl.errors import TgdslError
 if TYPE_CHECKING:
     import numpy as np
 
-    from tgdsl.calibrate.loads import Load, Samples, TipRecord
+    from tgdsl.calibration.hand.loads import Load, Samples, TipRecord
 
 Finger = Literal["thumb", "index", "middle", "ring", "pinky"]
 Intervals = Annotated[
@@ -25,11 +25,9 @@ Intervals = Annotated[
 
 
 @dataclass(frozen=True)
-class Calibrate:
+class CalibrateHand:
     """Fit scale, rotation and tare of fingertips to a log under known loads, or to a simulation of the same motion."""
 
-    what: Annotated[tyro.conf.Positional[Literal["hand"]], tyro.conf.arg(metavar="hand")]
-    """What to calibrate."""
     log: Annotated[Path, tyro.conf.arg(metavar="LOG.npz")]
     """A log of `tgdsl hand record`."""
     loads: OptionalFile = None
@@ -69,9 +67,9 @@ class Calibrate:
 
     def run(self) -> None:
         """Fit, report, and write the files."""
-        from tgdsl.calibrate.fit import FitError, fit_finger
-        from tgdsl.calibrate.loads import TipRecord
-        from tgdsl.calibrate.report import calibrated, fit_text, picture, report
+        from tgdsl.calibration.hand.fit import FitError, fit_finger
+        from tgdsl.calibration.hand.loads import TipRecord
+        from tgdsl.calibration.hand.report import calibrated, fit_text, picture, report
         from tgdsl.files.write import atomic_write, with_folder
         from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
         from tgdsl.runtime.xhand1.log.log import open_log
@@ -100,7 +98,7 @@ class Calibrate:
 
     def _samples(self, record: TipRecord) -> dict[str, Samples]:
         """Return the samples to fit to, by finger."""
-        from tgdsl.calibrate.loads import load_loads, samples_under_loads
+        from tgdsl.calibration.hand.loads import load_loads, samples_under_loads
 
         sources = [self.loads is not None, bool(self.load), self.simulation is not None]
         if sum(sources) != 1:
@@ -114,7 +112,7 @@ class Calibrate:
     def _loads(self) -> tuple[Load, ...]:
         from pydantic import ValidationError
 
-        from tgdsl.calibrate.loads import Load
+        from tgdsl.calibration.hand.loads import Load
 
         if self.finger is None:
             raise TgdslError("--load: expected --finger to say which finger it is on")
@@ -130,8 +128,8 @@ class Calibrate:
     def _simulated_samples(self, record: TipRecord, path: Path) -> dict[str, Samples]:
         import numpy as np
 
-        from tgdsl.calibrate.fit import time_offset
-        from tgdsl.calibrate.loads import samples_under_forces
+        from tgdsl.calibration.hand.fit import time_offset
+        from tgdsl.calibration.hand.loads import samples_under_forces
         from tgdsl.runtime.xhand1.wire.payloads import FINGERS
 
         time, forces = self._known_forces(path)
@@ -147,7 +145,7 @@ class Calibrate:
         return {name: samples_under_forces(record, name, time + offset, forces[name]) for name in loaded}
 
     def _known_forces(self, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        from tgdsl.calibrate.loads import known_tip_forces, simulated_tip_forces
+        from tgdsl.calibration.hand.loads import known_tip_forces, simulated_tip_forces
 
         if self.document is None:
             return known_tip_forces(path)

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field, model_validator
 
-from tgdsl.calibrate.fit import FitError, Forces, forces_at
+from tgdsl.calibration.hand.fit import FitError, Forces, forces_at
 from tgdsl.errors import TgdslError
 from tgdsl.fields.models import Quantity, SpecModel
 from tgdsl.module.module import TactileModule

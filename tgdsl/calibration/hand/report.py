@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tgdsl.calibrate.fit import FingerFit, FitError
-from tgdsl.calibrate.loads import Samples
+from tgdsl.calibration.hand.fit import FingerFit, FitError
+from tgdsl.calibration.hand.loads import Samples
 from tgdsl.files.write import atomic_open
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS

@@ -8,8 +8,8 @@ import pytest
 from hand_logs import random_readings, write_log
 
 import tgdsl
-from tgdsl.calibrate.fit import FingerFit, FitError, fit_finger, time_offset
-from tgdsl.calibrate.loads import (
+from tgdsl.calibration.hand.fit import FingerFit, FitError, fit_finger, time_offset
+from tgdsl.calibration.hand.loads import (
     Load,
     Samples,
     TipRecord,
@@ -19,7 +19,7 @@ from tgdsl.calibrate.loads import (
     samples_under_loads,
     simulated_tip_forces,
 )
-from tgdsl.calibrate.report import calibrated, drawing, picture, report
+from tgdsl.calibration.hand.report import calibrated, drawing, picture, report
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.log.log import open_log

@@ -1,0 +1,212 @@
+"""Fits to recordings made with known parameters: values, clocks, intervals, warnings, and the fitted document."""
+
+import numpy as np
+import pytest
+import torch
+from recorded_presses import LAG, TRUE, document, motion, readings, recording
+
+import tgdsl
+from tgdsl.calibration.model import InfeasibleError, Model
+from tgdsl.calibration.recordings import velocities
+from tgdsl.errors import TgdslError
+
+FIT = ["touch.normal_stiffness", "touch.depth_exponent"]
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return document(tmp_path_factory.mktemp("fitted"))
+
+
+@pytest.fixture(scope="module")
+def fitted(path):
+    return tgdsl.calibrate(path, recording(path), FIT, hold_out="time", starts=4)
+
+
+def test_parameters_and_clock_are_found(fitted):
+    stiffness, exponent = (fitted.parameters[name] for name in FIT)
+    assert stiffness.low < 900 < stiffness.high and exponent.low < 1.3 < exponent.high
+    assert exponent.high - exponent.low < 0.06
+    assert fitted.nuisances["<arrays>: clock of touch"] == pytest.approx(-LAG, abs=2e-3)
+    (error,) = fitted.errors
+    assert error.error == pytest.approx(error.floor, rel=0.1) and error.held_out < 1.1 * error.error
+    assert any("correlation 0.99" in text for text in fitted.warnings)
+
+
+def test_a_linear_parameter_is_solved_for(fitted):
+    """Force is linear in the stiffness, and not in the exponent; the solution is the minimum of the search without that."""
+    problem, solution = fitted.problem, fitted.solution
+    assert problem.linear == (0,)
+    plain = problem.minimise(solution.x, are_fixed=True)
+    assert solution.cost < plain.cost * (1 + 1e-6)
+    assert plain.cost == pytest.approx(solution.cost, rel=1e-3)
+    assert plain.x == pytest.approx(solution.x, abs=5e-3)
+
+
+def test_jacobian_of_the_projected_residual(fitted):
+    """Against central differences."""
+    problem, x = fitted.problem, fitted.solution.x
+    found = problem.jacobian(x, problem.weights(), (1, 2))
+    for j, column in zip((1, 2), found.T, strict=True):
+        step = 1e-3 * np.eye(3)[j]
+        slope = (
+            problem.solve(x + step, problem.weights()).residual - problem.solve(x - step, problem.weights()).residual
+        ) / 2e-3
+        assert column == pytest.approx(slope, abs=2e-2 * abs(slope).max())
+
+
+def test_the_document_is_written_and_predicts(path, fitted):
+    out = fitted.document(path.parent / "fitted.yaml")
+    text = out.read_text()
+    assert f"normal_stiffness: {fitted.parameters[FIT[0]].value:.6g}  # fitted, 95 %: " in text
+    again = tgdsl.calibrate(out, recording(path, seed=1))
+    assert again.errors[0].error == pytest.approx(again.errors[0].floor, rel=0.1)
+    assert not again.parameters
+    with pytest.raises(TgdslError, match="relative to its folder"):
+        fitted.document(path.parent / "elsewhere" / "fitted.yaml")
+
+
+def test_it_prints_and_draws(fitted, tmp_path):
+    text = str(fitted)
+    assert "touch.depth_exponent" in text and "held out" in text and "warning: touch.normal_stiffness" in text
+    assert fitted.plot(tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_lowered_again_is_compiled_again(path):
+    """A parameter set and set back gives the readings of a document that is compiled with it, to the bit."""
+    model = Model(path, FIT)
+    before = model.module
+    model.set((900.0, 1.3))
+    assert model.module is before
+    states = motion(40)
+    fields = {name: states[name] for name in ("body_pos", "body_quat")}
+    fields |= velocities(states["time"], fields)
+    found = model._read("touch", fields, states["time"])
+    assert np.array_equal(found, readings(path, states))
+    model.set(model.start)
+    assert np.array_equal(model._read("touch", fields, states["time"]), readings(path, states, {}))
+
+
+def test_what_changes_requests_is_compiled_again(path):
+    """An elastomer's `standoff` is part of what is requested of the scene."""
+    skin = {
+        "sensors": {"touch": {"kind": "elastomer", "links": "pad", "feels": ["ball"], "standoff": 0.001, "shear_strength": 0}}
+    }
+    model = Model(path, ["touch.standoff"], {"sensors.touch": skin["sensors"]["touch"]})
+    before = model.module
+    model.set((0.002,))
+    assert model.module is not before
+    states = motion(20)
+    found = model._read("touch", states, states["time"])
+    touch = tgdsl.compile(path, overrides={"sensors.touch": {**skin["sensors"]["touch"], "standoff": 0.002}}, dtype="float64")
+    state = tgdsl.SceneState(**{name: torch.from_numpy(states[name]) for name in ("body_pos", "body_quat")})
+    assert np.array_equal(found, touch(state)["touch"].numpy())
+
+
+def test_values_that_exclude_each_other_are_infeasible(path):
+    layer = {
+        "kernel": "bonded_layer",
+        "youngs_modulus": 1e5,
+        "normal_stiffness": 1e8,
+        "thickness": 0.003,
+        "marker_depth": 0.001,
+    }
+    sensor = {"kind": "elastomer", "links": "pad", "feels": ["ball"], **layer}
+    model = Model(path, ["touch.thickness", "touch.marker_depth"], {"sensors.touch": sensor})
+    with pytest.raises(InfeasibleError, match="below the layer"):
+        model.set((0.002, 0.0025))
+
+
+@pytest.mark.parametrize(
+    ("fit", "message"),
+    [
+        ("tuch.normal_stiffness", 'did you mean "touch"'),
+        ("touch.stiffness", 'there is no field "stiffness"'),
+        ("touch.feels", "no number that can be fitted"),
+        ("touch.friction_cone", "the document gives no value"),
+        ("touch.normal_stiffness=1", "expected a range such as"),
+        ("touch.normal_stiffness=600:900", "the document's value 500 is out of the range"),
+    ],
+)
+def test_parameters_that_cannot_be_fitted(path, fit, message):
+    with pytest.raises(TgdslError, match=message):
+        Model(path, [fit])
+
+
+def test_what_the_data_cannot_tell_is_named(path):
+    """No damping shows in a ball that rests: its interval is the whole range. A range that ends before the truth is hit."""
+    arrays = recording(path, lag=0.0)
+    still = arrays | {name: np.repeat(arrays[name][600:601], 1200, axis=0) for name in ("body_pos", "body_quat")}
+    still["target:touch"] = np.repeat(arrays["target:touch"][30:31], 60, axis=0)
+    still.pop("clock_width:touch")
+    fit = tgdsl.calibrate(path, still, ["touch.normal_damping=0:500"], starts=1)
+    assert not fit.parameters["touch.normal_damping"].is_identified
+    assert "touch.normal_damping: no reading depends on it; leave it out" in fit.warnings
+    short = tgdsl.calibrate(path, arrays, ["touch.normal_stiffness", "touch.depth_exponent=0.8:1.1"], starts=1)
+    assert any(text.startswith("touch.depth_exponent: at the end of its range, 1.1") for text in short.warnings)
+
+
+def test_a_pose_offset_within_its_prior(path):
+    """The ball was 0.3 mm lower than was recorded."""
+    arrays = recording(path, lag=0.0)
+    arrays["body_pos"] = arrays["body_pos"] + np.array([[0, 0, 3e-4], [0, 0, 0]])
+    arrays["width:body_pos"] = np.array([[0, 0, 5e-4], [0, 0, 0]])
+    fit = tgdsl.calibrate(path, arrays, FIT, starts=4)
+    assert fit.nuisances["<arrays>: body_pos ball.z"] == pytest.approx(-3e-4, abs=3e-5)
+    assert fit.parameters["touch.depth_exponent"].low < 1.3 < fit.parameters["touch.depth_exponent"].high
+
+
+def test_gain_and_offset_are_the_recordings_own(path):
+    first, second = recording(path, seed=1), recording(path, seed=2)
+    second["target:touch"] = 0.8 * second["target:touch"] + np.array([0.0, 0.1, -0.2])
+    fit = tgdsl.calibrate(path, [first, second], FIT[1:], reading="offset", gain=True, starts=2)
+    one, two = (value for name, value in fit.nuisances.items() if name.endswith("gain"))
+    assert two / one == pytest.approx(0.8, rel=0.02)
+    assert [e.error < 1.1 * e.floor for e in fit.errors] == [True, True]
+
+
+def test_robust_fits_ignore_lost_rows(path):
+    arrays = recording(path)
+    arrays["target:touch"][40:46, 1] += 0.5
+    robust, plain = (tgdsl.calibrate(path, arrays, FIT, robust=robust, starts=2) for robust in (True, False))
+    off = {name: abs(fit.parameters[FIT[1]].value - 1.3) for name, fit in (("robust", robust), ("plain", plain))}
+    assert off["robust"] < 0.02 and off["robust"] < 0.3 * off["plain"]
+
+
+@pytest.mark.parametrize("by", ["taxel", "blocks", "recording"])
+def test_other_ways_to_hold_out(path, by):
+    fit = tgdsl.calibrate(path, [recording(path, seed=1), recording(path, seed=2)], FIT, hold_out=by, folds=3, starts=1)
+    assert all(0.9 * e.error < e.held_out < 1.15 * e.error for e in fit.errors)
+
+
+def test_a_wrong_model_is_worse_on_what_was_held_out(path):
+    """The truth has damping, which the fit cannot have: no warning of noise fitted, and the error is above the floor."""
+    arrays = recording(path)
+    true = TRUE | {"sensors.touch.normal_damping": 3e4}
+    states = motion(1200)
+    values = readings(path, states, true).reshape(1200, -1)
+    clock = arrays["clock:touch"] - LAG
+    arrays["target:touch"] = np.stack([np.interp(clock, states["time"], c) for c in values.T], axis=1).reshape(60, 3, 3)
+    fit = tgdsl.calibrate(path, arrays, FIT, starts=2)
+    assert fit.errors[0].error > 2 * fit.errors[0].floor
+    better = tgdsl.calibrate(path, arrays, [*FIT, "touch.normal_damping=0:1e5"], starts=2)
+    assert better.errors[0].error < 0.2 * fit.errors[0].error
+
+
+def covered(path, seeds, intervals="profile"):
+    """Return how often intervals hold the true value, over both parameters."""
+    hits = []
+    for seed in seeds:
+        fit = tgdsl.calibrate(path, recording(path, seed=seed, num=25), FIT, starts=1, intervals=intervals)
+        hits += [fit.parameters[name].low <= TRUE[f"sensors.{name}"] <= fit.parameters[name].high for name in FIT]
+    return np.mean(hits)
+
+
+def test_intervals_cover_the_truth(path):
+    """Of 12 sets: 24 intervals of 95 %, strongly correlated in pairs."""
+    assert covered(path, range(12)) >= 0.8
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth_in_many_sets(path):
+    assert 0.90 <= covered(path, range(200)) <= 0.99

@@ -1,0 +1,1 @@
+"""Parameters of sensors, fitted to recordings, and the calibration of a real hand."""

@@ -1,0 +1,183 @@
+"""What can be said of a fit: errors on data that were held out, intervals, and what the data cannot tell.
+
+An interval by profile holds the values of a parameter whose best fit, all else free, is worse by less than Student's t allows
+(Bates and Watts, *Nonlinear Regression Analysis*, 1988, section 6.1): for independent normal noise. By bootstrap it is that of
+fits to rows, or samples, drawn with replacement: also where residuals are those of the model rather than noise.
+
+Shapes: `unknown` entries of a problem's x, `fold` parts that are held out in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from tgdsl.calibration.problem import Problem, Solution
+
+HoldOut = Literal["none", "taxel", "blocks", "time", "recording"]
+Intervals = Literal["profile", "bootstrap", "none"]
+LEVEL = 0.95
+CORRELATED = 0.95
+UNKNOWN = 0.9
+"""Part of its range from which a parameter's interval says nothing."""
+WORSE = 1.2
+"""Held-out error over the error in-sample from which a fit is warned of."""
+RESAMPLES = 100
+
+
+@dataclass(frozen=True)
+class TargetErrors:
+    """Relative RMSE of a target: the RMS of the residuals over that of the target.
+
+    Attributes:
+        recording: Name of the recording.
+        reading: The reading.
+        error: In-sample.
+        held_out: On numbers that were held out; None: none were.
+        floor: Of the target's noise; None: unknown.
+        alone: Of the reading's own map without any sensor.
+        rms: RMS of the target, in its unit.
+        unit: Unit of the reading.
+    """
+
+    recording: str
+    reading: str
+    error: float
+    held_out: float | None
+    floor: float | None
+    alone: float
+    rms: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How well the unknowns are known, from the derivatives at the optimum.
+
+    Attributes:
+        sigma: Standard deviation of each unknown in x; infinite where nothing depends on it.
+        correlation: Correlations of the unknowns.
+        noise: Standard deviation of the weighted residuals.
+        degrees: Degrees of freedom.
+    """
+
+    sigma: Float[np.ndarray, " unknown"]
+    correlation: Float[np.ndarray, "unknown unknown"]
+    noise: float
+    degrees: int
+
+
+def uncertainty(problem: Problem, solution: Solution) -> Uncertainty:
+    """Return how well the unknowns are known."""
+    num = len(solution.x)
+    jacobian = problem.jacobian(solution.x, problem.weights(), range(num), are_fixed=True)
+    spent = problem.num_parameters + sum(len(best) for best in solution.coefficients)
+    degrees = max(problem.num_numbers - spent, 1)
+    noise = float(np.sqrt(solution.cost / degrees))
+    size = np.linalg.norm(jacobian, axis=0)
+    told = np.flatnonzero(size > 1e-6 * noise)
+    covariance, sigma, correlation = np.zeros((num, num)), np.full(num, np.inf), np.eye(num)
+    if told.size:
+        scaled = jacobian[:, told] / size[told]
+        inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)
+        covariance[np.ix_(told, told)] = noise**2 * inverse / np.outer(size[told], size[told])
+        sigma[told] = np.sqrt(np.diag(covariance)[told])
+        correlation[np.ix_(told, told)] = covariance[np.ix_(told, told)] / np.outer(sigma[told], sigma[told])
+    return Uncertainty(sigma, correlation, noise, degrees)
+
+
+def profile_interval(problem: Problem, solution: Solution, known: Uncertainty, j: int) -> tuple[float, float]:
+    """Return the profile interval of a parameter, in x; 0 or 1 where it reaches the end of its range."""
+    limit = float(stats.t.ppf(0.5 + LEVEL / 2, known.degrees))
+    best, at = solution.cost, solution.x[j]
+
+    def end(side: float) -> float:
+        bound = 0.0 if side < 0 else 1.0
+        inside, inside_t, x = at, 0.0, solution.x.copy()
+        step = min(limit * known.sigma[j], abs(bound - at))
+        for _ in range(8):
+            place = float(np.clip(inside + side * step, 0.0, 1.0)) if step else bound
+            x[j] = place
+            fitted = problem.minimise(x, fixed=(j,), are_fixed=True, max_steps=8)
+            t = float(np.sqrt(max(fitted.cost - best, 0.0)) / known.noise)
+            if abs(t - limit) < 0.02 * limit:
+                return place
+            if t < limit and place == bound:
+                return bound
+            if t < limit:
+                inside, inside_t, x = place, t, fitted.x.copy()
+                step = min((limit - t) / max(t, 0.05 * limit) * max(abs(place - at), 1e-6), abs(bound - place))
+            else:
+                step = (limit - inside_t) / (t - inside_t) * abs(place - inside)
+        return place
+
+    return end(-1.0), end(1.0)
+
+
+def bootstrap_intervals(problem: Problem, solution: Solution, seed: int) -> Float[np.ndarray, "unknown 2"]:
+    """Return intervals of all parameters, in x, from fits to rows (of several samples of few rows: samples) drawn again."""
+    rng, places = np.random.default_rng(seed), []
+    for _ in range(RESAMPLES):
+        weights = []
+        for part in problem.parts:
+            samples, rows, _ = part.target.value.shape
+            by_row = rows >= samples
+            counts = np.bincount(rng.integers(0, max(rows, samples), max(rows, samples)), minlength=max(rows, samples))
+            shape = (1, rows, 1) if by_row else (samples, 1, 1)
+            weights.append(part.weight * np.broadcast_to(counts.reshape(shape), part.target.value.shape).reshape(-1))
+        places.append(problem.minimise(solution.x, weights, max_steps=10).x)
+    tail = 50 * (1 - LEVEL)
+    return np.percentile(np.stack(places), [tail, 100 - tail], axis=0).T
+
+
+def held_out(problem: Problem, solution: Solution, by: HoldOut, folds: int, seed: int) -> list[float]:
+    """Return the relative RMSE of each part on numbers that were held out, each once."""
+    predicted = [np.zeros_like(part.value) for part in problem.parts]
+    for masks in _masks(problem, by, folds, seed):
+        weights = [np.where(mask, 0.0, part.weight) for mask, part in zip(masks, problem.parts, strict=True)]
+        fitted = problem.minimise(solution.x, weights, max_steps=20)
+        if by == "recording":  # nuisances are its own, parameters the others'
+            fitted = problem.minimise(fitted.x, fixed=range(problem.num_parameters), are_fixed=True, max_steps=20)
+        for value, own, mask in zip(predicted, fitted.predicted, masks, strict=True):
+            value[mask] = own[mask]
+    return problem.errors(predicted)
+
+
+def _masks(problem: Problem, by: HoldOut, folds: int, seed: int) -> Iterator[list[np.ndarray]]:
+    """Yield which numbers of each part are held out."""
+    rng = np.random.default_rng(seed)
+    if by == "recording":
+        for i in range(len(problem.recordings)):
+            yield [np.full(len(part.value), part.recording == i) for part in problem.parts]
+        return
+    fold_of = []
+    for part in problem.parts:
+        samples, rows, _ = part.target.value.shape
+        if by == "time":
+            of_sample = np.arange(samples) * folds // max(samples, 1)
+            fold_of.append(np.broadcast_to(of_sample[:, None, None], part.target.value.shape).reshape(-1))
+            continue
+        places = problem.places[part.target.reading]
+        of_row = rng.permutation(np.arange(rows) % folds) if by == "taxel" or places is None else _blocks(places, folds)
+        fold_of.append(np.broadcast_to(of_row[None, :, None], part.target.value.shape).reshape(-1))
+    for fold in range(folds):
+        yield [own == fold for own in fold_of]
+
+
+def _blocks(places: np.ndarray, folds: int) -> np.ndarray:
+    """Return the block of each row: equal counts along the first principal direction, then along the second."""
+    along = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)[2]
+    num, columns = len(places), max(1, round(np.sqrt(folds)))
+    strip = np.argsort(np.argsort(places @ along[0], kind="stable")) * columns // num
+    result = np.zeros(num, dtype=np.int64)
+    for i in range(columns):
+        own = np.flatnonzero(strip == i)
+        rank = np.argsort(np.argsort(places[own] @ along[min(1, len(along) - 1)], kind="stable"))
+        first, last = i * folds // columns, (i + 1) * folds // columns
+        result[own] = first + rank * (last - first) // len(own)
+    return result

@@ -1,0 +1,277 @@
+"""Fits parameters of a document's sensors to recordings.
+
+fit = tgdsl.calibrate("skin.yaml", ["press.npz", "drag.npz"], ["skin.thickness", "skin.poissons_ratio"], reading="offset")
+print(fit)
+fit.plot("fit.png")
+fit.document("fitted.yaml")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from tgdsl.calibration import checks
+from tgdsl.calibration.checks import CORRELATED, UNKNOWN, WORSE, HoldOut, Intervals, TargetErrors, Uncertainty
+from tgdsl.calibration.model import Model, Parameter
+from tgdsl.calibration.problem import Problem, ReadingMap, Solution
+from tgdsl.calibration.recordings import Arrays, load_recording
+from tgdsl.compiler.pipeline import Document
+from tgdsl.console.tables import text_table
+from tgdsl.errors import TgdslError
+from tgdsl.sensors import Kind
+
+CONTINUED = 3
+"""Starts that are followed to their minimum."""
+HUBER = 1.345
+"""Residual over its scale from which a row counts less (95 % efficiency for normal noise)."""
+ROUNDS = 4
+"""Most times that weights of rows and noise of targets are estimated again."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A fitted parameter: its value, the ends of its 95 % interval, and whether the data tell it from any other value."""
+
+    parameter: Parameter
+    value: float
+    low: float
+    high: float
+    is_identified: bool
+
+    @property
+    def path(self) -> str:
+        """Sensor and field."""
+        return self.parameter.path
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters that fit recordings, and how well. `print(fit)` shows all of it.
+
+    Attributes:
+        parameters: What was fitted, by path.
+        nuisances: Offsets of poses [m] and clocks [s], gains and coefficients of the reading's own maps, by name.
+        errors: Errors, one for each target.
+        warnings: What the data cannot tell, and what speaks against the model.
+        problem: The problem that was solved.
+        solution: Its solution.
+    """
+
+    parameters: Mapping[str, FittedParameter]
+    nuisances: Mapping[str, float]
+    errors: tuple[TargetErrors, ...]
+    warnings: tuple[str, ...]
+    problem: Problem
+    solution: Solution
+
+    def __str__(self) -> str:
+        def of(value: float | None) -> str:
+            return "" if value is None else f"{value:.4f}"
+
+        parts = []
+        if self.parameters:
+            rows = [
+                (f.path, f"{f.value:.5g}", f"{f.low:.4g} to {f.high:.4g}", f.parameter.unit) for f in self.parameters.values()
+            ]
+            parts.append(text_table(("parameter", "value", "95 %", "unit"), rows))
+        errors = [(e.recording, e.reading, of(e.error), of(e.held_out), of(e.floor), of(e.alone)) for e in self.errors]
+        parts.append(text_table(("recording", "reading", "relative RMSE", "held out", "floor", "without a sensor"), errors))
+        if self.nuisances:
+            parts.append(text_table(("nuisance", "value"), [(name, f"{value:.4g}") for name, value in self.nuisances.items()]))
+        parts += ["\n".join(f"warning: {text}" for text in self.warnings)] if self.warnings else []
+        return "\n\n".join(parts)
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw each target, its fit and the residuals into a PNG file; return its path."""
+        from tgdsl.calibration.picture import picture
+
+        return picture(self.problem, self.solution, self.errors, Path(path))
+
+    def document(self, path: str | Path) -> Path:
+        """Write the document with the fitted values, its comments kept; return its path.
+
+        Raises:
+            TgdslError: If the document is a mapping, or the file would be in another folder, where its paths lead nowhere.
+        """
+        from tgdsl.files.write import atomic_write
+        from tgdsl.schema.rewrite import with_values
+
+        source = self.problem.model.document
+        if isinstance(source, Mapping):
+            raise TgdslError("the document is a mapping; set its values from `fit.parameters`")
+        values = {
+            ("sensors", *f.path.split(".")): (float(f"{f.value:.6g}"), f"fitted, 95 %: {f.low:.4g} to {f.high:.4g}")
+            for f in self.parameters.values()
+        }
+        out = Path(path)
+        if out.resolve().parent != Path(source).resolve().parent:
+            raise TgdslError(f"{out}: file names in {source} are relative to its folder; write the fitted document beside it")
+        atomic_write(out, with_values(Path(source), values).encode())
+        return out
+
+
+def calibrate(
+    document: Document,
+    recordings: Sequence[str | Path | Arrays] | str | Path | Arrays,
+    fit: Sequence[str] = (),
+    *,
+    reading: ReadingMap | Mapping[str, ReadingMap] = "none",
+    gain: bool = False,
+    robust: bool = False,
+    hold_out: HoldOut = "none",
+    folds: int = 6,
+    starts: int = 8,
+    intervals: Intervals = "profile",
+    seed: int = 0,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+) -> Fit:
+    """Fit parameters of sensors to recordings.
+
+    Args:
+        document: A YAML file, or the same as a mapping. Its values are where the search starts.
+        recordings: `.npz` files, or their arrays; `tgdsl.calibration.recordings` describes the format.
+        fit: Parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`. Without any, only
+            nuisances are fitted: the document predicts the recordings.
+        reading: Map of its own that each recording's reading may have: an `offset` of each channel (the camera moved); also a
+            `scale` about the middle of the rows; or an `affine` function of the rows' places. Of all, or by their names.
+        gain: Whether each recording may have a gain of its own.
+        robust: Whether rows far off, such as lost markers, count less (Huber's loss).
+        hold_out: What is left out in turn to measure the error on it: rows at random (`taxel`), `blocks` of neighbouring rows,
+            blocks of `time`, or each `recording` (whose nuisances are then fitted, but no parameter).
+        folds: Number of parts for that.
+        starts: Starts of the search: the document's values and points of a Sobol sequence in the ranges.
+        intervals: 95 % intervals by `profile` (for independent noise), by `bootstrap` of rows or samples, or `none`.
+        seed: Seed of starts, folds and the bootstrap.
+        overrides: Values by dotted path, as `tgdsl.compile` takes them.
+        kinds: Your own kinds of sensors.
+
+    Raises:
+        SpecError: All mistakes in the document, or in a recording, by its keys.
+        TgdslError: If a parameter does not exist or is no number, or there are fewer numbers than unknowns.
+    """
+    model = Model(document, fit, overrides, kinds)
+    sources = [recordings] if isinstance(recordings, (str, Path, Mapping)) else list(recordings)
+    outputs = {output.name: output for output in model.module.outputs}
+    names = ["<arrays>"] if len(sources) == 1 else [f"<arrays {i}>" for i in range(1, len(sources) + 1)]
+    loaded = [load_recording(source, model.module.inputs, outputs, name) for source, name in zip(sources, names, strict=True)]
+    problem = Problem(model, loaded, reading, gain)
+    solution = _best(problem, starts, seed, robust)
+    out = None if hold_out == "none" else checks.held_out(problem, solution, hold_out, folds, seed)
+    known = checks.uncertainty(problem, solution)
+    fitted = _parameters(problem, solution, known, intervals, seed)
+    errors = _errors(problem, solution, out)
+    notes = _warnings(problem, solution, known, fitted, errors)
+    model.set(problem.values(solution.x))
+    return Fit({f.path: f for f in fitted}, _nuisances(problem, solution), errors, notes, problem, solution)
+
+
+def _best(problem: Problem, starts: int, seed: int, robust: bool) -> Solution:
+    """Return the best of several minima, with the weights of rows and the noise of targets estimated."""
+    problem.find_linear()
+    places, num = [problem.start], problem.num_parameters - len(problem.linear)
+    if num and starts > 1:
+        sobol = qmc.Sobol(problem.num_parameters, seed=seed)  # pyright: ignore[reportCallIssue]
+        drawn = sobol.random(1 << (starts - 1).bit_length())[: starts - 1]
+        places += [np.concatenate([0.02 + 0.96 * u, np.zeros(len(problem.nuisances))]) for u in drawn]
+    weights = problem.weights()
+    ranked = sorted(places, key=lambda x: problem.solve(x, weights).cost)
+    chosen = [places[0], *[x for x in ranked if x is not places[0]][: CONTINUED - 1]]
+    rough = [problem.minimise(x, max_steps=12) for x in chosen]
+    solution = problem.minimise(min(rough, key=lambda each: each.cost).x)
+    for _ in range(ROUNDS):
+        before = problem.sigma.copy()
+        problem.estimate(solution, HUBER if robust else None)
+        if not robust and abs(problem.sigma / before - 1).max() < 0.02:
+            break
+        if not robust and len(problem.parts) == 1 and not problem.nuisances:
+            solution = problem.solve(solution.x, problem.weights())
+            break
+        solution = problem.minimise(solution.x, max_steps=20)
+    return solution
+
+
+def _parameters(
+    problem: Problem, solution: Solution, known: Uncertainty, intervals: Intervals, seed: int
+) -> list[FittedParameter]:
+    ends = checks.bootstrap_intervals(problem, solution, seed) if intervals == "bootstrap" else None
+    result = []
+    for j, parameter in enumerate(problem.model.parameters):
+        if intervals == "none":
+            low, high = np.clip(solution.x[j] + np.array([-1.96, 1.96]) * known.sigma[j], 0.0, 1.0)
+        else:
+            low, high = checks.profile_interval(problem, solution, known, j) if ends is None else ends[j]
+        is_identified = bool(high - low < UNKNOWN and known.sigma[j] < UNKNOWN)
+        value = parameter.value(solution.x[j])
+        result.append(FittedParameter(parameter, value, parameter.value(low), parameter.value(high), is_identified))
+    return result
+
+
+def _nuisances(problem: Problem, solution: Solution) -> dict[str, float]:
+    shifts = zip(problem.nuisances, solution.x[problem.num_parameters :], strict=True)
+    result = {nuisance.label: float(u * nuisance.width) for nuisance, u in shifts}
+    for part, best in zip(problem.parts, solution.coefficients, strict=True):
+        names = [*part.names, *(["gain"] if problem.gain else [])]
+        of = f"{problem.recordings[part.recording].name}: {part.target.reading}"
+        result |= {f"{of} {name}": float(value) for name, value in zip(names, best, strict=True)}
+    return result
+
+
+def _errors(problem: Problem, solution: Solution, out: Sequence[float] | None) -> tuple[TargetErrors, ...]:
+    inside, alone = problem.errors(solution.predicted), problem.errors(problem.alone())
+    result = []
+    for i, part in enumerate(problem.parts):
+        size = problem.rms(i)
+        floor = part.target.floor / size if part.target.floor and size else None
+        name = problem.recordings[part.recording].name
+        held = None if out is None else out[i]
+        result.append(TargetErrors(name, part.target.reading, inside[i], held, floor, alone[i], size, part.target.unit))
+    return tuple(result)
+
+
+def _warnings(
+    problem: Problem,
+    solution: Solution,
+    known: Uncertainty,
+    fitted: Sequence[FittedParameter],
+    errors: Sequence[TargetErrors],
+) -> tuple[str, ...]:
+    """Return what the data cannot tell and what speaks against the model, each by name and number."""
+    notes, names = [], problem.names
+    for j, each in enumerate(fitted):
+        parameter, u = each.parameter, solution.x[j]
+        if np.isinf(known.sigma[j]):
+            notes.append(f"{each.path}: no reading depends on it; leave it out")
+        elif not each.is_identified:
+            notes.append(f"{each.path}: the data do not tell it: 95 % are {each.low:.4g} to {each.high:.4g} {parameter.unit}")
+        if min(u, 1 - u) < 1e-3:
+            end = parameter.low if u < 0.5 else parameter.high
+            notes.append(f"{each.path}: at the end of its range, {end:.4g} {parameter.unit}")
+    size = known.correlation.shape[0]
+    for i in range(size):
+        for j in range(i + 1, size):
+            rho = known.correlation[i, j]
+            if i < problem.num_parameters and abs(rho) > CORRELATED:
+                notes.append(f"{names[i]} and {names[j]}: correlation {rho:.3f}, the data tell a combination of both")
+    for nuisance, u in zip(problem.nuisances, solution.x[problem.num_parameters :], strict=True):
+        if abs(u) > 3:
+            notes.append(f"{nuisance.label}: {u:.1f} standard deviations from what was recorded")
+    for i, (e, part) in enumerate(zip(errors, problem.parts, strict=True)):
+        name = f"{e.recording}: {e.reading}"
+        if problem.gain and solution.coefficients[i][-1] < 0:
+            notes.append(f"{name}: the gain {solution.coefficients[i][-1]:.3g} is negative")
+        if e.held_out is not None and e.held_out > WORSE * e.error:
+            notes.append(
+                f"{name}: held-out error {e.held_out:.4f}, {e.held_out / e.error - 1:.0%} above {e.error:.4f} in-sample"
+            )
+        if e.floor is not None and e.error < e.floor * (1 - 2 / np.sqrt(2 * (part.weight > 0).sum())):
+            notes.append(f"{name}: error {e.error:.4f} below the floor {e.floor:.4f}: noise is fitted")
+        if part.columns.shape[1] and 1 - e.alone > e.alone - e.error:
+            notes.append(f"{name}: the reading's own map explains more (1 → {e.alone:.3f}) than the sensor (→ {e.error:.3f})")
+    return tuple(notes)

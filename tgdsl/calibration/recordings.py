@@ -1,0 +1,333 @@
+"""Recordings that sensors are fitted to: one `.npz` file of a scene's states, and what a real sensor read meanwhile.
+
+| key | shape | content |
+|---|---|---|
+| `time` | (step,) | clock of the states [s], ascending |
+| a field of `SceneState` | (step, …) | as the simulator would give it; `body_pos` and `body_quat` are needed |
+| `bodies`, `pairs`, `joints`, … | names | what stands along the axis of such a field; default: the order of `touch.inputs` |
+| `width:<field>` | as one step, or as all | standard deviation of the field's offset, at all steps or at each; 0: none |
+| `target:<reading>` | (sample, row, channel) | what the sensor read |
+| `unit:<reading>` | text | unit of the target |
+| `clock:<reading>` | (sample,) | clock of the target [s], ascending |
+| `clock_width:<reading>` | () | standard deviation of its unknown offset from the states' clock [s]; default: 0, none |
+| `channels:<reading>` | names | channels of the target; default: all of the reading's |
+| `weight:<reading>` | as the target, or less | weight of each number; 0 leaves it out, and it may then be NaN |
+| `floor:<reading>` | () | RMS noise of the target, in its unit |
+| `zero:<reading>` | () | time on the target's clock at which the sensor was set to zero |
+
+Velocities that a module reads and a recording lacks are derivatives of the poses. States are interpolated at the target's
+times.
+
+Shapes: `step` states, `sample` times of a target, `row` taxels (or markers, bodies, …), `channel` numbers of a row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.errors import Problem, SpecError, did_you_mean, listed
+from tgdsl.fields.units import UNITS
+from tgdsl.module.outputs import Output
+from tgdsl.module.state import CHOICES, SHAPES
+from tgdsl.plan.inputs import Inputs
+
+NAMES_OF = {axis: f"{axis}s" for axis in ("pair", "object", "joint", "actuator")} | {"body": "bodies", "heated": "heated"}
+"""Key of the names along each axis of the state."""
+OF_TARGET = ("target", "unit", "clock", "clock_width", "channels", "weight", "floor", "zero")
+DERIVED = {"body_linvel": "body_pos", "body_angvel": "body_quat"}
+"""Velocities that follow from other fields."""
+Arrays = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a sensor read.
+
+    Attributes:
+        reading: Name of the reading.
+        value: In the unit of the reading; 0 where the weight is.
+        weight: Weight of each number.
+        channels: Places of its channels among the reading's.
+        time: Its clock [s].
+        clock_width: Standard deviation of the clock's offset [s].
+        floor: RMS noise, in the unit of the reading; 0: unknown.
+        unit: Unit of the reading.
+        zero: Time at which the reading was set to zero [s]; None: never.
+    """
+
+    reading: str
+    value: Float[np.ndarray, "sample row channel"]
+    weight: Float[np.ndarray, "sample row channel"]
+    channels: tuple[int, ...]
+    time: Float[np.ndarray, " sample"]
+    clock_width: float
+    floor: float
+    unit: str
+    zero: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """States of a scene and what sensors read.
+
+    Attributes:
+        name: Name of its file.
+        time: Clock of the states [s].
+        fields: Fields of `SceneState` (step, …), in the order of the module's inputs.
+        widths: Standard deviations of the fields' offsets, (1, …) or (step, …).
+        targets: What sensors read.
+    """
+
+    name: str
+    time: Float[np.ndarray, " step"]
+    fields: Arrays
+    widths: Arrays
+    targets: tuple[Target, ...]
+
+    def state_at(self, time: Float[np.ndarray, " sample"], fields: Arrays) -> dict[str, np.ndarray]:
+        """Return fields at other times, linear in between; choices and contacts as at the step before."""
+        if len(self.time) == 1:
+            return {name: np.repeat(value, len(time), axis=0) for name, value in fields.items()}
+        after = np.clip(np.searchsorted(self.time, time, side="right"), 1, len(self.time) - 1)
+        part = np.clip((time - self.time[after - 1]) / (self.time[after] - self.time[after - 1]), 0.0, 1.0)
+        result = {}
+        for name, value in fields.items():
+            first, second, share = value[after - 1], value[after], part.reshape(-1, *[1] * (value.ndim - 1))
+            if name in (*CHOICES, "contact_found"):
+                result[name] = np.where(share < 1, first, second)
+                continue
+            if name == "body_quat":
+                second = np.where((first * second).sum(axis=-1, keepdims=True) < 0, -second, second)
+            mixed = first + share * (second - first)
+            result[name] = mixed / np.linalg.norm(mixed, axis=-1, keepdims=True) if name == "body_quat" else mixed
+        return result
+
+
+def velocities(time: np.ndarray, fields: Arrays) -> dict[str, np.ndarray]:
+    """Return linear and angular velocities of bodies from their poses; 0 if there is one step only."""
+    pos, quat = fields["body_pos"], fields["body_quat"]
+    if len(time) == 1:
+        return {"body_linvel": np.zeros_like(pos), "body_angvel": np.zeros_like(pos)}
+    is_turned = np.cumprod(np.where((quat[1:] * quat[:-1]).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0), axis=0)
+    quat = quat * np.concatenate([np.ones((1, *quat.shape[1:-1], 1)), is_turned])
+    rate = np.gradient(quat, time, axis=0)
+    w, v, dw, dv = quat[..., :1], quat[..., 1:], rate[..., :1], rate[..., 1:]
+    return {"body_linvel": np.gradient(pos, time, axis=0), "body_angvel": 2.0 * (w * dv - dw * v - np.cross(dv, v))}
+
+
+def load_recording(
+    source: str | Path | Arrays, inputs: Inputs, outputs: Mapping[str, Output], name: str = "<arrays>"
+) -> Recording:
+    """Read a recording for a module.
+
+    Args:
+        source: A `.npz` file, or its arrays.
+        inputs: What the module reads.
+        outputs: The module's readings, by name.
+        name: What to call arrays.
+
+    Raises:
+        SpecError: All that is wrong with it, by its keys.
+    """
+    name = name if isinstance(source, Mapping) else str(source)
+    reader = _Reader(name, _arrays(source, name), inputs, outputs)
+    recording = reader.recording()
+    if reader.problems:
+        raise SpecError(reader.problems)
+    return recording
+
+
+def _arrays(source: str | Path | Arrays, name: str) -> dict[str, np.ndarray]:
+    if isinstance(source, Mapping):
+        return {key: np.asarray(value) for key, value in source.items()}
+    try:
+        with np.load(source) as file:
+            return dict(file)
+    except (OSError, ValueError, BadZipFile, AttributeError) as error:
+        why = "there is no such file" if isinstance(error, FileNotFoundError) else "this is no .npz file of plain arrays"
+        raise SpecError([Problem(name, 0, 0, "", why)]) from error
+
+
+@dataclass
+class _Reader:
+    """Reads one recording and notes all that is wrong with it."""
+
+    name: str
+    arrays: dict[str, np.ndarray]
+    inputs: Inputs
+    outputs: Mapping[str, Output]
+    problems: list[Problem] = field(default_factory=list)
+
+    def note(self, key: str, what: str, hint: str = "") -> None:
+        self.problems.append(Problem(self.name, 0, 0, key, what, hint))
+
+    def recording(self) -> Recording:
+        self._check_keys()
+        time = self._clock("time", "clock of the states")
+        fields = {name: self._field(name, len(time)) for name in self.inputs.fields if name != "dt" and name in self.arrays}
+        for name in self.inputs.fields:
+            if name not in fields and name != "dt" and DERIVED.get(name) not in self.arrays:
+                self.note(name, "this field is missing", f"the module reads {', '.join(self.inputs.fields)}")
+        widths = {}
+        for key in (key for key in self.arrays if key.startswith("width:")):
+            if (name := key.removeprefix("width:")) in fields:
+                widths[name] = self._width(key, name, fields[name])
+        readings = [key.removeprefix("target:") for key in self.arrays if key.startswith("target:")]
+        if not readings:
+            self.note("", "there is no target", f"expected target:<reading>, of {', '.join(self.outputs)}")
+        targets = [target for name in readings if (target := self._target(name, time)) is not None]
+        return Recording(Path(self.name).name, time, fields, widths, tuple(targets))
+
+    def _check_keys(self) -> None:
+        known = {"time", *SHAPES, *NAMES_OF.values(), *(f"width:{name}" for name in SHAPES)}
+        known |= {f"{what}:{name}" for what in OF_TARGET for name in self.outputs}
+        for key in self.arrays:
+            if key not in known:
+                self.note(key, "unknown key", did_you_mean(key, known, "keys"))
+
+    def _numbers(self, key: str) -> np.ndarray | None:
+        value = self.arrays[key]
+        if value.dtype.kind not in "biuf":
+            self.note(key, f"found an array of {value.dtype}, expected numbers")
+            return None
+        return value.astype(np.float64)
+
+    def _clock(self, key: str, what: str) -> np.ndarray:
+        if key not in self.arrays:
+            self.note(key, f"this {what} is missing", "expected times [s], one for each")
+            return np.zeros(0)
+        time = self._numbers(key)
+        if time is None or time.ndim != 1 or not len(time):
+            self.note(key, f"found shape {self.arrays[key].shape}, expected times [s]")
+            return np.zeros(0)
+        if (bad := np.flatnonzero(~np.isfinite(time))).size:
+            self.note(key, f"[{bad[0]}] is {time[bad[0]]}, expected a time")
+        elif (bad := np.flatnonzero(np.diff(time) <= 0)).size:
+            i = int(bad[0])
+            self.note(key, f"[{i + 1}] is {time[i + 1]:g} s after {time[i]:g} s", "expected ascending times: sort the samples")
+        return time
+
+    def _field(self, name: str, num_steps: int) -> np.ndarray:
+        value, shape = self._numbers(name), SHAPES[name]
+        if value is None:
+            return np.zeros(0)
+        sizes = [self.inputs.sizes[part] if isinstance(part, str) else part for part in shape]
+        if (bad := np.argwhere(~np.isfinite(value))).size:
+            place = ", ".join(map(str, bad[0]))
+            self.note(name, f"[{place}] is {value[tuple(bad[0])]}", "expected a finite number: leave the step out")
+        axis = shape[0]
+        order = self._order(str(axis), NAMES_OF[str(axis)])
+        if order is not None and value.ndim > 1 and value.shape[1] == len(self.arrays[NAMES_OF[str(axis)]]):
+            value = value[:, order]
+        if num_steps and value.shape != (num_steps, *sizes):
+            expected = ", ".join(map(str, (num_steps, *sizes)))
+            names = f"; {axis}: {listed(self.inputs.names[str(axis)])}"
+            self.note(name, f"found shape {value.shape}, expected ({expected}){names}")
+        return value
+
+    def _order(self, axis: str, key: str) -> list[int] | None:
+        """Return where each name of the module's axis stands in the recording."""
+        if key not in self.arrays:
+            return None
+        names = [str(name) for name in self.arrays[key]]
+        for wanted in self.inputs.names[axis]:
+            if wanted not in names:
+                problem = Problem(self.name, 0, 0, key, f'"{wanted}" is missing', did_you_mean(wanted, names, "names"))
+                if problem not in self.problems:
+                    self.problems.append(problem)
+                return None
+        return [names.index(wanted) for wanted in self.inputs.names[axis]]
+
+    def _width(self, key: str, name: str, value: np.ndarray) -> np.ndarray:
+        width, axis = self._numbers(key), str(SHAPES[name][0])
+        if width is None:
+            return np.zeros(0)
+        width = width[None] if width.ndim == value.ndim - 1 else width
+        order = self._order(axis, NAMES_OF[axis])
+        if order is not None and width.ndim == value.ndim and width.shape[1] == len(self.arrays[NAMES_OF[axis]]):
+            width = width[:, order]
+        if width.shape not in (value.shape, (1, *value.shape[1:])):
+            self.note(key, f"found shape {width.shape}, expected {value.shape[1:]}, or {value.shape} for each step its own")
+        elif not (np.isfinite(width) & (width >= 0)).all():
+            self.note(key, "expected standard deviations of at least 0")
+        return width
+
+    def _target(self, name: str, steps: np.ndarray) -> Target | None:
+        key = f"target:{name}"
+        output, value = self.outputs.get(name), self._numbers(key)
+        time = self._clock(f"clock:{name}", "clock of the target")
+        if output is None or value is None:
+            return None  # which is noted
+        channels = self._channels(name, output)
+        factor, unit = self._unit(name, output)
+        if not len(time):
+            return None
+        if len(output.shape) > 2:
+            self.note(key, "this reading stacks calls", "fit it with `history: null`")
+            return None
+        rows, _ = output.shape
+        shape = (len(time), rows, len(channels))
+        if value.shape != shape:
+            axes = f"samples, {output.rows}s, channels"
+            self.note(key, f"found shape {value.shape}, expected {shape}: {axes}")
+            return None
+        try:
+            weight = np.broadcast_to(self.arrays.get(f"weight:{name}", np.ones(())), shape).astype(np.float64)
+        except ValueError:
+            found = self.arrays[f"weight:{name}"].shape
+            self.note(f"weight:{name}", f"found shape {found}, expected one that fits {shape}")
+            return None
+        if not (np.isfinite(weight) & (weight >= 0)).all():
+            self.note(f"weight:{name}", "expected weights of at least 0")
+        if (bad := np.argwhere(~np.isfinite(value) & (weight > 0))).size:
+            place = ", ".join(map(str, bad[0]))
+            hint = f"leave the sample out, or set weight:{name} to 0 there"
+            self.note(key, f"[{place}] is {value[tuple(bad[0])]}, {len(bad)} such numbers in all", hint)
+        width = self._scalar(f"clock_width:{name}") or 0.0
+        if len(time) and len(steps) > 1 and (time[-1] < steps[0] - 5 * width or time[0] > steps[-1] + 5 * width):
+            span = f"{time[0]:g} to {time[-1]:g} s, the states are from {steps[0]:g} to {steps[-1]:g} s"
+            self.note(f"clock:{name}", f"found times from {span}", f"expected a common time, or a larger clock_width:{name}")
+        floor, zero = self._scalar(f"floor:{name}") or 0.0, self._scalar(f"zero:{name}")
+        value = np.where(weight > 0, np.where(np.isfinite(value), value, 0.0), 0.0) * factor
+        return Target(name, value, weight, channels, time, width, floor * factor, unit, zero)
+
+    def _channels(self, name: str, output: Output) -> tuple[int, ...]:
+        key = f"channels:{name}"
+        names = [str(part) for part in self.arrays.get(key, np.array(output.channels)).reshape(-1)]
+        for channel in names:
+            if channel not in output.channels:
+                self.note(key, f'"{channel}" is no channel', did_you_mean(channel, output.channels, "channels"))
+        return tuple(output.channels.index(channel) for channel in names if channel in output.channels)
+
+    def _unit(self, name: str, output: Output) -> tuple[float, str]:
+        """Return the factor from the target's unit to the reading's, and the latter."""
+        key, wanted = f"unit:{name}", output.units[0]
+        if key not in self.arrays:
+            self.note(
+                key, "the unit of the target is missing", f'the reading is in {wanted}: expected "{wanted}" or one like it'
+            )
+            return 1.0, wanted
+        written = str(self.arrays[key])
+        if written == wanted:
+            return 1.0, wanted
+        known = next((units for units in UNITS.values() if wanted.replace("·", "*") in units), {})
+        if written not in known:
+            options = ", ".join(known) or wanted
+            self.note(key, f'"{written}" is no unit of this reading, which is in {wanted}', f"expected one of {options}")
+            return 1.0, wanted
+        return known[written] / known[wanted.replace("·", "*")], wanted
+
+    def _scalar(self, key: str) -> float | None:
+        if key not in self.arrays:
+            return None
+        value = self._numbers(key)
+        if value is None or value.ndim or not np.isfinite(value):
+            self.note(key, f"found shape {self.arrays[key].shape}, expected one number")
+            return None
+        return float(value)
