@@ -12,7 +12,8 @@ from warp_cases import SCENE, module
 import tgdsl
 from tgdsl.errors import ObservationError, SimulationError, TgdslError
 from tgdsl.runtime.connect import SOURCES, known_sources
-from tgdsl.runtime.source import Simulator, Source
+from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.source import Source
 
 MODULE = '''
 import torch
@@ -89,7 +90,7 @@ def test_an_installed_source_is_connected_to_by_its_name(install, tmp_path):
     assert [kind.name for kind in known_sources()] == [*OWN, "fingertip", "raw"]
     with tgdsl.connect(touch, "fingertip:can0", control_step=0.01, gain=3.0) as env:
         source = env.source
-        assert isinstance(source, Source) and not isinstance(source, Simulator)
+        assert isinstance(source, Source) and not isinstance(source, Simulation)
         assert (env.num_envs, env.control_step, env.is_over, source.port) == (1, 0.01, False, "can0")
         env.step()
         env.step(np.zeros(2))
@@ -133,7 +134,7 @@ def test_an_installed_simulator_is_taken_for_its_device(install, tmp_path):
     install("handy", "1.2", mine="handy:SIMULATOR")
     touch = module(tmp_path)
     sim = tgdsl.simulate(touch, 3, device="xpu:1", substeps=4)
-    assert isinstance(sim, Simulator) and (sim.num_envs, sim.substeps) == (3, 4)
+    assert isinstance(sim, Simulation) and (sim.num_envs, sim.substeps) == (3, 4)
     with pytest.raises(SimulationError, match='"mine", which simulates on "xpu", has no option nconmax; it knows substeps'):
         tgdsl.simulate(touch, 3, device="xpu", nconmax=3)
     with pytest.raises(SimulationError, match='physics on "meta" is not supported, expected "xpu" or "cuda" or "cpu"'):

@@ -17,7 +17,6 @@ MORE = {
         "tgdsl.runtime.simulators.simulation.Simulation",
         "tgdsl.runtime.simulators.simulation.SimOptions",
         "tgdsl.runtime.source.Source",
-        "tgdsl.runtime.source.Simulator",
     ),
     "WarpSimulation": (),
 }
