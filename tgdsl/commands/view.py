@@ -77,16 +77,13 @@ class View:
         return SceneStage(module_of(self.source, self.set, progress), self.envs)
 
     def _is_task(self) -> bool:
-        """Return whether the file is a task's document; one with a mistake in its YAML is reported by who compiles it."""
-        from ruamel.yaml import YAML, YAMLError
+        """Return whether the file is a task's document."""
+        from tgdsl.schema.load import read_source
 
-        if self.source.suffix not in (".yaml", ".yml") or not self.source.is_file():
+        if self.source.suffix not in (".yaml", ".yml"):
             return False
-        try:
-            values = YAML(typ="safe").load(self.source)
-        except YAMLError:
-            return False
-        return isinstance(values, dict) and "task" in values
+        value = read_source(self.source).value
+        return isinstance(value, dict) and "task" in value
 
     def _task_stage(self, progress: StatusLine | None) -> Stage:
         from tgdsl.rl.env import TouchEnv
