@@ -271,8 +271,7 @@ class _Reader:
         if len(output.shape) > 2:
             self.note(key, "this reading stacks calls", "fit it with `history: null`")
             return None
-        rows, _ = output.shape
-        shape = (len(time), rows, len(channels))
+        shape = (len(time), output.shape[0], len(channels))
         if value.shape != shape:
             axes = f"samples, {output.rows}s, channels"
             self.note(key, f"found shape {value.shape}, expected {shape}: {axes}")

@@ -25,7 +25,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import Colormap, Normalize, to_hex
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -58,7 +58,7 @@ _LIFT = 2e-4
 """How far discs and arrows begin above the surface [m]."""
 _ARROW = 0.03
 """Length of the arrow of the largest vector [m]."""
-_HEAT = HEAT.with_extremes(under=np.divide(_REST, 255))
+_HEAT = HEAT.with_extremes(under=to_hex([value / 255 for value in _REST]))
 _SIGNED = matplotlib.colormaps["coolwarm"]
 MAGNITUDE = "magnitude"
 
@@ -202,7 +202,7 @@ class Page:
                 np.array([turn.as_quat(scalar_first=True) for turn in turns]),
                 table.pos[rows] + _LIFT * table.normal[rows],
                 batched_scales=np.clip(0.45 * table.size[rows], *_DISC_RADIUS),
-                batched_colors=np.tile(np.uint8(_REST), (len(rows), 1)),
+                batched_colors=np.tile(np.array(_REST, dtype=np.uint8), (len(rows), 1)),
                 side="double",
                 lod="off",
                 cast_shadow=False,
@@ -489,7 +489,7 @@ def _unit(unit: str) -> str:
 def _legend(colours: Colormap, norm: Normalize, label: str) -> str:
     """Return the colour bar as HTML."""
     low, high = float(norm.vmin or 0.0), float(norm.vmax or 1.0)
-    stops = ", ".join(matplotlib.colors.to_hex(colours(x)) for x in np.linspace(0, 1, 9))
+    stops = ", ".join(to_hex(colours(x)) for x in np.linspace(0, 1, 9))
     low_text = "0" if abs(low) < 1e-11 else f"{low:.3g}"
     return (
         f'<div style="padding:0 0.75em"><div>{label}</div>'
