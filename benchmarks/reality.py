@@ -129,10 +129,10 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
         places = gelsight_recordings(data, folder)
         press, drag, raw = (folder / f"{which}.npz" for which in ("press", "drag", "raw"))
         cases: list[tuple[str, dict[str, Any], list[Path], list[str], ReadingMap]] = [
-            ("gaussian, press, offset", GAUSSIAN, [press], ["skin.dilation_falloff=1e4:1e7"], "offset"),
+            ("gaussian, press, offset", GAUSSIAN, [press], ["skin.dilation_falloff=1e2:1e7"], "offset"),
             ("half_space, press, offset", HALF_SPACE, [press], OF_HALF_SPACE, "offset"),
             ("layer, press, offset", LAYER, [press], OF_LAYER, "offset"),
-            ("gaussian, press, affine", GAUSSIAN, [press], ["skin.dilation_falloff=1e4:1e7"], "affine"),
+            ("gaussian, press, affine", GAUSSIAN, [press], ["skin.dilation_falloff=1e2:1e7"], "affine"),
             ("layer, press, affine", LAYER, [press], OF_LAYER, "affine"),
             ("gaussian, drag, offset", {**GAUSSIAN, "dilation_strength": 0}, [drag], ["skin.shear_falloff=1e4:1e6"], "offset"),
             ("half_space, drag, offset", {**HALF_SPACE, "friction": 0.3}, [drag], [*OF_HALF_SPACE, FRICTION], "offset"),

@@ -268,10 +268,11 @@ class _Reader:
         factor, unit = self._unit(name, output)
         if not len(time):
             return None
+        num_rows = output.shape[-2]
         if len(output.shape) > 2:
             self.note(key, "this reading stacks calls", "fit it with `history: null`")
             return None
-        shape = (len(time), output.shape[0], len(channels))
+        shape = (len(time), num_rows, len(channels))
         if value.shape != shape:
             axes = f"samples, {output.rows}s, channels"
             self.note(key, f"found shape {value.shape}, expected {shape}: {axes}")
