@@ -1,5 +1,7 @@
 """Contacts on pads and on a finger: what tests of their sharing out are given."""
 
+import dataclasses
+
 import numpy as np
 import torch
 
@@ -101,5 +103,5 @@ def arguments(case, dtype):
     bodies, _, depth, *rest = case
     vectors = [tuple(torch.tensor(value, dtype=dtype) for value in part) for part in rest[:4]]
     radius, levenberg = (torch.tensor(value, dtype=dtype) for value in rest[4:])
-    floats = {name: value.to(dtype) for name, value in bodies._asdict().items() if value.is_floating_point()}
-    return bodies._replace(**floats), torch.tensor(depth, dtype=dtype), *vectors, radius, levenberg
+    floats = {name: value.to(dtype) for name, value in vars(bodies).items() if value.is_floating_point()}
+    return dataclasses.replace(bodies, **floats), torch.tensor(depth, dtype=dtype), *vectors, radius, levenberg

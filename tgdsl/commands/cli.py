@@ -39,8 +39,6 @@ from tgdsl.errors import SpecError, TgdslError
 
 Command = (
     Annotated[Compile, tyro.conf.subcommand("compile")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Verify, tyro.conf.subcommand("verify")]
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]
@@ -57,6 +55,8 @@ Command = (
     | Annotated[Layout, tyro.conf.subcommand("layout")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Verify, tyro.conf.subcommand("verify")]
     | Annotated[Cache, tyro.conf.subcommand("cache")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]

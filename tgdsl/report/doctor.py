@@ -33,6 +33,9 @@ WITHOUT: Mapping[str, tuple[Level, str]] = {
     "gymnasium": ("missing", "no vector environments of gymnasium: TouchEnv and rsl_rl's adapter remain"),
     "imageio-ffmpeg": ("missing", "`tgdsl play --video` is refused"),
     "mujoco-warp": ("missing", 'physics on a GPU is refused: `tgdsl.simulate(device="cuda")`; MuJoCo on the CPU remains'),
+    "onnx": ("missing", "`tgdsl export --to onnx` is refused"),
+    "onnxruntime": ("missing", "`tgdsl verify` is refused for ONNX files"),
+    "onnxscript": ("missing", "`tgdsl export --to onnx` is refused"),
     "pycollada": ("missing", "Collada meshes (.dae) of URDF files are refused"),
     "pyserial": ("missing", "a real hand cannot be connected; its emulator and logs remain"),
     "ray": ("missing", "`tgdsl sweep` is refused; single runs remain"),
@@ -40,6 +43,7 @@ WITHOUT: Mapping[str, tuple[Level, str]] = {
     "soundfile": ("missing", "`tgdsl listen` is refused"),
     "tensordict": ("missing", "`tgdsl train` and the adapter for rsl_rl are refused"),
     "triton": ("slower", "on a GPU, torch's operations stand in for the kernels written in Triton; a CPU needs none"),
+    "viser": ("missing", "`tgdsl view` and `tgdsl.show` are refused"),
     "warp-lang": ("missing", "`query: raycast` is refused; analytic shapes and distance grids remain"),
 }
 """What follows if a package is not installed that tgdsl can do without."""

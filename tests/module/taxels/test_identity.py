@@ -1,6 +1,7 @@
 """Modules that meet tables, artefacts, rollouts and states of others: the same order passes, another one is refused by name."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,7 +112,7 @@ def test_rollouts(three, tmp_path):
         recorder = Recorder(module, len(controls), 1)
         for step in rollout(module, sim, controls):
             recorder.add(step)
-        recorder.write(tmp_path / f"{name}.npz", controls)
+        recorder.write(tmp_path / f"{name}.npz", controls, Path("scene.yaml"))
     tgdsl.check_taxels(touch, tmp_path / "same.npz")
     with pytest.raises(TaxelError) as caught:
         tgdsl.check_taxels(touch, tmp_path / "other.npz")

@@ -388,7 +388,7 @@ def _impulsiveness(start: float, constant: float) -> float:
     """Return σ, that of an exponential by its moments: the equation of `response`."""
     z = start / (1 + constant - start) + 16 * (1 - start / constant) ** 2 * constant / (1 + constant)
     if z < 0.02:
-        return 1 - z / 4 + z**2 / 40
+        return 1 - z / 4 + z**2 / 40 - z**4 / 5600
     heat, left = -np.expm1(-z), np.exp(-z)
     last = 2 * (heat / z - left)
     return float((last - z * left) / (2 * (heat - last)))

@@ -146,4 +146,6 @@ def impulsiveness(start: Tensor, constant: Tensor) -> Tensor:
     left = torch.exp(-far)
     last = 2.0 * ((1.0 - left) / far - left)
     fast = (last - far * left) / (2.0 * (1.0 - left - last))
-    return torch.where(is_fast, fast, 1.0 - 0.25 * near * (1.0 - 0.1 * near))
+    square = near * near  # the next term is below 1e-15
+    series = 1 / 5600 - square * (1 / 504000 - square * (37 / 1552320000 - square * 59 / 201801600000))
+    return torch.where(is_fast, fast, 1.0 - 0.25 * near + square * (1 / 40 - square * series))

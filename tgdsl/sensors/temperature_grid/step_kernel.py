@@ -330,7 +330,9 @@ def _impulsiveness(start, constant, is_any):
     far, near = tl.where(z > 0.5, z, 1.0), tl.where(z > 0.5, 0.5, z)
     left = tl.exp(-far)
     last = 2.0 * ((1.0 - left) / far - left)
-    return tl.where(z > 0.5, (last - far * left) / (2.0 * (1.0 - left - last)), 1.0 - 0.25 * near * (1.0 - 0.1 * near))
+    square = near * near
+    series = 1.0 - 0.25 * near + square * (1.0 / 40.0 - square * (1.0 / 5600.0 - square * (1.0 / 504000.0)))
+    return tl.where(z > 0.5, (last - far * left) / (2.0 * (1.0 - left - last)), series)
 
 
 @triton.jit
