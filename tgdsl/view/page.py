@@ -58,7 +58,7 @@ _LIFT = 2e-4
 """How far discs and arrows begin above the surface [m]."""
 _ARROW = 0.03
 """Length of the arrow of the largest vector [m]."""
-_HEAT = HEAT.with_extremes(under=to_hex([value / 255 for value in _REST]))
+_HEAT = HEAT.with_extremes(under="#{:02x}{:02x}{:02x}".format(*_REST))
 _SIGNED = matplotlib.colormaps["coolwarm"]
 MAGNITUDE = "magnitude"
 

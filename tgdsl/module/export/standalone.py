@@ -17,7 +17,7 @@ Arrays = list[np.ndarray]
 def signature_text(file: str) -> str:
     """Return the text that says what goes in and comes out."""
     if file.endswith(".onnx"):
-        import onnxruntime  # pyright: ignore[reportMissingImports]
+        import onnxruntime
 
         return onnxruntime.InferenceSession(file).get_modelmeta().custom_metadata_map["tgdsl"]
     with zipfile.ZipFile(file) as archive:
@@ -27,10 +27,10 @@ def signature_text(file: str) -> str:
 def loaded(file: str, inputs: Sequence[str]) -> Callable[[Arrays], Arrays]:
     """Return a function of an exported file: inputs in order to outputs in order."""
     if file.endswith(".onnx"):
-        import onnxruntime  # pyright: ignore[reportMissingImports]
+        import onnxruntime
 
         session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
-        return lambda arrays: session.run(None, dict(zip(inputs, arrays, strict=True)))
+        return lambda arrays: [np.asarray(out) for out in session.run(None, dict(zip(inputs, arrays, strict=True)))]
     import torch
 
     with zipfile.ZipFile(file) as archive:
