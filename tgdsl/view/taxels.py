@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -27,6 +27,7 @@ class Pose(NamedTuple):
     quat: Float[Array, "body 4"]
 
 
+@runtime_checkable
 class Posed(Protocol):
     """A model whose bodies are somewhere: a simulator's, or a recorded run's.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple, Self, dataclass_transform, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, NamedTuple, dataclass_transform, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -167,7 +167,7 @@ class Stage:
         return 0.0
 
     @classmethod
-    def of(cls, values: Mapping[str, Tensor]) -> Self:
+    def of(cls, values: Mapping[str, Tensor]) -> Stage:
         """Return the stage with its numbers, from the values of all stages."""
         return cls(**{name: values.get(name) for name in cls.numbers})
 
