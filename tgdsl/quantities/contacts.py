@@ -227,7 +227,7 @@ class ReferenceContacts:
     net: Float[np.ndarray, "body 3"]
 
 
-def reference_contacts(scene: ReferenceScene, pair: int) -> list[list[np.ndarray]]:
+def reference_contacts(scene: ReferenceScene, pair: int | np.integer) -> list[list[np.ndarray]]:
     """Return a pair's contacts (place, force, torque, normal), what they lack of its whole force added by shares of force."""
     if "contact_force" not in scene.fields:
         return []

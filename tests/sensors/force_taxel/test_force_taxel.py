@@ -283,6 +283,9 @@ class NoSurfaces:
     def __call__(self, link, region):
         pytest.fail(f"the surface of {link} was asked for")
 
+    def taxels(self, resolution, layout):
+        raise AssertionError
+
     def of_object(self, name):
         pytest.fail(f"the surface of {name} was asked for")
 

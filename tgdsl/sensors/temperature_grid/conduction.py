@@ -177,7 +177,7 @@ def _nodes(
     coupled: Float[Tensor, "env row both both"],
     pulled: Float[Tensor, "env row both"],
     nodes: Float[Tensor, "env body"],
-    inverse: Float[Tensor, "env body"],
+    inverse: Float[Tensor, "#env body"],
     lump: Response,
     sides: Sides,
 ) -> tuple[Tensor, Tensor]:
