@@ -184,6 +184,15 @@ def test_what_is_no_run_is_refused_with_what_it_lacks(tmp_path):
         View(tmp_path / "log.npz")._stage()
 
 
+def test_another_stage_replaces_the_discs(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch)) as page:
+        first = page._discs
+        page.show(SceneStage(touch))
+        assert page._discs.keys() == first.keys()
+        assert all(page._discs[body] is not first[body] for body in first)
+
+
 def test_a_policy_needs_a_task(document):
     with pytest.raises(TgdslError, match=r"press\.yaml is no task's document"):
         View(document, policy=Path("policy.pt"))._stage()

@@ -103,6 +103,7 @@ class Page:
         with self.server.atomic():
             self.server.scene.reset()
             self.server.gui.reset()
+            self._discs: dict[int, Any] = {}
             self._add_bodies()
             self._add_controls(chosen)
             self._add_discs()
@@ -185,9 +186,9 @@ class Page:
 
     def _add_discs(self) -> None:
         """Add a disc for each row of the chosen reading, in the frame of its body."""
-        for handle in getattr(self, "_discs", {}).values():
+        for handle in self._discs.values():
             handle.remove()
-        self._discs: dict[int, Any] = {}
+        self._discs = {}
         table = self._table()
         angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
         corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])

@@ -198,7 +198,7 @@ def _nodes(
     blocks = coupled[..., :num], coupled[..., num:]
     columns = [equations(block[..., :num, :], block[..., num:, :], _between_nodes) for block in blocks]
     matrix = torch.cat(columns, dim=-1)
-    is_idle = (matrix.diagonal(dim1=-2, dim2=-1) == 0).to(nodes.dtype)
+    is_idle = (_diagonal(matrix) == 0).to(nodes.dtype)
     stores, gain, before = is_idle, torch.ones_like(is_idle), torch.zeros_like(right)
     if num_bodies:
         of_faces = [part.unflatten(1, (2, num_nodes))[:, :, num_bodies:] for part in (stores, gain, before)]
@@ -217,7 +217,7 @@ def _between_nodes(sides: Sides, values: Float[Tensor, "env row side side"]) -> 
     if sides.is_plain:
         return values.sum(dim=1)
     between = torch.nn.functional.pad(values.flatten(1), (0, 1))[:, sides.tables["coupled"]].sum(dim=-1)
-    return between + torch.diag_embed(_at_nodes(sides, values.diagonal(dim1=-2, dim2=-1)))
+    return between + torch.diag_embed(_at_nodes(sides, _diagonal(values)))
 
 
 def _solved(matrix: Float[Tensor, "*rest both both"], right: Float[Tensor, "*rest both column"]) -> Tensor:
@@ -235,6 +235,11 @@ def _solved(matrix: Float[Tensor, "*rest both both"], right: Float[Tensor, "*res
         rows = [[part - part[..., n, None] * one - part[..., num + n, None] * other for part in row] for row in rows]
         rows[n] = [one, other]
     return torch.stack([row[k][..., 2 * num :] for k in range(2) for row in rows], dim=-2)
+
+
+def _diagonal(matrix: Float[Tensor, "*rest both both"]) -> Float[Tensor, "*rest both"]:
+    """Return the diagonal; Inductor's own lowering of `Tensor.diagonal` warns."""
+    return matrix.flatten(-2)[..., :: matrix.shape[-1] + 1]
 
 
 def _times(one: Tensor, other: Tensor) -> Tensor:

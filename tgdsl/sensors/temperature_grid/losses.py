@@ -27,6 +27,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tgdsl.tensors.fusion import materialised
+
 
 def stefan_boltzmann() -> float:
     """Return σ [W/(m²·K⁴)] (CODATA 2018)."""
@@ -81,7 +83,9 @@ def lost(above: Tensor, surfaces: Surfaces, dt: Tensor) -> tuple[Tensor, Tensor]
             rate, glowing = rate - face.area * face.film, glowing - face.area * (face.film * face.film_radiated)
     is_any = rate != 0
     share = torch.where(is_any, glowing, 0.0) / torch.where(is_any, rate, 1.0)
-    return above * torch.expm1(-rate * dt), share
+    # One number for what cells lose and what is reported: computed again in another kernel, where the films' difference is
+    # contracted otherwise, the two are 1e-4 apart.
+    return materialised(above * torch.expm1(-rate * dt)), share
 
 
 def _coefficient(above: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
