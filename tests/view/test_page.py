@@ -193,6 +193,20 @@ def test_another_stage_replaces_the_discs(document):
         assert all(page._discs[body] is not first[body] for body in first)
 
 
+def test_a_stage_with_nothing_to_draw_is_a_problem_and_the_one_before_stays(document):
+    bare = document.with_name("bare.yaml")
+    bare.write_text(DOCUMENT.split("sensors:")[0] + "sensors:\n  hum: {kind: actuation_audio, samples: 32, substeps: 5}\n")
+    silent = SceneStage(tgdsl.compile(bare))
+    changes = [silent]
+    with opened(SceneStage(tgdsl.compile(document))) as page:
+        shown = page.stage
+        page.run(lambda: changes.pop() if changes else None, seconds=0.1)
+        assert page.stage is shown
+        assert "nothing" in page._problem.content or "to draw" in page._problem.content
+    with pytest.raises(TgdslError, match="to draw"):
+        Page(SceneStage(tgdsl.compile(bare)), port=8300)
+
+
 def test_a_policy_needs_a_task(document):
     with pytest.raises(TgdslError, match=r"press\.yaml is no task's document"):
         View(document, policy=Path("policy.pt"))._stage()

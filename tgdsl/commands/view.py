@@ -44,8 +44,6 @@ class View:
 
     def run(self) -> None:
         """Serve the page until Ctrl-C."""
-        import math
-
         from tgdsl.view.page import Page
 
         if str(self.source).partition(":")[0] in HANDS:
@@ -56,7 +54,7 @@ class View:
             page = Page(stage, self.address, self.port)
         print(f"{self.source}: {page.url}   (Ctrl-C ends it)", flush=True)
         try:
-            page.run(self._watch(), math.inf if self.seconds is None else self.seconds)
+            page.run(self._watch(), float("inf") if self.seconds is None else self.seconds)
         except KeyboardInterrupt:
             pass
         finally:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from io import StringIO
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -75,6 +75,7 @@ class Page:
     """
 
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
+        _drawn(stage)
         with redirect_stdout(StringIO()):  # viser prints its address
             self.server = _viser().ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
         if host != LOCAL:
@@ -90,19 +91,22 @@ class Page:
         return f"http://{'localhost' if host == LOCAL else host}:{self.server.get_port()}"
 
     def show(self, stage: Stage) -> None:
-        """Show a stage in place of the one before; its camera stays."""
+        """Show a stage in place of the one before; the camera stays.
+
+        Raises:
+            TgdslError: If the stage has nothing to draw; the one before stays.
+        """
+        self._outputs = _drawn(stage)
         is_first = not hasattr(self, "stage")
         chosen = None if is_first else self._reading.value
         self.stage = stage
-        self._outputs = {output.name: output for output in drawn_outputs(stage.touch)}
-        if not self._outputs:
-            raise TgdslError("no sensor of this document has taxels, bodies or cells to draw")
         self._picked: int | None = None
         self._range: dict[tuple[str, str], float] = {}
         self._history: deque[tuple[float, float]] = deque()
         with self.server.atomic():
             self.server.scene.reset()
             self.server.gui.reset()
+            self.server.gui.configure_theme(show_share_button=False)  # viser's would open a tunnel to the internet
             self._discs: dict[int, Any] = {}
             self._add_bodies()
             self._add_controls(chosen)
@@ -132,10 +136,15 @@ class Page:
             start = time.monotonic()
             change = watch()
             if isinstance(change, Stage):
-                self.stage.close()
-                self.show(change)
-            elif change is not None:
-                self._problem.content = f"```\n{change}\n```" if change else ""
+                last = self.stage
+                try:
+                    self.show(change)
+                    last.close()
+                except TgdslError as error:
+                    change.close()
+                    change = str(error)
+            if isinstance(change, str):
+                self._problem.content = f"```\n{change}\n```"
             self._react()
             due = 0.0 if self._paused.value else due + self._speed.value * (start - before)
             before = start
@@ -425,14 +434,14 @@ class Page:
         self._history.clear()
 
 
-class _Rows:
-    """Rows of a reading in the frames of their bodies: body, position [m], normal, width [m] and a label."""
+class _Rows(NamedTuple):
+    """Rows of a reading in the frames of their bodies."""
 
-    def __init__(
-        self, body: Int[Array, " taxel"], pos: Float[Array, "taxel 3"], normal: Float[Array, "taxel 3"],
-        size: Float[Array, " taxel"], labels: list[str],
-    ):  # fmt: skip
-        self.body, self.pos, self.normal, self.size, self.labels = body, pos, normal, size, labels
+    body: Int[Array, " taxel"]
+    pos: Float[Array, "taxel 3"]
+    normal: Float[Array, "taxel 3"]
+    size: Float[Array, " taxel"]
+    labels: list[str]
 
 
 class _Fixed:
@@ -462,6 +471,14 @@ def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int 
     page = Page(stage, host, port)
     print(f"tgdsl view: {page.url}")
     return page
+
+
+def _drawn(stage: Stage) -> dict[str, Output]:
+    """Return the readings that a page can show, by name."""
+    outputs = {output.name: output for output in drawn_outputs(stage.touch)}
+    if not outputs:
+        raise TgdslError("no sensor of this document has taxels, bodies or cells to draw")
+    return outputs
 
 
 def _viser() -> Any:
