@@ -169,7 +169,7 @@ class Page:
             for body, frame in self._frames.items():
                 frame.position, frame.wxyz = pos[body], quat[body]
             if self.stage.readings:
-                self._draw_touch(env, Pose(pos, quat))
+                self._draw_touch(env)
             self._draw_text()
 
     # The scene -------------------------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ class Page:
     def _env_index(self) -> int:
         return int(self._env.value) if self._env is not None else 0
 
-    def _draw_touch(self, env: int, pose: Pose) -> None:
+    def _draw_touch(self, env: int) -> None:
         """Colour the discs, and draw arrows, the legend and the plot."""
         output, channel = self._output, self._channel.value
         readings = self.stage.readings[output.name]
@@ -274,7 +274,7 @@ class Page:
             value, unit, colours = boxes.value[boxes.chosen], boxes.unit, WARMTH
             norm, label = boxes.norm, boxes.label
         elif channel == MAGNITUDE:
-            markers = markers_of(self.stage.touch, _Fixed(self.stage.model, pose), output, readings, env)
+            markers = markers_of(self.stage.touch, self.stage, output, readings, env)
             value, unit, colours, vector = markers.value / markers.scale, _unit(output.units[0]), _HEAT, markers.vector
             norm, label = Normalize(1e-12, self._widened(output, channel, value), clip=False), f"{markers.quantity} [{unit}]"
         else:
@@ -442,17 +442,6 @@ class _Rows(NamedTuple):
     normal: Float[Array, "taxel 3"]
     size: Float[Array, " taxel"]
     labels: list[str]
-
-
-class _Fixed:
-    """A model and the pose that its bodies have in a frame."""
-
-    def __init__(self, model: Any, pose: Pose):
-        self.model, self._pose = model, pose
-
-    def body_poses(self, env: int) -> Pose:
-        """Return the pose."""
-        return self._pose
 
 
 def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int = PORT) -> Page:
