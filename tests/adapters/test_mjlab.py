@@ -8,6 +8,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import pytest
+import scene_of_adapters
 import torch
 import warp as wp
 from mjlab.entity import EntityCfg
@@ -39,17 +40,7 @@ def mjcf(*bodies: str) -> str:
 
 
 def document(folder, **sensors) -> dict:
-    (folder / "scene.xml").write_text(mjcf(HAND, CUBE))
-    probes = [{"pos": [x, y, 0.01], "normal": [0, 0, 1]} for x in (-0.01, 0.01) for y in (-0.01, 0.01)]
-    points = {"method": "points", "points": probes, "radius": 0.005}
-    skin = {"kind": "kinematic_taxel", "links": ["palm", "pad"], "feels": ["cube"], "normal_stiffness": 500}
-    return {
-        "tgdsl": 1,
-        "robot": {"model": str(folder / "scene.xml"), "layout": {"resolutions": {"only": {"palm": points, "pad": points}}}},
-        "objects": {"cube": {"body": "cube"}},
-        "sensors": {"skin": skin, **sensors},
-        "observations": {"policy": [{"type": "force", "of": "skin"}]},
-    }
+    return scene_of_adapters.document(folder, mjcf(HAND, CUBE), **sensors)
 
 
 def touch_reward(env) -> torch.Tensor:

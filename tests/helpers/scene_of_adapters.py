@@ -21,8 +21,8 @@ LOAD = {"kind": "link_contact", "links": ["palm"], "feels": ["cube"], "outputs":
 DEPTH = {"kind": "contact_depth", "links": ["palm"], "feels": ["cube"]}
 
 
-def document(folder, **sensors) -> dict:
-    (folder / "scene.xml").write_text(SCENE)
+def document(folder, scene=SCENE, **sensors) -> dict:
+    (folder / "scene.xml").write_text(scene)
     probes = [{"pos": [x, y, 0.01], "normal": [0, 0, 1]} for x in (-0.01, 0.01) for y in (-0.01, 0.01)]
     points = {"method": "points", "points": probes, "radius": 0.005}
     skin = {"kind": "kinematic_taxel", "links": ["palm", "pad"], "feels": ["cube"], "normal_stiffness": 500}
