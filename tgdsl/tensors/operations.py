@@ -14,6 +14,8 @@ from typing import Generic, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from tgdsl.tensors.torch_internals import is_exporting
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -58,7 +60,7 @@ def are_kernel_inputs(*tensors: Tensor) -> bool:
     An exported program has none: it runs where tgdsl is not.
     """
     are_fit = all(tensor.is_cuda and tensor.dtype == torch.float32 for tensor in tensors)
-    return HAS_TRITON and len(tensors) > 0 and are_fit and not (needs_autograd(*tensors) or torch.compiler.is_exporting())
+    return HAS_TRITON and len(tensors) > 0 and are_fit and not (needs_autograd(*tensors) or is_exporting())
 
 
 def needs_autograd(*tensors: Tensor) -> bool:

@@ -116,6 +116,11 @@ def is_followed() -> bool:
     )
 
 
+def is_exporting() -> bool:
+    """Return whether torch.export traces this code: to torch.compile of torch 2.11, `torch.compiler.is_exporting` is always so."""
+    return torch.compiler._is_exporting_flag
+
+
 def copy_each(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
     """Copy tensors of one dtype into others by one kernel on a GPU. `copy_` launches one for each."""
     torch._foreach_copy_(list(targets), list(sources))  # pyright: ignore[reportPrivateImportUsage]
@@ -158,12 +163,14 @@ def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> d
         checks_indices: Whether kernels assert that indices read from tensors are in range.
         has_tiles: Whether kernels on a GPU have tiles of 32 × 32 of two axes, instead of blocks of one flat axis whose size is
             chosen by timing. Of a kernel that takes 10 µs that is the time of its launch: one tile is as likely as another.
+            From Hopper on, each such kernel is launched while the one before it ends (programmatic dependent launch).
         is_fused: Whether kernels have as many operations as can be, instead of 64 at most.
     """
     options: dict[str, Any] = {
         "assert_indirect_indexing": checks_indices,
         "triton.prefer_nd_tiling": has_tiles,
         "triton.autotune_pointwise": not has_tiles,
+        "triton.enable_pdl": has_tiles,
     }
     return options | {"max_fusion_size": MOST_FUSED} if is_fused else options
 

@@ -29,7 +29,7 @@ from tgdsl.quantities.points import LINK_POINTS, LinkPoints, ObjectPoints, Refer
 from tgdsl.sensors.elastomer.anchors import StickSlip, capped
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.operations import Operation, needs_autograd
-from tgdsl.tensors.torch_internals import expect_size
+from tgdsl.tensors.torch_internals import expect_size, is_exporting
 
 Row = tuple[Float[Tensor, "6 row slot"], Int[Tensor, " row"]]
 LARGEST_BLOCK = 16
@@ -49,7 +49,7 @@ def are_compacted(pos: Vec, strength: Vec) -> bool:
 
     An exported program cannot have its operation.
     """
-    is_here = pos[0].device.type == "cpu" and not torch.compiler.is_exporting()
+    is_here = pos[0].device.type == "cpu" and not is_exporting()
     return is_here and pos[0].shape[0] != 1 and not needs_autograd(*pos, *strength)
 
 

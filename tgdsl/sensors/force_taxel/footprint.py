@@ -211,7 +211,7 @@ def _shared_by_kernel(
     from tgdsl.sensors.force_taxel import footprint_kernel
 
     inverse_radius = bodies.inverse_radius.flatten()[bodies.row]
-    weight = depth * inverse_radius + unreached()
+    weight = torch.log2(depth * inverse_radius + unreached())
     args = radius, levenberg, bodies.first, bodies.box
     shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
     return Shared(shared, sums[:, :3], sums[:, 3:])

@@ -1,12 +1,12 @@
 """`footprint` as one Triton kernel, for a GPU in float32 without gradients.
 
 A program handles one body in a block of environments. Its threads hold contacts and loop over the taxels: sums over taxels
-need no communication between threads. The first pass writes the weights w, which no step changes, into memory that stays in the
-GPU's caches. Each further pass accumulates the moments of the lever arms; the mean and covariance of g follow from those, as g
-is linear in the arm. The last pass puts w exp(β · g) in the place of w. Groups of contacts that are all empty are skipped.
+need no communication between threads. A pass over the taxels accumulates the moments of the lever arms x_j − x_c; the mean and
+covariance of g follow from those, as g is linear in the arm. Groups of contacts that are all empty are skipped.
 
 Covariances are differences of moments, and float32 would suffer cancellation where few taxels are in the footprint, all of them
-on one side of the contact. So moments are about q_c, the nearest point to the contact in the bounding box of the body's taxels.
+on one side of the contact. So for contacts outside the bounding box of the body's taxels, moments are about the nearest point
+of that box.
 
 Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel` taxels of all bodies, one body after the other.
 """
@@ -37,6 +37,8 @@ FEW_STEPS = 12
 """Steps up to which no exponent β · g can overflow float32, as each makes β longer by √10 at most."""
 UNROLL = tl.constexpr(4)
 """Taxels of a pass that are worked on at a time."""
+BESIDE = tl.constexpr(0.25)
+"""Distance of a contact from the box of the taxels from which on moments are about that box [footprints]."""
 LIMIT = tl.constexpr(64.0)
 """More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
 NO_FORCE = tl.constexpr(no_force())
@@ -63,7 +65,7 @@ def shared_forces(
 
     Args:
         pos: Taxel positions in their body's frame [m], inactive ones far away, and −2 times their normals: (taxel, 6).
-        weight: Depth of each probe over its radius, plus `unreached()`, (env, taxel) [1].
+        weight: Logarithm to base 2 of the depth of each probe over its radius, and `unreached()`, (env, taxel) [1].
         point: Contact points, three planes (env, body, contact) [m].
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
@@ -78,10 +80,8 @@ def shared_forces(
     shared = weight.new_empty((num_envs, 3, num_taxels))
     sums = weight.new_empty((num_envs, 6, num_bodies))
     planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque, *normal)]
-    num_blocks = triton.cdiv(num_envs, ENVS)
-    scratch = weight.new_empty((num_blocks, triton.cdiv(num_contacts, GROUP), num_taxels + num_bodies, ENVS * GROUP))
-    wrap_triton(footprint_kernel)[(num_blocks, num_bodies)](
-        *planes, radius, levenberg, first, box, scratch, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
+    wrap_triton(footprint_kernel)[(triton.cdiv(num_envs, ENVS), num_bodies)](
+        *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
         STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, num_warps=1,
     )  # fmt: skip
     return shared, sums
@@ -90,34 +90,23 @@ def shared_forces(
 @triton.jit
 def footprint_kernel(
     pos, weight, point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z,
-    normal_x, normal_y, normal_z, radius, levenberg, first, box, scratch, shared, sums,
-    num_envs, num_bodies, num_contacts, num_taxels,
+    normal_x, normal_y, normal_z, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
     STEPS: tl.constexpr, FEW: tl.constexpr, ENVS: tl.constexpr, GROUP: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     """Find β of one body in a block of environments, and share out its contacts."""
-    block, body = tl.program_id(0).to(tl.int64), tl.program_id(1)
-    env = block * ENVS + tl.arange(0, ENVS)
+    body = tl.program_id(1)
+    env = tl.program_id(0) * ENVS + tl.arange(0, ENVS).to(tl.int64)
     is_env = env < num_envs
     row = env * num_bodies + body
     first_taxel = tl.load(first + body)
     num_here = tl.load(first + body + 1) - first_taxel
     pos += 6 * first_taxel
-    weight += first_taxel + tl.where(is_env, env, 0) * num_taxels
+    weights = weight + first_taxel + tl.where(is_env, env, 0) * num_taxels
     planes = (point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z)
     normals = (normal_x, normal_y, normal_z)
     inverse = 1.0 / tl.load(radius + body)
     box += 6 * body
     IS_LONG: tl.constexpr = STEPS > FEW
-    LANES: tl.constexpr = ENVS * GROUP
-    per_group = LANES * (num_taxels + num_bodies)
-    scratch += block * tl.cdiv(num_contacts, GROUP) * per_group + LANES * (first_taxel + body)
-    lane = tl.arange(0, ENVS)[:, None] * GROUP + tl.arange(0, GROUP)[None, :]
-
-    for start in range(0, num_contacts, GROUP):
-        point, force, torque, is_any = _contacts(planes, row, is_env, start, num_contacts, GROUP)
-        if is_any:
-            normal = _three(normals, row, is_env, start, num_contacts, GROUP)
-            _weigh(pos, weight, num_here, point, normal, inverse, scratch + start // GROUP * per_group + lane, LANES)
 
     zero = tl.zeros((ENVS,), tl.float32)
     tilt = (zero, zero, zero)
@@ -126,12 +115,13 @@ def footprint_kernel(
         excess = (zero, zero, zero)
         spread = (zero, zero, zero, zero, zero, zero)
         for start in range(0, num_contacts, GROUP):
-            point, force, torque, is_any = _contacts(planes, row, is_env, start, num_contacts, GROUP)
+            point, force, torque, normal, is_any = _contacts(planes, normals, row, is_env, start, num_contacts, GROUP)
             if is_any:
                 strength, way = _direction(force)
                 slope = _slope(way, tilt, inverse)
-                kept = scratch + start // GROUP * per_group + lane
-                captured, norm, mean, covariance = _moments(pos, num_here, box, point, slope, kept, LANES, IS_LONG, False)
+                captured, norm, top, mean, covariance = _moments(
+                    pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG
+                )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
                 excess = add3(excess, _unmet(captured, mean, force, torque))
@@ -145,43 +135,43 @@ def footprint_kernel(
 
     carried, unmet = (zero, zero, zero), (zero, zero, zero)
     for start in range(0, tl.maximum(num_contacts, 1), GROUP):
-        point, force, torque, is_any = _contacts(planes, row, is_env, start, num_contacts, GROUP)
-        if is_any:
-            _, way = _direction(force)
+        point, force, torque, normal, is_any = _contacts(planes, normals, row, is_env, start, num_contacts, GROUP)
+        if is_any | (start == 0):
+            strength, way = _direction(force)
             slope = _slope(way, tilt, inverse)
-            kept = scratch + start // GROUP * per_group
-            captured, norm, mean, _ = _moments(pos, num_here, box, point, slope, kept + lane, LANES, IS_LONG, True)
+            captured, norm, top, mean, covariance = _moments(
+                pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG
+            )
             unmet = add3(unmet, _unmet(captured, mean, force, torque))
             each = scale3(tl.where(norm == 0, 0.0, captured / norm), force)
             carried = add3(carried, _summed(scale3(norm, each)))
-            fx, fy, fz = _each(each[0]), _each(each[1]), _each(each[2])
-            tl.debug_barrier()
+            x, y, z = _each3(point)
+            nx, ny, nz = _each3(normal)
+            u, v, w = _each3(slope)
+            fx, fy, fz = _each3(each)
+            tops = _each(top)
             for taxel in range(0, num_here, TILE):
                 taxels = taxel + tl.arange(0, TILE)
                 is_taxel = is_env[:, None] & (taxels < num_here)[None, :]
-                parts = kept + taxels[None, :, None] * LANES + (tl.arange(0, ENVS) * GROUP)[:, None, None]
-                parts = _each(_load(parts + tl.arange(0, GROUP)[None, None, :], is_taxel[:, :, None]))
+                place, inward = _tile(pos + 6 * taxels, taxels < num_here), _tile(pos + 6 * taxels + 3, taxels < num_here)
+                pull = _load(weights[:, None] + taxels[None, :], is_taxel)
+                p0 = _pulled(
+                    place, inward, pull, (x[0], y[0], z[0]), (nx[0], ny[0], nz[0]), (u[0], v[0], w[0]), tops[0], inverse
+                )
+                p1 = _pulled(
+                    place, inward, pull, (x[1], y[1], z[1]), (nx[1], ny[1], nz[1]), (u[1], v[1], w[1]), tops[1], inverse
+                )
+                p2 = _pulled(
+                    place, inward, pull, (x[2], y[2], z[2]), (nx[2], ny[2], nz[2]), (u[2], v[2], w[2]), tops[2], inverse
+                )
+                p3 = _pulled(
+                    place, inward, pull, (x[3], y[3], z[3]), (nx[3], ny[3], nz[3]), (u[3], v[3], w[3]), tops[3], inverse
+                )
                 out = shared + first_taxel + env[:, None] * (3 * num_taxels) + taxels[None, :]
-                _accumulate(out, _weighted(parts, fx), is_taxel, start)
-                _accumulate(out + num_taxels, _weighted(parts, fy), is_taxel, start)
-                _accumulate(out + 2 * num_taxels, _weighted(parts, fz), is_taxel, start)
+                _accumulate(out, _weighted(p0, p1, p2, p3, fx), is_taxel, start)
+                _accumulate(out + num_taxels, _weighted(p0, p1, p2, p3, fy), is_taxel, start)
+                _accumulate(out + 2 * num_taxels, _weighted(p0, p1, p2, p3, fz), is_taxel, start)
             tl.debug_barrier()
-        elif start == 0:
-            normal = _three(normals, row, is_env, start, num_contacts, GROUP)
-            nothing = tl.sum(0.0 * (normal[0] + normal[1] + normal[2]), axis=1)  # or not a number
-            for taxel in range(0, num_here, TILE):
-                taxels = taxel + tl.arange(0, TILE)
-                is_taxel = is_env[:, None] & (taxels < num_here)[None, :]
-                nothing += tl.sum(0.0 * _load(weight[:, None] + taxels[None, :], is_taxel), axis=1)
-            carried, unmet = (nothing, nothing, nothing), (nothing, nothing, nothing)
-            for taxel in range(0, num_here, TILE):
-                taxels = taxel + tl.arange(0, TILE)
-                is_taxel = is_env[:, None] & (taxels < num_here)[None, :]
-                out = shared + first_taxel + env[:, None] * (3 * num_taxels) + taxels[None, :]
-                value = tl.broadcast_to(nothing[:, None], (ENVS, TILE))
-                tl.store(out, value, is_taxel)
-                tl.store(out + num_taxels, value, is_taxel)
-                tl.store(out + 2 * num_taxels, value, is_taxel)
     out = sums + 6 * env * num_bodies + body
     tl.store(out, carried[0], is_env)
     tl.store(out + num_bodies, carried[1], is_env)
@@ -192,24 +182,19 @@ def footprint_kernel(
 
 
 @triton.jit
-def _contacts(planes, row, is_env, start, num_contacts, GROUP: tl.constexpr):
-    """Return points, forces and torques of a group of contacts, (env, contact), and whether there is any."""
-    point = _three((planes[0], planes[1], planes[2]), row, is_env, start, num_contacts, GROUP)
-    force = _three((planes[3], planes[4], planes[5]), row, is_env, start, num_contacts, GROUP)
-    torque = _three((planes[6], planes[7], planes[8]), row, is_env, start, num_contacts, GROUP)
-    acts = (force[0] != 0) | (force[1] != 0) | (force[2] != 0) | (torque[0] != 0) | (torque[1] != 0) | (torque[2] != 0)
-    is_strange = (point[0] != point[0]) | (point[1] != point[1]) | (point[2] != point[2])
-    is_any = tl.max(tl.max((acts | is_strange).to(tl.int32), axis=1), axis=0) != 0
-    return point, force, torque, is_any
-
-
-@triton.jit
-def _three(planes, row, is_env, start, num_contacts, GROUP: tl.constexpr):
-    """Return vectors of a group of contacts, (env, contact)."""
+def _contacts(planes, normals, row, is_env, start, num_contacts, GROUP: tl.constexpr):
+    """Return points, forces, torques and normals of a group of contacts, (env, contact), and whether there is any."""
     contact = start + tl.arange(0, GROUP)
     at = row[:, None] * num_contacts + contact[None, :]
     is_contact = is_env[:, None] & (contact < num_contacts)[None, :]
-    return _load(planes[0] + at, is_contact), _load(planes[1] + at, is_contact), _load(planes[2] + at, is_contact)
+    px, py, pz = _load(planes[0] + at, is_contact), _load(planes[1] + at, is_contact), _load(planes[2] + at, is_contact)
+    fx, fy, fz = _load(planes[3] + at, is_contact), _load(planes[4] + at, is_contact), _load(planes[5] + at, is_contact)
+    tx, ty, tz = _load(planes[6] + at, is_contact), _load(planes[7] + at, is_contact), _load(planes[8] + at, is_contact)
+    acts = (fx != 0) | (fy != 0) | (fz != 0) | (tx != 0) | (ty != 0) | (tz != 0)
+    is_strange = (px != px) | (py != py) | (pz != pz)
+    is_any = tl.max(tl.max((acts | is_strange).to(tl.int32), axis=1), axis=0) != 0
+    normal = _load(normals[0] + at, is_contact), _load(normals[1] + at, is_contact), _load(normals[2] + at, is_contact)
+    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), normal, is_any
 
 
 @triton.jit
@@ -235,6 +220,12 @@ def _halves(pair):
 
 
 @triton.jit
+def _tile(at, is_there):
+    """Return the vectors of a tile of taxels, (1, taxel)."""
+    return _load(at, is_there)[None, :], _load(at + 1, is_there)[None, :], _load(at + 2, is_there)[None, :]
+
+
+@triton.jit
 def _direction(force):
     """Return the strength of forces, and their direction, which fades to zero with them."""
     strength = tl.sqrt(dot(force, force) + NO_FORCE * NO_FORCE)
@@ -257,57 +248,80 @@ def _arm(place, point):
 
 
 @triton.jit
-def _weigh(pos, weight, num_here, point, normal, inverse, kept, LANES: tl.constexpr):
-    """Write w of contacts and taxels, (env, contact) at each taxel; then γ."""
-    nearest = tl.zeros_like(point[0])
-    for taxel in tl.range(0, num_here, loop_unroll_factor=UNROLL):
-        place, inward = _taxel(pos, taxel)
-        arm = _arm(place, point)
-        near = 1.0 - inverse * inverse * dot(arm, arm)
-        near = tl.minimum(near, near * dot(inward, normal), propagate_nan=tl.PropagateNan.ALL)  # keeps the sign
-        near = tl.maximum(near, 0.0, propagate_nan=tl.PropagateNan.ALL)
-        nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
-        tl.store(kept + taxel * LANES, near * near * tl.load(weight + taxel)[:, None])
-    near = tl.minimum(nearest / WHOLLY, 1.0, propagate_nan=tl.PropagateNan.ALL)
-    tl.store(kept + num_here * LANES, near * near * (3.0 - 2.0 * near))
+def _pull(arm, facing, weight, slope, top, inverse):
+    """Return κ, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels; `facing` is −2 n · m, `weight` a logarithm."""
+    near = 1.0 - inverse * inverse * dot(arm, arm)
+    near = tl.minimum(near, near * facing, propagate_nan=tl.PropagateNan.ALL)  # keeps the sign
+    near = tl.maximum(near, 0.0, propagate_nan=tl.PropagateNan.ALL)
+    exponent = weight + slope[0] * arm[0] + slope[1] * arm[1] + slope[2] * arm[2] - top
+    exponent = tl.minimum(exponent, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # larger exponents are out of reach
+    return near, near * near * tl.exp2(exponent)
 
 
 @triton.jit
-def _moments(pos, num_here, box, point, slope, kept, LANES: tl.constexpr, IS_LONG: tl.constexpr, IS_LAST: tl.constexpr):
-    """Return γ, the shares' sum, and mean [m] and covariance [m²] of the arms: (env, contact).
+def _away(box, point, force, inverse):
+    """Return the way from contacts to the box of the taxels, (env, contact) [m], and whether one with a force is outside it."""
+    x = tl.clamp(point[0], tl.load(box), tl.load(box + 3)) - point[0]
+    y = tl.clamp(point[1], tl.load(box + 1), tl.load(box + 4)) - point[1]
+    z = tl.clamp(point[2], tl.load(box + 2), tl.load(box + 5)) - point[2]
+    acts = (force[0] != 0) | (force[1] != 0) | (force[2] != 0)
+    is_beside = acts & (inverse * inverse * (x * x + y * y + z * z) > BESIDE * BESIDE)
+    return (x, y, z), tl.max(tl.max(is_beside.to(tl.int32), axis=1), axis=0) != 0
 
-    The last time, w exp(β · g) is put in the place of w.
-    """
-    x = tl.clamp(point[0], tl.load(box), tl.load(box + 3))
-    y = tl.clamp(point[1], tl.load(box + 1), tl.load(box + 4))
-    z = tl.clamp(point[2], tl.load(box + 2), tl.load(box + 5))
-    nearest = (x, y, z)
-    away = _arm(nearest, point)
+
+@triton.jit
+def _moments(pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG: tl.constexpr):
+    """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
+    away, is_beside = _away(box, point, force, inverse)
+    if is_beside:
+        result = _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG, True)
+    else:
+        result = _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG, False)
+    return result
+
+
+@triton.jit
+def _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
+    """Return `_moments` with sums about the contacts, or about the points `away` from them."""
     zero = tl.zeros_like(point[0])
-    base = dot(slope, away)
+    top = zero
     if IS_LONG:
-        base -= _highest(pos, num_here, nearest, slope, base, kept, LANES)
-    total = zero
+        top += _highest(pos, num_here, point, normal, slope, inverse)
+    nearest, total = zero, zero
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for taxel in tl.range(0, num_here, loop_unroll_factor=UNROLL):
-        arm = _arm(_taxel(pos, taxel)[0], nearest)
-        exponent = base + slope[0] * arm[0] + slope[1] * arm[1] + slope[2] * arm[2]
-        exponent = tl.minimum(exponent, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # larger exponents are out of reach
-        part = tl.load(kept + taxel * LANES) * tl.exp2(exponent)
-        if IS_LAST:
-            tl.store(kept + taxel * LANES, part)
+        place, inward = _taxel(pos, taxel)
+        arm, facing = _arm(place, point), dot(inward, normal)
+        weight = tl.load(weights + taxel)[:, None]
+        near, part = _pull(arm, facing, weight, slope, top, inverse)
+        nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
+        if IS_BESIDE:
+            arm = _arm(arm, away)
         px, py, pz = part * arm[0], part * arm[1], part * arm[2]
         total += part
         x, y, z = x + px, y + py, z + pz
         xx, xy, xz = xx + px * arm[0], xy + px * arm[1], xz + px * arm[2]
         yy, yz, zz = yy + py * arm[1], yz + py * arm[2], zz + pz * arm[2]
+    near = tl.minimum(nearest / WHOLLY, 1.0, propagate_nan=tl.PropagateNan.ALL)
+    captured = near * near * (3.0 - 2.0 * near)
     norm = tl.where(total == 0, 0.0, 1.0 / total)
     x, y, z = norm * x, norm * y, norm * z
     spread = (
         norm * xx - x * x, norm * xy - x * y, norm * xz - x * z,
         norm * yy - y * y, norm * yz - y * z, norm * zz - z * z,
     )  # fmt: skip
-    return tl.load(kept + num_here * LANES), total, add3((x, y, z), away), spread
+    mean = (x + away[0], y + away[1], z + away[2]) if IS_BESIDE else (x, y, z)
+    return captured, total, top, mean, spread
+
+
+@triton.jit
+def _pulled(place, inward, weight, point, normal, slope, top, inverse):
+    """Return what one contact of each environment pulls at a tile of taxels with, (env, taxel)."""
+    arm = _arm(place, (point[0][:, None], point[1][:, None], point[2][:, None]))
+    facing = dot(inward, (normal[0][:, None], normal[1][:, None], normal[2][:, None]))
+    slope = (slope[0][:, None], slope[1][:, None], slope[2][:, None])
+    _near, part = _pull(arm, facing, weight, slope, top[:, None], inverse)
+    return part
 
 
 @triton.jit
@@ -320,19 +334,26 @@ def _each(a):
 
 
 @triton.jit
-def _weighted(parts, force):
-    """Return Σ_c part_c f_c, (env, taxel), of four parts (env, taxel) and four forces (env,)."""
-    x = parts[0] * force[0][:, None] + parts[1] * force[1][:, None]
-    return x + parts[2] * force[2][:, None] + parts[3] * force[3][:, None]
+def _each3(a):
+    """Return each plane's four contacts."""
+    return _each(a[0]), _each(a[1]), _each(a[2])
 
 
 @triton.jit
-def _highest(pos, num_here, nearest, slope, base, kept, LANES: tl.constexpr):
-    """Return the largest exponent of 2 among the taxels with a weight, (env, contact)."""
-    top = tl.full(nearest[0].shape, float("-inf"), tl.float32)
+def _weighted(p0, p1, p2, p3, force):
+    """Return Σ_c part_c f_c, (env, taxel), of four parts (env, taxel) and four forces (env,)."""
+    return p0 * force[0][:, None] + p1 * force[1][:, None] + p2 * force[2][:, None] + p3 * force[3][:, None]
+
+
+@triton.jit
+def _highest(pos, num_here, point, normal, slope, inverse):
+    """Return the largest exponent of 2 among the taxels in reach on the contact's side, (env, contact)."""
+    top = tl.full(point[0].shape, float("-inf"), tl.float32)
     for taxel in range(num_here):
-        exponent = base + dot(slope, _arm(_taxel(pos, taxel)[0], nearest))
-        top = tl.maximum(top, tl.where(tl.load(kept + taxel * LANES) > 0.0, exponent, float("-inf")))
+        place, inward = _taxel(pos, taxel)
+        arm, facing = _arm(place, point), dot(inward, normal)
+        is_reached = (inverse * inverse * dot(arm, arm) < 1.0) & (facing > 0.0)
+        top = tl.maximum(top, tl.where(is_reached, dot(slope, arm), float("-inf")))
     return tl.where(top == float("-inf"), 0.0, top)
 
 
