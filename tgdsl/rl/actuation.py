@@ -227,14 +227,6 @@ class Actuation:
     ):
         """Begin with all drives ideal, at their joints' present positions.
 
-        Args:
-            actuators: The actuators.
-            arrays: A simulation's live tensors (env, …): `qpos`, `qvel`, `ctrl`, `qfrc_applied`.
-            action: How actions are understood.
-            drive: What drives do that ideal ones do not.
-            draws: Where random numbers are from.
-            substeps: Physics steps per control step, for which noise is drawn at once on a CPU.
-
         Raises:
             SimulationError: If a drive's noise, kick or speed limit needs a largest torque that a joint does not have.
         """
@@ -271,12 +263,7 @@ class Actuation:
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     def draw(self, chosen: Bool[Tensor, " env"], count: Int[Tensor, " env"]) -> None:
-        """Draw the drives of some environments again.
-
-        Args:
-            chosen: The environments.
-            count: A count of each environment's own: other numbers at each count.
-        """
+        """Draw the drives of some environments again."""
         if self._random:
             num = self.target.shape[1]
             share = self._draws.side_by_side(dict.fromkeys(self._random, num), count, chosen).view(len(count), -1, num)
@@ -286,13 +273,7 @@ class Actuation:
             put(self._drawn, chosen[:, None], new.to(self._drawn.dtype).transpose(0, 1))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
-        """Have the drives of some environments begin again: see `place`.
-
-        Args:
-            chosen: The environments.
-            episode: How often each was reset.
-            at_controls: Whether targets are the present controls, as those of a hand that presses.
-        """
+        """Have the drives of some environments begin again: see `place`."""
         put(self._count, chosen, episode << 32)
         self.place(chosen, at_controls)
 
@@ -320,11 +301,7 @@ class Actuation:
         self._take(torch.where(action.isfinite(), command, self.target))
 
     def follow(self, control: Float[Tensor, "env actuator"]) -> None:
-        """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too.
-
-        Args:
-            control: Set-points of all actuators of the model [rad].
-        """
+        """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too."""
         self._arrays["ctrl"].copy_(control)
         self._take(control.index_select(1, self._index["actuator"]).to(self.target))
 

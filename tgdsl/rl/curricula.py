@@ -36,12 +36,7 @@ class Curricula:
         self.advance(0, None)
 
     def advance(self, iteration: int, score: float | None) -> None:
-        """Write the numbers at an iteration; a GPU is not waited for.
-
-        Args:
-            iteration: Number of iterations so far.
-            score: Mean score of the episodes that have ended last; None: none has ended yet.
-        """
+        """Write the numbers at an iteration; a GPU is not waited for."""
         for term in self._terms.values():
             self.values[term.of].fill_(term.value(iteration, score))
 

@@ -57,13 +57,6 @@ class Draws:
     ):
         """Begin.
 
-        Args:
-            seed: Another seed, other numbers.
-            num_envs: Number of environments.
-            device: Where the numbers are wanted.
-            first_env: Number of the first environment, counted over all processes.
-            is_compiled: Whether the hash, some fifty small operations, is compiled by torch.
-
         Raises:
             SimulationError: If the seed has more than 64 bits.
         """
@@ -94,13 +87,7 @@ class Draws:
     def side_by_side(
         self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None = None
     ) -> Float[Tensor, "env num"]:
-        """Return numbers between 0 and 1 for several purposes in turn, of the few operations that one of them takes.
-
-        Args:
-            sizes: How many each environment has, by what they are for, such as "friction".
-            counter: A count of each environment's own: other numbers at each count.
-            chosen: The environments whose numbers are wanted; those of the others mean nothing. Default: all.
-        """
+        """Return numbers between 0 and 1 for several purposes in turn, of the few operations that one of them takes."""
         streams = self._streams(sizes)
         if not self._is_on_host:
             return self._shares(*streams, counter)
@@ -132,15 +119,7 @@ class Draws:
     def uniform(
         self, what: str, counter: Int[Tensor, " env"], num: int, low: float = 0.0, high: float = 1.0
     ) -> Float[Tensor, "env num"]:
-        """Return numbers between two bounds, float32.
-
-        Args:
-            what: What they are for, such as "friction".
-            counter: A count of each environment's own: other numbers at each count.
-            num: How many each environment has.
-            low: Lower bound.
-            high: Upper bound.
-        """
+        """Return numbers between two bounds, float32."""
         return within(self.shares({what: num}, counter)[what], low, high)
 
     def normal(self, what: str, counter: Int[Tensor, " env"], num: int) -> Float[Tensor, "env num"]:

@@ -92,15 +92,6 @@ class Episodes:
     terms: tuple[str, ...]
 
     def __init__(self, sim: Simulation, task: Task, actuation: Actuation, events: Events, is_compiled: bool = False):
-        """Begin to count.
-
-        Args:
-            sim: The simulation.
-            task: The task.
-            actuation: The drives.
-            events: The events.
-            is_compiled: Whether what is done to tensors is compiled by torch.
-        """
         self._sim, self._task, self._actuation, self._events = sim, task, actuation, events
         self.number = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.qpos.device)
         self.steps = torch.zeros_like(self.number)

@@ -23,12 +23,7 @@ from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 
 
 def event_terms(random: RandomSpec, terms: Mapping[str, Term]) -> dict[str, EventTerm]:
-    """Return the events of a task's document by the names of their random numbers.
-
-    Args:
-        random: The document's `randomise`, the short form of events.
-        terms: The document's terms.
-    """
+    """Return the events of a task's document by the names of their random numbers."""
     events: dict[str, EventTerm] = {}
     if random.friction != ONE:
         events["friction"] = Friction(factor=random.friction)
@@ -68,13 +63,7 @@ class Events:
                 self.memory[f"{name}/{kind}"] = torch.zeros(setup.num_envs, dtype=torch.int64, device=setup.device)
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], is_placed: bool) -> None:
-        """Have events at a reset happen, end those that last, and draw when the others come first.
-
-        Args:
-            chosen: The environments.
-            episode: How often each was reset.
-            is_placed: Whether the scene was reset; before that, events happen that change what the scene is made of.
-        """
+        """Have events at a reset happen, end those that last, and draw when the others come first."""
         for name, term in self._terms.items():
             if term.mode == "reset":
                 if term.changes_model != is_placed:

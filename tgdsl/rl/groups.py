@@ -25,13 +25,6 @@ class MeasuredVelocity:
     """
 
     def __init__(self, joint_pos: Float[Tensor, "env joint"], control_step: float, time_constant: float = 0.02):
-        """Begin at rest.
-
-        Args:
-            joint_pos: Positions now [rad].
-            control_step: Time from one reading to the next [s].
-            time_constant: The filter's time constant [s].
-        """
         self._before, self.value = joint_pos.clone(), torch.zeros_like(joint_pos)
         self._control_step = control_step
         self._share = -math.expm1(-control_step / time_constant)
@@ -52,12 +45,7 @@ class MeasuredVelocity:
 
 
 def proprio(now: Now | HandNow, joint_vel: Float[Tensor, "env joint"] | None = None) -> Float[Tensor, "env feature"]:
-    """Return positions [rad], velocities [rad/s] and last action of the joints that the policy moves.
-
-    Args:
-        now: The instant.
-        joint_vel: Velocities in place of the instant's [rad/s].
-    """
+    """Return positions [rad], velocities [rad/s] and last action of the joints that the policy moves."""
     return torch.cat([now.joint_pos, now.joint_vel if joint_vel is None else joint_vel, now.action], dim=1)
 
 

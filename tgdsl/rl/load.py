@@ -153,11 +153,7 @@ def _task_class(source: Source, folder: Path) -> type[Task[Any]]:
 def _class_of(
     source: Source, folder: Path, place: Place, name: str, base: type[C], known: Mapping[str, Any], which: str
 ) -> type[C]:
-    """Return the class that a document names: of `known`, or as `package.module:Class` or `file.py:Class`.
-
-    Raises:
-        SpecError: If there is none.
-    """
+    """Return the class that a document names: of `known`, or as `package.module:Class` or `file.py:Class`."""
     module, colon, class_ = name.partition(":")
     if name in known:
         return known[name]

@@ -120,14 +120,6 @@ def compile_sensed(
 ) -> Sensed:
     """Compile what a task's environments feel.
 
-    Args:
-        loaded: The task's document.
-        device: Where the module lives.
-        progress: Called with a line of text for each long job.
-        only: Kinds of sensors to use, instead of the policy's and the task's.
-        feels: What policies feel, in place of the document's `touch`, `placement` and `noise`.
-        also: Groups of observations that the module has besides, as a document has them: `{"q": [{"type": "joint_pos"}]}`.
-
     Raises:
         SpecError: If the sensors' document lacks a sensor or the object, at the place in the task's document; or all mistakes
             of the sensors' document.
@@ -175,9 +167,6 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
     """Return what of the sensors' document is set for policies that feel several things: each sensor is computed once.
 
     It is on all links that are asked for, of which a policy takes its own columns, and gives readings with and without noise.
-
-    Raises:
-        SpecError: If there are two profiles of noise beside `clean`.
     """
     result: dict[str, Any] = {"observations": {}}
     for sensor in dict.fromkeys(felts.values()):
@@ -205,11 +194,7 @@ def _layout(touch: TactileModule, sensor: str) -> Layout:
 
 
 def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, sensor: str) -> Source:
-    """Return where a group of observations comes from: of the sensor's taxels or links those of the placement.
-
-    Raises:
-        SpecError: If it feels on some of the links alone, and its numbers are not of taxels or links.
-    """
+    """Return where a group of observations comes from: of the sensor's taxels or links those of the placement."""
     observation, layout = _observation(felt), _layout(touch, sensor)
     links = [link.name for link in layout.links]
     names = layout.groups.get(felt.placement) or tuple(matching(felt.placement, links))
@@ -261,11 +246,7 @@ def num_variants(loaded: LoadedTask) -> int:
 
 
 def _variants(loaded: LoadedTask, document: Loaded) -> list[Any]:
-    """Return the variants of its object that a task takes, as the sensors' document has them.
-
-    Raises:
-        SpecError: If one is not there, or is named twice.
-    """
+    """Return the variants of its object that a task takes, as the sensors' document has them."""
     spec = loaded.spec
     assert spec.variants is not None
     all_variants = document.raw(("objects", spec.object, "variants")) or []
@@ -304,7 +285,6 @@ def sensors_document(loaded: LoadedTask) -> Loaded:
 
 
 def _sensor_overrides(loaded: LoadedTask) -> dict[str, Any]:
-    """Return what the task replaces in the sensors' document, by dotted path."""
     return {f"sensors.{name}.{key}": value for name, keys in loaded.spec.sensors.items() for key, value in keys.items()}
 
 
@@ -313,16 +293,7 @@ def _kinds(document: Loaded) -> dict[str, str]:
 
 
 def _sensors_of(loaded: LoadedTask, kinds: Mapping[str, str], wanted: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Return the document's only sensor of each kind that is wanted, by kind.
-
-    Args:
-        loaded: The task's document.
-        kinds: Kind of each sensor.
-        wanted: Kinds, by the key of the task's document that wants them.
-
-    Raises:
-        SpecError: All kinds of which there is none, or several.
-    """
+    """Return the document's only sensor of each kind that is wanted, by kind."""
     sensor, problems = {}, []
     for key, kind in dict.fromkeys((key, kind) for key, some in wanted.items() for kind in some):
         names = [name for name, other in kinds.items() if other == kind]

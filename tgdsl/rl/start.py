@@ -62,16 +62,6 @@ def make_simulation(
 ) -> Simulation:
     """Simulate the task's scene; environments with faults wait for a reset.
 
-    Args:
-        loaded: The task's document.
-        sensed: Its module.
-        joints: The joints that the policy moves.
-        num_envs: Number of environments.
-        device: As for `tgdsl.simulate`.
-        simulator: As for `simulator_for`.
-        threads: CPU threads; 0: one per CPU.
-        first_env: Number of the first environment among those of all processes.
-
     Raises:
         SimulationError: If the scene cannot be simulated as the document says, or of no whole number of environments.
     """

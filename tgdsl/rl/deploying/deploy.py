@@ -200,10 +200,6 @@ class Deployment:
 
         A scene's episodes end as the task says; others, and a log that is not over, after some time.
 
-        Args:
-            episodes: How many.
-            seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
-
         Raises:
             DeployError: If there is nothing to do.
             ObservationError: If the source cannot give what the policy feels; no hand was touched then.

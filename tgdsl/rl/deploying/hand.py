@@ -44,14 +44,6 @@ class Hand:
     """
 
     def __init__(self, prepared: Prepared, connection: Connection, scene: TaskScene | None, is_exact: bool):
-        """Begin with all targets at zero; call `begin`.
-
-        Args:
-            prepared: The policy.
-            connection: The source.
-            scene: The task's scene, if the source has one.
-            is_exact: Whether velocities that are observed are a simulation's, and not measured as a hand does.
-        """
         self._prepared, self._connection, self._scene = prepared, connection, scene
         model, spec = prepared.model, prepared.loaded.spec
         sizes = {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu, "qfrc_applied": model.nv}
@@ -73,12 +65,7 @@ class Hand:
         return self._actuation.target.clone()
 
     def begin(self, start: Float[np.ndarray, " actuator"] | None, moves: bool) -> None:
-        """Begin where the scene or the hand is.
-
-        Args:
-            start: Set-points to begin with without a scene [rad]; None: those that hold the joints where they are.
-            moves: Whether the hand goes there first.
-        """
+        """Begin where the scene or the hand is."""
         if self._scene is not None:
             control = self._scene.start
         elif start is None:

@@ -105,17 +105,6 @@ def prepare(
     What it feels, where, how densely and with what noise stand in its card; the document's `touch`, `placement`, `resolution`
     and `noise` count for a policy without one.
 
-    Args:
-        task: The task's document.
-        policy: The policy's file.
-        groups: Groups of observations that it takes, in its order; default: as its card says, or `proprio`, `tactile_sensors`
-            and `goal`, of those that there are.
-        goal: What it is asked for, in the task's units; default: the task's own.
-        overrides: Values of the document to set first by dotted path.
-        device: Where the module computes.
-        is_emulated: Whether an emulated hand has to feel what the fingertips would.
-        progress: Called with a line of text for each long job.
-
     Raises:
         SpecError: All mistakes of the documents, at their places.
         PolicyError: If the policy cannot be read, or was learned in another task, with other actions, joints or taxels.
@@ -161,11 +150,7 @@ def prepare(
 
 
 def _asked(loaded: LoadedTask, goal: Sequence[float]) -> tuple[LoadedTask, tuple[float, ...] | None]:
-    """Return the document in which a user's goal is asked for, and the goal.
-
-    Raises:
-        DeployError: If it cannot be asked for.
-    """
+    """Return the document in which a user's goal is asked for, and the goal."""
     units = loaded.task.goal_units
     if not goal:
         return loaded, None

@@ -70,12 +70,7 @@ class Grasps:
 
 
 def settings_of(spec: TaskSpec, joints: tuple[str, ...]) -> str:
-    """Return all that grasps follow from besides the scene, as JSON.
-
-    Args:
-        spec: The task's document.
-        joints: The joints that the policy moves.
-    """
+    """Return all that grasps follow from besides the scene, as JSON."""
     grasps = grasp_spec(spec)
     assert grasps is not None
     physics = {"options": spec.physics.options, "substeps": spec.physics.substeps}
@@ -100,11 +95,6 @@ def write_grasps(grasps: Grasps, file: Path) -> None:
 
 def read_grasps(file: Path, scene: str, object: str) -> Grasps:
     """Read grasps of an object in a scene from a file.
-
-    Args:
-        file: The file.
-        scene: Digest of the scene.
-        object: The document's name of the object.
 
     Raises:
         SimulationError: If it cannot be read, or holds something else.

@@ -21,13 +21,6 @@ from tgdsl.scene.digest import scene_digest
 def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None = None) -> Setup:
     """Return what a task is made for, with its grasps if its document has any; the simulation has to be reset afterwards.
 
-    Args:
-        setup: The same without grasps.
-        loaded: The task's document.
-        sim: The environments.
-        scene: Their scene.
-        progress: Called with a line of text for each long job.
-
     Raises:
         SpecError: If the document's file of grasps is none of this scene, hardly any grasp holds, or a variant has none.
     """
@@ -52,13 +45,6 @@ def kept_grasps(
     """Return the grasps of the user's cache; those that it does not have are sampled now, which takes a minute or more.
 
     They are kept under a hash of the scene and of all settings, so these are found again.
-
-    Args:
-        loaded: The task's document, whose file of grasps is not looked at.
-        scene: The scene.
-        joints: The joints that the policy moves.
-        found: Is told how many were sampled.
-        progress: Called with a line of text for each long job.
 
     Raises:
         SpecError: If there is no such keyframe, the object cannot be held as asked, or hardly any grasp holds.

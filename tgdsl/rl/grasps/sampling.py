@@ -59,11 +59,6 @@ Found = Callable[[int, int], None]
 def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -> Grasps:
     """Sample a task's grasps, on the CPU.
 
-    Args:
-        loaded: The task's document.
-        found: Is told how many were found.
-        progress: Called with a line of text for each long job.
-
     Raises:
         SpecError: If there is no such keyframe, the object cannot be turned or moved as asked, or hardly any trial holds.
     """

@@ -62,13 +62,6 @@ class GraspTable:
 
         Its objects have to be as those that the grasps were sampled with, and not yet of a mass and friction of their own.
 
-        Args:
-            grasps: The grasps.
-            sim: The environments, which watch the object's body.
-            body: This body.
-            variant: Which of its variants the object has in each.
-            draws: Random numbers.
-
         Raises:
             SimulationError: If the grasps are of other joints or actuators, or a variant that some environment has is lacking.
         """

@@ -85,11 +85,6 @@ class ScriptActor(Actor):
 def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
     """Return who acts.
 
-    Args:
-        env: The environment.
-        actions: One of `KINDS`, `script` being the task's own method `script(obs)`; or `FILE.py:FUNCTION`, a `ScriptFunction`.
-        seed: What random actions follow from.
-
     Raises:
         ScriptError: If there is no such script.
     """
@@ -117,11 +112,7 @@ def check_actions(actions: str) -> None:
 
 
 def _script_of(actions: str) -> tuple[ScriptFunction, str, str]:
-    """Return the function that `FILE.py:FUNCTION` names, the file and the function's name.
-
-    Raises:
-        ScriptError: If there is none.
-    """
+    """Return the function that `FILE.py:FUNCTION` names, the file and the function's name."""
     file, _, name = actions.rpartition(":")
     if not file.endswith(".py"):
         raise ScriptError(f'there are no actions "{actions}", expected {", ".join(KINDS)} or FILE.py:FUNCTION')

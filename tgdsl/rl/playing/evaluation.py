@@ -155,13 +155,7 @@ def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed
 
 
 def mean_interval(mean: float, squares: float, num: int) -> tuple[float, float]:
-    """Return the 95 % interval of a mean, Student's.
-
-    Args:
-        mean: The mean.
-        squares: Sum of the squares.
-        num: How many numbers there were; of one alone nothing is known.
-    """
+    """Return the 95 % interval of a mean, Student's."""
     if num < 2:
         return -math.inf, math.inf
     half = float(student_t.ppf(0.975, num - 1)) * math.sqrt(max(0.0, squares - num * mean**2) / (num - 1) / num)

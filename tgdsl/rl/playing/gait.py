@@ -127,12 +127,6 @@ class GaitMeter:
     """Adds up how policies move objects, each in a block of environments."""
 
     def __init__(self, env: TouchEnv, blocks: int = 1):
-        """Begin.
-
-        Args:
-            env: The environments.
-            blocks: How many blocks they are: as many environments each, one block after the other.
-        """
         setup, num, device = env.task.setup, env.num_envs, env.sim.qpos.device
         self._env, self._blocks, actuators = env, blocks, setup.actuators
         self._links, self._joints = setup.links, actuators.names
@@ -152,11 +146,7 @@ class GaitMeter:
         self._most = torch.zeros((num, 2), dtype=torch.float64, device=device)
 
     def add(self, counts: Bool[Tensor, " env"]) -> None:
-        """Add the instant after a step of the environments.
-
-        Args:
-            counts: Environments whose instant counts: not those whose episode has just ended.
-        """
+        """Add the instant after a step of the environments."""
         actuation = self._env.actuation
         strength = SATURATED * actuation.drawn["strength"] - actuation.spec.torque_noise
         self.add_instant(self._env.now, self._env.task.step_progress(), strength, counts)
@@ -168,14 +158,7 @@ class GaitMeter:
         strength: Float[Tensor, "env joint"],
         counts: Bool[Tensor, " env"],
     ) -> None:
-        """Add an instant.
-
-        Args:
-            now: The instant.
-            progress: What the step before it has brought; None: the task has no progress.
-            strength: Share of its largest torque from which on each joint is at its torque limit.
-            counts: Environments that count.
-        """
+        """Add an instant."""
         counts = counts.to(now.joint_pos.device)
         force, torque = vector_norm(now.link_force, dim=2).double(), now.torque.double().abs()
         is_untouched = ~((force > TOUCH) & self._fingers).any(dim=1)
@@ -250,12 +233,7 @@ class GaitMeter:
 
 
 def percentile(counts: Tensor, share: float = PERCENTILE) -> float | None:
-    """Return the middle of the bin below whose upper end a share of all values lies; None if there are none.
-
-    Args:
-        counts: Values in each bin, (bin,).
-        share: The share.
-    """
+    """Return the middle of the bin below whose upper end a share of all values lies; None if there are none."""
     total = int(counts.sum())
     if not total:
         return None

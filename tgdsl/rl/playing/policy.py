@@ -81,9 +81,6 @@ class PolicyFile:
 def read_policy(file: Path) -> PolicyFile:
     """Read a policy's file, once.
 
-    Args:
-        file: The file; or the folder of a run, whose `policy.pt` is read.
-
     Raises:
         PolicyError: If it cannot be read, or is no TorchScript.
     """
@@ -133,11 +130,6 @@ def actor_groups(
 ) -> tuple[str, ...]:
     """Return the groups of observations that a policy takes.
 
-    Args:
-        groups: Size of each group that there is.
-        named: The groups, in their order; default: those of the card, or of `ACTOR_GROUPS` that there are.
-        card: The policy's card, if it has one.
-
     Raises:
         PolicyError: If there is no such group.
     """
@@ -159,13 +151,6 @@ class Policy(Actor):
         self, saved: PolicyFile, groups: Mapping[str, int], num_envs: int, num_actions: int, device: torch.device | str = "cpu"
     ):
         """See that a policy fits.
-
-        Args:
-            saved: Its file.
-            groups: Size of each group of observations that it takes, in its order.
-            num_envs: Number of environments.
-            num_actions: Number of joints that it moves.
-            device: Where it computes.
 
         Raises:
             PolicyError: If it does not fit.
@@ -205,11 +190,6 @@ class Policy(Actor):
 def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> Policy:
     """Return a policy that acts in some environments.
 
-    Args:
-        env: The environments.
-        saved: The policy's file.
-        named: Groups of observations that it takes, in its order; default: see `actor_groups`.
-
     Raises:
         PolicyError: If it is for other environments, or feels something else than they do.
     """
@@ -228,13 +208,7 @@ def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> P
 
 
 def changes_since(card: Mapping[str, Any], spec: TaskSpec, leave_out: tuple[str, ...] = ()) -> list[str]:
-    """Return what of a task's document is otherwise than where a policy was learned, a line each.
-
-    Args:
-        card: The policy's card.
-        spec: The task's document.
-        leave_out: Names at the top that do not count; those of learning, and of touch where the policy has none, never do.
-    """
+    """Return what of a task's document is otherwise than where a policy was learned, a line each."""
     unfelt = () if GROUP in card["groups"] else OF_TOUCH
     return spec_differences(card["spec"], spec.model_dump(mode="json"), type(spec), (*OF_LEARNING, *unfelt, *leave_out))
 
@@ -258,7 +232,6 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
 
 
 def _without_folder(task: str) -> str:
-    """Return a task's name; of one in a file without the folder, which is relative to the document: `task.py:Class`."""
     file, colon, class_ = task.rpartition(":")
     return f"{Path(file).name}{colon}{class_}"
 
@@ -281,11 +254,6 @@ def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None
 
     Taxels may differ by rounding, as those of a robot that was exported do. Sensors that the environments lack, such as those
     that only the task reads, are not compared.
-
-    Args:
-        saved: The policy's file.
-        joints: The joints that the environments' actions move.
-        touch: The module that senses with their taxels.
 
     Raises:
         PolicyError: If joints are others, or taxels are, and it feels with them.

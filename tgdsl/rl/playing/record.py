@@ -46,12 +46,7 @@ class Record:
             self._columns.setdefault(name, []).append(rows)
 
     def write(self, path: Path, **words: str) -> None:
-        """Write the file; it appears whole or not at all.
-
-        Args:
-            path: The file.
-            words: Words to write with the columns, by name.
-        """
+        """Write the file; it appears whole or not at all."""
         columns = {name: self[name] for name in self._columns} | {"joints": np.array(self.joints)}
         with atomic_open(with_folder(path)) as file:
             np.savez_compressed(file, **columns, **{name: np.array(word) for name, word in words.items()})  # type: ignore[arg-type]

@@ -66,13 +66,7 @@ class Moment:
 
 
 def rollout(actor: Actor, env: Environments, num_steps: int | None = None) -> Iterator[Moment]:
-    """Let an actor act from where the environments are, and yield each control step.
-
-    Args:
-        actor: Who acts; in environments that have just been reset, call its `begin` first.
-        env: Where.
-        num_steps: Number of control steps; None: without an end.
-    """
+    """Let an actor act from where the environments are, and yield each control step."""
     for index in count() if num_steps is None else range(num_steps):
         obs = env.observe()
         action = actor(obs)

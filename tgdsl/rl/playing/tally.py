@@ -33,11 +33,7 @@ class Tally:
             self._sums[name] = self._sums.get(name, 0.0) + float(value[info.ended].double().sum())
 
     def lines(self, time: float) -> list[str]:
-        """Return the table.
-
-        Args:
-            time: Time since the start [s].
-        """
+        """Return the table."""
         faults = f", {self.num_faults} by a fault" if self.num_faults else ""
         first = f"t = {time:.2f} s, {self._env.num_envs} environments, {self.num_ended} episodes ended{faults}"
         count = self.num_ended

@@ -56,15 +56,6 @@ def video(
 ) -> Path:
     """Draw an environment in real time; return the file.
 
-    Args:
-        model: The environment's model.
-        poses: Where everything was at each control step, by MuJoCo's names: `qpos`, and `mocap_pos`, `mocap_quat`.
-        control_step: Duration of a control step [s].
-        path: The file to write, `.mp4`.
-        camera: A camera of the scene; default: its first one, or MuJoCo's free camera where it has none.
-        progress: Called with a line of text for each long job.
-        trace: What the taxels read at each control step: they are drawn, and a bar for each link.
-
     Raises:
         VideoError: If the scene has no such camera, OpenGL cannot be started, or imageio-ffmpeg is missing.
         FileError: If the file cannot be written.
@@ -107,11 +98,7 @@ def _told(frames: Iterable[Frame], count: int, progress: Progress) -> Iterator[F
 
 
 def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
-    """Return what draws.
-
-    Raises:
-        VideoError: If OpenGL cannot be started.
-    """
+    """Return what draws."""
     drawn = copy.copy(model)
     drawn.vis.global_.offwidth, drawn.vis.global_.offheight = WIDTH, HEIGHT
     try:
@@ -124,11 +111,7 @@ def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
 
 
 def _encoder() -> str:
-    """Return the path of ffmpeg's program.
-
-    Raises:
-        VideoError: If there is none.
-    """
+    """Return the path of ffmpeg's program."""
     try:
         import imageio_ffmpeg
 
@@ -138,11 +121,7 @@ def _encoder() -> str:
 
 
 def _encode(encoder: str, frames: Iterable[Frame], rate: float, file: Path, target: Path) -> None:
-    """Write frames as H.264.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
+    """Write frames as H.264."""
     input_options = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{rate:.9g}", "-i", "-"]
     output_options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file)]
     command = [encoder, "-y", "-v", "error", *input_options, *output_options]

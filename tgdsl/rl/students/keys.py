@@ -55,12 +55,6 @@ class StudentKey:
 def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequence[str], seeds: int) -> list[StudentKey]:
     """Return a student per type, placement, noise and seed; of those that feel nothing, one per seed.
 
-    Args:
-        types: Types by name; `all`: those that there are.
-        placements: Where they feel.
-        noises: Profiles of noise.
-        seeds: How many of each.
-
     Raises:
         StudentError: If there is no such type, something is named twice, two have one name, or nobody is taught.
     """
@@ -161,11 +155,6 @@ def _touch_encoder(own: StudentNetworksSpec, felt: Felt, layout: Layout, size: i
 
 def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
     """Return where the taxels of a group stand in images.
-
-    Args:
-        layout: The taxels.
-        size: Size of the group.
-        felt: What it is of, for errors.
 
     Raises:
         StudentError: If the taxels of a link are on no grid.

@@ -46,13 +46,6 @@ class Distiller(Learning):
     def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: BoundTeacher, keys: Sequence[StudentKey], seed: int):
         """Make the students; torch's own random generators are seeded.
 
-        Args:
-            env: The environments; they divide by the number of students.
-            loaded: Their task's document.
-            teacher: The teacher.
-            keys: The students.
-            seed: What is random in their actions follows from.
-
         Raises:
             SpecError: If a group of observations or a privileged number that is named is not there.
             StudentError: If images are wanted of taxels on no grid.
@@ -149,7 +142,6 @@ class Distiller(Learning):
         self._asked[own.envs].copy_(action.action.flatten(0, 1))
 
     def _answer(self) -> None:
-        """Have the students say what they would ask for now: an earlier rollout's a_0 bounds nothing any more."""
         with torch.no_grad():
             self._beside([partial(self._answer_by, rollout) for rollout in self.rollouts])
 
@@ -269,11 +261,7 @@ class Distiller(Learning):
         return [*buffers, self._labels, self._privileged, self._ended]
 
     def _checked_targets(self, loaded: LoadedTask) -> list[str]:
-        """Return the privileged numbers that decoders tell.
-
-        Raises:
-            SpecError: If the task has no such number.
-        """
+        """Return the privileged numbers that decoders tell."""
         named = list(self._spec.decoders)
         numbers = list(self.env.task.decoded(self.env.now)) if named else []
         for name in named:

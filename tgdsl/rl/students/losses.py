@@ -26,15 +26,7 @@ Told = Float[Tensor, "student row target"]
 def behaviour(
     action: Actions, label: Actions, before: Actions, std: Float[Tensor, " joint"] | None = None, clip: float | None = None
 ) -> Float[Tensor, " student"]:
-    """Return the error of actions.
-
-    Args:
-        action: a_s.
-        label: a_t.
-        before: a_0.
-        std: σ_t; None: 1.
-        clip: Bound of a_s − a_0; None: there is none.
-    """
+    """Return the error of actions."""
     error = (action - label).square()
     if clip is not None:
         bounded = before + (action - before).clamp(-clip, clip)

@@ -65,15 +65,7 @@ class Row(NamedTuple):
 def rows_of(
     keys: Sequence[StudentKey], found: Sequence[Evaluation], resolution: str, samples: int, minutes: float
 ) -> list[Row]:
-    """Return the rows of students.
-
-    Args:
-        keys: The students.
-        found: How good each is.
-        resolution: How densely those who feel do.
-        samples: Control steps of each.
-        minutes: How long all have learned together [min].
-    """
+    """Return the rows of students."""
     kinds: dict[tuple[str, str, str], list[Evaluation]] = {}
     for key, evaluation in zip(keys, found, strict=True):
         kinds.setdefault(key.kind, []).append(evaluation)
@@ -133,16 +125,6 @@ def write_students(
     progress: Progress,
 ) -> None:
     """Write each student as a policy file, with its card, for `tgdsl play --policy` and `tgdsl evaluate`.
-
-    Args:
-        distiller: Who has taught.
-        loaded: The task's document.
-        origin: What the run was made from.
-        seconds: How long it took [s].
-        command: How to make the run again.
-        found: How good each student is; empty: that is not known.
-        folder: Where to.
-        progress: Called with a line of text for each long job.
 
     Raises:
         FileError: If one cannot be written.

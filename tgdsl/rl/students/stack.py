@@ -47,16 +47,6 @@ class Stack:
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ):
-        """Make students; torch's own random generators are left as they are.
-
-        Args:
-            architecture: Their networks.
-            seeds: What the first weights of each follow from.
-            learning_rate: Adam's.
-            max_grad_norm: Norm to which the gradient of each is scaled down; None: it is not.
-            device: Where they are.
-            dtype: Their dtype.
-        """
         self.architecture, self.size = architecture, len(seeds)
         self._max_norm, self._rate = max_grad_norm, learning_rate
         if torch.device(device).type == "cuda":

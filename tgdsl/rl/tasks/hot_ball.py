@@ -174,11 +174,7 @@ class HotBall(Task[HotBallSpec]):
 
 
 def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:
-    """Return where each ball's position and quaternion stand in `qpos`, the hot one's first.
-
-    Raises:
-        LowerError: If another ball is no body that moves freely, or is named twice.
-    """
+    """Return where each ball's position and quaternion stand in `qpos`, the hot one's first."""
     rows = [object_qpos(setup)]
     for name in spec.others:
         try:
@@ -191,7 +187,6 @@ def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:
 
 
 def _cells(links: np.ndarray) -> Int[Tensor, "link cell"]:
-    """Return the rows of each link's cells; a link with fewer than others has its first one again."""
     rows = [np.flatnonzero(links == name) for name in dict.fromkeys(links.tolist())]
     most = max(len(links) for links in rows)
     return torch.from_numpy(np.array([np.concatenate([links, np.repeat(links[:1], most - len(links))]) for links in rows]))

@@ -42,12 +42,6 @@ def placed(
     """Return `qpos` with the object at its start, and its position [m] and quaternion there, in the world.
 
     Objects of other heights than the first variant, which the keyframe has, stand where that one stands.
-
-    Args:
-        setup: The setup of the environments.
-        spec: What is random.
-        chosen: The environments; rows of the others mean nothing.
-        episode: How often each environment was reset.
     """
     own, draws, dtype = object_qpos(setup), setup.draws, setup.dtype
     qpos = setup.qpos.repeat(setup.num_envs, 1)

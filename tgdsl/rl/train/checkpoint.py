@@ -34,12 +34,7 @@ class CheckpointError(TgdslError):
 
 
 def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
-    """Return all that a run goes on from; all processes are asked.
-
-    Args:
-        learner: The learner.
-        seconds: How long it has learned [s].
-    """
+    """Return all that a run goes on from; all processes are asked."""
     env = learner.env
     state = {
         "resets": env.resets.cpu().clone(),
@@ -61,11 +56,6 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
 
 def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False) -> None:
     """Write a checkpoint, to the disk.
-
-    Args:
-        state: What `state_of` returned.
-        file: The file; one that is there is replaced.
-        is_slim: Whether the optimisers' moments, two thirds of it, are rounded to bfloat16.
 
     Raises:
         FileError: If it cannot be written; then the file that was there is as it was.
@@ -113,11 +103,6 @@ def _no_checkpoint(file: Path, found: str) -> CheckpointError:
 def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
     """Have a learner go on from a checkpoint; what its physics was has gone.
 
-    Args:
-        learner: The learner, of the same groups and networks.
-        state: What the checkpoint holds.
-        file: Its file, for errors.
-
     Raises:
         CheckpointError: If it is of other groups or networks.
     """
@@ -149,12 +134,6 @@ def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping
     """Return the name of the first tensor of a state that holds something else than finite numbers; none: nothing.
 
     Of moments of observations with the groups that these are of.
-
-    Args:
-        state: The state, or a part of it.
-        networks: Groups of observations of each network.
-        sizes: Size of each group.
-        path: Where the part is.
     """
     if isinstance(state, Mapping):
         parts = (not_finite(part, networks, sizes, f"{path}.{name}".lstrip(".")) for name, part in state.items())
@@ -185,7 +164,6 @@ def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _counted(env: TouchEnv) -> tuple[str, ...]:
-    """Return by which counts of the module's clock its random numbers differ; none if no sensor draws any."""
     return ("step", "episode") if env.touch.memory.clock.num_envs else ()
 
 

@@ -240,13 +240,7 @@ def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[s
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec]) -> list[str]:
-    """Return what of two starts of a run differs, a line each: the task's numbers, its seed, its sensors.
-
-    Args:
-        before: What the last start was made from; what its version of tgdsl did not know has its default.
-        now: What this one is made from.
-        model: Model of the task's document.
-    """
+    """Return what of two starts of a run differs, a line each: the task's numbers, its seed, its sensors."""
     lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
     descriptions = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}

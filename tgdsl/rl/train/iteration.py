@@ -132,14 +132,6 @@ class Learning(Actor):
     groups: dict[str, list[str]]
 
     def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
-        """Begin.
-
-        Args:
-            env: The environments of this process.
-            ranks: The processes.
-            steps: Control steps of a rollout.
-            desynchronise: Whether first episodes end at random times.
-        """
         self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
         self._num_steps, self._desynchronise, self._is_begun = steps, desynchronise, False
         self._clock, self._tally = Clock(env.device), EpisodeTally()
@@ -150,11 +142,7 @@ class Learning(Actor):
         return self._tally.names
 
     def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it.
-
-        Args:
-            share: How much of the run is over, 0 to 1: some learn in smaller and smaller steps.
-        """
+        """Make a rollout, and learn from it."""
         self.set_rate(share)
         self.roll()
         self.learn()

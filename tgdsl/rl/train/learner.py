@@ -39,12 +39,6 @@ class Learner(Learning):
     def __init__(self, env: TouchEnv, loaded: LoadedTask, seed: int, ranks: Ranks | None = None):
         """Make the networks; torch's own random generators are seeded.
 
-        Args:
-            env: The environments of this process.
-            loaded: Their task's document.
-            seed: What the networks' first weights and the actions follow from.
-            ranks: The processes.
-
         Raises:
             SpecError: If a group of observations that is named is not there.
         """
@@ -86,11 +80,7 @@ class Learner(Learning):
             self.algorithm.rnd.update_counter = state["rnd_steps"]
 
     def change_rates(self, before: Mapping[str, Any]) -> None:
-        """Take over the document's learning rates, once a state was loaded; one that adapts only if the document had another.
-
-        Args:
-            before: The document's `train` with which the state was saved, as plain values.
-        """
+        """Take over the document's learning rates, once a state was loaded; one that adapts only if the document had another."""
         train_spec = self._train
         if not train_spec.adaptive or before.get("learning_rate", train_spec.learning_rate) != train_spec.learning_rate:
             self.algorithm.learning_rate = train_spec.learning_rate

@@ -21,25 +21,13 @@ class ProgressBar:
     """A progress bar of a run; where there is no terminal, a line now and then."""
 
     def __init__(self, iterations: int | None, done: int, unit: str):
-        """Begin.
-
-        Args:
-            iterations: Iterations of the whole run; None: time ends it.
-            done: How many were made before.
-            unit: Unit of the score.
-        """
         self._unit, self._total, self._said = unit, iterations, -SAID_EVERY
         form = "{desc} {n_fmt}/{total_fmt} |{bar}| {postfix}" if iterations else "{desc} {n_fmt} {postfix}"
         self._bar = tqdm(total=iterations, initial=done, desc="learning", disable=None, leave=False, bar_format=form)
         self._seen: dict[str, float] = {}
 
     def show(self, row: Mapping[str, float | int], left: float) -> None:
-        """Show an iteration.
-
-        Args:
-            row: What it was, as `curve.csv` has it.
-            left: Time left [s].
-        """
+        """Show an iteration."""
         self._seen |= {name: row[name] for name in ("Episode/return", "Episode/score") if name in row}
         parts = [f"{timedelta(seconds=round(left))} left"]
         if self._seen:

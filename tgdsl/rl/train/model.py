@@ -52,22 +52,6 @@ class EncodedModel(MLPModel):
         eps: float = 1e-2,
         clip: float = float("inf"),
     ):
-        """Make the networks.
-
-        Args:
-            obs: Observations by group, as an example.
-            obs_groups: Groups of each set.
-            obs_set: The set that this model sees.
-            output_dim: How many numbers it returns.
-            hidden_dims: Widths of the hidden layers that follow the embeddings.
-            activation: As rsl_rl names it.
-            obs_normalization: Whether observations are normalised.
-            distribution_cfg: Distribution of what it returns, with its `class_name`; None: it returns numbers.
-            encoders: For groups by name, or for all others as "*", `hidden` widths and `size` of the embedding; a group without
-                any is taken as it is.
-            eps: As `Normalisation` has it.
-            clip: As `Normalisation` has it.
-        """
         self._sizes = [obs[name].shape[-1] for name in obs_groups[obs_set]]
         encoder_specs = [(encoders or {}).get(name, (encoders or {}).get("*")) for name in obs_groups[obs_set]]
         self._latent = sum(

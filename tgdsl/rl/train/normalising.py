@@ -24,14 +24,6 @@ class Normalisation(EmpiricalNormalization):
     count: Tensor
 
     def __init__(self, shape: int | list[int], eps: float = 1e-2, until: int | None = None, clip: float = float("inf")):
-        """Begin with mean 0 and variance 1.
-
-        Args:
-            shape: Shape of a row.
-            eps: What is added to the standard deviation.
-            until: After so many rows nothing changes any more; None: it goes on.
-            clip: Bound of what is normalised.
-        """
         super().__init__(shape, eps, until)
         self.clip = float(clip)
         for name in ("_mean", "_var", "_std"):
@@ -71,14 +63,6 @@ class RewardNormalisation(EmpiricalDiscountedVariationNormalization):
     """rsl_rl's normalisation of intrinsic rewards: divided by the standard deviation of their discounted sums."""
 
     def __init__(self, num_envs: int, eps: float = 1e-2, gamma: float = 0.99, until: int | None = None):
-        """Begin.
-
-        Args:
-            num_envs: Number of environments.
-            eps: As rsl_rl has it; without effect.
-            gamma: Discount.
-            until: After so many rewards nothing changes any more; None: it goes on.
-        """
         super().__init__([], eps, gamma, until)
         self.emp_norm = Normalisation([], eps, until)
         self.gamma = gamma

@@ -31,15 +31,7 @@ def card_of(
     command: str,
     groups: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """Return what is to be known of a policy, as plain values.
-
-    Args:
-        learner: Who has learned.
-        run: What its run was made from.
-        seconds: How long it has learned [s].
-        command: How to learn it again.
-        groups: Groups of observations that it takes, with their sizes; default: those of the actor.
-    """
+    """Return what is to be known of a policy, as plain values."""
     algorithm = getattr(learner, "algorithm", None)
     std = dict(algorithm.actor.named_parameters()).get("distribution.std_param") if algorithm else None
     return {
@@ -66,12 +58,6 @@ def write_policy(learner: Learner, card: Mapping[str, Any], file: Path) -> None:
 
 def write_module(scripted: Callable[[], Any], touch: TactileModule, card: Mapping[str, Any], file: Path) -> None:
     """Write a policy, and its card beside it.
-
-    Args:
-        scripted: Returns the policy as TorchScript.
-        touch: The module whose taxels it feels with.
-        card: What is to be known of it.
-        file: The file.
 
     Raises:
         FileError: If it cannot be written.

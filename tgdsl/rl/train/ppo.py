@@ -55,16 +55,6 @@ class CapturedPPO(PPO):
     ):
         """Make the algorithm.
 
-        Args:
-            actor: The policy.
-            critic: Its value.
-            storage: Holds a rollout.
-            learning_rate: Learning rate, at the start where it is adaptive.
-            device: Where all tensors are.
-            rnd_cfg: Options of random network distillation; None: there is none.
-            precision: As `TrainSpec` has it; without effect on a CPU.
-            options: Those of rsl_rl's PPO.
-
         Raises:
             TgdslError: If something is asked for that cannot be captured.
         """
@@ -115,14 +105,7 @@ class CapturedPPO(PPO):
         return transition.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
-        """Keep what a control step has brought: see rsl_rl.
-
-        Args:
-            obs: Observations after the step, of the next episode where one has ended.
-            rewards: Rewards of the step.
-            dones: Where an episode has ended.
-            extras: `time_outs`, where an episode was cut off; `final_obs`, observations at the ends of episodes.
-        """
+        """Keep what a control step has brought: see rsl_rl."""
         transition = self.transition
         paid = rewards.clone()
         transition.dones = dones
@@ -326,11 +309,7 @@ class CapturedPPO(PPO):
 
 
 def _refuse(actor: MLPModel, critic: MLPModel, options: dict[str, Any]) -> None:
-    """Refuse what cannot be captured.
-
-    Raises:
-        TgdslError: If it is asked for.
-    """
+    """Refuse what cannot be captured."""
     unsupported = {
         name: options.get(name) for name in ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")
     }

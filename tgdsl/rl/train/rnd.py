@@ -22,14 +22,6 @@ class Distillation(RandomNetworkDistillation):
     """rsl_rl's `RandomNetworkDistillation`, whose rewards wait for no tensor's value."""
 
     def __init__(self, num_envs: int, eps: float = 1e-2, clip: float = float("inf"), **options: Any):
-        """Make the networks.
-
-        Args:
-            num_envs: Number of environments.
-            eps: Of the states' normalisation: see `Normalisation`.
-            clip: The same.
-            options: Those of rsl_rl.
-        """
         super().__init__(**options)
         if self.state_normalization:
             self.state_normalizer = Normalisation([self.num_states], eps, UNTIL, clip).to(self.device)

@@ -62,12 +62,6 @@ class Run:
     def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
         """Write the first checkpoint: a folder or disk that cannot take it is found now.
 
-        Args:
-            learner: The learner.
-            folder: Its folder, which `RunFolder.begin` has begun.
-            every: Time between checkpoints [s].
-            seconds: How long it has learned before [s].
-
         Raises:
             FileError: If no checkpoint can be written.
         """
@@ -114,11 +108,6 @@ class Run:
 
         Iterations are told how much of the run is over: of iterations, or if that is more, of time, what was learned before
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
-
-        Args:
-            iterations: Iterations of the whole run, those made before included.
-            seconds: Time from now on [s]; may be infinite. Of 0 no iteration is made.
-            shown: Is shown each iteration.
 
         Raises:
             DivergedError: If losses or state are no numbers any more; the last checkpoint is from before.
