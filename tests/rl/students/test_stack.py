@@ -8,8 +8,7 @@ from torch import nn
 
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.encoders import Encoder, Grid, Lstm, network
-from tgdsl.rl.students.stack import Stack, made
-from tgdsl.rl.students.student import Architecture, deployed, forgotten
+from tgdsl.rl.students.student import Architecture, Stack, deployed, forgotten, made
 from tgdsl.rl.train.checkpoint import FORMAT, KEYS, read_checkpoint, write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # what policies are written in

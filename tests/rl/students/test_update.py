@@ -14,11 +14,10 @@ from written_teachers import teacher
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.students import rollout
+from tgdsl.rl.students import learner
 from tgdsl.rl.students.keys import feels, student_keys
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.stack import Stack
-from tgdsl.rl.students.student import Student
+from tgdsl.rl.students.student import Stack, Student
 from tgdsl.rl.students.teacher import Teacher
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
@@ -157,7 +156,7 @@ def make(files, monkeypatch):
         own = Teacher(file, loaded)
         made.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, feels=feels(keys, own.felt)))
         bound = own.bound(made[-1])
-        monkeypatch.setattr(rollout, "Stack", partial(Stack, dtype=torch.float64))
+        monkeypatch.setattr(learner, "Stack", partial(Stack, dtype=torch.float64))
         torch.set_default_dtype(torch.float64)
         return Distiller(made[-1], loaded, bound, keys, 0)
 

@@ -244,8 +244,7 @@ class _Part:
         from tgdsl.rl.students.learner import Distiller
         from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import made_from
-        from tgdsl.rl.train.logging import ProgressBar
-        from tgdsl.rl.train.run import Run
+        from tgdsl.rl.train.run import ProgressBar, Run
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
         state = self._state

@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import warnings
-import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile, is_zipfile
 
 import numpy as np
 import torch
@@ -29,7 +30,9 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from tgdsl.errors import TaxelError, TgdslError, did_you_mean
+from tgdsl.files.write import atomic_write
 from tgdsl.layout.identity import Columns
+from tgdsl.module.module import TactileModule
 from tgdsl.module.taxels.identity import HasPlan, check_taxels, plan_tables
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.provenance import changes_around, is_close, spec_differences
@@ -94,18 +97,54 @@ def read_policy(file: Path) -> PolicyFile:
         _module(content, "cpu", extra)
         card = json.loads(extra[CARD]) if extra[CARD] else None
     except (RuntimeError, ValueError) as error:
-        if _is_checkpoint(content):
+        archive = io.BytesIO(content)
+        files = {Path(name).name for name in ZipFile(archive).namelist()} if is_zipfile(archive) else set()
+        if "data.pkl" in files and "constants.pkl" not in files:  # `torch.save`, where TorchScript has a file of constants
             policy = f"the policy of a run is its {POLICY}, that of rsl_rl's runner what `export_policy_to_jit` writes"
             raise PolicyError(f"{file}: this is a checkpoint, from which learning goes on; {policy}") from error
         problem = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
         raise PolicyError(f"{file}: {problem}: {str(error).strip().splitlines()[0]}") from error
-    if card is not None:
-        _check_fields(card, file)
+    for path in FIELDS if card is not None else ():
+        part = card
+        for key in path.split("."):
+            if not isinstance(part, dict) or key not in part:
+                raise PolicyError(f"{file}: its {CARD} has no {path}: this is not what tgdsl train writes")
+            part = part[key]
     return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
 
 
+def write_policy(scripted: torch.nn.Module, touch: TactileModule, card: Mapping[str, Any], file: Path) -> None:
+    """Write a policy as TorchScript, in it its card and the taxels that it feels with, and the card beside it.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    content = io.BytesIO()
+    text = json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
+        torch.jit.save(scripted, content, _extra_files={CARD: text, TAXELS: taxel_csv(touch)})
+    atomic_write(file, content.getvalue())
+    atomic_write(file.with_suffix(".json"), text.encode())
+
+
+def taxel_csv(touch: TactileModule) -> str:
+    """Return the taxels of all sensors as a table: sensor, and the columns of `touch.taxels`, vectors by their components."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for i, (sensor, table) in enumerate(touch.taxels.items()):
+        columns = {name: np.asarray(table[name]) for name in table.dtype.names or ()}
+        if i == 0:
+            parts = [name if a.ndim == 1 else [f"{name}_{k}" for k in range(a.shape[1])] for name, a in columns.items()]
+            writer.writerow(["sensor", *np.hstack(parts)])
+        for row in table.tolist():
+            cells = [[repr(x) for x in value.tolist()] if isinstance(value, np.ndarray) else [str(value)] for value in row]
+            writer.writerow([sensor, *itertools.chain(*cells)])
+    return text.getvalue()
+
+
 def taxel_tables(text: str) -> dict[str, Columns]:
-    """Return the taxels of each sensor of a table as `tgdsl train` writes it, vectors joined of their components."""
+    """Return the taxels of each sensor of what `taxel_csv` returned."""
     rows, tables = list(csv.DictReader(io.StringIO(text))), dict[str, Columns]()
     for sensor in dict.fromkeys(row["sensor"] for row in rows):
         columns = {name: np.array([row[name] for row in rows if row["sensor"] == sensor]) for name in rows[0]}
@@ -115,14 +154,6 @@ def taxel_tables(text: str) -> dict[str, Columns]:
         table |= {name: columns[name].astype(np.float64) for name in ("radius", "area")}
         tables[sensor] = table | {name: columns[name].astype(np.int64) for name in ("row", "column")}
     return tables
-
-
-def _is_checkpoint(content: bytes) -> bool:
-    """Return whether a file is what `torch.save` writes: TorchScript has its constants in a file of their own."""
-    if not zipfile.is_zipfile(io.BytesIO(content)):
-        return False
-    names = {Path(name).name for name in zipfile.ZipFile(io.BytesIO(content)).namelist()}
-    return "data.pkl" in names and "constants.pkl" not in names
 
 
 def actor_groups(
@@ -280,13 +311,3 @@ def _module(content: bytes, device: torch.device | str, extra_files: dict[str, A
         if weight.dtype == torch.float16:
             weight.data = weight.data.float()
     return module
-
-
-def _check_fields(card: Any, file: Path) -> None:
-    """Raise `PolicyError` if a card lacks what is asked of it."""
-    for path in FIELDS:
-        part = card
-        for key in path.split("."):
-            if not isinstance(part, dict) or key not in part:
-                raise PolicyError(f"{file}: its {CARD} has no {path}: this is not what tgdsl train writes")
-            part = part[key]

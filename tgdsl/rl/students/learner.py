@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from tgdsl.errors import did_you_mean
@@ -24,13 +24,67 @@ from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.rollout import Actor, Moment
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
-from tgdsl.rl.students.rollout import Rollout, joined
-from tgdsl.rl.students.student import Architecture, Student, forgotten
+from tgdsl.rl.students.spec import DistillSpec
+from tgdsl.rl.students.student import Architecture, Stack, Student, forgotten
 from tgdsl.rl.students.teacher import BoundTeacher
 from tgdsl.rl.train.graphs import Captured, SideBySide
 from tgdsl.rl.train.iteration import Learning
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
+
+
+class Rollout:
+    """Students of one stack, and where they are.
+
+    Attributes:
+        stack: The students.
+        keys: Who they are.
+        seen: Groups of observations of each.
+        first: Environment in which the first one's block begins; the others' follow.
+        rows: Environments of each.
+        memory: What they remember now, (student, row, memory).
+        begun: What they remembered when the rollout began.
+        x: What they saw in it, (step, student, row, feature).
+        before: What they asked for in it, (step, student, row, joint).
+    """
+
+    def __init__(
+        self,
+        networks: Architecture,
+        keys: Sequence[StudentKey],
+        seen: Sequence[Sequence[str]],
+        first: int,
+        rows: int,
+        spec: DistillSpec,
+        device: torch.device,
+    ):
+        self.keys, self.seen, self.first, self.rows = keys, seen, first, rows
+        self.stack = Stack(networks, [key.seed for key in keys], spec.learning_rate, spec.max_grad_norm, device)
+        shape = (len(keys), rows)
+        self.memory, self.begun = (torch.zeros((*shape, self.stack.memory), device=device) for _ in range(2))
+        self.x = torch.zeros((spec.steps, *shape, networks.num_features), device=device)
+        self.before = torch.zeros((spec.steps, *shape, networks.actions), device=device)
+
+    @property
+    def envs(self) -> slice:
+        """Their environments."""
+        return slice(self.first, self.first + self.rows * len(self.keys))
+
+    def split(self, values: Tensor, dim: int = 0) -> Tensor:
+        """Return what is of each environment, (…, env, …), as (…, student, row, …)."""
+        own = values.narrow(dim, self.first, self.rows * len(self.keys))
+        return own.unflatten(dim, (len(self.keys), self.rows))
+
+    def inputs(self, obs: Mapping[str, Tensor]) -> Tensor:
+        """Return what each student sees: of its own environments its own groups, (student, row, feature)."""
+        blocks = [slice(self.first + i * self.rows, self.first + (i + 1) * self.rows) for i in range(len(self.keys))]
+        each = zip(blocks, self.seen, strict=True)
+        return torch.stack([torch.cat([obs[name][block] for name in names], dim=1) for block, names in each])
+
+
+def joined(values: Shaped[Tensor, "step student row feature"]) -> Shaped[Tensor, "student rows feature"]:
+    """Return the rows of all steps side by side."""
+    return values.transpose(0, 1).flatten(1, 2)
 
 
 class Distiller(Learning):
@@ -52,7 +106,12 @@ class Distiller(Learning):
         """
         self._teacher, self._spec = teacher, loaded.spec.distill
         super().__init__(env, Ranks(), self._spec.steps)
-        self._targets = self._checked_targets(loaded)
+        self._targets = list(self._spec.decoders)
+        numbers = list(env.task.decoded(env.now)) if self._targets else []
+        for name in self._targets:
+            if name not in numbers:
+                problem = f'the task has no privileged number "{name}"'
+                raise loaded.error(("distill", "decoders", name), problem, did_you_mean(name, numbers, "numbers"))
         names = groups_of(loaded, env.groups)
         stacked: dict[Architecture, list[StudentKey]] = {}
         for key in keys:
@@ -142,15 +201,17 @@ class Distiller(Learning):
         self._asked[own.envs].copy_(action.action.flatten(0, 1))
 
     def _answer(self) -> None:
-        with torch.no_grad():
-            self._beside([partial(self._answer_by, rollout) for rollout in self.rollouts])
+        """Have the students say what they would ask for now: an earlier rollout's a_0 bounds nothing any more."""
 
-    def _answer_by(self, own: Rollout) -> None:
-        memory = own.begun
-        for x, target, ended in zip(own.x, own.before, self._ended, strict=True):
-            action = own.stack(x, memory)
-            target.copy_(action.action)
-            memory = forgotten(action.memory, own.split(ended))
+        def answer(own: Rollout) -> None:
+            memory = own.begun
+            for x, before, ended in zip(own.x, own.before, self._ended, strict=True):
+                output = own.stack(x, memory)
+                before.copy_(output.action)
+                memory = forgotten(output.memory, own.split(ended))
+
+        with torch.no_grad():
+            self._beside([partial(answer, rollout) for rollout in self.rollouts])
 
     def _epoch(self) -> None:
         each = self._losses.split([len(rollout.keys) for rollout in self.rollouts])
@@ -185,11 +246,11 @@ class Distiller(Learning):
         return detached, memory.detach()
 
     def _look(self) -> None:
-        self._beside([partial(self._look_by, rollout) for rollout in self.rollouts])
+        def look(own: Rollout) -> None:
+            for x in own.x:
+                own.stack.look(x)
 
-    def _look_by(self, own: Rollout) -> None:
-        for x in own.x:
-            own.stack.look(x)
+        self._beside([partial(look, rollout) for rollout in self.rollouts])
 
     # The rest
 
@@ -259,16 +320,6 @@ class Distiller(Learning):
     def _of_rollout(self) -> list[Tensor]:
         buffers = [value for each in self.rollouts for value in (each.x, each.before, each.begun)]
         return [*buffers, self._labels, self._privileged, self._ended]
-
-    def _checked_targets(self, loaded: LoadedTask) -> list[str]:
-        """Return the privileged numbers that decoders tell."""
-        named = list(self._spec.decoders)
-        numbers = list(self.env.task.decoded(self.env.now)) if named else []
-        for name in named:
-            if name not in numbers:
-                problem = f'the task has no privileged number "{name}"'
-                raise loaded.error(("distill", "decoders", name), problem, did_you_mean(name, numbers, "numbers"))
-        return named
 
 
 class ActingStudents(Actor):

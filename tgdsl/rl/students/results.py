@@ -22,12 +22,12 @@ from tgdsl.console.tables import text_table
 from tgdsl.files.write import atomic_write, with_folder
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.evaluation import Evaluation
+from tgdsl.rl.playing.policy import write_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 from tgdsl.rl.students.keys import StudentKey
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import deployed
 from tgdsl.rl.students.teacher import own_task
-from tgdsl.rl.train.policies import card_of, write_module
 
 
 class Row(NamedTuple):
@@ -141,7 +141,7 @@ def write_students(
         chosen = {"touch": task_spec.touch, "placement": task_spec.placement, "noise": task_spec.noise}
         run = dict(origin) | {"spec": task_spec.model_dump(mode="json"), "taxels": touch.taxels_id, "seed": key.seed}
         run["overrides"] = dict(origin["overrides"]) | chosen
-        card = card_of(distiller, run, seconds, command, sizes)
+        card = distiller.card(run, seconds, command, sizes)
         card["samples"] = distiller.samples // len(distiller.keys)
         card |= {"teacher": origin["teacher"], "score": found[i].plain() if found else None}
-        write_module(lambda i=i: deployed(distiller.student(i)), touch, card, folder / f"{key.name}.pt")
+        write_policy(deployed(distiller.student(i)), touch, card, folder / f"{key.name}.pt")

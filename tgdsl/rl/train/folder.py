@@ -27,14 +27,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, new_folder, with_folder
-from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.policy import taxel_csv
 from tgdsl.rl.playing.provenance import differences, provenance, spec_differences
 from tgdsl.rl.spec import TaskSpec
 
@@ -256,26 +255,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return result
-
-
-def taxel_csv(touch: TactileModule) -> str:
-    """Return the taxels of all sensors as a table: sensor, and the columns of `touch.taxels`, vectors by their components."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    is_begun = False
-    for sensor, table in touch.taxels.items():
-        names = table.dtype.names or ()
-        if not is_begun:
-            writer.writerow(["sensor", *(part for name in names for part in _columns(name, table[name]))])
-            is_begun = True
-        for row in table.tolist():
-            writer.writerow([sensor, *(part for value in row for part in _cells(value))])
-    return text.getvalue()
-
-
-def _columns(name: str, values: Any) -> list[str]:
-    return [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
-
-
-def _cells(value: Any) -> list[str]:
-    return [repr(part) for part in value.tolist()] if isinstance(value, np.ndarray) else [str(value)]

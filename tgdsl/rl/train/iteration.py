@@ -1,4 +1,4 @@
-"""What an iteration is, whoever learns: its episodes, added up on the device and read once, and how long it took.
+"""An iteration of whoever learns: its episodes, added up on the device and read once, and how long it took.
 
 Shapes: `env` environments.
 """
@@ -20,16 +20,14 @@ from tgdsl.rl.env import Step, TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
 from tgdsl.rl.train.ranks import Ranks, summed
 
-OWN = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
+EPISODE_NAMES = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
 """Of an episode that has ended, besides each term: return, steps, score, whether it ended for good, and by a fault."""
+ORIGIN_KEYS = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "sensors", "scene", "versions", "spec")
+"""What a policy's card says of what its run was made from."""
 
 
 class EpisodeTally:
-    """Sums over the episodes that have ended.
-
-    Attributes:
-        names: What is told of them, known from the first control step on.
-    """
+    """Sums over the episodes that have ended; `names` are known from the first control step on."""
 
     def __init__(self):
         self.names: list[str] = []
@@ -38,18 +36,11 @@ class EpisodeTally:
     def add(self, step: Step) -> None:
         """Add a control step; the host does not wait."""
         info = step.info
-        numbers = [
-            info.episode_return,
-            info.episode_steps,
-            info.score,
-            step.terminated,
-            info.faults,
-            *info.episode_terms.values(),
-        ]
-        values = torch.stack([info.ended.double(), *(each.double() for each in numbers)])
+        numbers = [info.episode_return, info.episode_steps, info.score, step.terminated, info.faults]
+        values = torch.stack([info.ended.double(), *(each.double() for each in (*numbers, *info.episode_terms.values()))])
         sums = torch.where(info.ended, values, 0.0).sum(dim=1)
         if self._sums is None:
-            self.names = [*OWN, *(f"Reward/{name}" for name in info.episode_terms)]
+            self.names = [*EPISODE_NAMES, *(f"Reward/{name}" for name in info.episode_terms)]
             self._sums = torch.zeros_like(sums)
         self._sums += sums
 
@@ -69,11 +60,11 @@ class EpisodeTally:
 
 @dataclass(frozen=True)
 class Iteration:
-    """What an iteration was, over all processes.
+    """An iteration, over all processes.
 
     Attributes:
         episodes: How many episodes ended.
-        told: Means over these episodes, and what else there is to tell, by the names that TensorBoard groups: `Episode/score`.
+        told: Means over these episodes, and the learner's numbers, by the names that TensorBoard groups: `Episode/score`.
         rollout: Duration of the rollout [s].
         update: Duration of the update [s].
     """
@@ -84,44 +75,12 @@ class Iteration:
     update: float
 
 
-class Clock:
-    """Measures rollout and update; on a GPU by events, which nobody waits for."""
-
-    def __init__(self, device: torch.device):
-        self._is_gpu, self._marks = device.type == "cuda", []
-
-    def start(self) -> None:
-        """Begin the rollout."""
-        self._marks = [self._mark()]
-
-    def split(self) -> None:
-        """End the rollout, begin the update."""
-        self._marks.append(self._mark())
-
-    def stop(self) -> tuple[float, float]:
-        """Return the durations of rollout and update [s]; the device must be done."""
-        begun, middle, end = *self._marks, self._mark()
-        if not self._is_gpu:
-            return middle - begun, end - middle
-        end.synchronize()
-        return 1e-3 * begun.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
-
-    def _mark(self) -> Any:
-        if not self._is_gpu:
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
-
-
 class Learning(Actor):
     """Environments and who learns in them, iteration by iteration: a rollout in which it acts, and an update.
 
     On a GPU the host waits once per iteration, but for captures at the first ones.
 
     Attributes:
-        env: The environments.
-        ranks: The processes.
         groups: Groups of observations of each network.
         iteration: Number of iterations so far.
         samples: How many control steps these took, over all processes and environments.
@@ -130,11 +89,14 @@ class Learning(Actor):
 
     rates: ClassVar[str]
     groups: dict[str, list[str]]
+    std: list[float] | None = None
+    """Standard deviation of its actions."""
 
     def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
+        """Take the environments of this process; `steps` control steps are a rollout."""
         self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
         self._num_steps, self._desynchronise, self._is_begun = steps, desynchronise, False
-        self._clock, self._tally = Clock(env.device), EpisodeTally()
+        self._tally = EpisodeTally()
 
     @property
     def episode_names(self) -> list[str]:
@@ -142,14 +104,21 @@ class Learning(Actor):
         return self._tally.names
 
     def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it."""
+        """Make a rollout, and learn from it; `share` is how much of the run is over, 0 to 1."""
         self.set_rate(share)
         self.roll()
+        begun, middle = self._roll_start, self._mark()
         self.learn()
         sums, numbers = self._tally.taken(), self._numbers()
         values = torch.cat([sums, torch.stack(list(numbers.values())).double().to(sums.device)]).tolist()  # here the host waits
-        durations, own = self._clock.stop(), dict(zip(numbers, values[len(sums) :], strict=True))
-        own = {name: value for name, value in own.items() if not (name.startswith("Score/") and math.isnan(value))}
+        end = self._mark()
+        if self.env.device.type == "cuda":
+            end.synchronize()
+            durations = 1e-3 * begun.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
+        else:
+            durations = middle - begun, end - middle
+        own = zip(numbers, values[len(sums) :], strict=True)
+        own = {name: value for name, value in own if not (name.startswith("Score/") and math.isnan(value))}
         return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | own, *durations)
 
     def set_rate(self, share: float) -> None:
@@ -158,14 +127,12 @@ class Learning(Actor):
     def roll(self) -> None:
         """Make a rollout."""
         if not self._is_begun:
-            at_random = torch.randint_like(self.env.steps, self.env.max_steps) if self._desynchronise else None
-            self.go_on(at_random)
+            self.go_on(torch.randint_like(self.env.steps, self.env.max_steps) if self._desynchronise else None)
         self._start_rollout()
-        self._clock.start()
+        self._roll_start = self._mark()
         for moment in rollout(self, self.env, self._num_steps):
             self._keep(moment)
             self._tally.add(moment.step)
-        self._clock.split()
 
     def learn(self) -> None:
         """Learn from the rollout."""
@@ -185,6 +152,29 @@ class Learning(Actor):
         self._is_begun = True
         self.begin(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
 
+    def card(
+        self, origin: Mapping[str, Any], seconds: float, command: str, groups: Mapping[str, int] | None = None
+    ) -> dict[str, Any]:
+        """Return the card of a policy, as plain values.
+
+        Args:
+            origin: What its run was made from: see `made_from`.
+            seconds: How long it has learned [s].
+            command: How to learn it again.
+            groups: Size of each group of observations that it takes, in its order; default: those of the actor.
+        """
+        return {
+            "groups": dict(groups or {name: self.env.groups[name] for name in self.groups["actor"]}),
+            "joints": list(self.env.joint_names),
+            "iterations": self.iteration,
+            "samples": self.samples,
+            "minutes": round(seconds / 60.0, 2),
+            "command": command,
+            "score": None,
+            **{name: origin[name] for name in ORIGIN_KEYS},
+            "std": self.std,
+        }
+
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """Return what is learned, and what learning goes on from."""
@@ -196,6 +186,14 @@ class Learning(Actor):
         Raises:
             RuntimeError: If networks are of other sizes; also ValueError and KeyError.
         """
+
+    def _mark(self) -> Any:
+        """Return the time; on a GPU as an event, which nobody waits for."""
+        if self.env.device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
 
     def _start_rollout(self) -> None:
         """Prepare for a rollout."""
@@ -210,4 +208,4 @@ class Learning(Actor):
 
     @abstractmethod
     def _numbers(self) -> dict[str, Tensor]:
-        """Return what else there is to tell of the iteration, on the device; a score of no episode is not a number."""
+        """Return the learner's numbers of the iteration, on the device; a score of no episode is not a number."""

@@ -23,9 +23,8 @@ from torch import Tensor, nn
 
 from tgdsl.errors import TgdslError
 from tgdsl.rl.train.graphs import Captured
-from tgdsl.rl.train.model import Gaussian
+from tgdsl.rl.train.model import Distillation, Gaussian
 from tgdsl.rl.train.ranks import num_processes, summed
-from tgdsl.rl.train.rnd import Distillation
 from tgdsl.tensors.torch_internals import copy_each
 
 LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
