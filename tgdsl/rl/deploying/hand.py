@@ -19,7 +19,7 @@ from tgdsl.rl.actuation import Actuation, DriveSpec
 from tgdsl.rl.deploying.prepared import JOINT_POS, JOINT_VEL, Prepared
 from tgdsl.rl.deploying.scene import TaskScene, first_step
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.episodes import Observations, Step
+from tgdsl.rl.env import Observations, Step
 from tgdsl.rl.playing.policy import PolicyError
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.task import HandNow

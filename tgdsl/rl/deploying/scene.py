@@ -13,8 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.episodes import Step, StepInfo
+from tgdsl.rl.env import Step, StepInfo, TouchEnv
 from tgdsl.runtime.stepped_scene import SteppedScene
 
 

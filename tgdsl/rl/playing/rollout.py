@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.episodes import Observations, Step
+from tgdsl.rl.env import Observations, Step, TouchEnv
 
 
 class Actor(ABC):
