@@ -26,10 +26,9 @@ from tgdsl.console.tables import listing, shapes
 from tgdsl.errors import LowerError, SimulationError, listed
 from tgdsl.rl import groups
 from tgdsl.rl.actuation import Actuation
-from tgdsl.rl.curricula import Curricula
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.events import Events, event_terms
-from tgdsl.rl.grasps.load import with_grasps
+from tgdsl.rl.events import Curricula, Events, event_terms
+from tgdsl.rl.grasps.sampling import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints

@@ -34,9 +34,9 @@ from tgdsl.errors import SimulationError
 from tgdsl.fields.models import SpecModel
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.grasps.table import GraspTable
+from tgdsl.rl.grasps.grasps import GraspTable
 from tgdsl.rl.spec import TaskSpec, Weight
-from tgdsl.runtime.simulators.model_ids import Joints
+from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.state_values import Contacts, StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
 from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
@@ -56,6 +56,13 @@ def checked(what: str, value: object, num_envs: int, ndim: int = 1) -> Tensor:
     raise SimulationError(f"{what} is {given}, expected a tensor ({num_envs},{' …' if ndim > 1 else ''})")
 
 
+def free_qpos(model: mujoco.MjModel, name: str) -> slice | None:
+    """Return where a free body's position and quaternion stand in `qpos`; None if it does not move freely."""
+    body = model.body(element_id(model, "body", name))
+    first = int(model.jnt_qposadr[int(body.jntadr[0])])
+    return slice(first, first + 7) if int(body.dofnum[0]) == 6 and int(body.jntnum[0]) == 1 else None
+
+
 @dataclass(frozen=True, eq=False)
 class Setup:
     """What a task is made for.
@@ -66,22 +73,23 @@ class Setup:
         dtype: Dtype of physics: float64 on a CPU, float32 on a GPU.
         control_step: Duration of a control step Δt [s].
         model: The compiled scene.
-        joints: Where each joint stands in `qpos` and `qvel`.
         actuators: The joints that the policy moves.
         low: Lower ends of these joints' ranges [rad].
         high: Upper ends [rad].
         max_torque: Largest torques of their drives [N·m]; infinite where there is no limit.
         object: Body of the task's object.
         links: Bodies of the rows of `Now.link_force`.
-        qpos: Where episodes start, before anything is random: the keyframe.
+        qpos: The keyframe.
+        start: Where episodes start: the keyframe, with each object where the first variant stands; a live tensor, in which the
+            event `Placement` moves objects before `reset`.
         half_height: How far each environment's object reaches below its body's origin when it stands upright [m].
-        first_half_height: That of its first variant, which stands where the keyframe has it [m].
         variant: Which of its variants each environment's object is, from 0.
         num_variants: How many there are; 1 if the object has none.
         friction: Coefficient of sliding friction of each object: a live tensor, redrawn before `reset`.
         mass: Mass of each object [kg], in the same way.
-        scene_friction: The same as the scene has it.
-        scene_mass: The same.
+        scene_start: `start` before anything is random.
+        scene_friction: The same of `friction`.
+        scene_mass: The same of `mass`.
         draws: Random numbers.
         rows: By kind of sensor that the task looks at: its reading's name in `Now.readings`, and a table of that one's rows.
         grasps: Grasps that episodes begin from; None if the task's document has none.
@@ -92,7 +100,6 @@ class Setup:
     dtype: torch.dtype
     control_step: float
     model: mujoco.MjModel
-    joints: Joints
     actuators: Actuators
     low: Float[Tensor, " joint"]
     high: Float[Tensor, " joint"]
@@ -100,17 +107,30 @@ class Setup:
     object: str
     links: tuple[str, ...]
     qpos: Float[Tensor, " nq"]
+    start: Float[Tensor, "env nq"]
     half_height: Float[Tensor, " env"]
-    first_half_height: float
     variant: Int[Tensor, " env"]
     num_variants: int
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
+    scene_start: Float[Tensor, "env nq"]
     scene_friction: Float[Tensor, " env"]
     scene_mass: Float[Tensor, " env"]
     draws: Draws
     rows: Mapping[str, tuple[str, TaxelTable]]
     grasps: GraspTable | None = None
+
+    def free_qpos(self, body: str | None = None) -> slice:
+        """Return where a free body's position and quaternion stand in `qpos`; default: the object's.
+
+        Raises:
+            SimulationError: If there is no such body, or it does not move freely.
+        """
+        name = body or self.object
+        free = free_qpos(self.model, name)
+        if free is None:
+            raise SimulationError(f'the object\'s body "{name}" has no free joint, by which it could be put elsewhere')
+        return free
 
 
 @dataclass(frozen=True, eq=False)

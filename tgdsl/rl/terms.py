@@ -32,8 +32,8 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Number, PositiveLength, Quantity, Range, RangeOf, SpecModel
-from tgdsl.rl import groups
-from tgdsl.rl.actuation import Actuation, Factor
+from tgdsl.rl import groups, rotations
+from tgdsl.rl.actuation import ZERO, Actuation, Factor
 from tgdsl.rl.draws import within
 from tgdsl.rl.spec import PushSpec, TaskSpec
 from tgdsl.rl.task import Now, Rate, Setup, Task, TaskReward
@@ -356,6 +356,28 @@ class Mass(EventTerm):
         event.sim.properties.set(event.chosen, mass={setup.object: setup.mass})
 
 
+class Placement(EventTerm):
+    """The object, which moves freely, starts upright where the keyframe has the first variant, moved and turned at random."""
+
+    changes_model = True
+    mode: Literal["reset"] = "reset"  # pyright: ignore[reportIncompatibleVariableOverride]
+    """When it happens."""
+    xy: Annotated[Range, RangeOf("length")] = ZERO
+    """What is added to the object's place along the world's x and y, each [m]."""
+    yaw: Annotated[Range, RangeOf("angle")] = ZERO
+    """By how much the object is turned about the vertical [rad]."""
+
+    def apply(self, event: Event) -> None:
+        setup, item = event.setup, event.setup.free_qpos()
+        shares = setup.draws.shares({event.stream: 2, "yaw": 1}, event.count, event.chosen)
+        xy, yaw = (within(shares[name], *ends).to(setup.dtype) for name, ends in ((event.stream, self.xy), ("yaw", self.yaw)))
+        up = torch.eye(3, dtype=setup.dtype, device=setup.device)[2].expand(setup.num_envs, 3)
+        pos, quat = setup.scene_start[:, item].split([3, 4], dim=1)
+        pos = torch.cat([pos[:, :2] + xy, pos[:, 2:]], dim=1)
+        quat = rotations.product(rotations.about(up, yaw[:, 0]), quat)
+        put_rows(setup.start[:, item], event.chosen, torch.cat([pos, quat], dim=1))
+
+
 class Drive(EventTerm):
     """The drives are drawn again within `randomise.drive`."""
 
@@ -436,6 +458,7 @@ TERMS: Mapping[str, type[Term]] = {
     "object_velocity": ObjectVelocity,
     "friction": Friction,
     "mass": Mass,
+    "placement": Placement,
     "drive": Drive,
     "push": Push,
     "linear": Linear,

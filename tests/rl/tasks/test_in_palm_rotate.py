@@ -11,7 +11,7 @@ from task_references import in_palm_rotate
 from tiny_tasks import tiny_env
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.links import are_fingers
+from tgdsl.rl.tasks.holding import are_fingers
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "in_palm_rotate.yaml"

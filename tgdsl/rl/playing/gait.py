@@ -37,8 +37,8 @@ from torch.linalg import vector_norm
 from tgdsl.console.tables import text_table
 from tgdsl.fields.units import Dimension
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.links import are_fingers
 from tgdsl.rl.task import Now
+from tgdsl.rl.tasks.holding import are_fingers
 
 TOUCH = 0.01
 """Force above which a link touches the object [N]."""

@@ -53,7 +53,6 @@ from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.draws import whole
 from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.task import HandNow, Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.placing import object_qpos
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -156,7 +155,7 @@ class GripForce(Task[GripForceSpec]):
         """
         super().__init__(spec, setup)
         self.qpos, self.ctrl = (_keyframes(spec, setup, name)[setup.variant] for name in ("qpos", "ctrl"))
-        self.item, actuators = object_qpos(setup), setup.actuators
+        self.item, actuators = setup.free_qpos(), setup.actuators
         self.moved = torch.from_numpy(actuators.actuator).to(setup.device, torch.int64)
         held = self.qpos[:, torch.from_numpy(actuators.qpos).to(setup.device, torch.int64)]
         self.held, self.lag = held, self.ctrl[:, self.moved] - held

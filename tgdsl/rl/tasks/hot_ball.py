@@ -39,7 +39,6 @@ from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf
 from tgdsl.rl import groups, terms
 from tgdsl.rl.spec import RandomSpec, TaskSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.placing import free_qpos, object_qpos
 
 
 class HotBallRandomSpec(RandomSpec):
@@ -175,10 +174,10 @@ class HotBall(Task[HotBallSpec]):
 
 def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:
     """Return where each ball's position and quaternion stand in `qpos`, the hot one's first."""
-    rows = [object_qpos(setup)]
+    rows = [setup.free_qpos()]
     for name in spec.others:
         try:
-            rows.append(free_qpos(setup.model, name))
+            rows.append(setup.free_qpos(name))
         except SimulationError as error:
             raise LowerError(str(error), "others") from error
     if len({row.start for row in rows}) < len(rows):

@@ -48,7 +48,6 @@ from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Time, Whole
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.placing import placed
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -153,6 +152,7 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def __init__(self, spec: InHandReposeSpec, setup: Setup):
         super().__init__(spec, setup)
+        self.item = setup.free_qpos()
         self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.step = torch.full((setup.num_envs,), spec.goal_step, dtype=setup.dtype, device=setup.device)
         self.most_steps = round(spec.goal_timeout / setup.control_step)
@@ -165,14 +165,14 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random, and give each a first goal."""
-        qpos, pos, quat = placed(self.setup, self.spec.randomise, chosen, episode)
+        pos, quat = self.setup.start[:, self.item].split([3, 4], dim=1)
         for buffer in (self.reached, self.held, self.waited, self.is_reached, self.is_late):
             buffer.masked_fill_(chosen, 0)
         self.begin(chosen, start_pos=pos, episode=episode)
         goal = self._goal_after(quat)
         left = rotations.between(goal, quat)
         self.begin(chosen, goal=goal, left=left, error=left, rate=0.0)
-        return Start({"qpos": qpos})
+        return Start({"qpos": self.setup.start})
 
     def advance(self, now: Now) -> None:
         """Measure how far the goal is, and give another one where it was reached."""

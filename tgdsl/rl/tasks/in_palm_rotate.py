@@ -39,7 +39,6 @@ from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.tasks.placing import placed
 
 QUARTER = 0.5 * math.pi
 
@@ -131,6 +130,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
         super().__init__(spec, setup)
+        self.item = setup.free_qpos()
         self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.holding = Holding(spec.hold, setup)
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
@@ -142,10 +142,10 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random."""
-        qpos, pos, quat = placed(self.setup, self.spec.randomise, chosen, episode)
+        pos, quat = self.setup.start[:, self.item].split([3, 4], dim=1)
         self.begin(chosen, start_pos=pos, start_quat=quat, quat=quat, angle=0.0, rate=0.0, tilt=0.0, reached=0.0)
         self.begin(chosen, is_reached=0.0, pay=1.0, share=1.0, forth=0.0, paid=0.0)
-        return Start({"qpos": qpos})
+        return Start({"qpos": self.setup.start})
 
     def advance(self, now: Now) -> None:
         """Add up what the object has turned, and give it another goal where it has reached one."""

@@ -42,7 +42,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Angle, PositiveLength, Quantity, with_defaults
 from tgdsl.rl import groups, rotations, terms
-from tgdsl.rl.grasps.spec import GraspSpec
+from tgdsl.rl.grasps.grasps import GraspSpec
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
