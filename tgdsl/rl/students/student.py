@@ -97,8 +97,9 @@ class Student(nn.Module):
     def embed(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the embeddings of all groups, side by side, and what is remembered."""
         architecture = self.architecture
+        mean: Any = self.mean
         scale: Any = self.var.sqrt() + architecture.eps  # pyright: ignore[reportCallIssue]
-        normal = ((x - self.mean) / scale).clamp(-architecture.clip, architecture.clip)
+        normal = ((x - mean) / scale).clamp(-architecture.clip, architecture.clip)
         parts = normal.split([size for size, _ in architecture.groups], dim=1)
         held = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
         embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, held, strict=True)]

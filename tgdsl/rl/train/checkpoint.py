@@ -162,7 +162,7 @@ def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
 
 def _clock(env: TouchEnv) -> dict[str, Tensor]:
     """Return the counts by which the module's random numbers differ; none if no sensor draws any."""
-    clock = env.touch.memory.clock
+    clock: Any = env.touch.memory.clock
     return {"step": clock.step, "episode": clock.episode} if clock.num_envs else {}
 
 
