@@ -55,11 +55,7 @@ class Draws:
         *,
         is_compiled: bool = False,
     ):
-        """Begin.
-
-        Raises:
-            SimulationError: If the seed has more than 64 bits.
-        """
+        """Begin; raise `SimulationError` if the seed has more than 64 bits."""
         self.seed, self._device = _checked(seed), torch.device(device)
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._is_on_host = self._device.type == "cpu" and not is_compiled

@@ -298,11 +298,7 @@ class Deployment:
                 yield from self._episode(episode, connection, policy, num_steps, None)
 
     def report(self) -> Report:
-        """Return what came of the steps that were made.
-
-        Raises:
-            DeployError: If none was made.
-        """
+        """Return what came of the steps that were made; raise `DeployError` if none was made."""
         steps, prepared = self._steps, self.prepared
         num = len(steps.inferences)
         if not num:

@@ -82,11 +82,7 @@ class PolicyFile:
 
 
 def read_policy(file: Path) -> PolicyFile:
-    """Read a policy's file, once.
-
-    Raises:
-        PolicyError: If it cannot be read, or is no TorchScript.
-    """
+    """Read a policy's file, once; raise `PolicyError` if it cannot be read, or is no TorchScript."""
     file = file / POLICY if file.is_dir() else file
     try:
         content = file.read_bytes()
@@ -159,11 +155,7 @@ def taxel_tables(text: str) -> dict[str, Columns]:
 def actor_groups(
     groups: Mapping[str, int], named: Sequence[str] = (), card: Mapping[str, Any] | None = None
 ) -> tuple[str, ...]:
-    """Return the groups of observations that a policy takes.
-
-    Raises:
-        PolicyError: If there is no such group.
-    """
+    """Return the groups of observations that a policy takes; raise `PolicyError` if there is no such group."""
     named = tuple(named) or tuple((card or {}).get("groups", ()))
     for name in named:
         if name not in groups:
@@ -181,11 +173,7 @@ class Policy(Actor):
     def __init__(
         self, saved: PolicyFile, groups: Mapping[str, int], num_envs: int, num_actions: int, device: torch.device | str = "cpu"
     ):
-        """See that a policy fits.
-
-        Raises:
-            PolicyError: If it does not fit.
-        """
+        """See that a policy fits; raise `PolicyError` if it does not fit."""
         self.groups = tuple(groups)
         self._module, card, file = saved.module(device), saved.card, saved.file
         total, taken = sum(groups.values()), _summands(groups)
@@ -206,12 +194,10 @@ class Policy(Actor):
         self.begin(torch.ones(num_envs, dtype=torch.bool))
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return the actions for observations."""
         with torch.no_grad():
             return self._module(torch.cat([obs[name] for name in self.groups], dim=1))
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget episodes that have ended; a recurrent policy of rsl_rl, which takes one environment alone, if all have."""
         if hasattr(self._module, "begin"):
             self._module.begin(ended)
         elif hasattr(self._module, "reset") and bool(ended.all()):
@@ -245,11 +231,7 @@ def changes_since(card: Mapping[str, Any], spec: TaskSpec, leave_out: tuple[str,
 
 
 def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str = "policy") -> None:
-    """See that a policy was learned in a task, with its actions and control steps.
-
-    Raises:
-        PolicyError: If not.
-    """
+    """See that a policy was learned in a task, with its actions and control steps; raise `PolicyError` if not."""
     theirs, ours = dict(card["spec"]), spec.model_dump(mode="json")
     with suppress(ValidationError):  # what is no action here differs
         theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields

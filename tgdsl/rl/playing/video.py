@@ -35,11 +35,7 @@ class VideoError(TgdslError):
 
 
 def check_camera(model: mujoco.MjModel, camera: str | None) -> None:
-    """See that a scene has a camera.
-
-    Raises:
-        VideoError: If it has not.
-    """
+    """See that a scene has a camera; raise `VideoError` if it has not."""
     names = [model.camera(i).name for i in range(model.ncam)]
     if camera is not None and camera not in names:
         raise VideoError(f'the scene has no camera "{camera}"; {did_you_mean(camera, names, "cameras")}')

@@ -31,12 +31,7 @@ class StudentError(TgdslError):
 
 @dataclass(frozen=True)
 class StudentKey:
-    """Who is taught.
-
-    Attributes:
-        felt: What it feels; None: nothing.
-        seed: What its first weights follow from.
-    """
+    """Who is taught: what it feels (None: nothing), and the seed of its first weights."""
 
     felt: Felt | None
     seed: int
@@ -154,11 +149,7 @@ def _touch_encoder(own: StudentNetworksSpec, felt: Felt, layout: Layout, size: i
 
 
 def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
-    """Return where the taxels of a group stand in images.
-
-    Raises:
-        StudentError: If the taxels of a link are on no grid.
-    """
+    """Return where the taxels of a group stand in images; raise `StudentError` if the taxels of a link are on no grid."""
     try:
         images = image_indices(layout)
     except TgdslError as error:

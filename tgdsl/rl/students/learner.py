@@ -34,14 +34,10 @@ from tgdsl.tensors.torch_internals import copy_each
 
 
 class Rollout:
-    """Students of one stack, and where they are.
+    """Students of one stack in the blocks of `rows` environments that begin with environment `first`.
 
     Attributes:
-        stack: The students.
-        keys: Who they are.
         seen: Groups of observations of each.
-        first: Environment in which the first one's block begins; the others' follow.
-        rows: Environments of each.
         memory: What they remember now, (student, row, memory).
         begun: What they remembered when the rollout began.
         x: What they saw in it, (step, student, row, feature).
@@ -154,17 +150,14 @@ class Distiller(Learning):
         return self._action
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget what is remembered of episodes that have ended."""
         for each in self.rollouts:
             each.memory.copy_(forgotten(each.memory, each.split(ended)))
         self._teacher.begin(ended)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what is learned, and what learning goes on from."""
         return {"stacks": [rollout.stack.state_dict() for rollout in self.rollouts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved: see `Learning`."""
         for rollout, saved in zip(self.rollouts, state["stacks"], strict=True):
             rollout.stack.load_state_dict(saved)
         for captured in (self._chosen, self._answered, self._learned, self._looked):
@@ -340,7 +333,6 @@ class ActingStudents(Actor):
         return torch.cat(actions)
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget episodes that have ended."""
         self._memory = [
             forgotten(memory, stack.split(ended)) for memory, stack in zip(self._memory, self._rollouts, strict=True)
         ]

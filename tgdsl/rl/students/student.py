@@ -84,7 +84,6 @@ class Student(nn.Module):
         self.decoders = nn.ModuleList([mlp(latent, hidden, 1) for hidden in architecture.heads])
 
     def forward(self, x: Tensor, memory: Tensor) -> Made:
-        """Return actions and what else is made of observations."""
         latent, memory = self.embed(x, memory)
         decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
         return Made(self.trunk(latent), decoded, memory)

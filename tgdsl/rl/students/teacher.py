@@ -17,14 +17,7 @@ WARM_CALLS = 3
 
 
 class Teacher:
-    """A learned policy, seen to be of this task.
-
-    Attributes:
-        saved: Its file.
-        card: Its card.
-        felt: What it feels; None: nothing.
-        changes: What else of the task was otherwise when it was learned, a line each.
-    """
+    """A learned policy, seen to be of this task: its file, its card, and what it feels; None: nothing."""
 
     def __init__(self, file: Path, loaded: LoadedTask):
         """Read it, and see that it is for this task and these actions.
@@ -51,11 +44,7 @@ class Teacher:
         self.changes = changes_since(card, loaded.spec, OF_TOUCH)
 
     def check_taxels(self) -> None:
-        """See that a teacher that feels does so with the taxels that there are now.
-
-        Raises:
-            PolicyError: If they are others.
-        """
+        """See that a teacher that feels does so with the taxels that there are now; raise `PolicyError` if they are others."""
         if self.felt is not None:
             touch = compile_sensed(own_task(self._loaded, self.felt), "cpu").touch
             check_card(self.saved, self.card["joints"], touch)
@@ -73,11 +62,7 @@ class BoundTeacher(Policy):
     """
 
     def __init__(self, teacher: Teacher, env: TouchEnv):
-        """See that it fits.
-
-        Raises:
-            PolicyError: If joints or groups of observations are others.
-        """
+        """See that it fits; raise `PolicyError` if joints or groups of observations are others."""
         card, file = teacher.card, teacher.saved.file
         if list(env.joint_names) != list(card["joints"]):
             moved = (", ".join(names) for names in (card["joints"], env.joint_names))

@@ -144,7 +144,6 @@ class GripForce(Task[GripForceSpec]):
 
     @classmethod
     def observe_hand(cls, spec: GripForceSpec, now: HandNow) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the command."""
         return {"goal": now.goal}
 
     def __init__(self, spec: GripForceSpec, setup: Setup):
@@ -195,7 +194,6 @@ class GripForce(Task[GripForceSpec]):
             self._command(is_due, now.mass, now.friction)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where the object was dropped or crushed."""
         return self.drop(now) | self.crush(now)
 
     def asked(self) -> Float[Tensor, "env goal"]:
@@ -212,7 +210,6 @@ class GripForce(Task[GripForceSpec]):
         }
 
     def score(self) -> Float[Tensor, " env"]:
-        """Return the root of the mean squared relative error of settled forces; 1 where none has been seen."""
         mean = self.squares / self.samples.clamp(min=1.0)
         return torch.where(self.samples > 0, mean.sqrt(), 1.0)
 

@@ -118,11 +118,7 @@ class HotBall(Task[HotBallSpec]):
     work = terms.Work.of_task(-5e-3)
 
     def __init__(self, spec: HotBallSpec, setup: Setup):
-        """Look up the balls, and the cells of each link.
-
-        Raises:
-            LowerError: If another ball is no body that moves freely.
-        """
+        """Look up the balls, and the cells of each link; raise `LowerError` if another ball is no body that moves freely."""
         super().__init__(spec, setup)
         self.places = _places(spec, setup).to(setup.device)
         self.heat, table = setup.rows["temperature_grid"]
@@ -155,7 +151,6 @@ class HotBall(Task[HotBallSpec]):
         self.held += self.setup.control_step * (self.is_latched & self.is_touched)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where the hot ball has left the bin."""
         return now.object.pos[:, 2] < self.spec.lost_height
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:

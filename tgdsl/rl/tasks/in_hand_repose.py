@@ -193,7 +193,6 @@ class InHandRepose(Task[InHandReposeSpec]):
             self.left.copy_(rotations.between(self.goal, quat))
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where the object was dropped or the goal was not reached in time."""
         return self.drop(now) | self.is_late
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
@@ -210,7 +209,6 @@ class InHandRepose(Task[InHandReposeSpec]):
         return self.rate * self.setup.control_step
 
     def score(self) -> Float[Tensor, " env"]:
-        """Return how many goals were reached."""
         return self.reached.to(self.setup.dtype)
 
     def _goal_after(self, quat: Float[Tensor, "env 4"]) -> Float[Tensor, "env 4"]:

@@ -141,7 +141,6 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.forth, self.paid = self.keep("forth"), self.keep("paid")  # Σ max(0, Δψ) and Σ c max(0, Δψ) since the goal before
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
-        """Put objects upright on the palm, moved and turned at random."""
         pos, quat = self.setup.start[:, self.item].split([3, 4], dim=1)
         self.begin(chosen, start_pos=pos, start_quat=quat, quat=quat, angle=0.0, rate=0.0, tilt=0.0, reached=0.0)
         self.begin(chosen, is_reached=0.0, pay=1.0, share=1.0, forth=0.0, paid=0.0)
@@ -172,7 +171,6 @@ class InPalmRotate(Task[InPalmRotateSpec]):
             total.masked_fill_(self.is_reached, 0.0)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where the object was dropped."""
         return self._distance(now) > self.spec.drop_distance
 
     def step_progress(self) -> Float[Tensor, " env"]:
@@ -194,7 +192,6 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         return {"object_size": 2.0 * self.setup.half_height, "goal_distance": self.observe(now)["goal"][:, -1]}
 
     def score(self) -> Float[Tensor, " env"]:
-        """Return how many quarter turns were reached."""
         return self.reached
 
     def _distance(self, now: Now) -> Float[Tensor, " env"]:

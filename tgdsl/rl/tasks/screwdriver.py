@@ -150,11 +150,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
     effort = terms.Effort.of_task(0.0)
 
     def __init__(self, spec: ScrewdriverSpec, setup: Setup):
-        """Begin with all screwdrivers upright, as the keyframe has them.
-
-        Raises:
-            SimulationError: If there are no grasps.
-        """
+        """Begin with all screwdrivers upright, as the keyframe has them; raise `SimulationError` if there are no grasps."""
         super().__init__(spec, setup)
         if setup.grasps is None:
             raise SimulationError("this task begins with grasps, and there are none")
@@ -168,7 +164,6 @@ class Screwdriver(Task[ScrewdriverSpec]):
 
     @classmethod
     def watch(cls, spec: ScrewdriverSpec) -> Watch:
-        """Return that it looks at the tip."""
         return Watch(sites=(spec.tip,))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
@@ -190,7 +185,6 @@ class Screwdriver(Task[ScrewdriverSpec]):
         self.quat.copy_(quat)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where the screwdriver has fallen over, or its tip is out of the screw."""
         return (self.tilt > self.spec.drop_tilt) | (self._tip_distance(now) > self.spec.engagement)
 
     def step_progress(self) -> Float[Tensor, " env"]:
@@ -198,7 +192,6 @@ class Screwdriver(Task[ScrewdriverSpec]):
         return self.rate * self.setup.control_step
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return what is privileged of the object."""
         return {
             "priv_obj_state": torch.cat([groups.object_state(now), now.distance], dim=1),
             "priv_obj_props": torch.stack([now.friction, now.mass], dim=1),

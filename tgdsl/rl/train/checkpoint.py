@@ -69,11 +69,7 @@ def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:
-    """Return what a checkpoint holds, on the CPU.
-
-    Raises:
-        CheckpointError: If it cannot be read, or is none.
-    """
+    """Return what a checkpoint holds, on the CPU; raise `CheckpointError` if it cannot be read, or is none."""
     if not file.is_file():
         raise CheckpointError(f"{file}: there is no checkpoint")
     found = "a file of something else"

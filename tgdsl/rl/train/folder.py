@@ -45,16 +45,7 @@ ASKED = frozenset({"spec", "seed", "envs", "module", "taxels"})
 
 
 class RunFolder:
-    """The files of a run.
-
-    Attributes:
-        path: The folder.
-        run: What the run was made from.
-        curve: What each iteration was.
-        checkpoint: What the run goes on from.
-        policy: What it has learned.
-        evaluation: How good that is.
-    """
+    """The files of a run, at its `path`."""
 
     def __init__(self, path: Path):
         self.path, self.run, self.curve = path, path / "run.json", path / "curve.csv"
@@ -94,7 +85,13 @@ class RunFolder:
         with new_folder(check_writable(self.run)):
             folder = os.open(self.path, os.O_RDONLY)
             try:
-                self._lock(folder)
+                try:
+                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    problem = "another process runs in this folder; wait until it has ended, or give another --out"
+                    raise TgdslError(f"{self.path}: {problem}") from error
+                except OSError:  # of a file system that has no locks
+                    pass
                 yield
             finally:
                 os.close(folder)
@@ -116,11 +113,7 @@ class RunFolder:
         atomic_write(self.path / "taxels.csv", taxel_csv(env.touch).encode())
 
     def last_start(self) -> dict[str, Any]:
-        """Return what the run was made from when it was started last.
-
-        Raises:
-            TgdslError: If that cannot be read.
-        """
+        """Return what the run was made from when it was started last; raise `TgdslError` if that cannot be read."""
         starts = self._read()["starts"]
         if not starts:
             raise TgdslError(f"{self.path}: there is no run to go on with: run.json is missing or empty")
@@ -181,15 +174,6 @@ class RunFolder:
     def _no_curve(self, line: int, found: list[str], expected: str) -> TgdslError:
         first, hint = ",".join(found[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
         return TgdslError(f"{self.curve}:{line}: found {len(found)} values, {first!r}, expected {expected}; {hint}")
-
-    def _lock(self, folder: int) -> None:
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            problem = "another process runs in this folder; wait until it has ended, or give another --out"
-            raise TgdslError(f"{self.path}: {problem}") from error
-        except OSError:  # of a file system that has no locks
-            return
 
     def _read(self) -> dict[str, Any]:
         try:

@@ -58,7 +58,6 @@ class Learner(Learning):
         torch.manual_seed(seed * self.ranks.size + self.ranks.rank)
 
     def __call__(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return actions, with exploration."""
         return self.algorithm.act(self._seen(obs))
 
     def iterate(self, share: float = 0.0) -> Iteration:
@@ -69,7 +68,6 @@ class Learner(Learning):
         return result
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what is learned, and what learning goes on from."""
         algorithm = self.algorithm
         steps = algorithm.rnd.update_counter if algorithm.rnd else 0
         return {"algorithm": algorithm.save(), "rnd_steps": steps, "score": self._score}

@@ -94,7 +94,6 @@ class Gaussian(GaussianDistribution):
     """rsl_rl's Gaussian distribution; to draw from it waits for nothing, where torch's own looks at the deviations' signs."""
 
     def sample(self) -> Tensor:
-        """Draw: the numbers that torch's own would give."""
         return torch.randn_like(self.mean) * self.std + self.mean
 
     def bound(self) -> None:

@@ -52,11 +52,7 @@ class CapturedPPO(PPO):
         precision: str = "tf32",
         **options: Any,
     ):
-        """Make the algorithm.
-
-        Raises:
-            TgdslError: If something is asked for that cannot be captured.
-        """
+        """Make the algorithm; raise `TgdslError` if something is asked for that cannot be captured."""
         _refuse(actor, critic, options)
         rows, parts = storage.num_envs * storage.num_transitions_per_env, options.get("num_mini_batches", 1)
         if rows < max(2, parts):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import signal
 import sys
@@ -63,13 +64,11 @@ class Board:
     def __init__(self, folder: Path, done: int):
         self._writer: Any = None
         self._file = folder / "events.out.tfevents"
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of its own packages
-                from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            return
-        self._writer = SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
+        with contextlib.suppress(ImportError), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of its own packages
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writer = SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
 
     @property
     def is_there(self) -> bool:
@@ -77,24 +76,15 @@ class Board:
         return self._writer is not None
 
     def add(self, told: Mapping[str, float], iteration: int) -> None:
-        """Add what an iteration was.
-
-        Raises:
-            FileError: If what was added before could not be written.
-        """
-        if self._writer is not None:
-            with as_file_error(self._file):
-                for name, value in told.items():
-                    self._writer.add_scalar(name, value, iteration)
+        """Add an iteration's numbers; raise `FileError` if those before could not be written."""
+        with as_file_error(self._file):
+            for name, value in told.items() if self._writer else ():
+                self._writer.add_scalar(name, value, iteration)
 
     def close(self) -> None:
-        """Write what has not been written.
-
-        Raises:
-            FileError: If it cannot be written.
-        """
-        if self._writer is not None:
-            with as_file_error(self._file):
+        """Write what has not been written; raise `FileError` if it cannot be."""
+        with as_file_error(self._file):
+            if self._writer:
                 self._writer.close()
 
 
@@ -107,14 +97,11 @@ Shown = Callable[[Mapping[str, float | int], float], None]
 
 
 class StopRequest:
-    """Notes the first SIGINT (Ctrl-C) or SIGTERM, so that work can end at a good place; the second acts as it did before.
+    """Notes the first SIGINT (Ctrl-C) or SIGTERM, so that work can end at a good place; the second acts as it did before."""
 
-    Attributes:
-        signal: The signal that came; None: none has.
-    """
+    signal: signal.Signals | None = None
 
     def __init__(self) -> None:
-        self.signal: signal.Signals | None = None
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -146,8 +133,7 @@ class Run:
             FileError: If no checkpoint can be written.
         """
         self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
-        self._rate, self._samples = 0.0, learner.samples
-        self._saved = learner.iteration
+        self._rate, self._samples, self._saved = 0.0, learner.samples, learner.iteration
         self.stopped_by: signal.Signals | None = None
         self._writes = learner.ranks.is_first
         if self._writes:
@@ -213,9 +199,8 @@ class Run:
         is_over = learner.iteration >= iterations or seconds <= 0.0
         while not is_over:
             start = time.monotonic()
-            iteration = learner.iterate(
-                max(learner.iteration / iterations, (seconds_before + start - begun) / (seconds_before + seconds))
-            )
+            time_share = (seconds_before + start - begun) / (seconds_before + seconds)
+            iteration = learner.iterate(max(learner.iteration / iterations, time_share))
             now = time.monotonic()
             self.seconds = seconds_before + now - begun
             self._refuse_diverged(iteration)
@@ -251,10 +236,9 @@ class Run:
             shown(row | made.told, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
 
     def _refuse_diverged(self, made: Iteration) -> None:
-        wrong: dict[str, Any] = {name: value for name, value in made.told.items() if name.startswith("Loss/")}
-        wrong = {name: value for name, value in wrong.items() if not math.isfinite(value)}
-        if wrong:
-            problem = ", ".join(f"{name} is {value}" for name, value in wrong.items())
+        losses = {name: value for name, value in made.told.items() if name.startswith("Loss/")}
+        problem = ", ".join(f"{name} is {value}" for name, value in losses.items() if not math.isfinite(value))
+        if problem:
             raise DivergedError(
                 f"iteration {self._learner.iteration}: {problem}; {self._folder.checkpoint} is from before: try a smaller "
                 f"{self._learner.rates}"
