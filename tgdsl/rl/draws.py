@@ -47,15 +47,9 @@ class Draws:
     """
 
     def __init__(
-        self,
-        seed: int,
-        num_envs: int,
-        device: torch.device | str = "cpu",
-        first_env: int = 0,
-        *,
-        is_compiled: bool = False,
+        self, seed: int, num_envs: int, device: torch.device | str = "cpu", first_env: int = 0, *, is_compiled: bool = False
     ):
-        """Begin; raise `SimulationError` if the seed has more than 64 bits."""
+        """Begin; raise `SimulationError` if the seed has more than 64 bits. `first_env` is counted over all processes."""
         self.seed, self._device = _checked(seed), torch.device(device)
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._is_on_host = self._device.type == "cpu" and not is_compiled
@@ -64,11 +58,7 @@ class Draws:
         self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
 
     def reseed(self, seed: int) -> None:
-        """Choose another seed, in place: graphs that were captured draw its numbers.
-
-        Raises:
-            SimulationError: If it has more than 64 bits.
-        """
+        """Choose another seed, in place: graphs that were captured draw its numbers."""
         self.seed = _checked(seed)
         self._ahead.clear()
         for sizes, streams in self._known.items():
@@ -140,14 +130,8 @@ class Draws:
         keys = torch.tensor([sensor_key(self.seed, purpose) for purpose in names], dtype=torch.int32, device=self._device)
         return mix(self._envs.to(torch.int32)[:, None, None] ^ keys)
 
-    def _share(
-        self,
-        begun: Int[Tensor, "env purpose half"],
-        purpose: Int[Tensor, " num"],
-        index: Int[Tensor, " num"],
-        counter: Int[Tensor, " env"],
-    ) -> Float[Tensor, "env num"]:
-        return uniform(self._hash(begun, purpose, index, counter), torch.float32)
+    def _share(self, *streams: Tensor) -> Float[Tensor, "env num"]:
+        return uniform(self._hash(*streams), torch.float32)
 
     def _hash(
         self,
@@ -157,9 +141,8 @@ class Draws:
         counter: Int[Tensor, " env"],
     ) -> Int[Tensor, "env num"]:
         if self._is_on_host:
-            return torch.from_numpy(
-                _hash_on_host(*(tensor.numpy() for tensor in (begun, purpose, index, counter))).view(np.int32)
-            )
+            words = _hash_on_host(*(tensor.numpy() for tensor in (begun, purpose, index, counter)))
+            return torch.from_numpy(words.view(np.int32))
         low, high = (half.to(torch.int32)[:, None, None] for half in (counter, counter >> 32))
         mixed = mix(torch.cat([begun ^ low, high.expand(-1, 1, 2)], dim=1))  # both at once
         first, second = mix(mixed[:, :-1] ^ mixed[:, -1:])[:, purpose].unbind(-1)

@@ -29,15 +29,14 @@ class MeasuredVelocity:
         self._control_step = control_step
         self._share = -math.expm1(-control_step / time_constant)
 
-    def update(self, joint_pos: Float[Tensor, "env joint"]) -> None:
-        """Take the positions of the next control step [rad]."""
-        self.value += self._share * ((joint_pos - self._before) / self._control_step - self.value)
-        self._before.copy_(joint_pos)
-
-    def begin(self, chosen: Bool[Tensor, " env"], joint_pos: Float[Tensor, "env joint"]) -> None:
-        """Begin again at rest in some environments."""
-        self.value.masked_fill_(chosen[:, None], 0.0)
-        self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
+    def update(self, joint_pos: Float[Tensor, "env joint"], begun: Bool[Tensor, " env"] | None = None) -> None:
+        """Take the positions of the next control step [rad], or begin again at rest in some environments."""
+        if begun is None:
+            self.value += self._share * ((joint_pos - self._before) / self._control_step - self.value)
+            self._before.copy_(joint_pos)
+        else:
+            self.value.masked_fill_(begun[:, None], 0.0)
+            self._before.copy_(torch.where(begun[:, None], joint_pos, self._before))
 
     def memory(self) -> dict[str, Tensor]:
         """Return the memory by name: live tensors."""

@@ -119,11 +119,13 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         """Close the environments."""
         self.touch_env.close()
 
-    def _given(self, tensor: Tensor) -> Any:
-        return tensor.cpu().numpy() if self._is_numpy else tensor
+    def _given(self, value: Tensor | Mapping[str, Tensor]) -> Any:
+        if isinstance(value, Mapping):
+            return {name: self._given(part) for name, part in value.items()}
+        return value.cpu().numpy() if self._is_numpy else value
 
     def _obs(self, obs: Mapping[str, Tensor]) -> dict[str, Any]:
-        return {group: self._given(obs[group]) for group in self._groups}
+        return self._given({group: obs[group] for group in self._groups})
 
     def _told_in_torch(self, info: StepInfo) -> dict[str, Any]:
         entries = {name: getattr(info, name) for name in TOLD}
@@ -135,7 +137,7 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
 
     def _told_in_numpy(self, info: StepInfo) -> dict[str, Any]:
         ended = info.ended.cpu().numpy()
-        entries = {name: _in_numpy(getattr(info, name)) for name in TOLD}
+        entries = {name: self._given(getattr(info, name)) for name in TOLD}
         present = {} if ended.all() else _masked(entries, ~ended)
         if not ended.any():
             return present
@@ -146,12 +148,6 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
             final_obs[row] = {group: values[i] for group, values in last.items()}
         final = {"final_obs": final_obs, "final_info": _masked(entries, ended)}
         return present | final | {f"_{name}": ended.copy() for name in final}
-
-
-def _in_numpy(value: Tensor | Mapping[str, Tensor]) -> Any:
-    if isinstance(value, Mapping):
-        return {name: part.cpu().numpy() for name, part in value.items()}
-    return value.cpu().numpy()
 
 
 def _masked(values: Mapping[str, Any], mask: Any) -> dict[str, Any]:

@@ -23,11 +23,7 @@ Column = Shaped[np.ndarray, "row ..."]
 
 
 class Record:
-    """Columns to which rows are added, and which are written with the names of the joints.
-
-    Attributes:
-        joints: The joints that the policy moves.
-    """
+    """Columns to which rows are added, and which are written with the names of the joints that the policy moves."""
 
     def __init__(self, joints: Sequence[str]):
         self.joints = tuple(joints)
@@ -113,12 +109,7 @@ def _numpy(tensor: Tensor) -> np.ndarray:
 
 
 class Tally:
-    """Means over environments: of the present episodes so far, and of those that have ended.
-
-    Attributes:
-        num_ended: How many episodes have ended.
-        num_faults: How many of them a fault has ended.
-    """
+    """A table of means over environments: of the present episodes so far, and of those that have ended."""
 
     def __init__(self, env: TouchEnv):
         self._env = env
@@ -132,7 +123,7 @@ class Tally:
         values |= {f"  {name}": total for name, total in info.episode_terms.items()}
         self.num_ended += int(info.ended.sum())
         self.num_faults += int(info.faults.sum())
-        self._now = {name: _mean(value) for name, value in values.items()}
+        self._now = {name: float(value.double().mean()) for name, value in values.items()}
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + float(value[info.ended].double().sum())
 
@@ -143,7 +134,3 @@ class Tally:
         count = self.num_ended
         rows = [(name, f"{now:.3g}", f"{self._sums[name] / count:.3g}" if count else "–") for name, now in self._now.items()]
         return [first, *text_table(("mean over environments", "so far", "ended"), rows).splitlines()]
-
-
-def _mean(values: Tensor) -> float:
-    return float(values.double().mean())

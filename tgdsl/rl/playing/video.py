@@ -60,7 +60,7 @@ def video(
     every = max(1, math.ceil(1.0 / (MAX_RATE * control_step) - 1e-9))
     steps, encoder = range(0, len(poses["qpos"]), every), _encoder()
     with closing(_renderer(model)) as renderer, atomic_path(path) as temporary:
-        frames = _told(_frames(model, poses, steps, renderer, camera, trace), len(steps), progress)
+        frames = _frames(model, poses, steps, renderer, camera, trace, progress)
         _encode(encoder, frames, 1.0 / (every * control_step), temporary, path)
     return path
 
@@ -72,10 +72,12 @@ def _frames(
     renderer: mujoco.Renderer,
     camera: str | None,
     trace: TouchTrace | None,
+    progress: Progress,
 ) -> Iterator[Frame]:
     data, bars = mujoco.MjData(model), None if trace is None else trace.bars()
     seen_from = camera if camera is not None else (0 if model.ncam else -1)
-    for i in steps:
+    for number, i in enumerate(steps):
+        progress(f"drawing the video: frame {number + 1} of {len(steps)}")
         for name, values in poses.items():
             getattr(data, name)[:] = values[i]
         mujoco.mj_forward(model, data)
@@ -85,12 +87,6 @@ def _frames(
         else:
             trace.draw(renderer.scene, model, data, i)
             yield bars.draw(renderer.render(), i)
-
-
-def _told(frames: Iterable[Frame], count: int, progress: Progress) -> Iterator[Frame]:
-    for i, frame in enumerate(frames):
-        progress(f"drawing the video: frame {i + 1} of {count}")
-        yield frame
 
 
 def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
