@@ -55,7 +55,8 @@ class Draws:
         self._is_on_host = self._device.type == "cpu" and not is_compiled
         self._known: dict[tuple[tuple[str, int], ...], _Streams] = {}
         self._ahead: dict[tuple[str, int], _Prefetched] = {}
-        self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
+        self._words = FusedCall(self._hash, is_compiled, has_fixed_shapes=False)
+        self._shares = FusedCall(self._share, is_compiled, has_fixed_shapes=False)
 
     def reseed(self, seed: int) -> None:
         """Choose another seed, in place: graphs that were captured draw its numbers."""

@@ -110,7 +110,7 @@ def test_distillation_is_turned_on_and_off_where_a_run_goes_on(tmp_path, before,
         assert all(torch.equal(one[name], two[name]) for name in one)
     rnd = other.algorithm.rnd
     assert rnd is None if now else rnd.update_counter == 0
-    found = other.iterate().told
+    found = other.iterate().metrics
     assert found["Loss/value"] > 0 and (found["Loss/rnd"] > 0) == (not now)
 
 

@@ -374,7 +374,7 @@ def deploy(
         source: As `tgdsl.connect` takes it.
         episodes: How many.
         seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
-        watch: Is told of each control step.
+        watch: Called with each control step.
         **options: As for `Deployment`.
 
     Raises:

@@ -92,7 +92,7 @@ def evaluate_each(
         blocks: How many blocks they are: as many environments each, one block after the other.
         episodes: How many episodes count of each block.
         seed: What all that is random in the environments follows from.
-        progress: Is told how many episodes have ended.
+        progress: Called with the number of episodes that have ended.
 
     Raises:
         TgdslError: If no episode is asked for.

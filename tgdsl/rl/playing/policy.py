@@ -168,6 +168,7 @@ class Policy(Actor):
 
     Attributes:
         groups: Groups of observations that it takes, in their order.
+        std: Standard deviation of its actions while it was learned; None if its card does not have it.
     """
 
     def __init__(
@@ -176,6 +177,8 @@ class Policy(Actor):
         """See that a policy fits; raise `PolicyError` if it does not fit."""
         self.groups = tuple(groups)
         self._module, card, file = saved.module(device), saved.card, saved.file
+        std = (card or {}).get("std")
+        self.std = torch.tensor(std, dtype=torch.float32, device=device) if std else None
         total, taken = sum(groups.values()), _summands(groups)
         first = next((weight.shape[1] for weight in self._module.parameters() if weight.ndim == 2), total)
         theirs = f"{first} numbers" if card is None else _summands(card["groups"])

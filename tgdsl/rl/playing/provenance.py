@@ -101,7 +101,7 @@ def spec_differences(
     before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec], leave_out: tuple[str, ...] = ()
 ) -> list[str]:
     """Return how two documents differ."""
-    with suppress(ValidationError):  # of a version with other names: what it had is told as it was
+    with suppress(ValidationError):  # of a version with other names: its values stand as they are
         before = model.model_validate(before).model_dump(mode="json")
     left, other = ({name: value for name, value in spec.items() if name not in leave_out} for spec in (before, now))
     return differences(left, other)

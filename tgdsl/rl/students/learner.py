@@ -21,12 +21,12 @@ from torch import Tensor
 from tgdsl.errors import did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.policy import Policy
 from tgdsl.rl.playing.rollout import Actor, Moment
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.students.student import Architecture, Stack, Student, forgotten
-from tgdsl.rl.students.teacher import BoundTeacher
 from tgdsl.rl.train.graphs import Captured, SideBySide
 from tgdsl.rl.train.iteration import Learning
 from tgdsl.rl.train.ranks import Ranks
@@ -93,7 +93,7 @@ class Distiller(Learning):
 
     rates = "distill.learning_rate"
 
-    def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: BoundTeacher, keys: Sequence[StudentKey], seed: int):
+    def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: Policy, keys: Sequence[StudentKey], seed: int):
         """Make the students; torch's own random generators are seeded.
 
         Raises:
@@ -233,7 +233,7 @@ class Distiller(Learning):
                 detached = detached + error.detach()
                 total = total + error
                 if self._targets:
-                    total = total + losses.decoded(outputs.told, targets, self._scales, self._weights) / len(parts)
+                    total = total + losses.decoded(outputs.decoded, targets, self._scales, self._weights) / len(parts)
                 memory = forgotten(outputs.memory, ended[..., 0]) if own.stack.memory else memory
             own.stack.descend(total)
         return detached, memory.detach()
@@ -241,7 +241,7 @@ class Distiller(Learning):
     def _look(self) -> None:
         def look(own: Rollout) -> None:
             for x in own.x:
-                own.stack.look(x)
+                own.stack.observe(x)
 
         self._beside([partial(look, rollout) for rollout in self.rollouts])
 

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 Actions = Float[Tensor, "student row joint"]
-Told = Float[Tensor, "student row target"]
+Numbers = Float[Tensor, "student row target"]
 
 
 def behaviour(
@@ -37,7 +37,7 @@ def behaviour(
 
 
 def decoded(
-    told: Told, targets: Told, scales: Float[Tensor, " target"], weights: Float[Tensor, " target"]
+    numbers: Numbers, targets: Numbers, scales: Float[Tensor, " target"], weights: Float[Tensor, " target"]
 ) -> Float[Tensor, " student"]:
     """Return the weighted error of what decoders tell; zeros if there are none."""
-    return ((told - scales * targets).square().mean(dim=1) * weights).sum(dim=1)
+    return ((numbers - scales * targets).square().mean(dim=1) * weights).sum(dim=1)

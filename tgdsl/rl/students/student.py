@@ -50,17 +50,17 @@ class Architecture:
         return sum(size for size, _ in self.groups)
 
 
-class Made(NamedTuple):
+class StudentOutput(NamedTuple):
     """What a student makes of observations.
 
     Attributes:
         action: Actions.
-        told: What the decoders tell.
+        decoded: What the decoders tell.
         memory: What it remembers.
     """
 
     action: Tensor
-    told: Tensor
+    decoded: Tensor
     memory: Tensor
 
 
@@ -83,10 +83,10 @@ class Student(nn.Module):
         self.trunk = mlp(latent, architecture.hidden, architecture.actions)
         self.decoders = nn.ModuleList([mlp(latent, hidden, 1) for hidden in architecture.heads])
 
-    def forward(self, x: Tensor, memory: Tensor) -> Made:
+    def forward(self, x: Tensor, memory: Tensor) -> StudentOutput:
         latent, memory = self.embed(x, memory)
         decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
-        return Made(self.trunk(latent), decoded, memory)
+        return StudentOutput(self.trunk(latent), decoded, memory)
 
     def act(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions and what is remembered, and nothing that is dropped at deployment."""
@@ -178,7 +178,7 @@ class Stack:
         self._max_norm, self._rate = max_grad_norm, learning_rate
         if torch.device(device).type == "cuda":
             self._rate = torch.tensor(learning_rate, dtype=torch.float32, device=device)  # which a CUDA graph reads
-        students = [made(architecture, seed).to(device, dtype) for seed in seeds]
+        students = [seeded_student(architecture, seed).to(device, dtype) for seed in seeds]
         self.memory = students[0].memory
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
         self.moments = {name: self.buffers[name].to(torch.float64, copy=True) for name in ("mean", "var")}
@@ -187,9 +187,9 @@ class Stack:
         self.optimiser = torch.optim.Adam(list(self.parameters.values()), **self._options())
         self._called: Any = vmap(self._call)
 
-    def __call__(self, x: Float[Tensor, "student row feature"], memory: Float[Tensor, "student row memory"]) -> Made:
+    def __call__(self, x: Float[Tensor, "student row feature"], memory: Float[Tensor, "student row memory"]) -> StudentOutput:
         """Return what each student makes of its own rows: (student, row, …)."""
-        return Made(*self._called(self.parameters, self.buffers, x, memory))
+        return StudentOutput(*self._called(self.parameters, self.buffers, x, memory))
 
     def descend(self, losses: Float[Tensor, " student"]) -> None:
         """Take one step of Adam, each student by its own loss."""
@@ -213,7 +213,7 @@ class Stack:
             self._rated()
 
     @torch.no_grad()
-    def look(self, x: Float[Tensor, "student row feature"]) -> None:
+    def observe(self, x: Float[Tensor, "student row feature"]) -> None:
         """Take rows into account in each student's mean and variance, in place."""
         num = x.shape[1]
         rate = num / (self.seen + num)
@@ -276,7 +276,7 @@ class Stack:
         return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))
 
 
-def made(architecture: Architecture, seed: int) -> Student:
+def seeded_student(architecture: Architecture, seed: int) -> Student:
     """Return a student whose first weights follow from a seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -49,38 +49,30 @@ class Teacher:
             touch = compile_sensed(own_task(self._loaded, self.felt), "cpu").touch
             check_card(self.saved, self.card["joints"], touch)
 
-    def bound(self, env: TouchEnv) -> BoundTeacher:
-        """Return it for some environments; raise `PolicyError` if joints or groups of observations are others."""
-        return BoundTeacher(self, env)
+    def bound(self, env: TouchEnv) -> Policy:
+        """Return the policy for some environments.
 
-
-class BoundTeacher(Policy):
-    """A teacher in some environments.
-
-    Attributes:
-        std: Standard deviation of its actions; None if it does not tell.
-    """
-
-    def __init__(self, teacher: Teacher, env: TouchEnv):
-        """See that it fits; raise `PolicyError` if joints or groups of observations are others."""
-        card, file = teacher.card, teacher.saved.file
+        Raises:
+            PolicyError: If joints or groups of observations are others.
+        """
+        card, file = self.card, self.saved.file
         if list(env.joint_names) != list(card["joints"]):
             moved = (", ".join(names) for names in (card["joints"], env.joint_names))
             raise PolicyError("{}: this teacher moves {}, not {}".format(file, *moved))
         groups = {}
         for name, size in card["groups"].items():
-            group = teacher.felt.group if name == GROUP and teacher.felt else name
+            group = self.felt.group if name == GROUP and self.felt else name
             if env.groups.get(group) != size:
                 there = f"has {env.groups[group]} numbers, not {size}: probes or objects are others"
                 problem = there if group in env.groups else "is not there"
                 raise PolicyError(f'{file}: this teacher sees the group "{name}", which {problem}')
             groups[group] = size
-        super().__init__(teacher.saved, groups, env.num_envs, env.num_actions, env.device)
-        self.std = torch.tensor(card["std"], dtype=torch.float32, device=env.device) if card.get("std") else None
+        policy = Policy(self.saved, groups, env.num_envs, env.num_actions, env.device)
         zeros = {name: torch.zeros((env.num_envs, size), device=env.device) for name, size in groups.items()}
         for _ in range(WARM_CALLS):
-            self(zeros)
-        self.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+            policy(zeros)
+        policy.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+        return policy
 
 
 def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:

@@ -64,13 +64,13 @@ class Iteration:
 
     Attributes:
         episodes: How many episodes ended.
-        told: Means over these episodes, and the learner's numbers, by the names that TensorBoard groups: `Episode/score`.
+        metrics: Means over these episodes, and the learner's numbers, by the names that TensorBoard groups: `Episode/score`.
         rollout: Duration of the rollout [s].
         update: Duration of the update [s].
     """
 
     episodes: int
-    told: dict[str, float]
+    metrics: dict[str, float]
     rollout: float
     update: float
 

@@ -64,7 +64,7 @@ class Learner(Learning):
         """Make a rollout, and learn from it; `share` changes nothing: the rate adapts to the policy, or stays."""
         self.env.curricula.advance(self.iteration, self._score)
         result = super().iterate(share)
-        self._score = result.told.get("Episode/score", self._score)
+        self._score = result.metrics.get("Episode/score", self._score)
         return result
 
     def state_dict(self) -> dict[str, Any]:

@@ -197,7 +197,7 @@ class Distillation(RandomNetworkDistillation):
         for parameter in self.target.parameters():
             parameter.requires_grad_(False)
 
-    def surprise(self, obs: TensorDict) -> Tensor:
+    def prediction_error(self, obs: TensorDict) -> Tensor:
         """Return the error of the prediction, normalised, (env,)."""
         with torch.no_grad():
             state = self.state_normalizer(self.get_rnd_state(obs))
@@ -215,4 +215,4 @@ class Distillation(RandomNetworkDistillation):
 
     def get_intrinsic_reward(self, obs: TensorDict) -> Tensor:
         """Return the rewards of a control step, (env,)."""
-        return self.surprise(obs) * self.next_weight()
+        return self.prediction_error(obs) * self.next_weight()

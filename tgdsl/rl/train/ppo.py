@@ -67,15 +67,14 @@ class CapturedPPO(PPO):
         self.losses = torch.zeros(len(LOSSES), dtype=kind, device=device)
         self._kl = self._flat[-1:]
         self._rows = rows // self.num_mini_batches
-        self._order = torch.zeros(rows // self.num_mini_batches * self.num_mini_batches, dtype=torch.int64, device=device)
+        self._order = torch.zeros(self._rows * self.num_mini_batches, dtype=torch.int64, device=device)
         self._obs = storage.observations[0].clone()
         is_cuda, tf32 = self._flat.is_cuda, precision != "float32"
         self._autocast = {"device_type": "cuda", "dtype": torch.bfloat16, "enabled": is_cuda and precision == "bfloat16"}
         self._chosen = Captured(self._choose, device, tf32)
         self._valued = Captured(self._final_value, device, tf32)
-        self._rnd_graph = Captured(
-            self._intrinsic_reward, device, tf32, is_captured=not self.is_multi_gpu
-        )  # all processes join in it
+        is_alone = not self.is_multi_gpu  # else all processes join in it
+        self._rnd_graph = Captured(self._intrinsic_reward, device, tf32, is_captured=is_alone)
         self._returned = Captured(self._returns, device, tf32)
         self._learned = Captured(self._epoch, device, tf32)
         self._parts = [Captured(lambda i=i: self._differentiate(i), device, tf32) for i in range(self.num_mini_batches)]
@@ -102,7 +101,7 @@ class CapturedPPO(PPO):
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Keep what a control step has brought: see rsl_rl."""
         transition = self.transition
-        paid = rewards.clone()
+        reward = rewards.clone()
         transition.dones = dones
         if self.rnd is not None or "final_obs" in extras:
             transition.observations = self._obs.clone()
@@ -110,12 +109,12 @@ class CapturedPPO(PPO):
             self._see(extras["final_obs"])
             self._value = self._valued()
         if "time_outs" in extras:
-            paid += self.gamma * self._value[:, 0] * extras["time_outs"]
+            reward += self.gamma * self._value[:, 0] * extras["time_outs"]
         if self.rnd is not None:
             self._see(obs)
             self.intrinsic_rewards = self._rnd_graph() * self.rnd.next_weight()
-            paid += self.intrinsic_rewards
-        transition.rewards = paid
+            reward += self.intrinsic_rewards
+        transition.rewards = reward
         self.storage.add_transition(transition)
         transition.clear()
 
@@ -163,16 +162,9 @@ class CapturedPPO(PPO):
         for group in self.optimizer.param_groups:
             self.rate.fill_(float(group["lr"]))
             group["lr"] = self.rate
-        for captured in (
-            self._chosen,
-            self._valued,
-            self._rnd_graph,
-            self._returned,
-            self._learned,
-            *self._parts,
-            self._applied,
-        ):
-            captured.forget()
+        graphs = (self._chosen, self._valued, self._rnd_graph, self._returned, self._learned, *self._parts, self._applied)
+        for graph in graphs:
+            graph.forget()
         return is_loaded
 
     def broadcast_parameters(self) -> None:
@@ -232,7 +224,7 @@ class CapturedPPO(PPO):
 
     def _intrinsic_reward(self) -> Tensor:
         assert isinstance(self.rnd, Distillation)
-        return self.rnd.surprise(self._obs)
+        return self.rnd.prediction_error(self._obs)
 
     def _returns(self) -> None:
         with torch.no_grad():

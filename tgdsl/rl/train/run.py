@@ -75,10 +75,10 @@ class Board:
         """Whether TensorBoard is installed."""
         return self._writer is not None
 
-    def add(self, told: Mapping[str, float], iteration: int) -> None:
+    def add(self, metrics: Mapping[str, float], iteration: int) -> None:
         """Add an iteration's numbers; raise `FileError` if those before could not be written."""
         with as_file_error(self._file):
-            for name, value in told.items() if self._writer else ():
+            for name, value in metrics.items() if self._writer else ():
                 self._writer.add_scalar(name, value, iteration)
 
     def close(self) -> None:
@@ -93,7 +93,7 @@ class DivergedError(TgdslError):
 
 
 Shown = Callable[[Mapping[str, float | int], float], None]
-"""Is told what an iteration was, as `curve.csv` has it, and how much time is left [s]."""
+"""Called with an iteration, as `curve.csv` has it, and the time that is left [s]."""
 
 
 class StopRequest:
@@ -172,7 +172,7 @@ class Run:
     def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
         """Learn. Ctrl-C and SIGTERM end it after the iteration under way, with a checkpoint.
 
-        Iterations are told how much of the run is over: of iterations, or if that is more, of time, what was learned before
+        Iterations get the share of the run that is over: of iterations, or if that is more, of time, what was learned before
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
 
         Raises:
@@ -229,14 +229,14 @@ class Run:
             "update": made.update,
             "episodes": made.episodes,
         }
-        self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **made.told})
+        self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **made.metrics})
         if self._board is not None:
-            self._board.add(made.told | perf, learner.iteration)
+            self._board.add(made.metrics | perf, learner.iteration)
         if shown is not None:
-            shown(row | made.told, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
+            shown(row | made.metrics, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
 
     def _refuse_diverged(self, made: Iteration) -> None:
-        losses = {name: value for name, value in made.told.items() if name.startswith("Loss/")}
+        losses = {name: value for name, value in made.metrics.items() if name.startswith("Loss/")}
         problem = ", ".join(f"{name} is {value}" for name, value in losses.items() if not math.isfinite(value))
         if problem:
             raise DivergedError(
