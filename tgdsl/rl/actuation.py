@@ -128,33 +128,20 @@ class DriveSpec(SpecModel):
 
 @dataclass(frozen=True, eq=False)
 class Actuators:
-    """The position actuators of some joints, and where both stand in a model.
-
-    Attributes:
-        names: The joints.
-        actuator: Index of each one's actuator.
-        qpos: Where each stands in `qpos`.
-        dof: Where each stands in `qvel`.
-        low: Lower end of each range [rad].
-        high: Upper end of each range [rad].
-        stiffness: k_p [N·m/rad].
-        damping: k_d of the actuator, not of the joint [N·m·s/rad].
-        limit: τ_max [N·m]; infinite where there is none.
-        top_speed: Speed at which joint damping takes all of τ_max [rad/s]; infinite where there is none.
-        is_slide: Whether a joint is a slide: m for rad and N for N·m in all of these.
-    """
+    """The position actuators of some joints, and where both stand in a model."""
 
     names: tuple[str, ...]
-    actuator: Int[np.ndarray, " joint"]
-    qpos: Int[np.ndarray, " joint"]
-    dof: Int[np.ndarray, " joint"]
-    low: Float[np.ndarray, " joint"]
-    high: Float[np.ndarray, " joint"]
-    stiffness: Float[np.ndarray, " joint"]
-    damping: Float[np.ndarray, " joint"]
-    limit: Float[np.ndarray, " joint"]
+    actuator: Int[np.ndarray, " joint"]  # index of each one's actuator
+    qpos: Int[np.ndarray, " joint"]  # where each stands in `qpos`
+    dof: Int[np.ndarray, " joint"]  # where each stands in `qvel`
+    low: Float[np.ndarray, " joint"]  # lower end of each range [rad]
+    high: Float[np.ndarray, " joint"]  # upper end of each range [rad]
+    stiffness: Float[np.ndarray, " joint"]  # k_p [N·m/rad]
+    damping: Float[np.ndarray, " joint"]  # k_d of the actuator, not of the joint [N·m·s/rad]
+    limit: Float[np.ndarray, " joint"]  # τ_max [N·m]; infinite where there is none
     top_speed: Float[np.ndarray, " joint"]
-    is_slide: Bool[np.ndarray, " joint"]
+    """Speed at which joint damping takes all of τ_max [rad/s]; infinite where there is none."""
+    is_slide: Bool[np.ndarray, " joint"]  # whether a joint is a slide: m for rad and N for N·m in all of these
 
     @classmethod
     def of(cls, model: mujoco.MjModel, names: Sequence[str]) -> Actuators:

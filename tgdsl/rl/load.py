@@ -33,21 +33,13 @@ REQUIRED = ("tgdsl", "task", "document", "object", "joints")
 
 @dataclass(frozen=True, eq=False)
 class LoadedTask:
-    """A task's document, as found and as read.
+    """A task's document, as found and as read."""
 
-    Attributes:
-        spec: The document.
-        task: The task's class.
-        source: Its text's values and places.
-        folder: Folder that file names in it are relative to.
-        terms: Terms that it adds to the task, by name.
-    """
-
-    spec: TaskSpec
-    task: type[Task[Any]]
-    source: Source
-    folder: Path
-    terms: Mapping[str, Term] = field(default_factory=dict)
+    spec: TaskSpec  # the document
+    task: type[Task[Any]]  # the task's class
+    source: Source  # its text's values and places
+    folder: Path  # folder that file names in it are relative to
+    terms: Mapping[str, Term] = field(default_factory=dict)  # terms that it adds to the task, by name
 
     @property
     def senses(self) -> tuple[str, ...]:

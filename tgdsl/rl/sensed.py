@@ -59,27 +59,17 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sensed:
-    """What a task's environments feel.
-
-    Attributes:
-        touch: The module.
-        felt: Name of the sensor that the policy feels; None if it feels nothing.
-        contact: Name of the `link_contact` sensor; None if the task takes none.
-        channels: Names of its channels: those of the force, and of the normal force if the task wants it, among them.
-        distance: Name of the `surface_distance` sensor; None if the task takes none.
-        object: Body of the task's object in the scene.
-        by_kind: Name of the sensor of each kind that the task looks at.
-        groups: Groups of observations of what is felt.
-    """
+    """What a task's environments feel."""
 
     touch: TactileModule
-    felt: str | None
-    contact: str | None
+    felt: str | None  # name of the sensor that the policy feels; None if it feels nothing
+    contact: str | None  # name of the `link_contact` sensor; None if the task takes none
     channels: tuple[str, ...]
-    distance: str | None
-    object: str
-    by_kind: Mapping[str, str]
-    groups: Mapping[str, Source]
+    """Names of its channels: those of the force, and of the normal force if the task wants it, among them."""
+    distance: str | None  # name of the `surface_distance` sensor; None if the task takes none
+    object: str  # body of the task's object in the scene
+    by_kind: Mapping[str, str]  # name of the sensor of each kind that the task looks at
+    groups: Mapping[str, Source]  # groups of observations of what is felt
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the groups of observations of what is felt."""

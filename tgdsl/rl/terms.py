@@ -113,23 +113,15 @@ class ObservationTerm(Term):
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """An event that happens now.
+    """An event that happens now."""
 
-    Attributes:
-        sim: The simulation; its `arrays` and `properties` may be changed, of the chosen environments alone.
-        setup: The setup of the environments.
-        actuation: The drives.
-        chosen: The environments in which it happens: decide by this mask, not by `if`.
-        count: How often each environment was reset; of events at intervals, how often it has happened, above that the episode.
-        stream: What its random numbers are for.
-    """
-
-    sim: Simulation
-    setup: Setup
-    actuation: Actuation
-    chosen: Bool[Tensor, " env"]
+    sim: Simulation  # the simulation; its `arrays` and `properties` may be changed, of the chosen environments alone
+    setup: Setup  # the setup of the environments
+    actuation: Actuation  # the drives
+    chosen: Bool[Tensor, " env"]  # the environments in which it happens: decide by this mask, not by `if`
     count: Int[Tensor, " env"]
-    stream: str
+    """How often each environment was reset; of events at intervals, how often it has happened, above that the episode."""
+    stream: str  # what its random numbers are for
 
     def shares(self, num: int) -> Float[Tensor, "env num"]:
         """Return random numbers between 0 and 1, float32: others each time that it happens."""

@@ -39,19 +39,12 @@ real one: what its gains do is not published."""
 
 @dataclass(frozen=True, eq=False)
 class HandMoment(Moment):
-    """One control step of a policy on a source; `step` is what a scene's task says of it.
+    """One control step of a policy on a source; `step` is what a scene's task says of it."""
 
-    Attributes:
-        episode: Number of the episode, from 0.
-        target: Set-points of the joints that it moves [rad].
-        age_s: How old the sample was [s]; None where nothing runs in real time.
-        inference_s: From then until the set-points were there [s].
-    """
-
-    episode: int
-    target: Float[Tensor, "env joint"]
-    age_s: float | None
-    inference_s: float
+    episode: int  # number of the episode, from 0
+    target: Float[Tensor, "env joint"]  # set-points of the joints that it moves [rad]
+    age_s: float | None  # how old the sample was [s]; None where nothing runs in real time
+    inference_s: float  # from then until the set-points were there [s]
 
 
 class DeployRecord(Record):
@@ -117,37 +110,25 @@ class Scores(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What came of a policy that acted.
-
-    Attributes:
-        source: On what it acted, as `tgdsl.connect` takes it.
-        steps: Control steps of all episodes.
-        scores: None where no scene says what happened, as on a real hand and of a log, or no episode was whole.
-        has_scene: Whether a scene says what happened.
-        age: How old the sample was that an action was chosen from; None where nothing runs in real time.
-        inference: From a sample to set-points: what it took to observe and to choose.
-        latency: Age and inference, of each step together; None where there is no age.
-        control_rate: Control steps per second that the task asks for [Hz].
-        rate: Achieved rate [Hz].
-        late_steps: Control steps that began after they should have ended.
-        moves: Whether set-points went to joints.
-    """
+    """What came of a policy that acted."""
 
     task: str
     policy: str
-    source: str
+    source: str  # on what it acted, as `tgdsl.connect` takes it
     unit: str
     episodes: int
-    steps: int
+    steps: int  # control steps of all episodes
     scores: Scores | None
-    has_scene: bool
+    """None where no scene says what happened, as on a real hand and of a log, or no episode was whole."""
+    has_scene: bool  # whether a scene says what happened
     age: Quantiles | None
-    inference: Quantiles | None
-    latency: Quantiles | None
-    control_rate: float
-    rate: float
-    late_steps: int
-    moves: bool
+    """How old the sample was that an action was chosen from; None where nothing runs in real time."""
+    inference: Quantiles | None  # from a sample to set-points: what it took to observe and to choose
+    latency: Quantiles | None  # age and inference, of each step together; None where there is no age
+    control_rate: float  # control steps per second that the task asks for [Hz]
+    rate: float  # achieved rate [Hz]
+    late_steps: int  # control steps that began after they should have ended
+    moves: bool  # whether set-points went to joints
 
     def __str__(self) -> str:
         lines = [self._scored(), self._timed()]

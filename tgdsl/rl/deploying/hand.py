@@ -62,29 +62,17 @@ class DeployError(TgdslError):
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A policy with all that is needed to connect it.
-
-    Attributes:
-        saved: The policy's file.
-        loaded: The task's document, with what the policy feels and is asked for.
-        sensed: Its module: what the policy feels and the task looks at, and the joints.
-        felt: What the policy feels; None: nothing.
-        groups: Groups of observations that it takes, in its order, with their sizes.
-        goal: What a user asks for; None: what the scene's task does.
-        model: The scene.
-        moved: The joints that the policy moves.
-        changes: What of the task was otherwise when the policy was learned, a line each.
-    """
+    """A policy with all that is needed to connect it."""
 
     saved: PolicyFile
-    loaded: LoadedTask
-    sensed: Sensed
-    felt: Felt | None
-    groups: Mapping[str, int]
-    goal: tuple[float, ...] | None
+    loaded: LoadedTask  # the task's document, with what the policy feels and is asked for
+    sensed: Sensed  # its module: what the policy feels and the task looks at, and the joints
+    felt: Felt | None  # what the policy feels; None: nothing
+    groups: Mapping[str, int]  # groups of observations that it takes, in its order, with their sizes
+    goal: tuple[float, ...] | None  # what a user asks for; None: what the scene's task does
     model: mujoco.MjModel
-    moved: Actuators
-    changes: Sequence[str]
+    moved: Actuators  # the joints that the policy moves
+    changes: Sequence[str]  # what of the task was otherwise when the policy was learned, a line each
 
     @property
     def control_step(self) -> float:

@@ -83,23 +83,14 @@ FORMAT = "tgdsl grasps 1"
 
 @dataclass(frozen=True, eq=False)
 class Grasps:
-    """Grasps of an object, at rest.
+    """Grasps of an object, at rest."""
 
-    Attributes:
-        qpos: Positions of all joints.
-        ctrl: Controls of all actuators, with which the hand presses.
-        variant: Which of the object's variants each holds.
-        scene: Digest of the scene: see `tgdsl.scene.digest`.
-        object: The document's name of the object.
-        settings: How they were sampled, as JSON.
-    """
-
-    qpos: Float[np.ndarray, "grasp nq"]
-    ctrl: Float[np.ndarray, "grasp nu"]
-    variant: Int[np.ndarray, " grasp"]
-    scene: str
-    object: str
-    settings: str
+    qpos: Float[np.ndarray, "grasp nq"]  # positions of all joints
+    ctrl: Float[np.ndarray, "grasp nu"]  # controls of all actuators, with which the hand presses
+    variant: Int[np.ndarray, " grasp"]  # which of the object's variants each holds
+    scene: str  # digest of the scene: see `tgdsl.scene.digest`
+    object: str  # the document's name of the object
+    settings: str  # how they were sampled, as JSON
 
     def __len__(self) -> int:
         return len(self.qpos)

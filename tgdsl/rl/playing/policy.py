@@ -62,19 +62,13 @@ class PolicyError(TgdslError):
 
 @dataclass(frozen=True, eq=False)
 class PolicyFile:
-    """A policy's file as it was when it was read; what is written into it later is another policy.
+    """A policy's file as it was when it was read; what is written into it later is another policy."""
 
-    Attributes:
-        file: The file.
-        content: Its bytes.
-        card: Its card; None: it has none.
-        taxels: The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none.
-    """
-
-    file: Path
-    content: bytes
-    card: dict[str, Any] | None
+    file: Path  # the file
+    content: bytes  # its bytes
+    card: dict[str, Any] | None  # its card; None: it has none
     taxels: Mapping[str, Columns]
+    """The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none."""
 
     def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
         """Return the network, with a memory of its own."""

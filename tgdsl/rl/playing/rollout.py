@@ -49,19 +49,12 @@ class Environments(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """One control step of a policy.
+    """One control step of a policy."""
 
-    Attributes:
-        index: Its number, from 0.
-        obs: Observations that the action was chosen from, by group.
-        action: The action.
-        step: What came of it.
-    """
-
-    index: int
-    obs: Mapping[str, Float[Tensor, "env feature"]]
-    action: Float[Tensor, "env joint"]
-    step: Step
+    index: int  # its number, from 0
+    obs: Mapping[str, Float[Tensor, "env feature"]]  # observations that the action was chosen from, by group
+    action: Float[Tensor, "env joint"]  # the action
+    step: Step  # what came of it
 
 
 def rollout(actor: Actor, env: Environments, num_steps: int | None = None) -> Iterator[Moment]:

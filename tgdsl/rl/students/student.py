@@ -26,23 +26,14 @@ from tgdsl.rl.students.encoders import Encoder, mlp, network
 
 @dataclass(frozen=True)
 class Architecture:
-    """All that students of one stack have in common.
+    """All that students of one stack have in common."""
 
-    Attributes:
-        groups: Size of each group of observations, and the network that embeds it.
-        hidden: Widths of the hidden layers that follow the embeddings.
-        actions: Number of joints.
-        heads: Widths of the hidden layers of each decoder.
-        eps: What is added to the standard deviation by which an observation is divided.
-        clip: Bound of normalised observations.
-    """
-
-    groups: tuple[tuple[int, Encoder], ...]
-    hidden: tuple[int, ...]
-    actions: int
-    heads: tuple[tuple[int, ...], ...] = ()
-    eps: float = 1e-5
-    clip: float = 10.0
+    groups: tuple[tuple[int, Encoder], ...]  # size of each group of observations, and the network that embeds it
+    hidden: tuple[int, ...]  # widths of the hidden layers that follow the embeddings
+    actions: int  # number of joints
+    heads: tuple[tuple[int, ...], ...] = ()  # widths of the hidden layers of each decoder
+    eps: float = 1e-5  # what is added to the standard deviation by which an observation is divided
+    clip: float = 10.0  # bound of normalised observations
 
     @property
     def num_features(self) -> int:
@@ -51,17 +42,11 @@ class Architecture:
 
 
 class StudentOutput(NamedTuple):
-    """What a student makes of observations.
+    """What a student makes of observations."""
 
-    Attributes:
-        action: Actions.
-        decoded: What the decoders tell.
-        memory: What it remembers.
-    """
-
-    action: Tensor
-    decoded: Tensor
-    memory: Tensor
+    action: Tensor  # actions
+    decoded: Tensor  # what the decoders tell
+    memory: Tensor  # what it remembers
 
 
 class Student(nn.Module):

@@ -60,19 +60,13 @@ class EpisodeTally:
 
 @dataclass(frozen=True)
 class Iteration:
-    """An iteration, over all processes.
+    """An iteration, over all processes."""
 
-    Attributes:
-        episodes: How many episodes ended.
-        metrics: Means over these episodes, and the learner's numbers, by the names that TensorBoard groups: `Episode/score`.
-        rollout: Duration of the rollout [s].
-        update: Duration of the update [s].
-    """
-
-    episodes: int
+    episodes: int  # how many episodes ended
     metrics: dict[str, float]
-    rollout: float
-    update: float
+    """Means over these episodes, and the learner's numbers, by the names that TensorBoard groups: `Episode/score`."""
+    rollout: float  # duration of the rollout [s]
+    update: float  # duration of the update [s]
 
 
 class Learning(Actor):
