@@ -39,7 +39,6 @@ class MeasuredVelocity:
             self._before.copy_(torch.where(begun[:, None], joint_pos, self._before))
 
     def memory(self) -> dict[str, Tensor]:
-        """Return the memory by name: live tensors."""
         return {"before": self._before, "value": self.value}
 
 

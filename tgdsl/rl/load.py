@@ -43,11 +43,9 @@ class LoadedTask:
 
     @property
     def senses(self) -> tuple[str, ...]:
-        """Kinds of sensors that task and terms look at."""
         return tuple(dict.fromkeys(kind for part in (self.task, *self.terms.values()) for kind in part.senses))
 
     def error(self, place: Place, what: str, hint: str = "") -> SpecError:
-        """Return the error of a mistake at a place of the document."""
         return SpecError([self.source.problem(place, what, hint)])
 
 

@@ -72,7 +72,6 @@ class Sensed:
     groups: Mapping[str, Source]  # groups of observations of what is felt
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the groups of observations of what is felt."""
         observed = self.touch.observe(readings) if self.groups else {}
         parts = {name: (observed[source.observation], source.columns) for name, source in self.groups.items()}
         return {name: value if columns is None else value.index_select(1, columns) for name, (value, columns) in parts.items()}

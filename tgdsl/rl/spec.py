@@ -90,7 +90,6 @@ class PhysicsSpec(SpecModel):
 
     @property
     def capacities(self) -> dict[str, int]:
-        """Capacities of the GPU's simulator."""
         return self.model_dump(include={"nconmax", "njmax"}, exclude_none=True)
 
 

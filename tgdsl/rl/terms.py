@@ -316,13 +316,18 @@ class ObjectVelocity(EventTerm):
         event.sim.arrays["qvel"][:, first : first + 6] += torch.where(event.chosen[:, None], added, 0.0)
 
 
-class Friction(EventTerm):
-    """The object's coefficient of sliding friction is the scene's times a factor."""
+class ResetEvent(EventTerm):
+    """Something that changes what the scene is made of, by default at each reset."""
 
     changes_model = True
-    per_env = ("friction",)
     mode: Literal["reset", "interval"] = "reset"
     """When it happens."""
+
+
+class Friction(ResetEvent):
+    """The object's coefficient of sliding friction is the scene's times a factor."""
+
+    per_env = ("friction",)
     factor: Factor
     """The factor."""
 
@@ -332,13 +337,10 @@ class Friction(EventTerm):
         event.sim.properties.set(event.chosen, friction={setup.object: setup.friction})
 
 
-class Mass(EventTerm):
+class Mass(ResetEvent):
     """The object's mass is the scene's and something more."""
 
-    changes_model = True
     per_env = ("mass",)
-    mode: Literal["reset", "interval"] = "reset"
-    """When it happens."""
     added: Annotated[Range, RangeOf("mass", ge=0.0)]
     """What is added [kg]."""
 
@@ -348,10 +350,9 @@ class Mass(EventTerm):
         event.sim.properties.set(event.chosen, mass={setup.object: setup.mass})
 
 
-class Placement(EventTerm):
+class Placement(ResetEvent):
     """The object, which moves freely, starts upright where the keyframe has the first variant, moved and turned at random."""
 
-    changes_model = True
     mode: Literal["reset"] = "reset"  # pyright: ignore[reportIncompatibleVariableOverride]
     """When it happens."""
     xy: Annotated[Range, RangeOf("length")] = ZERO
@@ -370,12 +371,8 @@ class Placement(EventTerm):
         put_rows(setup.start[:, item], event.chosen, torch.cat([pos, quat], dim=1))
 
 
-class Drive(EventTerm):
+class Drive(ResetEvent):
     """The drives are drawn again within `randomise.drive`."""
-
-    changes_model = True
-    mode: Literal["reset", "interval"] = "reset"
-    """When it happens."""
 
     def apply(self, event: Event) -> None:
         event.actuation.draw(event.chosen, event.count)

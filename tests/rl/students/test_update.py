@@ -212,7 +212,7 @@ def test_an_update_is_that_of_separate_students(make, kind, chosen):
         passes = [latest] + [chance.randrange(len(kept)) if own.aggregate > 1 else latest for _ in range(EPOCHS - 1)]
         errors = [[each.passed(kept[i][n], i == latest) for i in passes] for n, each in enumerate(alone)]
         for each, lesson in zip(alone, kept[-1], strict=True):
-            each.observe(lesson)
+            each.look(lesson)
         found.learn()
         told = found._losses * LENGTH / (EPOCHS * STEPS)
         expected = torch.tensor(errors).mean(dim=1)

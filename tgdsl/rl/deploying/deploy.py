@@ -101,7 +101,6 @@ class Scores(NamedTuple):
 
     @classmethod
     def of(cls, scores: Sequence[float], are_held: Sequence[bool]) -> Scores:
-        """Return what episodes were."""
         num = len(scores)
         mean, share = math.fsum(scores) / num, sum(are_held) / num
         interval = mean_interval(mean, math.fsum(score**2 for score in scores), num)

@@ -96,7 +96,6 @@ class Grasps:
         return len(self.qpos)
 
     def packed(self) -> dict[str, np.ndarray]:
-        """Return them as arrays."""
         words = {"format": FORMAT, "scene": self.scene, "object": self.object, "settings": self.settings}
         arrays = {"qpos": self.qpos, "ctrl": self.ctrl, "variant": self.variant}
         return {name: np.array(word) for name, word in words.items()} | arrays

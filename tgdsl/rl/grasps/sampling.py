@@ -151,7 +151,6 @@ class _Trials:
         return self.variant[holds], grasp[holds], ctrl[holds]
 
     def _start(self, count: Int[Tensor, " env"]) -> Float[Tensor, "env nq"]:
-        """Return where trials start."""
         spread = self._spread * self._draws.uniform("start", count, len(self.joints), -1.0, 1.0).double()
         qpos = self._open.repeat(len(count), 1)
         qpos[:, self._joint] = torch.minimum(torch.maximum(qpos[:, self._joint] + spread, self._low), self._high)

@@ -71,7 +71,6 @@ class PolicyFile:
     """The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none."""
 
     def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
-        """Return the network, with a memory of its own."""
         return _module(self.content, device)
 
 

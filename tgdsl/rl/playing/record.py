@@ -30,7 +30,6 @@ class Record:
         self._columns: dict[str, list[Column]] = {}
 
     def __getitem__(self, name: str) -> Column:
-        """Return a column."""
         return np.concatenate(self._columns[name])
 
     def __len__(self) -> int:
@@ -38,7 +37,6 @@ class Record:
         return len(next(iter(self._columns.values()), ()))
 
     def add_rows(self, columns: Mapping[str, Column]) -> None:
-        """Add rows, as many of each column."""
         for name, rows in columns.items():
             self._columns.setdefault(name, []).append(rows)
 
@@ -128,7 +126,6 @@ class Tally:
             self._sums[name] = self._sums.get(name, 0.0) + float(value[info.ended].double().sum())
 
     def lines(self, time: float) -> list[str]:
-        """Return the table."""
         faults = f", {self.num_faults} by a fault" if self.num_faults else ""
         first = f"t = {time:.2f} s, {self._env.num_envs} environments, {self.num_ended} episodes ended{faults}"
         count = self.num_ended

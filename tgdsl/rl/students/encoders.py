@@ -141,7 +141,6 @@ class Convolution(Images):
         self.projection = nn.Linear(channels[-1] * len(encoder.grid.taxels), encoder.size)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embedding."""
         images = self.marked(x)
         for layer in self.layers:
             images = nn.functional.elu(layer(images))
@@ -162,7 +161,6 @@ class RecurrentConvolution(Images):
         self.projection, self.memory = nn.Linear(self.width * cells, encoder.size), 2 * self.width * cells
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embedding, and h and c of all images."""
         links, *image = self.grid.shape
         held = memory.unflatten(1, (2, links, self.width, *image)).transpose(0, 1).flatten(1, 2)
         h, c = gated(self.norm(self.gates(torch.cat([self.marked(x), held[0]], dim=1))), held[1])

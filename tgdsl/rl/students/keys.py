@@ -43,7 +43,6 @@ class StudentKey:
 
     @property
     def name(self) -> str:
-        """Its name, which is a file's too."""
         return "-".join([*(part for part in self.kind if part), f"s{self.seed}"]).replace("*", "_").replace("/", "_")
 
 

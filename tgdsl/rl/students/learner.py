@@ -63,7 +63,6 @@ class Rollout:
 
     @property
     def envs(self) -> slice:
-        """Their environments."""
         return slice(self.first, self.first + self.rows * len(self.keys))
 
     def split(self, values: Tensor, dim: int = 0) -> Tensor:
@@ -187,7 +186,6 @@ class Distiller(Learning):
                 self._action.add_(torch.randn_like(self._action), alpha=self._spec.std)
 
     def _act(self, own: Rollout, x: Tensor) -> None:
-        """Have a stack act."""
         x.copy_(own.inputs(self._seen))
         action = own.stack(x, own.memory)
         own.memory.copy_(action.memory)

@@ -37,7 +37,6 @@ class Architecture:
 
     @property
     def num_features(self) -> int:
-        """How many numbers a student takes."""
         return sum(size for size, _ in self.groups)
 
 

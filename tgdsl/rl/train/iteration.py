@@ -129,7 +129,6 @@ class Learning(Actor):
             self._tally.add(moment.step)
 
     def learn(self) -> None:
-        """Learn from the rollout."""
         self._update()
         self.iteration += 1
         self.samples += self._num_steps * self.env.num_envs * self.ranks.size

@@ -82,7 +82,6 @@ class Learner(Learning):
 
     @property
     def std(self) -> list[float] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Standard deviation of its actions."""
         std = dict(self.algorithm.actor.named_parameters()).get("distribution.std_param")
         return None if std is None else std.tolist()
 

@@ -136,7 +136,6 @@ class EncodedModel(MLPModel):
         self.encoders = nn.ModuleList(encoders_of_groups)
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """Return the embeddings of all groups, side by side."""
         return self.embed(torch.cat([obs[name] for name in self.obs_groups], dim=-1))
 
     def embed(self, x: Tensor) -> Tensor:
@@ -180,7 +179,6 @@ class Exported(nn.Module):
         return self.output(self.model.mlp(self.model.embed(x)))
 
     def get_dummy_inputs(self) -> tuple[Tensor]:
-        """Return an example of what it takes."""
         first = next(self.parameters())
         return (torch.zeros((2, self.model.obs_dim), dtype=first.dtype, device=first.device),)
 
@@ -214,5 +212,4 @@ class Distillation(RandomNetworkDistillation):
         return self.weight
 
     def get_intrinsic_reward(self, obs: TensorDict) -> Tensor:
-        """Return the rewards of a control step, (env,)."""
         return self.prediction_error(obs) * self.next_weight()

@@ -168,7 +168,6 @@ class CapturedPPO(PPO):
         return is_loaded
 
     def broadcast_parameters(self) -> None:
-        """Give all processes the first one's networks."""
         models = [self._raw_actor, self._raw_critic, *([self.rnd.predictor, self.rnd.target] if self.rnd else [])]
         for model in models:
             for tensor in model.state_dict().values():

@@ -53,7 +53,6 @@ class ProgressBar:
             print(f"{row['iteration']:.0f}{f'/{self._total}' if self._total else ''}: {text}", flush=True)
 
     def close(self) -> None:
-        """Remove the bar."""
         self._bar.close()
         sys.stdout.flush()
 
@@ -72,7 +71,6 @@ class Board:
 
     @property
     def is_there(self) -> bool:
-        """Whether TensorBoard is installed."""
         return self._writer is not None
 
     def add(self, metrics: Mapping[str, float], iteration: int) -> None:
@@ -143,12 +141,10 @@ class Run:
 
     @property
     def iteration(self) -> int:
-        """How many iterations were made."""
         return self._learner.iteration
 
     @property
     def has_board(self) -> bool:
-        """Whether this process writes for TensorBoard."""
         return self._board is not None and self._board.is_there
 
     def save(self) -> None:
