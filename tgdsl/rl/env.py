@@ -347,7 +347,7 @@ class TouchEnv:
 
     def _memory(self) -> dict[str, dict[str, Tensor]]:
         """Return the memory outside simulation and module: live tensors by part and name."""
-        setup, sums = self.task.setup, zip(getattr(self, "_terms", ()), self._sums, strict=True)
+        setup, sums = self.task.setup, zip(self._terms, self._sums, strict=True)
         episodes = {"number": self.resets, "steps": self.steps, "total": self._return}
         episodes |= {"friction": setup.friction, "mass": setup.mass} | {f"sums/{name}": value for name, value in sums}
         memory = {"episodes": episodes, "actuation": self.actuation.memory(), "task": self.task.memory}

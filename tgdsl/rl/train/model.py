@@ -210,6 +210,3 @@ class Distillation(RandomNetworkDistillation):
             self.initial_weight if scheduler is None else scheduler(self.update_counter, **self.weight_scheduler_params)
         )
         return self.weight
-
-    def get_intrinsic_reward(self, obs: TensorDict) -> Tensor:
-        return self.prediction_error(obs) * self.next_weight()

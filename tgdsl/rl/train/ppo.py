@@ -74,7 +74,7 @@ class CapturedPPO(PPO):
         self._chosen = Captured(self._choose, device, tf32)
         self._valued = Captured(self._final_value, device, tf32)
         is_alone = not self.is_multi_gpu  # else all processes join in it
-        self._rnd_graph = Captured(self._intrinsic_reward, device, tf32, is_captured=is_alone)
+        self._rnd_graph = Captured(lambda: self.rnd.prediction_error(self._obs), device, tf32, is_captured=is_alone)
         self._returned = Captured(self._returns, device, tf32)
         self._learned = Captured(self._epoch, device, tf32)
         self._parts = [Captured(lambda i=i: self._differentiate(i), device, tf32) for i in range(self.num_mini_batches)]
@@ -220,10 +220,6 @@ class CapturedPPO(PPO):
     def _final_value(self) -> Tensor:
         with torch.no_grad():
             return self._judge(self._obs)
-
-    def _intrinsic_reward(self) -> Tensor:
-        assert isinstance(self.rnd, Distillation)
-        return self.rnd.prediction_error(self._obs)
 
     def _returns(self) -> None:
         with torch.no_grad():
