@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tgdsl.rl.rotations import six_numbers
+from tgdsl.rl.rotations import between, six_numbers
 from tgdsl.rl.task import HandNow, Now
 
 
@@ -61,3 +61,14 @@ def object_state(now: Now) -> Float[Tensor, "env feature"]:
 def object_props(now: Now) -> Float[Tensor, "env feature"]:
     """Return the object's friction, mass [kg] and the distance from each probe to its surface [m]."""
     return torch.cat([now.friction[:, None], now.mass[:, None], now.distance], dim=1)
+
+
+def of_object(now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+    """Return the groups of the object that only a simulation knows."""
+    return {"priv_obj_state": object_state(now), "priv_obj_props": object_props(now)}
+
+
+def goal(orientation: Float[Tensor, "env 4"], now: Now) -> Float[Tensor, "env feature"]:
+    """Return six numbers of an orientation in the world, and the angle from there to the object's [rad]."""
+    error = between(orientation, now.object.quat)
+    return torch.cat([six_numbers(orientation), error[:, None]], dim=1)

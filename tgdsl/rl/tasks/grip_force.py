@@ -205,8 +205,7 @@ class GripForce(Task[GripForceSpec]):
         return {
             "goal": self.asked(),
             "priv_force": torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
+            **groups.of_object(now),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -158,8 +158,7 @@ class HotBall(Task[HotBallSpec]):
         bits = torch.stack([self.is_latched, self.is_touched], dim=1).to(self.progress)
         return {
             "priv_heat": torch.cat([self.progress, bits], dim=1),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
+            **groups.of_object(now),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -197,12 +197,7 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
-        error = rotations.between(self.goal, now.object.quat)
-        return {
-            "goal": torch.cat([rotations.six_numbers(self.goal), error[:, None]], dim=1),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
-        }
+        return {"goal": groups.goal(self.goal, now), **groups.of_object(now)}
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return by how much the object has come closer to its goal in this control step [rad]."""

@@ -180,12 +180,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
         goal = rotations.product(rotations.about(self.axis, self._goal()), self.start_quat)
-        error = rotations.between(goal, now.object.quat)
-        return {
-            "goal": torch.cat([rotations.six_numbers(goal), error[:, None]], dim=1),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
-        }
+        return {"goal": groups.goal(goal, now), **groups.of_object(now)}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return the object's height when it stands upright [m], and the angle from the goal to its orientation [rad]."""
