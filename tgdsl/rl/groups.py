@@ -63,7 +63,7 @@ def object_props(now: Now) -> Float[Tensor, "env feature"]:
     return torch.cat([now.friction[:, None], now.mass[:, None], now.distance], dim=1)
 
 
-def of_object(now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+def object_groups(now: Now) -> dict[str, Float[Tensor, "env feature"]]:
     """Return the groups of the object that only a simulation knows."""
     return {"priv_obj_state": object_state(now), "priv_obj_props": object_props(now)}
 

@@ -205,7 +205,7 @@ class GripForce(Task[GripForceSpec]):
         return {
             "goal": self.asked(),
             "priv_force": torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1),
-            **groups.of_object(now),
+            **groups.object_groups(now),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -158,7 +158,7 @@ class HotBall(Task[HotBallSpec]):
         bits = torch.stack([self.is_latched, self.is_touched], dim=1).to(self.progress)
         return {
             "priv_heat": torch.cat([self.progress, bits], dim=1),
-            **groups.of_object(now),
+            **groups.object_groups(now),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -197,7 +197,7 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
-        return {"goal": groups.goal(self.goal, now), **groups.of_object(now)}
+        return {"goal": groups.goal(self.goal, now), **groups.object_groups(now)}
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return by how much the object has come closer to its goal in this control step [rad]."""

@@ -180,7 +180,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
         goal = rotations.product(rotations.about(self.axis, self._goal()), self.start_quat)
-        return {"goal": groups.goal(goal, now), **groups.of_object(now)}
+        return {"goal": groups.goal(goal, now), **groups.object_groups(now)}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return the object's height when it stands upright [m], and the angle from the goal to its orientation [rad]."""
