@@ -249,7 +249,8 @@ class TouchEnv:
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
-            now = self._instant = self._now(self.sim.read(), everyone)
+            now = self._instant = self._now(self.sim.read())
+            self._measure(now, everyone)
             self._obs, self._is_loaded = self._observe(now), False
             return dict(self._obs)
 
@@ -299,6 +300,7 @@ class TouchEnv:
             self._events.advance()
             self.sim.step(self.sim.ctrl)
             now = self._instant = self._now(self.sim.read())
+            self._measure(now)
             self.task.advance_healthy(now, self.sim.faults)
             step = self._judged(now, self.sim.faults)
         self._obs, self._is_loaded = step.obs, False
@@ -398,11 +400,13 @@ class TouchEnv:
     def _conclude(self, readings: dict[str, Tensor]) -> tuple[Step, Now]:
         """Return what a control step has brought, by its readings, and its instant; begin episodes where some have ended."""
         sim, now = self.sim, self._now(readings)
+        self._measure(now)
         self.task.advance_healthy(now, sim.faults)
         step = self._judged(now, sim.faults)
         if may_be_nonempty(step.info.ended):
             self._begin(step.info.ended)
-            now = self._now(sim.read(step.info.ended), step.info.ended)
+            now = self._now(sim.read(step.info.ended))
+            self._measure(now, step.info.ended)
             step = step._replace(obs=self._observed(now))
         return step, now
 
@@ -413,6 +417,13 @@ class TouchEnv:
         self.actuation.command(action)
         self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
         return torch.where(is_bad[:, None], torch.nan, ctrl)
+
+    def _measure(self, now: Now, begun: Bool[Tensor, " env"] | None = None) -> None:
+        """Take note of where joints are, for velocities that are measured; of some environments at the start of an episode."""
+        if self._speeds and begun is None:
+            self._speeds.update(now.joint_pos)
+        elif self._speeds and begun is not None:
+            self._speeds.begin(begun, now.joint_pos)
 
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
@@ -452,13 +463,11 @@ class TouchEnv:
                 rates[name] = checked(f'the term "{name}"', term.weight * term.rate(now, self.task.setup), self.num_envs)
         return rates
 
-    def _now(self, readings: dict[str, Tensor], begun: Bool[Tensor, " env"] | None = None) -> Now:
-        """Return the instant that readings are of, and measure velocities: of a control step, or where episodes have begun."""
+    def _now(self, readings: dict[str, Tensor]) -> Now:
+        """Return the instant that readings are of."""
         watched, none, num = self.sim.watched(), self._used[:, :0], self.num_actions
         distance = self._sensed.distance
         force, normal_force = self._sensed.forces(readings, self._used)
-        if self._speeds:
-            self._speeds.update(watched.joint_pos[:, :num], begun)
         return Now(
             watched=watched,
             object=watched.body(self._sensed.object),

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tgdsl.rl.rotations import between, six_numbers
+from tgdsl.rl.rotations import six_numbers
 from tgdsl.rl.task import HandNow, Now
 
 
@@ -29,21 +29,27 @@ class MeasuredVelocity:
         self._control_step = control_step
         self._share = -math.expm1(-control_step / time_constant)
 
-    def update(self, joint_pos: Float[Tensor, "env joint"], begun: Bool[Tensor, " env"] | None = None) -> None:
-        """Take the positions of the next control step [rad], or begin again at rest in some environments."""
-        if begun is None:
-            self.value += self._share * ((joint_pos - self._before) / self._control_step - self.value)
-            self._before.copy_(joint_pos)
-        else:
-            self.value.masked_fill_(begun[:, None], 0.0)
-            self._before.copy_(torch.where(begun[:, None], joint_pos, self._before))
+    def update(self, joint_pos: Float[Tensor, "env joint"]) -> None:
+        """Take the positions of the next control step [rad]."""
+        self.value += self._share * ((joint_pos - self._before) / self._control_step - self.value)
+        self._before.copy_(joint_pos)
+
+    def begin(self, chosen: Bool[Tensor, " env"], joint_pos: Float[Tensor, "env joint"]) -> None:
+        """Begin again at rest in some environments."""
+        self.value.masked_fill_(chosen[:, None], 0.0)
+        self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
 
     def memory(self) -> dict[str, Tensor]:
         return {"before": self._before, "value": self.value}
 
 
 def proprio(now: Now | HandNow, joint_vel: Float[Tensor, "env joint"] | None = None) -> Float[Tensor, "env feature"]:
-    """Return positions [rad], velocities [rad/s] and last action of the joints that the policy moves."""
+    """Return positions [rad], velocities [rad/s] and last action of the joints that the policy moves.
+
+    Args:
+        now: The instant.
+        joint_vel: Velocities in place of the instant's [rad/s].
+    """
     return torch.cat([now.joint_pos, now.joint_vel if joint_vel is None else joint_vel, now.action], dim=1)
 
 
@@ -61,14 +67,3 @@ def object_state(now: Now) -> Float[Tensor, "env feature"]:
 def object_props(now: Now) -> Float[Tensor, "env feature"]:
     """Return the object's friction, mass [kg] and the distance from each probe to its surface [m]."""
     return torch.cat([now.friction[:, None], now.mass[:, None], now.distance], dim=1)
-
-
-def object_groups(now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-    """Return the groups of the object that only a simulation knows."""
-    return {"priv_obj_state": object_state(now), "priv_obj_props": object_props(now)}
-
-
-def goal(orientation: Float[Tensor, "env 4"], now: Now) -> Float[Tensor, "env feature"]:
-    """Return six numbers of an orientation in the world, and the angle from there to the object's [rad]."""
-    error = between(orientation, now.object.quat)
-    return torch.cat([six_numbers(orientation), error[:, None]], dim=1)

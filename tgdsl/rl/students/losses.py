@@ -20,13 +20,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 Actions = Float[Tensor, "student row joint"]
-Numbers = Float[Tensor, "student row target"]
+Told = Float[Tensor, "student row target"]
 
 
 def behaviour(
     action: Actions, label: Actions, before: Actions, std: Float[Tensor, " joint"] | None = None, clip: float | None = None
 ) -> Float[Tensor, " student"]:
-    """Return the error of actions."""
+    """Return the error of actions.
+
+    Args:
+        action: a_s.
+        label: a_t.
+        before: a_0.
+        std: σ_t; None: 1.
+        clip: Bound of a_s − a_0; None: there is none.
+    """
     error = (action - label).square()
     if clip is not None:
         bounded = before + (action - before).clamp(-clip, clip)
@@ -37,7 +45,7 @@ def behaviour(
 
 
 def decoded(
-    numbers: Numbers, targets: Numbers, scales: Float[Tensor, " target"], weights: Float[Tensor, " target"]
+    told: Told, targets: Told, scales: Float[Tensor, " target"], weights: Float[Tensor, " target"]
 ) -> Float[Tensor, " student"]:
     """Return the weighted error of what decoders tell; zeros if there are none."""
-    return ((numbers - scales * targets).square().mean(dim=1) * weights).sum(dim=1)
+    return ((told - scales * targets).square().mean(dim=1) * weights).sum(dim=1)

@@ -194,6 +194,7 @@ class GripForce(Task[GripForceSpec]):
             self._command(is_due, now.mass, now.friction)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object was dropped or crushed."""
         return self.drop(now) | self.crush(now)
 
     def asked(self) -> Float[Tensor, "env goal"]:
@@ -205,7 +206,8 @@ class GripForce(Task[GripForceSpec]):
         return {
             "goal": self.asked(),
             "priv_force": torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1),
-            **groups.object_groups(now),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -151,6 +151,7 @@ class HotBall(Task[HotBallSpec]):
         self.held += self.setup.control_step * (self.is_latched & self.is_touched)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the hot ball has left the bin."""
         return now.object.pos[:, 2] < self.spec.lost_height
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
@@ -158,7 +159,8 @@ class HotBall(Task[HotBallSpec]):
         bits = torch.stack([self.is_latched, self.is_touched], dim=1).to(self.progress)
         return {
             "priv_heat": torch.cat([self.progress, bits], dim=1),
-            **groups.object_groups(now),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -193,17 +193,24 @@ class InHandRepose(Task[InHandReposeSpec]):
             self.left.copy_(rotations.between(self.goal, quat))
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object was dropped or the goal was not reached in time."""
         return self.drop(now) | self.is_late
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
-        return {"goal": groups.goal(self.goal, now), **groups.object_groups(now)}
+        error = rotations.between(self.goal, now.object.quat)
+        return {
+            "goal": torch.cat([rotations.six_numbers(self.goal), error[:, None]], dim=1),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
+        }
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return by how much the object has come closer to its goal in this control step [rad]."""
         return self.rate * self.setup.control_step
 
     def score(self) -> Float[Tensor, " env"]:
+        """Return how many goals were reached."""
         return self.reached.to(self.setup.dtype)
 
     def _goal_after(self, quat: Float[Tensor, "env 4"]) -> Float[Tensor, "env 4"]:

@@ -171,6 +171,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
             total.masked_fill_(self.is_reached, 0.0)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object was dropped."""
         return self._distance(now) > self.spec.drop_distance
 
     def step_progress(self) -> Float[Tensor, " env"]:
@@ -180,13 +181,19 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
         goal = rotations.product(rotations.about(self.axis, self._goal()), self.start_quat)
-        return {"goal": groups.goal(goal, now), **groups.object_groups(now)}
+        error = rotations.between(goal, now.object.quat)
+        return {
+            "goal": torch.cat([rotations.six_numbers(goal), error[:, None]], dim=1),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
+        }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return the object's height when it stands upright [m], and the angle from the goal to its orientation [rad]."""
         return {"object_size": 2.0 * self.setup.half_height, "goal_distance": self.observe(now)["goal"][:, -1]}
 
     def score(self) -> Float[Tensor, " env"]:
+        """Return how many quarter turns were reached."""
         return self.reached
 
     def _distance(self, now: Now) -> Float[Tensor, " env"]:

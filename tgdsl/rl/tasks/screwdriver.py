@@ -119,10 +119,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
     @reward_term(10.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:
         """Angular velocity about the long axis, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
-        rate = self.rate.clamp(max=self.spec.max_spin)
-        if self.holding.pays_in_full:
-            return rate
-        return rate * torch.where(self.rate > 0, self.holding.pay(now), 1.0)
+        return self.rate.clamp(max=self.spec.max_spin) * self._pay(now)
 
     near = terms.Near.of_task(1.0, width="near_width")
 
@@ -188,14 +185,15 @@ class Screwdriver(Task[ScrewdriverSpec]):
         self.quat.copy_(quat)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        tip_distance = (now.watched.site_pos[:, 0] - self.upright_tip).norm(dim=1)
-        return (self.tilt > self.spec.drop_tilt) | (tip_distance > self.spec.engagement)
+        """Return where the screwdriver has fallen over, or its tip is out of the screw."""
+        return (self.tilt > self.spec.drop_tilt) | (self._tip_distance(now) > self.spec.engagement)
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the screwdriver has turned in this control step [rad]."""
         return self.rate * self.setup.control_step
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return what is privileged of the object."""
         return {
             "priv_obj_state": torch.cat([groups.object_state(now), now.distance], dim=1),
             "priv_obj_props": torch.stack([now.friction, now.mass], dim=1),
@@ -208,6 +206,14 @@ class Screwdriver(Task[ScrewdriverSpec]):
     def score(self) -> Float[Tensor, " env"]:
         """Return what was turned while upright, over the duration of a whole episode [rad/s]."""
         return self.turned / self.spec.episode
+
+    def _pay(self, now: Now) -> Float[Tensor, " env"]:
+        if self.holding.pays_in_full:
+            return torch.ones_like(self.rate)
+        return torch.where(self.rate > 0, self.holding.pay(now), 1.0)
+
+    def _tip_distance(self, now: Now) -> Float[Tensor, " env"]:
+        return (now.watched.site_pos[:, 0] - self.upright_tip).norm(dim=1)
 
 
 def _upright(setup: Setup, tip: str) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
