@@ -135,6 +135,7 @@ class Now:
         mass: Mass of the object [kg].
         readings: All readings of the module by name.
         time: When the instant is, in each environment, by MuJoCo's clock [s]; that of a step is its last physics step's start.
+        score: Score of the episode up to now, in `Task.score_unit`; in `Task.advance`, up to the control step before.
     """
 
     watched: Watched
@@ -152,6 +153,7 @@ class Now:
     mass: Float[Tensor, " env"]
     readings: Mapping[str, Tensor]
     time: Float[Tensor, " env"]
+    score: Float[Tensor, " env"]
 
 
 @dataclass(frozen=True, eq=False)

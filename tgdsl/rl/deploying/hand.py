@@ -112,7 +112,7 @@ class Hand:
             control_step=prepared.control_step,
             goal=self._goal if self._scene is None else self._scene.goal,
         )
-        result = {"proprio": groups.proprio(now)} | prepared.loaded.task.observe_hand(spec, now)
+        result = {"proprio": groups.proprio(now, spec.proprio.vel_scale)} | prepared.loaded.task.observe_hand(spec, now)
         if prepared.felt is not None:
             source = prepared.sensed.groups[prepared.felt.group]
             result[GROUP] = observed[source.observation].cpu()

@@ -35,7 +35,7 @@ EMULATED = "agg_force"
 """What an emulated hand's fingertips feel, whatever a policy makes of it."""
 
 
-_OF_CARDS = ("sensors", "touch", "placement", "resolution", "noise", "joint_vel")
+_OF_CARDS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel", "proprio")
 """What of a task's document is as it was where the policy was learned."""
 
 
@@ -137,6 +137,9 @@ def prepare(
     loaded, asked = _asked(loaded, goal)
     spec = loaded.spec
     felt = Felt(spec.touch, spec.placement, spec.noise) if GROUP in names and spec.touch != "none" else None
+    if felt is not None and spec.temporal == "stack":
+        problem = f"this policy feels at each of {spec.physics.substeps} physics steps of a control step (temporal: stack)"
+        raise DeployError(f"{policy}: {problem}, and a hand feels once; teach one with temporal: last")
     feels = [] if felt is None else [felt]
     if is_emulated and felt is not None and felt.type in PER_LINK and felt.type != EMULATED:
         feels.append(felt._replace(type=EMULATED))

@@ -1,21 +1,44 @@
-"""Where a free object starts: upright where the keyframe has it, moved and turned at random.
+"""Tasks whose object lies freely: where it starts, when it is dropped, and what is observed of its goal.
+
+It starts upright where the keyframe has it, moved and turned at random.
 
 Shapes: `env` environments, `nq` as in MuJoCo's model.
 """
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import mujoco
 import torch
 from jaxtyping import Bool, Float, Int
+from pydantic import Field
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl import rotations
 from tgdsl.rl.draws import within
-from tgdsl.rl.spec import PlacedRandomSpec
+from tgdsl.rl.groups import GoalPart
+from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
 from tgdsl.rl.task import Setup
 from tgdsl.runtime.simulators.model_ids import element_id
+
+
+class PlacedTaskSpec(TaskSpec):
+    """A task whose object is put down freely, and has an orientation as its goal."""
+
+    randomise: PlacedRandomSpec = PlacedRandomSpec()
+    """What is random."""
+    goal: Annotated[tuple[GoalPart, ...], Field(min_length=1)] = ("orientation", "angle")
+    """What the group `goal` has, in order: six numbers of the goal's `orientation`; the same of the `difference`, the turn from
+    the object to the goal in world axes; the `angle` of that turn [rad]."""
+    drop_measure: Literal["distance", "below"] = "distance"
+    """What `drop_distance` bounds: how far the object is from where it started, or how far below."""
+
+    def dropped_by(self, offset: Float[Tensor, "env 3"]) -> Float[Tensor, " env"]:
+        """Return what `drop_distance` bounds, of an object's position less that at its start [m]."""
+        return vector_norm(offset, dim=1) if self.drop_measure == "distance" else -offset[:, 2]
 
 
 def object_qpos(setup: Setup) -> slice:
