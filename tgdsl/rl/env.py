@@ -27,6 +27,7 @@ from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.curricula import Curricula
+from tgdsl.rl.description import Description, describe
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes, Observations, Step, StepInfo
 from tgdsl.rl.events import Events, event_terms
@@ -232,6 +233,10 @@ class TouchEnv:
     def observe(self) -> Observations:
         """Return the last observations, by group."""
         return dict(self._obs)
+
+    def describe(self) -> Description:
+        """Return what each feature of each group of observations is: it prints as a table."""
+        return describe(self)
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.

@@ -21,7 +21,7 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -34,9 +34,10 @@ from torch.linalg import vector_norm
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.fields.models import Number, PositiveLength, Quantity, Range, RangeOf, SpecModel
-from tgdsl.rl import groups, rotations
+from tgdsl.rl import features, groups, rotations
 from tgdsl.rl.actuation import Actuation, Factor
 from tgdsl.rl.draws import within
+from tgdsl.rl.features import Features
 from tgdsl.rl.spec import PushSpec, TaskSpec, Whole
 from tgdsl.rl.task import Now, Rate, Setup, Task, TaskReward
 from tgdsl.runtime.simulators.simulation import Simulation
@@ -114,6 +115,10 @@ class ObservationTerm(Term):
     @abstractmethod
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
         """Return the group."""
+
+    def describe(self, setup: Setup) -> Sequence[Features]:
+        """Return what its features are, in order; none: they are not described."""
+        return ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,6 +345,9 @@ class LinkForce(ObservationTerm):
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
         return torch.cat([now.link_force[:, i] for i in self.rows(setup)], dim=1)
 
+    def describe(self, setup: Setup) -> Sequence[Features]:
+        return features.link_forces([setup.links[i] for i in self.rows(setup)])
+
     def rows(self, setup: Setup) -> list[int]:
         """Return which links are observed.
 
@@ -357,6 +365,9 @@ class ObjectState(ObservationTerm):
 
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
         return groups.object_state(now)
+
+    def describe(self, setup: Setup) -> Sequence[Features]:
+        return features.object_state(setup)
 
 
 class ObjectVelocity(EventTerm):

@@ -33,7 +33,6 @@ from tgdsl.rl.train.normalising import Normalisation
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
 
-
 LEAST_STD = 1e-3
 """Least deviation of the teacher's actions by which an error is divided."""
 

@@ -90,8 +90,8 @@ class DistillSpec(SpecModel):
     max_grad_norm: Positive | None = 2.0
     """Norm to which the gradient of each student is scaled down; null: it is not."""
     loss: Loss = "mse"
-    """Mean of e², e = a_s − a_t; of e²/σ_t², σ_t the standard deviation of the teacher's exploration; or of Huber's loss, e² up to
-    |e| = 1 and 2|e| − 1 beyond."""
+    """Mean of e², e = a_s − a_t; of e²/σ_t², σ_t the standard deviation with which the teacher explores; or of Huber's
+    loss, e² up to |e| = 1 and 2|e| − 1 beyond."""
     normalise: StrictBool = False
     """Whether e is divided by the standard deviation of the teacher's actions over all states seen so far, joint by joint."""
     pushes: StrictBool = True
@@ -123,9 +123,7 @@ class DistillSpec(SpecModel):
             )
             raise ValueError(problem)
         if self.normalise and self.loss == "inverse_variance":
-            problem = (
-                "loss inverse_variance divides errors by the teacher's exploration, and normalise by its actions' deviation"
-            )
+            problem = "inverse_variance and normalise each divide errors by a deviation, expected one of them"
             raise ValueError(f"{problem}; take loss mse or huber, or normalise: false")
         if len(set(self.groups or ())) < len(self.groups or ()):
             raise ValueError("groups names a group twice")

@@ -37,6 +37,7 @@ speaks of penalties of grip and slip, which its table does not have, and which a
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -45,8 +46,9 @@ from pydantic import model_validator
 from torch import Tensor
 
 from tgdsl.fields.models import Angle, PositiveLength, Quantity, Range, RangeOf, with_defaults
-from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.draws import within
+from tgdsl.rl.features import Features
 from tgdsl.rl.spec import Whole
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
@@ -199,6 +201,14 @@ class InHandRepose(Task[InHandReposeSpec]):
             "goal": groups.goal(self.spec.goal, self.goal, now.object.quat),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),
+        }
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "goal": features.goal(self.spec.goal, self.setup.object),
+            "priv_obj_state": features.object_state(self.setup),
+            "priv_obj_props": features.object_props(self.setup),
         }
 
     def step_progress(self) -> Float[Tensor, " env"]:

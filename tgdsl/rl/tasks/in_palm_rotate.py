@@ -29,6 +29,7 @@ that coasts; goals that were reached stay reached.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -37,7 +38,8 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Angle, PositiveLength, Quantity
-from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl import features, groups, rotations, terms
+from tgdsl.rl.features import Features
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
@@ -187,6 +189,14 @@ class InPalmRotate(Task[InPalmRotateSpec]):
             "goal": groups.goal(self.spec.goal, self._goal_quat(), now.object.quat),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),
+        }
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "goal": features.goal(self.spec.goal, self.setup.object),
+            "priv_obj_state": features.object_state(self.setup),
+            "priv_obj_props": features.object_props(self.setup),
         }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:

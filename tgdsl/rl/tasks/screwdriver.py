@@ -34,6 +34,7 @@ alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import mujoco
@@ -43,7 +44,8 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel, with_defaults
-from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl import features, groups, rotations, terms
+from tgdsl.rl.features import Features
 from tgdsl.rl.grasps.spec import GraspSpec
 from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
@@ -228,6 +230,13 @@ class Screwdriver(Task[ScrewdriverSpec]):
         return {
             "priv_obj_state": torch.cat([groups.object_state(now), now.distance], dim=1),
             "priv_obj_props": torch.stack([now.friction, now.mass], dim=1),
+        }
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "priv_obj_state": features.object_state(self.setup) + features.distances(self.setup),
+            "priv_obj_props": features.object_props(self.setup, has_probes=False),
         }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
