@@ -44,5 +44,5 @@ class SubstepTouch:
             self.stacked[name].copy_(torch.where(chosen[:, None, None], start, self.stacked[name]))
 
     def observe(self) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the groups: all features of the first physics step, then of the second."""
-        return {name: value.flatten(1) for name, value in self.stacked.items()}
+        """Return copies of the groups: all features of the first physics step, then of the second."""
+        return {name: value.flatten(1).clone() for name, value in self.stacked.items()}
