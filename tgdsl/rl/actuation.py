@@ -41,7 +41,7 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import model_validator
+from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
@@ -56,14 +56,21 @@ ZERO: Range = (0.0, 0.0)
 Factor = Annotated[Range, RangeOf("number", gt=0.0)]
 
 
+Scale = Annotated[
+    Annotated[Literal["half_range"], Tag("word")] | Annotated[float, Quantity("angle", gt=0.0), Tag("angle")],
+    Discriminator(lambda value: "word" if value == "half_range" else "angle"),
+]
+
+
 class ActionSpec(SpecModel):
     """How an action of a policy is understood."""
 
     mode: Literal["relative", "absolute", "offset"] = "relative"
     """Whether an action moves the target, is the target, −1 and 1 being the ends of the joint's range, or is how far the target
     is from that at the episode's start."""
-    scale: Annotated[float, Quantity("angle", gt=0.0)] = 0.05
-    """s, what an action of 1 is for a hinge's target [rad]: in a control step if relative, in all if `offset`."""
+    scale: Scale = 0.05
+    """s, what an action of 1 is for a hinge's target [rad]: in a control step if relative, in all if `offset`. `half_range`:
+    half of each joint's range, of slides too."""
     slide_scale: PositiveLength = 0.01
     """The same of slides [m]."""
     smoothing: Annotated[float, Quantity("number", ge=0.0)] = 0.0
@@ -74,9 +81,8 @@ class ActionSpec(SpecModel):
         for name, unit in (("scale", "rad"), ("slide_scale", "m")):
             value = getattr(self, name)
             if self.mode == "absolute" and value != type(self).model_fields[name].default:
-                problem = (
-                    f"{name} is {value:g} {unit}, but absolute actions have none: their ends are those of the joint's range"
-                )
+                shown = value if isinstance(value, str) else f"{value:g} {unit}"
+                problem = f"{name} is {shown}, but absolute actions have none: their ends are those of the joint's range"
                 raise ValueError(f"{problem}; leave it out, or take mode relative or offset")
         if self.smoothing >= 1.0:
             raise ValueError(f"smoothing is {self.smoothing:g}, expected less than 1: targets would never move")
@@ -225,7 +231,9 @@ class Actuation:
             raise SimulationError(f"joints {listed(unlimited)} have no largest torque, of which this drive's is a share")
         self._index = {f: torch.from_numpy(getattr(actuators, f)).to(device, torch.int64) for f in ("actuator", "qpos", "dof")}
         self._is_slide = actuators.is_slide
-        scale = np.where(actuators.is_slide, action.slide_scale, action.scale)
+        scale = 0.5 * (actuators.high - actuators.low)
+        if not isinstance(action.scale, str):
+            scale = np.where(actuators.is_slide, action.slide_scale, action.scale)
         self._scale = torch.from_numpy(scale).to(device, dtype)
         values = [f.name for f in fields(actuators) if f.name not in ("names", "is_slide", *self._index)]
         self._values = {name: torch.from_numpy(getattr(actuators, name)).to(device, dtype) for name in values}

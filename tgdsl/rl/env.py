@@ -13,6 +13,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -26,12 +27,14 @@ from tgdsl.console.tables import listing, shapes
 from tgdsl.errors import LowerError, SimulationError, listed
 from tgdsl.rl import groups
 from tgdsl.rl.actuation import Actuation
+from tgdsl.rl.description import Description, describe
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.events import Curricula, Events, event_terms
 from tgdsl.rl.grasps.sampling import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints
+from tgdsl.rl.substeps import SubstepTouch
 from tgdsl.rl.task import Now, checked
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_be_nonempty
@@ -204,6 +207,8 @@ class TouchEnv:
         is_measured = self.spec.joint_vel == "measured"
         self._speeds = groups.MeasuredVelocity(self.actuation.target, setup.control_step) if is_measured else None
         self._restarted = FusedCall(self._restart, is_compiled)
+        is_stacked = self.spec.temporal == "stack" and sensed.groups
+        self._substeps = SubstepTouch(sensed, self.sim) if is_stacked else None
         self._commanded = FusedCall(self._command, is_compiled)
         self._judged = FusedCall(self._judge, is_compiled)
         self._observed = FusedCall(self._observe, is_compiled)
@@ -249,8 +254,7 @@ class TouchEnv:
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
-            now = self._instant = self._now(self.sim.read())
-            self._measure(now, everyone)
+            now = self._instant = self._begun(everyone, self.sim.read())
             self._obs, self._is_loaded = self._observe(now), False
             return dict(self._obs)
 
@@ -287,6 +291,10 @@ class TouchEnv:
         """Return the last observations, by group."""
         return dict(self._obs)
 
+    def describe(self) -> Description:
+        """Return what each feature of each group of observations is: it prints as a table."""
+        return describe(self)
+
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
 
@@ -298,10 +306,7 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad(), self._dispatch():
             self.actuation.follow(control)
             self._events.advance()
-            self.sim.step(self.sim.ctrl)
-            now = self._instant = self._now(self.sim.read())
-            self._measure(now)
-            self.task.advance_healthy(now, self.sim.faults)
+            now = self._instant = self._advanced(self._stepped(self.sim.ctrl))
             step = self._judged(now, self.sim.faults)
         self._obs, self._is_loaded = step.obs, False
         return step
@@ -392,23 +397,43 @@ class TouchEnv:
             self._before.copy_(self._used)
             control = self._commanded(self._action, sim.ctrl)
             self._events.advance()
-        sim.step(control)
-        readings = sim.read()
+        readings = self._stepped(control)
         with self._logic_by():
             return self._conclude(readings)
 
+    def _stepped(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
+        """Make the physics steps of a control step, and return the readings at its end."""
+        if self._substeps is not None:
+            return self._substeps.step(control)
+        self.sim.step(control)
+        return self.sim.read()
+
     def _conclude(self, readings: dict[str, Tensor]) -> tuple[Step, Now]:
         """Return what a control step has brought, by its readings, and its instant; begin episodes where some have ended."""
-        sim, now = self.sim, self._now(readings)
-        self._measure(now)
-        self.task.advance_healthy(now, sim.faults)
+        sim, now = self.sim, self._advanced(readings)
         step = self._judged(now, sim.faults)
         if may_be_nonempty(step.info.ended):
             self._begin(step.info.ended)
-            now = self._now(sim.read(step.info.ended))
-            self._measure(now, step.info.ended)
+            now = self._begun(step.info.ended, sim.read(step.info.ended))
             step = step._replace(obs=self._observed(now))
         return step, now
+
+    def _advanced(self, readings: dict[str, Tensor]) -> Now:
+        """Return the instant at the end of a control step, of which the task has taken note."""
+        now = self._now(readings)
+        if self._speeds:
+            self._speeds.update(now.joint_pos)
+        self.task.advance_healthy(now, self.sim.faults)
+        return replace(now, score=self.task.score())
+
+    def _begun(self, chosen: Bool[Tensor, " env"], readings: dict[str, Tensor]) -> Now:
+        """Return the instant at which some environments begin an episode."""
+        now = self._now(readings)
+        if self._speeds:
+            self._speeds.begin(chosen, now.joint_pos)
+        if self._substeps is not None:
+            self._substeps.begin(chosen, readings)
+        return now
 
     def _command(self, action: Float[Tensor, "env joint"], ctrl: Float[Tensor, "env nu"]) -> Float[Tensor, "env nu"]:
         """Take an action over; return the simulation's controls, which are no numbers where an action is none."""
@@ -417,13 +442,6 @@ class TouchEnv:
         self.actuation.command(action)
         self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
         return torch.where(is_bad[:, None], torch.nan, ctrl)
-
-    def _measure(self, now: Now, begun: Bool[Tensor, " env"] | None = None) -> None:
-        """Take note of where joints are, for velocities that are measured; of some environments at the start of an episode."""
-        if self._speeds and begun is None:
-            self._speeds.update(now.joint_pos)
-        elif self._speeds and begun is not None:
-            self._speeds.begin(begun, now.joint_pos)
 
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
@@ -484,14 +502,16 @@ class TouchEnv:
             mass=self.task.setup.mass,
             readings=readings,
             time=self.sim.time,
+            score=self.task.score(),
         )
 
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""
-        felt = self._sensed.observe(now.readings)
-        exact = groups.proprio(now)
-        proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
-        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
+        felt = self._sensed.observe(now.readings) if self._substeps is None else self._substeps.observe()
+        measured = replace(now, joint_vel=self._speeds.value) if self._speeds else now
+        count = (self.resets << 32) | self.steps
+        proprio = groups.noisy_proprio(measured, self.spec.proprio, self._draws, count)
+        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, groups.proprio(now))}
         task = type(self.task).__name__
         for name, term in self.curricula.terms.items():
             if isinstance(term, ObservationTerm):

@@ -44,6 +44,10 @@ def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
         keyframe_id(model, loaded.spec.keyframe)
     except SimulationError as error:
         problems.append(loaded.source.problem(("keyframe",), str(error)))
+    for pattern in loaded.spec.physics.max_torque:
+        if not matching(pattern, joint_names):
+            place, problem = ("physics", "max_torque", pattern), f'no actuated joint matches "{pattern}"'
+            problems.append(loaded.source.problem(place, problem, did_you_mean(pattern, joint_names, "joints"), on_key=True))
     if problems:
         raise SpecError(problems)
     return tuple(name for name in joint_names if any(matching(pattern, [name]) for pattern in loaded.spec.joints))
@@ -68,8 +72,9 @@ def make_simulation(
         raise SimulationError(f"num_envs is {num_envs!r}, expected a whole number of at least 1")
     spec = loaded.spec
     own = loaded.task.watch(spec)
+    links = contact_links(sensed) if any(term.watches_links for term in loaded.terms.values()) else ()
     watch = Watch(
-        bodies=tuple(dict.fromkeys((sensed.object, *own.bodies))),
+        bodies=tuple(dict.fromkeys((sensed.object, *own.bodies, *links))),
         sites=own.sites,
         joints=tuple(dict.fromkeys((*joints, *own.joints, *sensed.touch.inputs.joints))),
         actuators=own.actuators,
@@ -101,7 +106,6 @@ def make_setup(
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
     num_variants = _num_variants(sensed, loaded.spec.object)
-    rows = sensed.touch.rows[sensed.contact]["body"].tolist() if sensed.contact else ()
     friction, mass = (get(sensed.object).to(sim.qpos).clone() for get in (sim.properties.friction, sim.properties.mass))
     keyframe = sim.qpos[0].double().cpu().numpy()
     heights = [half_height(sim.env_model(i), sensed.object, keyframe) for i in range(min(num_variants, sim.num_envs))]
@@ -122,7 +126,7 @@ def make_setup(
         high=torch.from_numpy(actuators.high).to(sim.qpos),
         max_torque=torch.from_numpy(actuators.limit).to(sim.qpos),
         object=sensed.object,
-        links=tuple(rows),
+        links=contact_links(sensed),
         qpos=sim.qpos[0].clone(),
         start=start,
         half_height=heights,
@@ -136,6 +140,11 @@ def make_setup(
         draws=draws,
         rows={kind: (name, sensed.touch.rows[name]) for kind, name in sensed.by_kind.items()},
     )
+
+
+def contact_links(sensed: Sensed) -> tuple[str, ...]:
+    """Return the bodies of the `link_contact` sensor's rows; none if the task takes none."""
+    return tuple(sensed.touch.rows[sensed.contact]["body"].tolist()) if sensed.contact else ()
 
 
 def _num_variants(sensed: Sensed, name: str) -> int:

@@ -18,7 +18,7 @@ probes of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -34,6 +34,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.fields.models import SpecModel
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
+from tgdsl.rl.features import Features
 from tgdsl.rl.grasps.grasps import GraspTable
 from tgdsl.rl.spec import TaskSpec, Weight
 from tgdsl.runtime.simulators.model_ids import element_id
@@ -135,6 +136,8 @@ class Now:
     readings: Mapping[str, Tensor]  # all readings of the module by name
     time: Float[Tensor, " env"]
     """When the instant is, in each environment, by MuJoCo's clock [s]; that of a step is its last physics step's start."""
+    score: Float[Tensor, " env"]
+    """Score of the episode up to now, in `Task.score_unit`; in `Task.advance`, up to the control step before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,6 +314,10 @@ class Task(ABC, Generic[S]):
     @abstractmethod
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what the features of `observe` are, by group and in order; what is left out counts as not described."""
+        return {}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""

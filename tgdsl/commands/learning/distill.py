@@ -198,13 +198,13 @@ class _Part:
         from tgdsl.rl.load import load_task
         from tgdsl.rl.sensed import check_felt, num_variants
         from tgdsl.rl.students.keys import check_blocks, feels, student_keys
-        from tgdsl.rl.students.teacher import Teacher
+        from tgdsl.rl.students.teacher import Teacher, students_task
         from tgdsl.rl.train.folder import RunFolder
 
         self._command, self.resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
         override = {} if resolution == "default" else {"resolution": resolution}
         self._given, self._overrides = overrides, overrides | override
-        self._loaded = load_task(command.task, self._overrides)
+        self._loaded = students_task(load_task(command.task, self._overrides))
         types = _known(self._loaded, asked["types"])
         self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
         self.teacher = Teacher(Path(asked["teacher"]), self._loaded)

@@ -49,7 +49,7 @@ JOINT_POS, JOINT_VEL = "joint_pos", "joint_vel"
 """Groups of the module that proprioception is made of: all actuated joints, in the order of the actuators."""
 EMULATED = "agg_force"
 """What an emulated hand's fingertips feel, whatever a policy makes of it."""
-CARD_KEYS = ("sensors", "touch", "placement", "resolution", "noise", "joint_vel")
+CARD_KEYS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel", "proprio")
 """What of a task's document is as it was where the policy was learned."""
 EVERYONE = torch.ones(1, dtype=torch.bool)
 APPROACH_S = 2.0
@@ -125,6 +125,9 @@ def prepare(
         loaded = _with_goal(loaded, tuple(goal))
     spec = loaded.spec
     felt = Felt(spec.touch, spec.placement, spec.noise) if GROUP in names and spec.touch != "none" else None
+    if felt is not None and spec.temporal == "stack":
+        problem = f"this policy feels at each of {spec.physics.substeps} physics steps of a control step (temporal: stack)"
+        raise DeployError(f"{policy}: {problem}, and a hand feels once; teach one with temporal: last")
     feels = [] if felt is None else [felt]
     if is_emulated and felt is not None and felt.type in PER_LINK and felt.type != EMULATED:
         feels.append(felt._replace(type=EMULATED))
@@ -288,7 +291,7 @@ class Hand:
             control_step=prepared.control_step,
             goal=self._goal if self._scene is None else self._scene.goal,
         )
-        result = {"proprio": groups.proprio(now)} | prepared.loaded.task.observe_hand(spec, now)
+        result = {"proprio": groups.proprio(now, spec.proprio.vel_scale)} | prepared.loaded.task.observe_hand(spec, now)
         if prepared.felt is not None:
             result[GROUP] = observed[prepared.sensed.groups[prepared.felt.group].observation].cpu()
         return {name: result[name].float() for name in prepared.groups}

@@ -29,8 +29,12 @@ from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.students.student import Architecture, Stack, Student, forgotten
 from tgdsl.rl.train.graphs import Captured, SideBySide
 from tgdsl.rl.train.iteration import Learning
+from tgdsl.rl.train.model import Normalisation
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
+
+LEAST_STD = 1e-3
+"""Least deviation of the teacher's actions by which an error is divided."""
 
 
 class Rollout:
@@ -154,11 +158,14 @@ class Distiller(Learning):
         self._teacher.begin(ended)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"stacks": [rollout.stack.state_dict() for rollout in self.rollouts]}
+        actions = {} if self._teacher_actions is None else {"actions": self._teacher_actions.state_dict()}
+        return {"stacks": [rollout.stack.state_dict() for rollout in self.rollouts]} | actions
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         for rollout, saved in zip(self.rollouts, state["stacks"], strict=True):
             rollout.stack.load_state_dict(saved)
+        if self._teacher_actions is not None and "actions" in state:
+            self._teacher_actions.load_state_dict(state["actions"])
         for captured in (self._chosen, self._answered, self._learned, self._looked):
             captured.forget()
 
@@ -227,7 +234,9 @@ class Distiller(Learning):
                     joined(own.split(values[part], 1)) for values in (self._labels, self._privileged, self._ended[..., None])
                 )
                 outputs = own.stack(x, memory if own.stack.memory else x[..., :0])
-                error = losses.behaviour(outputs.action, label, target, self._std, spec.clip) / len(parts)
+                error = losses.behaviour(
+                    outputs.action, label, target, self._std, spec.clip, is_huber=spec.loss == "huber"
+                ) / len(parts)
                 detached = detached + error.detach()
                 total = total + error
                 if self._targets:
@@ -258,6 +267,9 @@ class Distiller(Learning):
 
     def _update(self) -> None:
         self._losses.zero_()
+        if self._teacher_actions is not None and self._std is not None:
+            self._teacher_actions.update(self._labels.flatten(0, 1))
+            self._std.copy_(self._teacher_actions.std).clamp_(min=LEAST_STD)
         if self._spec.aggregate > 1:
             self._gathered.append([value.clone() for value in self._of_rollout()])
         for i in range(self._spec.epochs):
@@ -295,7 +307,10 @@ class Distiller(Learning):
         self._scales, self._weights = (
             torch.tensor([getattr(head, name) for head in heads], device=device) for name in ("scale", "weight")
         )
+        self._teacher_actions = Normalisation(actions).to(device) if spec.normalise else None
         self._std = self._teacher.std if spec.loss == "inverse_variance" else None
+        if spec.normalise:
+            self._std = torch.ones(actions, device=device)
         self._losses = torch.zeros(len(self.keys), device=device)
         self._scores = torch.zeros((2, num), dtype=torch.float64, device=device)
         has_tf32 = spec.precision == "tf32"

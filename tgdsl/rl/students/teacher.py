@@ -11,6 +11,7 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.policy import OF_TOUCH, Policy, PolicyError, changes_since, check_card, check_learned, read_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
+from tgdsl.rl.spec import PushSpec
 
 WARM_CALLS = 3
 """Calls in which TorchScript optimises a policy, before one is captured on a GPU."""
@@ -73,6 +74,14 @@ class Teacher:
             policy(zeros)
         policy.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
         return policy
+
+
+def students_task(loaded: LoadedTask) -> LoadedTask:
+    """Return the task in which students are taught: without pushes if its document says so."""
+    if loaded.spec.distill.pushes:
+        return loaded
+    randomise = loaded.spec.randomise.model_copy(update={"push": PushSpec()})
+    return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update={"randomise": randomise}))
 
 
 def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:

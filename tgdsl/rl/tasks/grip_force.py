@@ -39,6 +39,7 @@ ends the episode, since what is crushed stays so.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -49,8 +50,9 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, RangeOf
-from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.draws import whole
+from tgdsl.rl.features import Features
 from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.task import HandNow, Now, Setup, Start, Task, reward_term
 from tgdsl.runtime.simulators.model_ids import keyframe_id
@@ -208,6 +210,18 @@ class GripForce(Task[GripForceSpec]):
             "priv_force": torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),
+        }
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "goal": [Features("force to press with", 1, "N")],
+            "priv_force": [
+                Features("sum of normal forces", 1, "N"),
+                *(Features("normal force", 1, "N", "", link) for link in self.setup.links),
+            ],
+            "priv_obj_state": features.object_state(self.setup),
+            "priv_obj_props": features.object_props(self.setup),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -26,6 +26,7 @@ refused.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -36,7 +37,8 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf, Temperature
-from tgdsl.rl import groups, terms
+from tgdsl.rl import features, groups, terms
+from tgdsl.rl.features import Features
 from tgdsl.rl.spec import RandomSpec, TaskSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 
@@ -161,6 +163,21 @@ class HotBall(Task[HotBallSpec]):
             "priv_heat": torch.cat([self.progress, bits], dim=1),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),
+        }
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "priv_heat": [
+                *(
+                    Features("progress", 1, "1", "", link)
+                    for link in dict.fromkeys(self.setup.rows["temperature_grid"][1]["link"])
+                ),
+                Features("whether the latch is on", 1),
+                Features("whether the hot ball is touched", 1),
+            ],
+            "priv_obj_state": features.object_state(self.setup),
+            "priv_obj_props": features.object_props(self.setup),
         }
 
     def score(self) -> Float[Tensor, " env"]:
