@@ -4,7 +4,7 @@ import torch
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.policy import write_policy
-from tgdsl.rl.train.folder import made_from
+from tgdsl.rl.train.folder import run_origin
 from tgdsl.rl.train.iteration import ORIGIN_KEYS
 
 
@@ -41,7 +41,7 @@ def teacher(file, loaded, groups, module=None, std=None, **card):
     try:
         sizes = {name: env.groups[name] for name in groups}
         network = module or Linear(sum(sizes.values()), env.num_actions)
-        origin = made_from(loaded, env, 0, {}, 1)
+        origin = run_origin(loaded, env, 0, {}, 1)
         own = {"groups": sizes, "joints": list(env.joint_names), "std": std, **{name: origin[name] for name in ORIGIN_KEYS}}
         traced = torch.jit.trace(network, torch.zeros((2, sum(sizes.values()))))
         write_policy(traced, env.touch, own | card, file)

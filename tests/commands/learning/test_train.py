@@ -283,11 +283,11 @@ def test_a_folder_in_which_another_process_runs_is_left_alone(base, here, fails,
     begun = ("train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
     assert here(base, *begun)[0] == 0
     name, *options = command
-    with RunFolder(base / "other" / "run").held():
+    with RunFolder(base / "other" / "run").lock():
         said = fails(name, "task.yaml", "--device", "cpu", *options, "--out", "other/run")
         assert said == "tgdsl: other/run: another process runs in this folder; wait until it has ended, or give another --out\n"
     (base / "out" / "task" / "checkpoint.pt").write_bytes(b"half written")
-    with RunFolder(base / "out" / "task").held():
+    with RunFolder(base / "out" / "task").lock():
         assert "another process runs in this folder" in fails("train", "task.yaml", *ON, "--resume", "out/task")
 
 

@@ -8,7 +8,7 @@ import torch
 from small_runs import small_learner
 
 from tgdsl.rl.playing.policy import PolicyError, policy_for, read_policy
-from tgdsl.rl.train.folder import made_from
+from tgdsl.rl.train.folder import run_origin
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
@@ -17,7 +17,7 @@ def test_sensors_that_environments_lack_are_not_compared(tmp_path):
     """On a hand there is what the policy feels with, and not what only its task reads; but something must be there."""
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     file = tmp_path / "policy.pt"
-    card = learner.card(made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
+    card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
     learner.write_policy(card, file)
     extra = {"card.json": "", "taxels.csv": ""}
     module = torch.jit.load(file, _extra_files=extra)
@@ -36,7 +36,7 @@ def test_taxels_may_differ_by_rounding(tmp_path):
     """The table in the file says by how much."""
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     file, touch = tmp_path / "policy.pt", learner.env.touch
-    card = learner.card(made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
+    card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
     learner.write_policy(card, file)
     saved = read_policy(file)
     for name, table in touch.taxels.items():
@@ -64,7 +64,7 @@ def test_a_policy_brings_its_card(tmp_path):
     """
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     learner.iterate()
-    card = learner.card(made_from(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
+    card = learner.card(run_origin(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
     file = tmp_path / "a policy.pt"
     learner.write_policy(card, file)
     assert read_policy(file).card == card == json.loads((tmp_path / "a policy.json").read_text())

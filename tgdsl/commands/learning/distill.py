@@ -90,7 +90,7 @@ class Distill:
         settings = self._asked(loaded, last_start, folder)
         prepared = [_Part(self, name, settings, overrides, folder / name) for name in settings["resolutions"]]
         settings["envs"] = prepared[0].envs
-        with RunFolder(folder).held():
+        with RunFolder(folder).lock():
             self._teach(loaded, folder, prepared)
 
     def _teach(self, loaded: LoadedTask, folder: Path, prepared: list[_Part]) -> None:
@@ -243,7 +243,7 @@ class _Part:
         from tgdsl.rl.playing.provenance import changes_around
         from tgdsl.rl.students.learner import Distiller
         from tgdsl.rl.train.checkpoint import restore
-        from tgdsl.rl.train.folder import made_from
+        from tgdsl.rl.train.folder import run_origin
         from tgdsl.rl.train.run import ProgressBar, Run
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
@@ -256,7 +256,7 @@ class _Part:
                 print(f"changed since the teacher was learned: {line}")
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
-            origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
+            origin = run_origin(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
             origin["teacher_sha256"] = hashlib.sha256(self.teacher.saved.content).hexdigest()
             taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
             for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():

@@ -78,7 +78,7 @@ class Train:
         overrides = joined_overrides(last_start.get("overrides", {}) if is_same else {}, parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
         self._check()
-        with folder.held() if ranks.is_first else nullcontext():
+        with folder.lock() if ranks.is_first else nullcontext():
             if ranks.is_first:
                 folder.check(is_resumed=is_same)
             state = read_checkpoint(source.checkpoint) if source else None
@@ -111,7 +111,7 @@ class Train:
     ) -> None:
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.train.checkpoint import restore
-        from tgdsl.rl.train.folder import changes, made_from
+        from tgdsl.rl.train.folder import changes, run_origin
         from tgdsl.rl.train.learner import Learner
         from tgdsl.rl.train.run import ProgressBar, Run
 
@@ -124,7 +124,7 @@ class Train:
             if state is not None and self.resume is not None:
                 restore(learner, state, self.resume / "checkpoint.pt")
                 learner.change_rates(before.get("spec", {}).get("train", {}))
-            origin = made_from(loaded, env, seed, overrides, ranks.size)
+            origin = run_origin(loaded, env, seed, overrides, ranks.size)
             if self.resume is not None:
                 origin["goes_on_from"] = str(self.resume)
             if ranks.is_first:

@@ -1,11 +1,11 @@
-"""A run's folder: what it was made from, where it stands, and what it has learned.
+"""A run's folder: its origin, its progress, and what it has learned.
 
-- `run.json`: the task with all that its document leaves out, overrides, seed, versions, hashes; an entry per start
-- `task.yaml`, the sensors' document, the module of a task of one's own: as they were found
+- `run.json`: the task with all defaults, overrides, seed, versions, hashes; an entry per start
+- `task.yaml`, the sensors' document, the module of a user's task: copies
 - `taxels.csv`: the taxels of all sensors
 - `curve.csv`: a row per iteration
-- `checkpoint.pt`: what it goes on from
-- `policy.pt`: the policy without exploration, with its card, for `tgdsl play --policy`
+- `checkpoint.pt`: its state, to resume
+- `policy.pt`: the policy without exploration and its card, for `tgdsl play --policy`
 - `evaluation.json`: the evaluation at the end
 - `events.out.*`: TensorBoard's, if that is installed
 """
@@ -40,8 +40,8 @@ from tgdsl.rl.spec import TaskSpec
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
 COLUMNS = ("iteration", "samples", "seconds")
 """First columns of a curve."""
-ASKED = frozenset({"spec", "seed", "envs", "module", "taxels"})
-"""What of a start is asked when the run goes on."""
+ORIGIN = frozenset({"spec", "seed", "envs", "module", "taxels"})
+"""What a resumed run needs of an entry of `run.json`."""
 
 
 class RunFolder:
@@ -55,11 +55,11 @@ class RunFolder:
 
     @property
     def has_run(self) -> bool:
-        """Whether there is a run: one that was killed before its first checkpoint is none."""
+        """Whether there is a run with a checkpoint or an iteration."""
         return self.checkpoint.exists() or bool(self.rows())
 
     def check(self, is_resumed: bool) -> None:
-        """See that a run can begin or go on here; nothing is made.
+        """Check that a run can begin or resume here, without writing.
 
         Raises:
             FileError: If the folder cannot be written.
@@ -73,14 +73,12 @@ class RunFolder:
         check_writable(self.checkpoint)
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold the folder against other processes; it is free again if this one is killed.
-
-        It is made if it is not there, and not left behind empty if anything is raised.
+    def lock(self) -> Iterator[None]:
+        """Lock the folder; the lock ends with the process. The folder is created, and removed if it stays empty.
 
         Raises:
-            FileError: If it cannot be made, or written into.
-            TgdslError: If another process holds it.
+            FileError: If it cannot be created, or written into.
+            TgdslError: If another process has locked it.
         """
         with new_folder(check_writable(self.run)):
             folder = os.open(self.path, os.O_RDONLY)
@@ -96,8 +94,8 @@ class RunFolder:
             finally:
                 os.close(folder)
 
-    def begin(self, made_from: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
-        """Write what a run is made from, or that it is made to go on; starts that made no run are discarded.
+    def begin(self, origin: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
+        """Write the origin of a run, or of its resumption; entries without a run are dropped.
 
         Raises:
             FileError: If it cannot be written.
@@ -106,21 +104,21 @@ class RunFolder:
         for file in self.path.iterdir():  # temporary files that a run which was killed has left
             if re.fullmatch(TEMPORARY.pattern + r"\.\w+", file.name):
                 file.unlink(missing_ok=True)
-        starts = [*(self._read()["starts"] if self.has_run else []), dict(made_from)]
+        starts = [*(self._starts() if self.has_run else []), dict(origin)]
         atomic_write(self.run, (json.dumps({"starts": starts}, indent=2, ensure_ascii=False) + "\n").encode())
         for name, file in documents(loaded).items():
             atomic_write(self.path / name, file.read_bytes())
         atomic_write(self.path / "taxels.csv", taxel_csv(env.touch).encode())
 
     def last_start(self) -> dict[str, Any]:
-        """Return what the run was made from when it was started last; raise `TgdslError` if that cannot be read."""
-        starts = self._read()["starts"]
+        """Return the origin of the run's last start; raise `TgdslError` if it cannot be read."""
+        starts = self._starts()
         if not starts:
             raise TgdslError(f"{self.path}: there is no run to go on with: run.json is missing or empty")
         return starts[-1]
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows of the curve but for a line, header or row, that was half written when the run was killed.
+        """Return the complete rows of the curve; a killed run may leave half a line.
 
         Raises:
             TgdslError: If it is no curve.
@@ -140,7 +138,7 @@ class RunFolder:
         return rows
 
     def keep_rows(self, iterations: int) -> None:
-        """Drop the curve's rows beyond some iterations, which are made again, and what was half written.
+        """Keep the curve's complete rows up to an iteration; later iterations run again.
 
         Raises:
             TgdslError: If it is no curve.
@@ -157,7 +155,7 @@ class RunFolder:
             atomic_write(self.curve, content)
 
     def add_row(self, row: Mapping[str, float | int]) -> None:
-        """Add a row to the curve, under the names that its first row had; nan is what is not known.
+        """Append a row to the curve, with the columns of its header; an unknown value is nan.
 
         Raises:
             FileError: If it cannot be written.
@@ -175,23 +173,22 @@ class RunFolder:
         first, hint = ",".join(found[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
         return TgdslError(f"{self.curve}:{line}: found {len(found)} values, {first!r}, expected {expected}; {hint}")
 
-    def _read(self) -> dict[str, Any]:
+    def _starts(self) -> list[dict[str, Any]]:
         try:
             result = json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {"starts": []}
         except (OSError, ValueError) as error:
             raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
         starts = result.get("starts") if isinstance(result, dict) else None
-        if not isinstance(starts, list) or not all(isinstance(start, dict) and start.keys() >= ASKED for start in starts):
-            raise TgdslError(
-                f"{self.run}: expected what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ASKED))}"
-            )
-        return result
+        if not isinstance(starts, list) or not all(isinstance(start, dict) and start.keys() >= ORIGIN for start in starts):
+            expected = f"what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ORIGIN))}"
+            raise TgdslError(f"{self.run}: expected {expected}")
+        return starts
 
 
 def documents(loaded: LoadedTask) -> dict[str, Path]:
-    """Return the files of the task's and the sensors' documents, and of a task of one's own, by the names of their copies.
+    """Return the files of the task's and the sensors' documents and of a user's task, by the names of their copies.
 
-    Of documents that are files. Two files of one name have that of their folder before it, as in `sub_palm.yaml`.
+    Files with the same name get their folder's name as a prefix, as in `sub_palm.yaml`.
     """
     documents = [file for file in (Path(loaded.source.file), loaded.folder / loaded.spec.document) if file.is_file()]
     module = sys.modules.get(loaded.task.__module__)
@@ -202,8 +199,8 @@ def documents(loaded: LoadedTask) -> dict[str, Path]:
     return {f"{file.resolve().parent.name}_{file.name}": file for file in documents}
 
 
-def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[str, Any], processes: int) -> dict[str, Any]:
-    """Return what a run is made from, as plain values."""
+def run_origin(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[str, Any], processes: int) -> dict[str, Any]:
+    """Return the origin of a run, as plain values."""
     device = env.device
     return {
         "task": loaded.source.file,
@@ -223,7 +220,7 @@ def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[s
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec]) -> list[str]:
-    """Return what of two starts of a run differs, a line each: the task's numbers, its seed, its sensors."""
+    """Return the differences between the origins of two starts, a line each: the task's numbers, its seed, its sensors."""
     lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
     descriptions = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
@@ -231,7 +228,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskS
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what a run depends on, of those packages that there are."""
+    """Return the versions of Python and of the installed packages that a run depends on."""
     result = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

@@ -1,4 +1,4 @@
-"""An iteration of whoever learns: its episodes, added up on the device and read once, and how long it took.
+"""One iteration of learning: its episodes, summed on the device and read once, and its durations.
 
 Shapes: `env` environments.
 """
@@ -21,20 +21,20 @@ from tgdsl.rl.playing.rollout import Actor, Moment, rollout
 from tgdsl.rl.train.ranks import Ranks, summed
 
 EPISODE_NAMES = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
-"""Of an episode that has ended, besides each term: return, steps, score, whether it ended for good, and by a fault."""
+"""Numbers of a finished episode, before its terms: return, steps, score, whether it ended for good, and by a fault."""
 ORIGIN_KEYS = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "sensors", "scene", "versions", "spec")
-"""What a policy's card says of what its run was made from."""
+"""Entries of a run's origin that a policy's card has."""
 
 
 class EpisodeTally:
-    """Sums over the episodes that have ended; `names` are known from the first control step on."""
+    """Sums over finished episodes; `names` are set at the first control step."""
 
     def __init__(self):
         self.names: list[str] = []
         self._sums: Tensor | None = None
 
     def add(self, step: Step) -> None:
-        """Add a control step; the host does not wait."""
+        """Add a control step, without waiting for the device."""
         info = step.info
         numbers = [info.episode_return, info.episode_steps, info.score, step.terminated, info.faults]
         values = torch.stack([info.ended.double(), *(each.double() for each in (*numbers, *info.episode_terms.values()))])
@@ -44,8 +44,8 @@ class EpisodeTally:
             self._sums = torch.zeros_like(sums)
         self._sums += sums
 
-    def taken(self) -> Tensor:
-        """Return the sums over all processes, the number of episodes first, and begin again; the host does not wait."""
+    def pop(self) -> Tensor:
+        """Return the sums over all processes, the number of episodes first, and restart; the host does not wait."""
         assert self._sums is not None
         sums = self._sums.clone()
         summed(sums)
@@ -53,7 +53,7 @@ class EpisodeTally:
         return sums
 
     def means(self, sums: list[float]) -> dict[str, float]:
-        """Return means over episodes by name, of sums that were taken; none if no episode has ended."""
+        """Return means over episodes by name, from the sums of `pop`; none if no episode has ended."""
         count = sums[0]
         return {name: total / count for name, total in zip(self.names, sums[1:], strict=True)} if count else {}
 
@@ -103,7 +103,7 @@ class Learning(Actor):
         self.roll()
         begun, middle = self._roll_start, self._mark()
         self.learn()
-        sums, numbers = self._tally.taken(), self._numbers()
+        sums, numbers = self._tally.pop(), self._numbers()
         values = torch.cat([sums, torch.stack(list(numbers.values())).double().to(sums.device)]).tolist()  # here the host waits
         end = self._mark()
         if self.env.device.type == "cuda":
@@ -111,12 +111,12 @@ class Learning(Actor):
             durations = 1e-3 * begun.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
         else:
             durations = middle - begun, end - middle
-        own = zip(numbers, values[len(sums) :], strict=True)
-        own = {name: value for name, value in own if not (name.startswith("Score/") and math.isnan(value))}
-        return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | own, *durations)
+        pairs = zip(numbers, values[len(sums) :], strict=True)
+        metrics = {name: value for name, value in pairs if not (name.startswith("Score/") and math.isnan(value))}
+        return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | metrics, *durations)
 
     def set_rate(self, share: float) -> None:
-        """Learn at the rate that stands when a share of the run is over; by default it stays."""
+        """Set the learning rate for a share of the run that is over; by default it stays."""
 
     def roll(self) -> None:
         """Make a rollout."""
@@ -134,14 +134,14 @@ class Learning(Actor):
         self.samples += self._num_steps * self.env.num_envs * self.ranks.size
 
     def go_on(self, steps: Int[Tensor, " env"] | None = None) -> None:
-        """Begin episodes that count as having lasted so many control steps; default: as new ones."""
+        """Begin episodes, at given numbers of control steps; default: 0."""
         self.env.reset()
         if steps is not None:
             self.env.steps.copy_(steps)
         self.go_on_here()
 
     def go_on_here(self) -> None:
-        """Go on from where the environments are; what was remembered of their episodes is forgotten."""
+        """Go on from where the environments are, with an empty memory of their episodes."""
         self._is_begun = True
         self.begin(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
 
@@ -151,7 +151,7 @@ class Learning(Actor):
         """Return the card of a policy, as plain values.
 
         Args:
-            origin: What its run was made from: see `made_from`.
+            origin: The origin of its run: see `run_origin`.
             seconds: How long it has learned [s].
             command: How to learn it again.
             groups: Size of each group of observations that it takes, in its order; default: those of the actor.
