@@ -19,7 +19,7 @@ from torch.linalg import vector_norm
 from tgdsl.errors import SimulationError
 from tgdsl.rl import rotations
 from tgdsl.rl.draws import within
-from tgdsl.rl.groups import GoalPart
+from tgdsl.rl.features import GoalPart
 from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
 from tgdsl.rl.task import Setup
 from tgdsl.runtime.simulators.model_ids import element_id
