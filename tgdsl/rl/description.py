@@ -5,19 +5,20 @@ A task describes its own groups by `Task.describe`, a document's term its group 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from tgdsl.console.tables import text_table
 from tgdsl.observations.observations import WANTED, AggForceObservation
 from tgdsl.rl.features import Features, link_forces, runs_of
-from tgdsl.rl.sensed import Source, sensors_document
-
-if TYPE_CHECKING:
-    from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.sensed import Sensed, Source, sensors_document
+from tgdsl.rl.task import Task
+from tgdsl.rl.terms import ObservationTerm, Term
 
 HEADER = ("group", "features", "what", "unit", "frame", "link", "scale", "note")
 
@@ -46,16 +47,28 @@ class Description(dict[str, tuple[tuple[slice, Features], ...]]):
         return text_table(HEADER, self.rows())
 
 
-def describe(env: TouchEnv) -> Description:
-    """Return what each feature of each group of observations is."""
-    task, sensed = env.task, env._sensed
-    joints = _joints(env, env.spec.proprio.vel_scale)
-    exact = [*_joints(env), *link_forces(task.setup.links)]
-    own = {name: _touch(env, source) for name, source in sensed.groups.items()} | task.describe()
-    terms = {name: term.describe(task.setup) for name, term in env.curricula.terms.items() if hasattr(term, "observe")}
-    known = {"proprio": joints, "priv_proprio": exact} | own | terms
-    result, notes = {}, _notes(env)
-    for group, size in env.groups.items():
+def describe(
+    loaded: LoadedTask, sensed: Sensed, task: Task[Any], terms: Mapping[str, Term], sizes: Mapping[str, int]
+) -> Description:
+    """Return what each feature of each group of observations is.
+
+    Args:
+        loaded: The task's document.
+        sensed: What is felt.
+        task: The task.
+        terms: Terms that the document adds.
+        sizes: Size of each group.
+    """
+    setup, substeps = task.setup, loaded.spec.physics.substeps if loaded.spec.temporal == "stack" else 0
+    names, is_slide = setup.actuators.names, setup.actuators.is_slide.tolist()
+    known: dict[str, Sequence[Features]] = {
+        "proprio": _joints(names, is_slide, loaded.spec.proprio.vel_scale),
+        "priv_proprio": [*_joints(names, is_slide, 1.0), *link_forces(setup.links)],
+    }
+    known |= {name: _touch(sensed, source, substeps) for name, source in sensed.groups.items()} | dict(task.describe())
+    known |= {name: term.describe(setup) for name, term in terms.items() if isinstance(term, ObservationTerm)}
+    result, notes = {}, _notes(loaded)
+    for group, size in sizes.items():
         features = [
             replace(each, note=notes.get(each.sensor, "")) for each in known.get(group) or [Features("not described", size)]
         ]
@@ -64,10 +77,10 @@ def describe(env: TouchEnv) -> Description:
     return Description(result)
 
 
-def _notes(env: TouchEnv) -> dict[str, str]:
+def _notes(loaded: LoadedTask) -> dict[str, str]:
     """Return where sensors are cut off, by name."""
     notes = {}
-    for name, sensor in sensors_document(env.loaded).spec.sensors.items():
+    for name, sensor in sensors_document(loaded).spec.sensors.items():
         if (most := getattr(sensor, "max_range", None)) is not None:
             notes[name] = f"at most {most:g} m"
         elif getattr(sensor, "gate", None) == "contact_pair":
@@ -75,18 +88,16 @@ def _notes(env: TouchEnv) -> dict[str, str]:
     return notes
 
 
-def _joints(env: TouchEnv, vel_scale: float = 1.0) -> list[Features]:
-    is_slide = dict(zip(env.joint_names, env.task.setup.actuators.is_slide.tolist(), strict=True))
-    pos = [Features(f"position of {name}", 1, "m" if is_slide[name] else "rad") for name in env.joint_names]
-    vel = [
-        Features(f"velocity of {name}", 1, "m/s" if is_slide[name] else "rad/s", scale=vel_scale) for name in env.joint_names
-    ]
-    return pos + vel + [Features(f"last action of {name}", 1) for name in env.joint_names]
+def _joints(names: Sequence[str], is_slide: Sequence[bool], vel_scale: float) -> list[Features]:
+    units = ["m" if each else "rad" for each in is_slide]
+    pos = [Features(f"position of {name}", 1, unit) for name, unit in zip(names, units, strict=True)]
+    vel = [Features(f"velocity of {name}", 1, f"{unit}/s", scale=vel_scale) for name, unit in zip(names, units, strict=True)]
+    return pos + vel + [Features(f"last action of {name}", 1) for name in names]
 
 
-def _touch(env: TouchEnv, source: Source) -> list[Features]:
-    """Return what a group of touch has: of each physics step that is stacked, each channel, and each link's rows."""
-    touch = env.touch
+def _touch(sensed: Sensed, source: Source, substeps: int) -> list[Features]:
+    """Return what a group of touch has: of each channel each link's rows, and all that of each physics step if stacked."""
+    touch = sensed.touch
     (term,) = (term for term in touch.plan.observations if term.group == source.observation)
     assert term.reading is not None
     (output,) = (output for output in touch.outputs if output.name == term.reading)
@@ -108,7 +119,5 @@ def _touch(env: TouchEnv, source: Source) -> list[Features]:
         name, unit, frame = channels[channel]
         for link, rows in runs_of(links, [column % num for column in group]):
             features.append(Features(name, len(rows), unit, frame, link, scale, rows, term.reading))
-    if env.spec.temporal == "last":
-        return features
-    steps = range(env.sim.substeps)
-    return [replace(each, name=f"{each.name} of physics step {step}") for step in steps for each in features]
+    steps = [replace(each, name=f"{each.name} of physics step {step}") for step in range(substeps) for each in features]
+    return steps or features

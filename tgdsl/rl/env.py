@@ -293,7 +293,7 @@ class TouchEnv:
 
     def describe(self) -> Description:
         """Return what each feature of each group of observations is: it prints as a table."""
-        return describe(self)
+        return describe(self.loaded, self._sensed, self.task, self.curricula.terms, self.groups)
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Literal
 
-import numpy as np
+from tgdsl.console.tables import TaxelTable
 
-if TYPE_CHECKING:
-    from tgdsl.rl.groups import GoalPart
-    from tgdsl.rl.task import Setup
-
+GoalPart = Literal["orientation", "difference", "angle"]
+"""What can be observed of a goal that is an orientation."""
 AXES = ("x", "y", "z")
 COLUMNS = ("xx", "xy", "xz", "yx", "yy", "yz")
 """Components of the first two columns of a rotation's matrix, that is of the turned x axis and y axis."""
@@ -54,9 +52,8 @@ def orientation(name: str, link: str = "") -> Features:
     return Features(", ".join(f"{name}_{part}" for part in COLUMNS), 6, "1", "world", link)
 
 
-def object_state(setup: Setup) -> list[Features]:
+def object_state(body: str) -> list[Features]:
     """Return what `groups.object_state` has."""
-    body = setup.object
     return [
         vector("position", "m", body),
         orientation("orientation", body),
@@ -65,20 +62,17 @@ def object_state(setup: Setup) -> list[Features]:
     ]
 
 
-def distances(setup: Setup) -> list[Features]:
-    """Return what `Now.distance` has: of each probe, less than 0 inside the object."""
-    sensor, table = setup.rows["surface_distance"]
+def distances(sensor: str, table: TaxelTable) -> list[Features]:
+    """Return what `Now.distance` has, of each probe: less than 0 inside the object. See `Setup.rows`."""
+    links = table["link"].tolist()
     return [
-        Features("distance", len(rows), "m", "", link, 1.0, rows, sensor)
-        for link, rows in runs_of(np.asarray(table["link"]).tolist(), range(len(table)))
+        Features("distance", len(rows), "m", "", link, 1.0, rows, sensor) for link, rows in runs_of(links, range(len(links)))
     ]
 
 
-def object_props(setup: Setup, *, has_probes: bool = True) -> list[Features]:
-    """Return what `groups.object_props` has."""
-    body = setup.object
-    props = [Features("friction", 1, "1", "", body), Features("mass", 1, "kg", "", body)]
-    return props + (distances(setup) if has_probes else [])
+def object_props(body: str) -> list[Features]:
+    """Return what `groups.object_props` has before the distances."""
+    return [Features("friction", 1, "1", "", body), Features("mass", 1, "kg", "", body)]
 
 
 def link_forces(links: Sequence[str]) -> list[Features]:

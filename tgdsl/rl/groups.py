@@ -10,19 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.rl.draws import Draws
+from tgdsl.rl.features import GoalPart
 from tgdsl.rl.rotations import Quat, between, inverse, product, six_numbers
 from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.task import HandNow, Now
-
-GoalPart = Literal["orientation", "difference", "angle"]
-"""What can be observed of a goal that is an orientation."""
 
 
 class MeasuredVelocity:

@@ -359,7 +359,7 @@ class ObjectState(ObservationTerm):
         return groups.object_state(now)
 
     def describe(self, setup: Setup) -> Sequence[Features]:
-        return features.object_state(setup)
+        return features.object_state(setup.object)
 
 
 class ObjectVelocity(EventTerm):

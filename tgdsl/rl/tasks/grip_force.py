@@ -220,8 +220,11 @@ class GripForce(Task[GripForceSpec]):
                 Features("sum of normal forces", 1, "N"),
                 *(Features("normal force", 1, "N", "", link) for link in self.setup.links),
             ],
-            "priv_obj_state": features.object_state(self.setup),
-            "priv_obj_props": features.object_props(self.setup),
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
         }
 
     def score(self) -> Float[Tensor, " env"]:

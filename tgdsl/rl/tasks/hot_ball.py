@@ -176,8 +176,11 @@ class HotBall(Task[HotBallSpec]):
                 Features("whether the latch is on", 1),
                 Features("whether the hot ball is touched", 1),
             ],
-            "priv_obj_state": features.object_state(self.setup),
-            "priv_obj_props": features.object_props(self.setup),
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
         }
 
     def score(self) -> Float[Tensor, " env"]:

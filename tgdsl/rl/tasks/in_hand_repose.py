@@ -208,8 +208,11 @@ class InHandRepose(Task[InHandReposeSpec]):
         """Return what these groups hold."""
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
-            "priv_obj_state": features.object_state(self.setup),
-            "priv_obj_props": features.object_props(self.setup),
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
         }
 
     def step_progress(self) -> Float[Tensor, " env"]:

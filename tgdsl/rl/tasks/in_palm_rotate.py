@@ -195,8 +195,11 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         """Return what these groups hold."""
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
-            "priv_obj_state": features.object_state(self.setup),
-            "priv_obj_props": features.object_props(self.setup),
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
         }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:

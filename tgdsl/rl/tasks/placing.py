@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.rl.groups import GoalPart
+from tgdsl.rl.features import GoalPart
 from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
 
 

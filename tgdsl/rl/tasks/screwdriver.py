@@ -230,8 +230,11 @@ class Screwdriver(Task[ScrewdriverSpec]):
     def describe(self) -> Mapping[str, Sequence[Features]]:
         """Return what these groups hold."""
         return {
-            "priv_obj_state": features.object_state(self.setup) + features.distances(self.setup),
-            "priv_obj_props": features.object_props(self.setup, has_probes=False),
+            "priv_obj_state": [
+                *features.object_state(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
+            "priv_obj_props": features.object_props(self.setup.object),
         }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
