@@ -99,28 +99,25 @@ class Student(nn.Module):
         return torch.cat([each for each, _ in embeddings], dim=1), torch.cat([each for _, each in embeddings], dim=1)
 
 
-class Deployed(nn.Module):
-    """A student that acts: takes (env, feature) and returns (env, joint), as TorchScript."""
-
-    def __init__(self, student: Student):
-        super().__init__()
-        self.student = student
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return actions."""
-        return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
-
-
 class Acting(nn.Module):
-    """The networks of a student with memory, as a function."""
+    """The networks of a student as a function: of observations alone, (env, feature), if it remembers nothing."""
 
     def __init__(self, student: Student):
         super().__init__()
         self.student = student
+        self.input_names = ("obs", "memory") if student.memory else ("obs",)
+        self.output_names = ("actions", "next_memory") if student.memory else ("actions",)
 
-    def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions and what is remembered."""
+    def forward(self, x: Tensor, memory: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
+        """Return actions, and what is remembered."""
+        if memory is None:
+            return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
         return self.student.act(x, memory)
+
+    def get_dummy_inputs(self) -> tuple[Tensor, ...]:
+        """Return an example of what it takes."""
+        sizes = (self.student.architecture.num_features, self.student.memory)
+        return tuple(torch.zeros((2, size)) for size in sizes[: len(self.input_names)])
 
 
 RECURRENT = """
@@ -146,18 +143,20 @@ class Remembering(nn.Module):
         self.acting, self.size, self.memory = acting, size, torch.zeros((0, size))
 
 
-def deployed(student: Student) -> torch.jit.ScriptModule:
-    """Return a student as TorchScript, on the CPU."""
-    student_copy = (
-        copy.deepcopy(student).cpu().eval().requires_grad_(False)
-    )  # what remembers would keep a graph of all its steps
+def acting(student: Student) -> Acting:
+    """Return a copy of a student on the CPU, without decoders; without gradients, as memory would keep the graph of all steps."""
+    student_copy = copy.deepcopy(student).cpu().eval().requires_grad_(False)
     student_copy.decoders = nn.ModuleList()
-    x, memory = torch.zeros((2, student_copy.architecture.num_features)), torch.zeros((2, student_copy.memory))
+    return Acting(student_copy)
+
+
+def deployed(network: Acting) -> torch.jit.ScriptModule:
+    """Return a student as TorchScript, on the CPU."""
     with torch.no_grad():
-        if student_copy.memory == 0:
-            return torch.jit.trace(Deployed(student_copy), (x,))  # pyright: ignore[reportReturnType]
-        acting: torch.jit.ScriptModule = torch.jit.trace(Acting(student_copy), (x, memory))  # pyright: ignore[reportAssignmentType]
-        script: Any = torch.jit.script(Remembering(acting, student_copy.memory))
+        traced: torch.jit.ScriptModule = torch.jit.trace(network, network.get_dummy_inputs())  # pyright: ignore[reportAssignmentType]
+        if network.student.memory == 0:
+            return traced
+        script: Any = torch.jit.script(Remembering(traced, network.student.memory))
         script.define(RECURRENT)
         return script
 

@@ -6,6 +6,7 @@
 - `curve.csv`: a row per iteration
 - `checkpoint.pt`: what it goes on from
 - `policy.pt`: the policy without exploration, with its card, for `tgdsl play --policy`
+- `policy.onnx`: the same for ONNX Runtime
 - `evaluation.json`: the evaluation at the end
 - `events.out.*`: TensorBoard's, if that is installed
 """

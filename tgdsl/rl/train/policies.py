@@ -13,12 +13,14 @@ import torch
 
 from tgdsl.files.write import atomic_write
 from tgdsl.module.module import TactileModule
-from tgdsl.rl.playing.policy import CARD
+from tgdsl.rl.playing.onnx_policy import write_onnx_policy
+from tgdsl.rl.playing.policy import CARD, TAXELS
 from tgdsl.rl.train.folder import taxel_csv
 from tgdsl.rl.train.iteration import Learning
 
 if TYPE_CHECKING:
     from tgdsl.rl.train.learner import Learner
+    from tgdsl.rl.train.model import EncodedModel
 
 KEPT = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "sensors", "scene", "versions", "spec")
 """What a card says of what a run was made from."""
@@ -56,12 +58,14 @@ def card_of(
 
 
 def write_policy(learner: Learner, card: Mapping[str, Any], file: Path) -> None:
-    """Write a policy without exploration, and its card beside it as JSON, for people.
+    """Write a policy without exploration, as TorchScript and ONNX, and its card beside it as JSON, for people.
 
     Raises:
         FileError: If it cannot be written.
     """
-    write_module(lambda: learner.algorithm.get_policy().as_jit(), learner.env.touch, card, file)
+    policy: EncodedModel = learner.algorithm.get_policy()  # pyright: ignore[reportAssignmentType]
+    write_module(policy.as_jit, learner.env.touch, card, file)
+    write_onnx_policy(policy.as_onnx(verbose=False), texts_of(learner.env.touch, card), file.with_suffix(".onnx"))
 
 
 def write_module(scripted: Callable[[], Any], touch: TactileModule, card: Mapping[str, Any], file: Path) -> None:
@@ -76,10 +80,14 @@ def write_module(scripted: Callable[[], Any], touch: TactileModule, card: Mappin
     Raises:
         FileError: If it cannot be written.
     """
-    content = io.BytesIO()
-    text = json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    content, texts = io.BytesIO(), texts_of(touch, card)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
-        torch.jit.save(scripted(), content, _extra_files={CARD: text, "taxels.csv": taxel_csv(touch)})
+        torch.jit.save(scripted(), content, _extra_files=dict(texts))
     atomic_write(file, content.getvalue())
-    atomic_write(file.with_suffix(".json"), text.encode())
+    atomic_write(file.with_suffix(".json"), texts[CARD].encode())
+
+
+def texts_of(touch: TactileModule, card: Mapping[str, Any]) -> dict[str, str]:
+    """Return the texts that a policy's file holds, by name: its card, and the taxels that it feels with."""
+    return {CARD: json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n", TAXELS: taxel_csv(touch)}
