@@ -57,8 +57,8 @@ def write(program: torch.export.ExportedProgram, signature: Signature, path: Pat
     """
     with atomic_path(path) as temporary:
         if to == "onnx":
-            names = [[port.name for port in ports] for ports in (signature.inputs, signature.outputs)]
-            write_onnx(without_strides(program), *names, {Path(ENTRY).stem: signature.to_json()}, temporary)
+            inputs, outputs = ([port.name for port in ports] for ports in (signature.inputs, signature.outputs))
+            write_onnx(without_strides(program), inputs, outputs, {Path(ENTRY).stem: signature.to_json()}, temporary)
         elif to == "pt2":
             torch.export.save(program, str(temporary), extra_files={ENTRY: signature.to_json()})
         else:

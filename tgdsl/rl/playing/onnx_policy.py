@@ -10,40 +10,26 @@ policy remembers of an episode.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import torch
-from torch import Tensor, nn
 
 from tgdsl.files.write import atomic_path
 from tgdsl.module.export.formats import write_onnx
 
 
-class Network(Protocol):
-    """What acts without exploration, as rsl_rl's `as_onnx` returns it."""
-
-    input_names: Sequence[str]
-    output_names: Sequence[str]
-
-    def get_dummy_inputs(self) -> tuple[Tensor, ...]:
-        """Return an example of its inputs, of at least two environments."""
-        ...
-
-
-def write_onnx_policy(network: Network, texts: dict[str, str], file: Path) -> None:
+def write_onnx_policy(network: Any, texts: dict[str, str], file: Path) -> None:
     """Write a policy.
 
     Args:
-        network: The policy, an `nn.Module`.
+        network: The policy: a module with `input_names`, `output_names` and `get_dummy_inputs`, as rsl_rl's `as_onnx` returns.
         texts: The card and the table of taxels by the names that they have in the TorchScript file; metadata of this one.
         file: The file.
 
     Raises:
         FileError: If it cannot be written.
     """
-    assert isinstance(network, nn.Module)
     module = network.cpu().eval().requires_grad_(False)
     inputs = network.get_dummy_inputs()
     env = torch.export.Dim("env", min=1)

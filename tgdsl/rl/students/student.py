@@ -144,7 +144,7 @@ class Remembering(nn.Module):
 
 
 def acting(student: Student) -> Acting:
-    """Return a copy of a student on the CPU, without decoders; without gradients, as memory would keep the graph of all steps."""
+    """Return a copy of a student on the CPU, without decoders; nor gradients, as memory would keep the graph of all steps."""
     student_copy = copy.deepcopy(student).cpu().eval().requires_grad_(False)
     student_copy.decoders = nn.ModuleList()
     return Acting(student_copy)
