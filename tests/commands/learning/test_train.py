@@ -51,7 +51,16 @@ def test_from_nothing_to_a_policy_that_plays(base, here):
     assert lines[-1].startswith("score ") and "quarter turns" in lines[-1] and "in 6 episodes" in lines[-1]
     folder = base / "out" / "task"
     names = {file.name.split(".out.")[0] for file in folder.iterdir()}
-    assert names == {"checkpoint.pt", "curve.csv", "evaluation.json", "events", "policy.json", "policy.pt", "run.json"} | {
+    assert names == {
+        "checkpoint.pt",
+        "curve.csv",
+        "evaluation.json",
+        "events",
+        "policy.json",
+        "policy.onnx",
+        "policy.pt",
+        "run.json",
+    } | {
         "sensors.yaml",
         "task.yaml",
         "taxels.csv",

@@ -8,7 +8,7 @@ from torch import nn
 
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.encoders import Encoder, Grid, Lstm, network
-from tgdsl.rl.students.student import Architecture, Stack, deployed, forgotten, seeded_student
+from tgdsl.rl.students.student import Architecture, Stack, acting, deployed, forgotten, seeded_student
 from tgdsl.rl.train.checkpoint import FORMAT, KEYS, read_checkpoint, write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # what policies are written in
@@ -189,7 +189,7 @@ def test_cells_without_a_taxel_tell_nothing_and_each_taxel_does(kind):
 @pytest.mark.parametrize("kind", ENCODERS)
 def test_a_deployed_student_acts_as_it_did_and_forgets_episode_by_episode(kind, tmp_path):
     stack = Stack(architecture(kind), SEEDS, 1e-3, 1.0)
-    torch.jit.save(deployed(stack.student(1)), tmp_path / "policy.pt")
+    torch.jit.save(deployed(acting(stack.student(1))), tmp_path / "policy.pt")
     policy = torch.jit.load(tmp_path / "policy.pt")
     assert not [name for name, _ in policy.named_parameters() if "decoder" in name]
     memory = torch.zeros((3, 4, stack.memory))

@@ -108,13 +108,17 @@ def write_policy(scripted: torch.nn.Module, touch: TactileModule, card: Mapping[
     Raises:
         FileError: If it cannot be written.
     """
-    content = io.BytesIO()
-    text = json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    content, texts = io.BytesIO(), card_texts(touch, card)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
-        torch.jit.save(scripted, content, _extra_files={CARD: text, TAXELS: taxel_csv(touch)})
+        torch.jit.save(scripted, content, _extra_files=dict(texts))
     atomic_write(file, content.getvalue())
-    atomic_write(file.with_suffix(".json"), text.encode())
+    atomic_write(file.with_suffix(".json"), texts[CARD].encode())
+
+
+def card_texts(touch: TactileModule, card: Mapping[str, Any]) -> dict[str, str]:
+    """Return the texts that a policy's file holds, by name: its card, and the taxels that it feels with."""
+    return {CARD: json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n", TAXELS: taxel_csv(touch)}
 
 
 def taxel_csv(touch: TactileModule) -> str:

@@ -22,11 +22,12 @@ from tgdsl.console.tables import text_table
 from tgdsl.files.write import atomic_write, with_folder
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.evaluation import Evaluation
-from tgdsl.rl.playing.policy import write_policy
+from tgdsl.rl.playing.onnx_policy import write_onnx_policy
+from tgdsl.rl.playing.policy import card_texts, write_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 from tgdsl.rl.students.keys import StudentKey
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.student import deployed
+from tgdsl.rl.students.student import acting, deployed
 from tgdsl.rl.students.teacher import own_task
 
 
@@ -136,4 +137,6 @@ def write_students(
         card = distiller.card(run, seconds, command, sizes)
         card["samples"] = distiller.samples // len(distiller.keys)
         card |= {"teacher": origin["teacher"], "score": found[i].plain() if found else None}
-        write_policy(deployed(distiller.student(i)), touch, card, folder / f"{key.name}.pt")
+        network = acting(distiller.student(i))
+        write_policy(deployed(network), touch, card, folder / f"{key.name}.pt")
+        write_onnx_policy(network, card_texts(touch, card), folder / f"{key.name}.onnx")

@@ -89,15 +89,32 @@ class Student(nn.Module):
         return torch.cat([each for each, _ in embeddings], dim=1), torch.cat([each for _, each in embeddings], dim=1)
 
 
-STATELESS = """
-def forward(self, x: Tensor) -> Tensor:
-    return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
-"""
+class Acting(nn.Module):
+    """The networks of a student as a function: of observations alone, (env, feature), if it remembers nothing."""
+
+    def __init__(self, student: Student):
+        super().__init__()
+        self.student = student
+        self.input_names = ("obs", "memory") if student.memory else ("obs",)
+        self.output_names = ("actions", "next_memory") if student.memory else ("actions",)
+
+    def forward(self, x: Tensor, memory: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
+        """Return actions, and what is remembered."""
+        if memory is None:
+            return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
+        return self.student.act(x, memory)
+
+    def get_dummy_inputs(self) -> tuple[Tensor, ...]:
+        """Return an example of what it takes."""
+        sizes = (self.student.architecture.num_features, self.student.memory)
+        return tuple(torch.zeros((2, size)) for size in sizes[: len(self.input_names)])
+
+
 RECURRENT = """
 def forward(self, x: Tensor) -> Tensor:
     if self.memory.shape[0] != x.shape[0]:
         self.memory = x.new_zeros((x.shape[0], self.size))
-    action, memory = self.student.act(x, self.memory)
+    action, memory = self.student(x, self.memory)
     self.memory = memory
     return action
 
@@ -116,16 +133,22 @@ class Deployed(nn.Module):
         self.student, self.size, self.memory = student, size, torch.zeros((0, size))
 
 
-def deployed(student: Student) -> torch.jit.ScriptModule:
-    """Return a student as TorchScript on the CPU: takes (env, feature) and returns (env, joint)."""
-    actor = copy.deepcopy(student).cpu().eval().requires_grad_(False)  # memory would keep a graph of all its steps
-    actor.decoders = nn.ModuleList()
-    inputs = torch.zeros((2, actor.architecture.num_features)), torch.zeros((2, actor.memory))
+def acting(student: Student) -> Acting:
+    """Return a copy of a student on the CPU, without decoders; nor gradients, as memory would keep the graph of all steps."""
+    student_copy = copy.deepcopy(student).cpu().eval().requires_grad_(False)
+    student_copy.decoders = nn.ModuleList()
+    return Acting(student_copy)
+
+
+def deployed(network: Acting) -> torch.jit.ScriptModule:
+    """Return a student as TorchScript, on the CPU."""
     with torch.no_grad():
-        traced: Any = torch.jit.trace_module(actor, {"act": inputs})
-        script: Any = torch.jit.script(Deployed(traced, actor.memory))
-    script.define(RECURRENT if actor.memory else STATELESS)
-    return script
+        traced: torch.jit.ScriptModule = torch.jit.trace(network, network.get_dummy_inputs())  # pyright: ignore[reportAssignmentType]
+        if network.student.memory == 0:
+            return traced
+        script: Any = torch.jit.script(Deployed(traced, network.student.memory))
+        script.define(RECURRENT)
+        return script
 
 
 def forgotten(memory: Tensor, ended: Tensor) -> Tensor:

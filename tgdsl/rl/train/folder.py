@@ -6,6 +6,7 @@
 - `curve.csv`: a row per iteration
 - `checkpoint.pt`: its state, to resume
 - `policy.pt`: the policy without exploration and its card, for `tgdsl play --policy`
+- `policy.onnx`: the same for ONNX Runtime
 - `evaluation.json`: the evaluation at the end
 - `events.out.*`: TensorBoard's, if that is installed
 """

@@ -20,7 +20,8 @@ from torch import Tensor
 from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.policy import write_policy
+from tgdsl.rl.playing.onnx_policy import write_onnx_policy
+from tgdsl.rl.playing.policy import card_texts, write_policy
 from tgdsl.rl.playing.rollout import Moment
 from tgdsl.rl.train.config import config
 from tgdsl.rl.train.iteration import Iteration, Learning
@@ -86,12 +87,14 @@ class Learner(Learning):
         return None if std is None else std.tolist()
 
     def write_policy(self, card: Mapping[str, Any], file: Path) -> None:
-        """Write the policy without exploration, and its card beside it as JSON, for people.
+        """Write the policy without exploration, as TorchScript and ONNX, and its card beside it as JSON, for people.
 
         Raises:
             FileError: If it cannot be written.
         """
-        write_policy(self.algorithm.get_policy().as_jit(), self.env.touch, card, file)
+        policy: Any = self.algorithm.get_policy()
+        write_policy(policy.as_jit(), self.env.touch, card, file)
+        write_onnx_policy(policy.as_onnx(verbose=False), card_texts(self.env.touch, card), file.with_suffix(".onnx"))
 
     def change_rates(self, before: Mapping[str, Any]) -> None:
         """Take over the document's learning rates, once a state was loaded; one that adapts only if the document had another.
