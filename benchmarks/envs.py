@@ -190,7 +190,7 @@ def share_of(label: str) -> str:
 @contextmanager
 def stamped(env: TouchEnv) -> Iterator[Stamps]:
     """Have a step note its parts; what was captured is captured again."""
-    stamps, sim, episodes = Stamps(env.device), env.sim, env._episodes
+    stamps, sim = Stamps(env.device), env.sim
     advance, read, began = env._advance, sim.read, env._begin
     patches: list[tuple[Any, str, Any]] = []
 
@@ -212,7 +212,7 @@ def stamped(env: TouchEnv) -> Iterator[Stamps]:
         (sim, "step", "physics"),
         (sim, "reset", "simulator"),
         (sim.properties, "set", "properties"),
-        (episodes, "_restarted", "drives"),
+        (env, "_restarted", "drives"),
     ):
         patch(owner, name, stamps.within(label, getattr(owner, name)))
     patch(sim, "read", lambda *mask: stamps.within("read again" if mask else "touch", read)(*mask))

@@ -6,7 +6,7 @@ from pincer_tasks import write_pincer
 
 from tgdsl.files import cache
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.grasps import load as loading
+from tgdsl.rl.grasps import sampling as loading
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The page that sets the paper beside tgdsl says what tgdsl's documents have."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -12,41 +13,70 @@ from tgdsl.rl.tasks.in_palm_rotate import InPalmRotateSpec
 
 REPOSITORY = Path(__file__).parents[2]
 SECTIONS = re.split(r"^## ", (REPOSITORY / "docs" / "paper.md").read_text(encoding="utf-8"), flags=re.M)[1:]
-KEYED = {section.partition("\n")[0]: section for section in SECTIONS if re.search(r"^(Document|Defaults): ", section, re.M)}
+NAMED = {section.partition("\n")[0]: section for section in SECTIONS}
+KEYED = {name: section for name, section in NAMED.items() if re.search(r"^(Document|Defaults): ", section, re.M)}
+PUBLISHED = {name: section for name, section in NAMED.items() if "Published: `" in section}
 ENTRY = re.compile(r"`([a-z_.]+): ([^`]+)`")
+CODE, TGDSL, COMPARED = 2, 3, 4
+"""Columns: what the authors' code has, tgdsl's document, and the published one."""
 
 
 def spec_of(section):
-    document = re.search(r"^Document: `(.+)`", section, re.M)
+    document = re.search(r"^Document: `([^`]+)`", section, re.M)
     if document:
         return load_task(REPOSITORY / document[1]).spec
     return InPalmRotateSpec(tgdsl=1, task="in_palm_rotate", document="palm.yaml", object="item", joints=("a",))
 
 
-def entries_of(section):
-    rows = [line.split(" | ") for line in section.splitlines() if line.startswith("| ")]
-    return [entry for row in rows[1:] for entry in ENTRY.findall(row[3])]
+def rows_of(section):
+    lines = [line for line in section.splitlines() if line.startswith("| ")][1:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def value_of(spec, key):
+def entries_of(section, column=TGDSL):
+    return [entry for row in rows_of(section) for entry in ENTRY.findall(row[column])]
+
+
+def value_of(spec, key, terms=None):
+    owner = {"terms": terms} if key.startswith("terms.") else spec
     for name in key.split("."):
-        spec = getattr(spec, name) if isinstance(spec, BaseModel) else spec[name]
-    return list(spec) if isinstance(spec, tuple) else spec
+        owner = getattr(owner, name) if isinstance(owner, BaseModel) else owner[name]
+    return list(owner) if isinstance(owner, tuple) else owner
+
+
+def differences(entries, spec, terms=None):
+    wrong = []
+    for key, text in entries:
+        shown, value = YAML(typ="safe", pure=True).load(text), value_of(spec, key, terms)
+        is_text = (
+            isinstance(value, str | bool | Mapping) or value is None or (isinstance(value, list) and isinstance(value[0], str))
+        )
+        if not (shown == value if is_text else shown == pytest.approx(value, rel=1e-4)):
+            wrong.append(f"{key}: {text}, but the document has {value}")
+    return wrong
 
 
 @pytest.mark.parametrize("name", KEYED)
 def test_each_key_of_the_page_has_its_value(name):
-    spec, entries = spec_of(KEYED[name]), entries_of(KEYED[name])
+    entries = entries_of(KEYED[name])
     assert entries
-    wrong = []
-    for key, text in entries:
-        shown, value = YAML(typ="safe", pure=True).load(text), value_of(spec, key)
-        is_same = shown == value if isinstance(value, str | bool) or value is None else None
-        if is_same is None and isinstance(value, list) and isinstance(value[0], str):
-            is_same = shown == value
-        if not (shown == pytest.approx(value, rel=1e-4) if is_same is None else is_same):
-            wrong.append(f"{key}: {text}, but the document has {value}")
+    wrong = differences(entries, spec_of(KEYED[name]))
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_each_key_of_the_published_documents_has_its_value(name):
+    loaded = load_task(REPOSITORY / re.search(r"Published: `([^`]+)`", PUBLISHED[name])[1])
+    entries = entries_of(PUBLISHED[name], COMPARED)
+    assert entries
+    wrong = differences(entries, loaded.spec, loaded.terms)
+    assert not wrong, "\n".join(wrong)
+
+
+def test_each_setting_of_the_authors_code_has_a_key_in_a_published_document():
+    stated = [(name, row) for name, section in NAMED.items() for row in rows_of(section) if row[CODE] != "–"]
+    assert len(stated) > 30
+    assert [(name, row[0]) for name, row in stated if not ENTRY.search(row[COMPARED])] == []
 
 
 def test_the_page_has_all_weights_of_each_reward():

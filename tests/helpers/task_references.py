@@ -25,6 +25,19 @@ def pay(spec, link_force: np.ndarray, fingers: np.ndarray) -> float:
     return 1.0 if is_loaded.sum() >= spec.links and (is_loaded & fingers).any() else spec.coasting_pay
 
 
+def paid_rate(spec, rate: float) -> float:
+    """Return what pays of a rate of progress [rad/s]."""
+    bounded = min(rate, spec.max_spin)
+    bounded = bounded if spec.min_spin is None else max(bounded, spec.min_spin)
+    return bounded if bounded >= 0 else spec.backward * bounded
+
+
+def dropped(spec, pos: np.ndarray, start: np.ndarray) -> bool:
+    """Whether an object at a place is lost, that started at another [m]."""
+    away = np.linalg.norm(pos - start) if spec.drop_measure == "distance" else start[2] - pos[2]
+    return bool(away > spec.drop_distance)
+
+
 def in_palm_rotate(spec, record, dt):
     # The record has `pos` [m], `quat`, `link_force` (step, link, 3) [N]; and `fingers`, which links are fingers
     way, pos, quat = (1.0 if spec.direction == "counterclockwise" else -1.0), record["pos"], record["quat"]
@@ -42,10 +55,11 @@ def in_palm_rotate(spec, record, dt):
         share = paid / forth if forth else 1.0
         forth, paid = (0.0, 0.0) if is_reached else (forth, paid)
         distance = np.linalg.norm(pos[t] - pos[0])
-        is_over = distance > spec.drop_distance
+        is_over = dropped(spec, pos[t], pos[0])
+        pays = spec.spin_tilt is None or tilt <= spec.spin_tilt
         yield {
             "success": is_reached * share,
-            "spin": min(step / dt, spec.max_spin) * (share_paid if step > 0 else 1.0),
+            "spin": pays * paid_rate(spec, step / dt) * (share_paid if step > 0 else 1.0),
             "tilt": tilt,
             "object_distance": max(0.0, distance - spec.free_distance),
             "drop": is_over,
@@ -60,29 +74,37 @@ def _quat_product(left: np.ndarray, right: np.ndarray):
 
 
 def in_hand_repose(spec, record, dt):
-    # The record has `pos` [m] and `quat`; and `goal_axis` (goal, 3), axes of goals in turn
+    # The record has `pos` [m] and `quat`; and `goal_axis` (goal, 3), axes of goals in turn, or `goal_angles` (goal, 2), angles
+    # about x and then y [rad]; and `goal_steps`, control steps for each
     pos = record["pos"]
     rot = [_matrix(quat) for quat in record["quat"]]
     reached, near_since, goal_time = 0, 0, 0
-    goal = _turn(record["goal_axis"][0], spec.goal_step) @ rot[0]
+    goal = _next_goal(spec, record, 0) @ rot[0]
     for t in range(1, len(pos)):
         error = _angle_between(goal, rot[t])
         near_since = near_since + 1 if error < spec.goal_tolerance else 0
         is_reached = near_since >= spec.goal_hold
-        is_late = not is_reached and t - goal_time >= round(spec.goal_timeout / dt)
-        is_dropped = np.linalg.norm(pos[t] - pos[0]) > spec.drop_distance
+        is_late = not is_reached and t - goal_time >= record["goal_steps"][reached]
+        is_dropped = dropped(spec, pos[t], pos[0])
         row = {
             "success": is_reached,
             "track_gaussian": math.exp(-0.5 * (error / spec.track_width) ** 2),
             "track_inverse": 1 / (1 + (error / spec.track_half) ** 2),
-            "progress": min((_angle_between(goal, rot[t - 1]) - error) / dt, spec.max_spin),
+            "progress": paid_rate(spec, (_angle_between(goal, rot[t - 1]) - error) / dt),
             "drop": is_dropped,
             "goal_timeout": is_late,
         }
         if is_reached:
             reached, near_since, goal_time = reached + 1, 0, t
-            goal = _turn(record["goal_axis"][reached], spec.goal_step) @ goal
+            goal = _next_goal(spec, record, reached) @ goal
         yield row | {"is_over": is_dropped or is_late, "score": reached}
+
+
+def _next_goal(spec, record, number: int) -> np.ndarray:
+    if "goal_angles" in record:
+        x, y = record["goal_angles"][number]
+        return _turn(np.eye(3)[1], y) @ _turn(np.eye(3)[0], x)
+    return _turn(record["goal_axis"][number], spec.goal_step)
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
@@ -102,7 +124,7 @@ def _angle_between(one: np.ndarray, other: np.ndarray) -> float:
 def screwdriver(spec, record, dt):
     # The record has `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `link_force` (step, link, 3) [N]; `upright_pos`,
     # `upright_tip` [m], where body and tip are in the keyframe; and `fingers`, which links are fingers
-    quat, turned = record["quat"], 0.0
+    quat, turned, angle, mark, since = record["quat"], 0.0, 0.0, 0.0, 0
     for t in range(1, len(quat)):
         step = -_turned_about_z(quat[t - 1], quat[t])
         _, x, y, _ = quat[t]
@@ -110,10 +132,15 @@ def screwdriver(spec, record, dt):
         turned += step * (tilt < UPRIGHT)
         distance = np.linalg.norm(record["pos"][t] - record["upright_pos"])
         away = np.linalg.norm(record["tip"][t] - record["upright_tip"])
-        is_over = tilt > spec.drop_tilt or away > spec.engagement
+        angle, since = angle + step, since + 1
+        is_stalled = False
+        if spec.stall is not None:
+            mark, since = (angle, 0) if angle >= mark + spec.stall.turn else (mark, since)
+            is_stalled = since >= round(spec.stall.within / dt)
+        is_over = tilt > spec.drop_tilt or away > spec.engagement or is_stalled
         share_paid = pay(spec.hold, record["link_force"][t], record["fingers"])
         yield {
-            "spin": min(step / dt, spec.max_spin) * (share_paid if step > 0 else 1.0),
+            "spin": paid_rate(spec, step / dt) * (share_paid if step > 0 else 1.0),
             "alignment": 1.0 - math.cos(tilt),
             "object_distance": max(0.0, distance - spec.free_distance),
             "hand_pose": np.sum((record["joint_pos"][t] - record["joint_pos"][0]) ** 2),
@@ -202,7 +229,7 @@ def _contact_force(term, row):
 
 
 def _near(term, row):
-    return np.mean(np.exp(-np.maximum(row["distance"], 0.0) / term.width))
+    return np.mean(np.exp(-np.maximum(np.sort(row["distance"])[: term.nearest], 0.0) / term.width))
 
 
 def _object_speed(term, row):

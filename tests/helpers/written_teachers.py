@@ -3,8 +3,9 @@
 import torch
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.train.folder import made_from
-from tgdsl.rl.train.policies import KEPT, write_module
+from tgdsl.rl.playing.policy import write_policy
+from tgdsl.rl.train.folder import run_origin
+from tgdsl.rl.train.iteration import ORIGIN_KEYS
 
 
 class FindRidge(torch.nn.Module):
@@ -40,10 +41,10 @@ def teacher(file, loaded, groups, module=None, std=None, **card):
     try:
         sizes = {name: env.groups[name] for name in groups}
         network = module or Linear(sum(sizes.values()), env.num_actions)
-        origin = made_from(loaded, env, 0, {}, 1)
-        own = {"groups": sizes, "joints": list(env.joint_names), "std": std, **{name: origin[name] for name in KEPT}}
+        origin = run_origin(loaded, env, 0, {}, 1)
+        own = {"groups": sizes, "joints": list(env.joint_names), "std": std, **{name: origin[name] for name in ORIGIN_KEYS}}
         traced = torch.jit.trace(network, torch.zeros((2, sum(sizes.values()))))
-        write_module(lambda: traced, env.touch, own | card, file)
+        write_policy(traced, env.touch, own | card, file)
     finally:
         env.close()
     return file

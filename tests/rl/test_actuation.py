@@ -238,6 +238,17 @@ def test_offsets_are_from_the_target_that_an_episode_began_with(tmp_path, simula
     assert actuation.target[:, 0].tolist() == pytest.approx([0.3, 0.7], abs=1e-6)
 
 
+def test_offsets_of_half_a_range_reach_as_far_as_it_is_wide(tmp_path):
+    """The joint's range is ±2: from −0.5 rad an action of −1 to 1 asks for −2.5 to 1.5 rad, of which −2 is the end."""
+    sim, actuation = hinge(tmp_path, BatchSimulation, num_envs=3, action=ActionSpec(mode="offset", scale="half_range"))
+    sim.qpos[:, 0] = -0.5
+    begin(actuation, torch.ones(3, dtype=torch.bool), torch.ones(3, dtype=torch.int64))
+    actuation.command(torch.tensor([[-1.0], [0.5], [1.0]]))
+    assert actuation.target[:, 0].tolist() == pytest.approx([-2.0, 0.5, 1.5])
+    with pytest.raises(ValueError, match="scale is half_range, but absolute actions have none"):
+        ActionSpec(mode="absolute", scale="half_range")
+
+
 # What is drawn
 
 

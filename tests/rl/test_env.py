@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from tiny_tasks import NOISY, RADIUS, RANDOM, actions, same, taxel_world, tiny_envs
+from tiny_tasks import NOISY, RADIUS, RANDOM, actions, same, taxel_world, tiny_env, tiny_envs
 
-from tgdsl.errors import SimulationError
+from tgdsl.errors import SimulationError, SpecError
 from tgdsl.runtime import simulate
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connect import SOURCES
@@ -389,3 +389,33 @@ def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
         make(3, simulator="min")
     with pytest.raises(SimulationError, match='MuJoCo steps on the CPU, and the device is "cuda"'):
         simulate.simulator_for("cuda", "mujoco")
+
+
+def test_joints_are_observed_with_noise_and_scaled(tmp_path):
+    """Positions and velocities, not actions, and nothing that is privileged; other numbers at each step, the same ones again."""
+    more = "proprio: {pos_noise: 0.01 rad, vel_noise: 0.3, vel_scale: 0.2}\n"
+    env = tiny_env(tmp_path, 500, more=more)
+    first, noise = env.observe()["proprio"], []
+    for action in actions(env, 4):
+        obs = env.step(action).obs
+        pos, vel, last = obs["proprio"].double().split(2, dim=1)
+        noise.append(torch.cat([pos - env.now.joint_pos, vel / 0.2 - env.now.joint_vel], dim=1))
+        assert torch.equal(last.float(), action)
+        exact = torch.cat([env.now.joint_pos, env.now.joint_vel, env.now.action], dim=1).float()
+        assert torch.equal(obs["priv_proprio"][:, :6], exact)
+    stacked = torch.stack(noise)
+    scale = torch.tensor([0.01, 0.01, 0.3, 0.3])
+    assert (stacked.mean(dim=(0, 1)).abs() < 0.1 * scale).all()
+    np.testing.assert_allclose(stacked.std(dim=(0, 1)) / scale, 1.0, atol=0.05)
+    correlations = torch.corrcoef(torch.cat([stacked[:-1].reshape(-1, 4).T, stacked[1:].reshape(-1, 4).T]))
+    assert (correlations - torch.eye(8)).abs().max() < 0.12
+    assert torch.equal(env.reset(0)["proprio"], first)
+    env.close()
+
+
+def test_a_document_sets_the_largest_torques(tmp_path):
+    env = tiny_env(tmp_path, 1, more="physics: {max_torque: {le*: 0.7 N*m}}\n")
+    assert env.task.setup.max_torque.tolist() == pytest.approx([0.7, 0.3])
+    env.close()
+    with pytest.raises(SpecError, match=r"physics.max_torque.lift: no actuated joint matches .*left"):
+        tiny_env(tmp_path, 1, more="physics: {max_torque: {lift: 0.7 N*m}}\n")

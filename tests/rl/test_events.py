@@ -152,3 +152,13 @@ def test_what_is_wrong_with_an_event_is_told(tmp_path):
         load_task(write_task(tmp_path, more='terms: {lift: {term: "own.py:lift"}}\n'))
     with pytest.raises(SimulationError, match=r'"knock" comes every 0\.001 s, more often than control steps of 0\.025 s'):
         tiny_env(tmp_path, more=KNOCK.replace("0.1 s, 0.2 s", "1 ms, 0.2 s"))
+
+
+def test_a_document_places_the_object(tmp_path):
+    """Within bounds along x and y, turned about the vertical, and otherwise as the keyframe has it."""
+    env = tiny_env(tmp_path, 32, more="terms: {place: {term: placement, xy: [1 mm, 2 mm], yaw: [0.2, 0.3]}}\n")
+    pos, quat = env.sim.qpos[:, 3:6].numpy(), env.sim.qpos[:, 6:10].numpy()
+    assert (pos[:, :2] > 1e-3 - 1e-9).all() and (pos[:, :2] < 2e-3 + 1e-9).all() and np.unique(pos[:, 0]).size == 32
+    np.testing.assert_allclose(pos[:, 2], 0.03)
+    turn = 2.0 * np.arctan2(quat[:, 3], quat[:, 0])
+    assert (quat[:, 1:3] == 0.0).all() and (turn > 0.2).all() and (turn < 0.3).all()

@@ -1,5 +1,6 @@
 """Terms that a document adds to its task: rewards, reasons to end, groups of observations; a user's own from a file."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -185,3 +186,57 @@ def test_a_task_of_ones_own_lists_its_terms(folder):
     made = env.step(torch.zeros(4, 2))
     expected = -2 * env.control_step * env.now.object.pos[:, 2].numpy()
     np.testing.assert_allclose(made.info.terms["height"], expected, rtol=1e-6)
+
+
+def test_only_the_nearest_probes_count(folder):
+    env = tiny_env(folder, more="rewards: {near: null}\nterms: {near: {weight: 2, width: 1 cm, nearest: 3}}\n")
+    made = env.step(torch.full((4, 2), 0.3))
+    nearest = np.sort(np.maximum(env.now.distance.numpy(), 0.0), axis=1)[:, :3]
+    expected = 2 * env.control_step * np.exp(-nearest / 0.01).mean(axis=1)
+    np.testing.assert_allclose(made.info.terms["near"], expected, rtol=1e-6)
+
+
+def test_the_net_force_is_that_of_mujocos_contacts(folder):
+    """Both plates and the floor press: with one physics step, forces are of where the control step began."""
+    more = "randomise: {xy: [20 mm, 20 mm]}\nphysics: {substeps: 1}\naction: {mode: absolute}\n"
+    more += "terms: {free: {term: net_force, weight: 1, free: 1 mN, most: 1000 N}, bounded: {term: net_force, weight: 1, free: 1 N, most: 2 N}}\n"
+    env, names = tiny_env(folder, 1, more=more), ("qpos", "qvel", "qacc_warmstart", "ctrl")
+    model, seen = env.sim.env_model(0), []
+    for _ in range(120):
+        before = {name: env.sim.arrays[name][0].clone().numpy() for name in names}
+        made = env.step(torch.tensor([[0.0, -1.0]]))
+        before["ctrl"] = env.sim.arrays["ctrl"][0].numpy()
+        data = mujoco.MjData(model)
+        for name, value in before.items():
+            getattr(data, name)[:] = value
+        mujoco.mj_forward(model, data)
+        net, force, hand = np.zeros(3), np.zeros(6), [model.body(name).id for name in ("left", "right")]
+        for i in range(data.ncon):
+            mujoco.mj_contactForce(model, data, i, force)
+            bodies = model.geom_bodyid[data.contact[i].geom]
+            if set(bodies) & set(hand) and model.body("ball").id in bodies:
+                net += (1 if bodies[0] in hand else -1) * data.contact[i].frame.reshape(3, 3).T @ force[:3]
+        size = np.linalg.norm(net)
+        found = [float(made.info.terms[name]) / env.control_step for name in ("free", "bounded")]
+        np.testing.assert_allclose(found, [max(0, size - 1e-3), min(2, max(0, size - 1))], atol=1e-5)
+        seen.append(size)
+    assert max(seen) > 3 and any(1 < size < 3 for size in seen)
+
+
+def test_an_episode_ends_at_a_score(folder):
+    env = tiny_env(folder, 3, gravity="0 0 0", more="episode: 20 s\nterms: {enough: {term: score_limit, most: 2}}\n")
+    ends = []
+    for _ in range(60):
+        env.sim.qvel[:, 8] = torch.tensor([0.0, 6.0, 3.0])  # spun by hand
+        made = env.step(torch.zeros(3, 2))
+        ends += [(made.terminated.tolist(), made.info.score.tolist())] if made.terminated.any() else []
+    assert next(end for end, _ in ends) == [False, True, False] and ends[0][1][1] == 2
+    assert not any(end[0] for end, _ in ends) and any(end[2] for end, _ in ends)
+
+
+def test_a_group_of_forces_is_of_links_that_a_document_names(folder):
+    env = tiny_env(folder, more='terms: {tip: {term: link_force, links: ["ri*"]}}\n')
+    obs = env.step(torch.ones(4, 2)).obs["tip"]
+    assert torch.equal(obs, env.now.link_force[:, 1].float())
+    with pytest.raises(SimulationError, match='no link matches "tip"; known links: left, right'):
+        tiny_env(folder, more="terms: {tip: {term: link_force, links: [tip]}}\n")

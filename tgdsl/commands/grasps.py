@@ -32,9 +32,8 @@ class Grasps:
 
         from tgdsl.files.cache import folder
         from tgdsl.files.write import check_writable
-        from tgdsl.rl.grasps.grasps import write_grasps
-        from tgdsl.rl.grasps.load import kept_grasps
-        from tgdsl.rl.grasps.spec import grasp_spec
+        from tgdsl.rl.grasps.grasps import grasp_spec, write_grasps
+        from tgdsl.rl.grasps.sampling import kept_grasps
         from tgdsl.rl.load import load_task
         from tgdsl.rl.sensed import compile_sensed
         from tgdsl.rl.start import moved_joints

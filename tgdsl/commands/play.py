@@ -105,8 +105,8 @@ class Play:
         from tqdm import tqdm
 
         from tgdsl.console.live import LiveTable
+        from tgdsl.rl.playing.record import Tally
         from tgdsl.rl.playing.rollout import rollout
-        from tgdsl.rl.playing.tally import Tally
         from tgdsl.view.picture import chosen_output
         from tgdsl.view.trace import TouchTrace
 

@@ -41,7 +41,7 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import model_validator
+from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
@@ -56,14 +56,21 @@ ZERO: Range = (0.0, 0.0)
 Factor = Annotated[Range, RangeOf("number", gt=0.0)]
 
 
+Scale = Annotated[
+    Annotated[Literal["half_range"], Tag("word")] | Annotated[float, Quantity("angle", gt=0.0), Tag("angle")],
+    Discriminator(lambda value: "word" if value == "half_range" else "angle"),
+]
+
+
 class ActionSpec(SpecModel):
     """How an action of a policy is understood."""
 
     mode: Literal["relative", "absolute", "offset"] = "relative"
     """Whether an action moves the target, is the target, −1 and 1 being the ends of the joint's range, or is how far the target
     is from that at the episode's start."""
-    scale: Annotated[float, Quantity("angle", gt=0.0)] = 0.05
-    """s, what an action of 1 is for a hinge's target [rad]: in a control step if relative, in all if `offset`."""
+    scale: Scale = 0.05
+    """s, what an action of 1 is for a hinge's target [rad]: in a control step if relative, in all if `offset`. `half_range`:
+    half of each joint's range, of slides too."""
     slide_scale: PositiveLength = 0.01
     """The same of slides [m]."""
     smoothing: Annotated[float, Quantity("number", ge=0.0)] = 0.0
@@ -74,9 +81,8 @@ class ActionSpec(SpecModel):
         for name, unit in (("scale", "rad"), ("slide_scale", "m")):
             value = getattr(self, name)
             if self.mode == "absolute" and value != type(self).model_fields[name].default:
-                problem = (
-                    f"{name} is {value:g} {unit}, but absolute actions have none: their ends are those of the joint's range"
-                )
+                shown = value if isinstance(value, str) else f"{value:g} {unit}"
+                problem = f"{name} is {shown}, but absolute actions have none: their ends are those of the joint's range"
                 raise ValueError(f"{problem}; leave it out, or take mode relative or offset")
         if self.smoothing >= 1.0:
             raise ValueError(f"smoothing is {self.smoothing:g}, expected less than 1: targets would never move")
@@ -128,33 +134,20 @@ class DriveSpec(SpecModel):
 
 @dataclass(frozen=True, eq=False)
 class Actuators:
-    """The position actuators of some joints, and where both stand in a model.
-
-    Attributes:
-        names: The joints.
-        actuator: Index of each one's actuator.
-        qpos: Where each stands in `qpos`.
-        dof: Where each stands in `qvel`.
-        low: Lower end of each range [rad].
-        high: Upper end of each range [rad].
-        stiffness: k_p [N·m/rad].
-        damping: k_d of the actuator, not of the joint [N·m·s/rad].
-        limit: τ_max [N·m]; infinite where there is none.
-        top_speed: Speed at which joint damping takes all of τ_max [rad/s]; infinite where there is none.
-        is_slide: Whether a joint is a slide: m for rad and N for N·m in all of these.
-    """
+    """The position actuators of some joints, and where both stand in a model."""
 
     names: tuple[str, ...]
-    actuator: Int[np.ndarray, " joint"]
-    qpos: Int[np.ndarray, " joint"]
-    dof: Int[np.ndarray, " joint"]
-    low: Float[np.ndarray, " joint"]
-    high: Float[np.ndarray, " joint"]
-    stiffness: Float[np.ndarray, " joint"]
-    damping: Float[np.ndarray, " joint"]
-    limit: Float[np.ndarray, " joint"]
+    actuator: Int[np.ndarray, " joint"]  # index of each one's actuator
+    qpos: Int[np.ndarray, " joint"]  # where each stands in `qpos`
+    dof: Int[np.ndarray, " joint"]  # where each stands in `qvel`
+    low: Float[np.ndarray, " joint"]  # lower end of each range [rad]
+    high: Float[np.ndarray, " joint"]  # upper end of each range [rad]
+    stiffness: Float[np.ndarray, " joint"]  # k_p [N·m/rad]
+    damping: Float[np.ndarray, " joint"]  # k_d of the actuator, not of the joint [N·m·s/rad]
+    limit: Float[np.ndarray, " joint"]  # τ_max [N·m]; infinite where there is none
     top_speed: Float[np.ndarray, " joint"]
-    is_slide: Bool[np.ndarray, " joint"]
+    """Speed at which joint damping takes all of τ_max [rad/s]; infinite where there is none."""
+    is_slide: Bool[np.ndarray, " joint"]  # whether a joint is a slide: m for rad and N for N·m in all of these
 
     @classmethod
     def of(cls, model: mujoco.MjModel, names: Sequence[str]) -> Actuators:
@@ -227,14 +220,6 @@ class Actuation:
     ):
         """Begin with all drives ideal, at their joints' present positions.
 
-        Args:
-            actuators: The actuators.
-            arrays: A simulation's live tensors (env, …): `qpos`, `qvel`, `ctrl`, `qfrc_applied`.
-            action: How actions are understood.
-            drive: What drives do that ideal ones do not.
-            draws: Where random numbers are from.
-            substeps: Physics steps per control step, for which noise is drawn at once on a CPU.
-
         Raises:
             SimulationError: If a drive's noise, kick or speed limit needs a largest torque that a joint does not have.
         """
@@ -246,7 +231,9 @@ class Actuation:
             raise SimulationError(f"joints {listed(unlimited)} have no largest torque, of which this drive's is a share")
         self._index = {f: torch.from_numpy(getattr(actuators, f)).to(device, torch.int64) for f in ("actuator", "qpos", "dof")}
         self._is_slide = actuators.is_slide
-        scale = np.where(actuators.is_slide, action.slide_scale, action.scale)
+        scale = 0.5 * (actuators.high - actuators.low)
+        if not isinstance(action.scale, str):
+            scale = np.where(actuators.is_slide, action.slide_scale, action.scale)
         self._scale = torch.from_numpy(scale).to(device, dtype)
         values = [f.name for f in fields(actuators) if f.name not in ("names", "is_slide", *self._index)]
         self._values = {name: torch.from_numpy(getattr(actuators, name)).to(device, dtype) for name in values}
@@ -271,12 +258,7 @@ class Actuation:
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     def draw(self, chosen: Bool[Tensor, " env"], count: Int[Tensor, " env"]) -> None:
-        """Draw the drives of some environments again.
-
-        Args:
-            chosen: The environments.
-            count: A count of each environment's own: other numbers at each count.
-        """
+        """Draw the drives of some environments again."""
         if self._random:
             num = self.target.shape[1]
             share = self._draws.side_by_side(dict.fromkeys(self._random, num), count, chosen).view(len(count), -1, num)
@@ -286,13 +268,7 @@ class Actuation:
             put(self._drawn, chosen[:, None], new.to(self._drawn.dtype).transpose(0, 1))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
-        """Have the drives of some environments begin again: see `place`.
-
-        Args:
-            chosen: The environments.
-            episode: How often each was reset.
-            at_controls: Whether targets are the present controls, as those of a hand that presses.
-        """
+        """Have the drives of some environments begin again: see `place`."""
         put(self._count, chosen, episode << 32)
         self.place(chosen, at_controls)
 
@@ -320,11 +296,7 @@ class Actuation:
         self._take(torch.where(action.isfinite(), command, self.target))
 
     def follow(self, control: Float[Tensor, "env actuator"]) -> None:
-        """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too.
-
-        Args:
-            control: Set-points of all actuators of the model [rad].
-        """
+        """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too."""
         self._arrays["ctrl"].copy_(control)
         self._take(control.index_select(1, self._index["actuator"]).to(self.target))
 
@@ -363,7 +335,6 @@ class Actuation:
         arrays["qfrc_applied"][:, self._index["dof"]] = torque - plain
 
     def memory(self) -> dict[str, Tensor]:
-        """Return the memory by name: live tensors."""
         memory = {"target": self.target, "start": self.start, "torque": self.torque}
         memory |= {"play": self._play, "past": self._past, "count": self._count}
         return memory | {f"drawn/{name}": value for name, value in self.drawn.items()}

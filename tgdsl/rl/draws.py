@@ -47,39 +47,19 @@ class Draws:
     """
 
     def __init__(
-        self,
-        seed: int,
-        num_envs: int,
-        device: torch.device | str = "cpu",
-        first_env: int = 0,
-        *,
-        is_compiled: bool = False,
+        self, seed: int, num_envs: int, device: torch.device | str = "cpu", first_env: int = 0, *, is_compiled: bool = False
     ):
-        """Begin.
-
-        Args:
-            seed: Another seed, other numbers.
-            num_envs: Number of environments.
-            device: Where the numbers are wanted.
-            first_env: Number of the first environment, counted over all processes.
-            is_compiled: Whether the hash, some fifty small operations, is compiled by torch.
-
-        Raises:
-            SimulationError: If the seed has more than 64 bits.
-        """
+        """Begin; raise `SimulationError` if the seed has more than 64 bits. `first_env` is counted over all processes."""
         self.seed, self._device = _checked(seed), torch.device(device)
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._is_on_host = self._device.type == "cpu" and not is_compiled
         self._known: dict[tuple[tuple[str, int], ...], _Streams] = {}
         self._ahead: dict[tuple[str, int], _Prefetched] = {}
-        self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
+        self._words = FusedCall(self._hash, is_compiled, has_fixed_shapes=False)
+        self._shares = FusedCall(self._share, is_compiled, has_fixed_shapes=False)
 
     def reseed(self, seed: int) -> None:
-        """Choose another seed, in place: graphs that were captured draw its numbers.
-
-        Raises:
-            SimulationError: If it has more than 64 bits.
-        """
+        """Choose another seed, in place: graphs that were captured draw its numbers."""
         self.seed = _checked(seed)
         self._ahead.clear()
         for sizes, streams in self._known.items():
@@ -94,13 +74,7 @@ class Draws:
     def side_by_side(
         self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None = None
     ) -> Float[Tensor, "env num"]:
-        """Return numbers between 0 and 1 for several purposes in turn, of the few operations that one of them takes.
-
-        Args:
-            sizes: How many each environment has, by what they are for, such as "friction".
-            counter: A count of each environment's own: other numbers at each count.
-            chosen: The environments whose numbers are wanted; those of the others mean nothing. Default: all.
-        """
+        """Return numbers between 0 and 1 for several purposes in turn, of the few operations that one of them takes."""
         streams = self._streams(sizes)
         if not self._is_on_host:
             return self._shares(*streams, counter)
@@ -132,15 +106,7 @@ class Draws:
     def uniform(
         self, what: str, counter: Int[Tensor, " env"], num: int, low: float = 0.0, high: float = 1.0
     ) -> Float[Tensor, "env num"]:
-        """Return numbers between two bounds, float32.
-
-        Args:
-            what: What they are for, such as "friction".
-            counter: A count of each environment's own: other numbers at each count.
-            num: How many each environment has.
-            low: Lower bound.
-            high: Upper bound.
-        """
+        """Return numbers between two bounds, float32."""
         return within(self.shares({what: num}, counter)[what], low, high)
 
     def normal(self, what: str, counter: Int[Tensor, " env"], num: int) -> Float[Tensor, "env num"]:
@@ -165,14 +131,8 @@ class Draws:
         keys = torch.tensor([sensor_key(self.seed, purpose) for purpose in names], dtype=torch.int32, device=self._device)
         return mix(self._envs.to(torch.int32)[:, None, None] ^ keys)
 
-    def _share(
-        self,
-        begun: Int[Tensor, "env purpose half"],
-        purpose: Int[Tensor, " num"],
-        index: Int[Tensor, " num"],
-        counter: Int[Tensor, " env"],
-    ) -> Float[Tensor, "env num"]:
-        return uniform(self._hash(begun, purpose, index, counter), torch.float32)
+    def _share(self, *streams: Tensor) -> Float[Tensor, "env num"]:
+        return uniform(self._hash(*streams), torch.float32)
 
     def _hash(
         self,
@@ -182,9 +142,8 @@ class Draws:
         counter: Int[Tensor, " env"],
     ) -> Int[Tensor, "env num"]:
         if self._is_on_host:
-            return torch.from_numpy(
-                _hash_on_host(*(tensor.numpy() for tensor in (begun, purpose, index, counter))).view(np.int32)
-            )
+            words = _hash_on_host(*(tensor.numpy() for tensor in (begun, purpose, index, counter)))
+            return torch.from_numpy(words.view(np.int32))
         low, high = (half.to(torch.int32)[:, None, None] for half in (counter, counter >> 32))
         mixed = mix(torch.cat([begun ^ low, high.expand(-1, 1, 2)], dim=1))  # both at once
         first, second = mix(mixed[:, :-1] ^ mixed[:, -1:])[:, purpose].unbind(-1)

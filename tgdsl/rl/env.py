@@ -13,8 +13,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from os import PathLike
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,17 +23,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import LowerError, SimulationError
-from tgdsl.rl import groups, saving
+from tgdsl.console.tables import listing, shapes
+from tgdsl.errors import LowerError, SimulationError, listed
+from tgdsl.rl import groups
 from tgdsl.rl.actuation import Actuation
-from tgdsl.rl.curricula import Curricula
+from tgdsl.rl.description import Description, describe
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.episodes import Episodes, Observations, Step, StepInfo
-from tgdsl.rl.events import Events, event_terms
-from tgdsl.rl.grasps.load import with_grasps
+from tgdsl.rl.events import Curricula, Events, event_terms
+from tgdsl.rl.grasps.sampling import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints
+from tgdsl.rl.substeps import SubstepTouch
 from tgdsl.rl.task import Now, checked
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_be_nonempty
@@ -46,6 +48,61 @@ FAR_BEYOND = 10.0
 """Actions of that size are a mistake, such as angles in degrees."""
 PREPARING_STEPS = 3
 """The third step is captured on a GPU, and the second one compiled."""
+
+
+Observations = dict[str, Float[Tensor, "env feature"]]
+
+
+class StepInfo(NamedTuple):
+    """What else a step returns. Rows of what is of an episode are of that which has just ended, where one has.
+
+    Attributes:
+        ended: Episodes that have ended, terminated or truncated.
+        final_obs: Observations before the reset; other than those that the step returns where an episode has ended.
+        terms: Terms of the reward of this step by name, weights and Δt included.
+        score: Score of the episode, in `task.score_unit`.
+        episode_return: Sum of its rewards.
+        episode_steps: Its control steps.
+        episode_terms: Sums of its terms by name.
+        faults: Environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0.
+    """
+
+    ended: Bool[Tensor, " env"]
+    final_obs: Observations
+    terms: dict[str, Float[Tensor, " env"]]
+    score: Float[Tensor, " env"]
+    episode_return: Float[Tensor, " env"]
+    episode_steps: Int[Tensor, " env"]
+    episode_terms: dict[str, Float[Tensor, " env"]]
+    faults: Bool[Tensor, " env"]
+
+    def __repr__(self) -> str:
+        return "StepInfo\n" + listing((name, shapes(value)) for name, value in self._asdict().items())
+
+    def is_whole(self, max_steps: int) -> Bool[Tensor, " env"]:
+        """Return which episodes have lasted as long as one may, in control steps, and were not ended by a fault."""
+        return (self.episode_steps >= max_steps) & ~self.faults
+
+
+class Step(NamedTuple):
+    """What a step returns.
+
+    Attributes:
+        obs: Observations by group; of episodes that have ended, the first of the next one.
+        reward: Sum of the terms.
+        terminated: Episodes that have ended for good.
+        truncated: Episodes that have merely lasted long enough.
+        info: What else there is to tell.
+    """
+
+    obs: Observations
+    reward: Float[Tensor, " env"]
+    terminated: Bool[Tensor, " env"]
+    truncated: Bool[Tensor, " env"]
+    info: StepInfo
+
+    def __repr__(self) -> str:
+        return "Step\n" + listing((name, shapes(value)) for name, value in self._asdict().items())
 
 
 class TouchEnv:
@@ -142,12 +199,16 @@ class TouchEnv:
         self._events = Events(event_terms(random, self.curricula.terms), self.sim, setup, self.actuation)
         self.control_step = setup.control_step
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
-        self._episodes = Episodes(self.sim, self.task, self.actuation, self._events, is_compiled)
-        self.steps, self.resets = self._episodes.steps, self._episodes.number
+        self.resets = torch.zeros(num_envs, dtype=torch.int64, device=self.sim.qpos.device)
+        self.steps, self._return = torch.zeros_like(self.resets), torch.zeros_like(self.resets, dtype=torch.float32)
+        self._sums = self._return[None][:0]  # of each term of the reward over the present episode, (term, env)
         self._action = torch.zeros((num_envs, self.num_actions), dtype=torch.float32, device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
         is_measured = self.spec.joint_vel == "measured"
         self._speeds = groups.MeasuredVelocity(self.actuation.target, setup.control_step) if is_measured else None
+        self._restarted = FusedCall(self._restart, is_compiled)
+        is_stacked = self.spec.temporal == "stack" and sensed.groups
+        self._substeps = SubstepTouch(sensed, self.sim) if is_stacked else None
         self._commanded = FusedCall(self._command, is_compiled)
         self._judged = FusedCall(self._judge, is_compiled)
         self._observed = FusedCall(self._observe, is_compiled)
@@ -162,7 +223,8 @@ class TouchEnv:
         if is_cuda or is_compiled:
             tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
         obs = self.reset(seed)
-        self._episodes.sum_up(tuple(self._rates(self.now, torch.zeros_like(self.sim.faults))))
+        self._terms = tuple(self._rates(self.now, torch.zeros_like(self.sim.faults)))
+        self._sums = self._return.new_zeros((len(self._terms), num_envs))
         self.groups = {name: value.shape[1] for name, value in obs.items()}
         if is_cuda or is_compiled:
             self._prepare(seed)
@@ -188,12 +250,11 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             if seed is not None:
                 self._draws.reseed(seed)
-                self._episodes.number.zero_()
+                self.resets.zero_()
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
-            now = self._instant = self._now(self.sim.read())
-            self._measure(now, everyone)
+            now = self._instant = self._begun(everyone, self.sim.read())
             self._obs, self._is_loaded = self._observe(now), False
             return dict(self._obs)
 
@@ -222,13 +283,17 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too
             self._action.copy_(action)
             step, self._instant = self._call()
-            step = saving.copied(step) if self.device.type == "cuda" else step
+            step = _copied(step) if self.device.type == "cuda" else step
         self._obs, self._is_loaded = step.obs, False
         return step._replace(obs=dict(step.obs))
 
     def observe(self) -> Observations:
         """Return the last observations, by group."""
         return dict(self._obs)
+
+    def describe(self) -> Description:
+        """Return what each feature of each group of observations is: it prints as a table."""
+        return describe(self.loaded, self._sensed, self.task, self.curricula.terms, self.groups)
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
@@ -241,10 +306,7 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad(), self._dispatch():
             self.actuation.follow(control)
             self._events.advance()
-            self.sim.step(self.sim.ctrl)
-            now = self._instant = self._now(self.sim.read())
-            self._measure(now)
-            self.task.advance_healthy(now, self.sim.faults)
+            now = self._instant = self._advanced(self._stepped(self.sim.ctrl))
             step = self._judged(now, self.sim.faults)
         self._obs, self._is_loaded = step.obs, False
         return step
@@ -265,7 +327,7 @@ class TouchEnv:
         Another `TouchEnv` of the same document and number of environments goes on from it: on a CPU bit for bit.
         """
         memory = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs}
-        return saving.copied(memory) | {"sim": self.sim.state_dict(), "seed": {"seed": torch.tensor(self._draws.seed)}}
+        return _copied(memory) | {"sim": self.sim.state_dict(), "seed": {"seed": torch.tensor(self._draws.seed)}}
 
     def load_state_dict(self, state: Mapping[str, Mapping[str, Tensor]]) -> Observations:
         """Go on where environments of the same document and number were saved; return the observations there.
@@ -274,13 +336,15 @@ class TouchEnv:
             SimulationError: If they were others; nothing has changed.
         """
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
-        saving.refuse_other(own, {part: saved_part for part, saved_part in state.items() if part != "sim"})
+        _refuse_other(own, {part: saved for part, saved in state.items() if part != "sim"})
         self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
-        for part, memory in self._memory().items():
-            saving.restore(memory, state[part])
+        with torch.no_grad():
+            for part, memory in self._memory().items():
+                for name, value in memory.items():
+                    value.copy_(state[part][name])
         self.touch.load_state_dict(dict(state["touch"]))
         self._draws.reseed(int(state["seed"]["seed"]))
-        self._obs = {name: value.to(self.device) for name, value in saving.copied(state["obs"]).items()}
+        self._obs = {name: value.to(self.device, copy=True) for name, value in state["obs"].items()}
         self._is_loaded = True
         return dict(self._obs)
 
@@ -290,12 +354,14 @@ class TouchEnv:
 
     def _memory(self) -> dict[str, dict[str, Tensor]]:
         """Return the memory outside simulation and module: live tensors by part and name."""
-        actions = {"used": self._used, "before": self._before}
-        memory = {"episodes": self._episodes.memory(), "actuation": self.actuation.memory()}
-        memory |= {"task": self.task.memory, "actions": actions}
-        memory |= {"speeds": self._speeds.memory()} if self._speeds else {}
-        memory |= {"curricula": self.curricula.values} if self.curricula.values else {}
-        return memory | ({"events": self._events.memory} if self._events.memory else {})
+        setup, sums = self.task.setup, zip(self._terms, self._sums, strict=True)
+        episodes = {"number": self.resets, "steps": self.steps, "total": self._return}
+        episodes |= {"friction": setup.friction, "mass": setup.mass} | {f"sums/{name}": value for name, value in sums}
+        memory = {"episodes": episodes, "actuation": self.actuation.memory(), "task": self.task.memory}
+        memory["actions"] = {"used": self._used, "before": self._before}
+        memory["speeds"] = self._speeds.memory() if self._speeds else {}
+        memory |= {"curricula": self.curricula.values, "events": self._events.memory}
+        return {part: tensors for part, tensors in memory.items() if tensors or part == "task"}
 
     def _prepare(self, seed: int) -> None:
         """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
@@ -306,9 +372,20 @@ class TouchEnv:
         self.reset(seed)
 
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
-        self._episodes.begin(chosen)
-        for held in (self._used, self._before):
-            held.masked_fill_(chosen[:, None], 0.0)
+        """Begin a new episode in some environments, in the simulation and the module too."""
+        self.resets += chosen
+        self._events.reset(chosen, self.resets, is_placed=False)
+        start = self.task.reset(chosen, self.resets)
+        self.sim.reset(chosen, contacts=start.contacts, **start.values)
+        self._restarted(chosen, "ctrl" in start.values)
+        self._events.reset(chosen, self.resets, is_placed=True)
+        for action in (self._used, self._before):
+            action.masked_fill_(chosen[:, None], 0.0)
+
+    def _restart(self, chosen: Bool[Tensor, " env"], at_controls: bool) -> None:
+        self.actuation.reset(chosen, self.resets, at_controls)
+        for counted in (self.steps, self._return, self._sums):
+            counted.masked_fill_(chosen, 0)
 
     def _advance(self) -> tuple[Step, Now]:
         """Make one control step with the action that was copied, and return the instant it ends at: see the top of this page.
@@ -320,23 +397,43 @@ class TouchEnv:
             self._before.copy_(self._used)
             control = self._commanded(self._action, sim.ctrl)
             self._events.advance()
-        sim.step(control)
-        readings = sim.read()
+        readings = self._stepped(control)
         with self._logic_by():
             return self._conclude(readings)
 
+    def _stepped(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
+        """Make the physics steps of a control step, and return the readings at its end."""
+        if self._substeps is not None:
+            return self._substeps.step(control)
+        self.sim.step(control)
+        return self.sim.read()
+
     def _conclude(self, readings: dict[str, Tensor]) -> tuple[Step, Now]:
         """Return what a control step has brought, by its readings, and its instant; begin episodes where some have ended."""
-        sim, now = self.sim, self._now(readings)
-        self._measure(now)
-        self.task.advance_healthy(now, sim.faults)
+        sim, now = self.sim, self._advanced(readings)
         step = self._judged(now, sim.faults)
         if may_be_nonempty(step.info.ended):
             self._begin(step.info.ended)
-            now = self._now(sim.read(step.info.ended))
-            self._measure(now, step.info.ended)
+            now = self._begun(step.info.ended, sim.read(step.info.ended))
             step = step._replace(obs=self._observed(now))
         return step, now
+
+    def _advanced(self, readings: dict[str, Tensor]) -> Now:
+        """Return the instant at the end of a control step, of which the task has taken note."""
+        now = self._now(readings)
+        if self._speeds:
+            self._speeds.update(now.joint_pos)
+        self.task.advance_healthy(now, self.sim.faults)
+        return replace(now, score=self.task.score())
+
+    def _begun(self, chosen: Bool[Tensor, " env"], readings: dict[str, Tensor]) -> Now:
+        """Return the instant at which some environments begin an episode."""
+        now = self._now(readings)
+        if self._speeds:
+            self._speeds.begin(chosen, now.joint_pos)
+        if self._substeps is not None:
+            self._substeps.begin(chosen, readings)
+        return now
 
     def _command(self, action: Float[Tensor, "env joint"], ctrl: Float[Tensor, "env nu"]) -> Float[Tensor, "env nu"]:
         """Take an action over; return the simulation's controls, which are no numbers where an action is none."""
@@ -345,13 +442,6 @@ class TouchEnv:
         self.actuation.command(action)
         self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
         return torch.where(is_bad[:, None], torch.nan, ctrl)
-
-    def _measure(self, now: Now, begun: Bool[Tensor, " env"] | None = None) -> None:
-        """Take note of where joints are, for velocities that are measured; of some environments at the start of an episode."""
-        if self._speeds and begun is None:
-            self._speeds.update(now.joint_pos)
-        elif self._speeds and begun is not None:
-            self._speeds.begin(begun, now.joint_pos)
 
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
@@ -362,16 +452,16 @@ class TouchEnv:
                 terminated = terminated | checked(f'the term "{name}"', term.is_over(now, self.task.setup), self.num_envs)
         earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self.control_step).float()
         reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
-        self._episodes.add(earned, reward)
+        self._sums += earned
+        self._return += reward
+        self.steps += 1
         truncated = (self.steps >= self.max_steps) & ~terminated
         obs = self._observe(now)
         if may_be_nonempty(faults):
             obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in obs.items()}
-        episodes = self._episodes
-        sums = dict(zip(rates, episodes.sums.clone(), strict=True))
-        score, total = self.task.score().float().clone(), episodes.total.clone()
+        sums, score = dict(zip(rates, self._sums.clone(), strict=True)), self.task.score().float().clone()
         ended = terminated | truncated
-        info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults.clone())
+        info = StepInfo(ended, obs, terms, score, self._return.clone(), self.steps.clone(), sums, faults.clone())
         return Step(obs, reward, terminated, truncated, info)
 
     def _rates(self, now: Now, terminated: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
@@ -412,14 +502,16 @@ class TouchEnv:
             mass=self.task.setup.mass,
             readings=readings,
             time=self.sim.time,
+            score=self.task.score(),
         )
 
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""
-        felt = self._sensed.observe(now.readings)
-        exact = groups.proprio(now)
-        proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
-        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
+        felt = self._sensed.observe(now.readings) if self._substeps is None else self._substeps.observe()
+        measured = replace(now, joint_vel=self._speeds.value) if self._speeds else now
+        count = (self.resets << 32) | self.steps
+        proprio = groups.noisy_proprio(measured, self.spec.proprio, self._draws, count)
+        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, groups.proprio(now))}
         task = type(self.task).__name__
         for name, term in self.curricula.terms.items():
             if isinstance(term, ObservationTerm):
@@ -429,3 +521,23 @@ class TouchEnv:
                 raise SimulationError(f'{task}: `observe` has a group "{name}", as all tasks do; call it otherwise')
             result[name] = checked(f'{task}: the group "{name}" of `observe`', value, self.num_envs, 2)
         return {name: value.to(self.device, torch.float32) for name, value in result.items()}
+
+
+def _refuse_other(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Raise `SimulationError` if parts, or names or shapes in one, differ from what was saved."""
+    if wrong := sorted(own.keys() ^ given.keys()):
+        raise SimulationError(f"the state that was saved is of other environments: {listed(wrong)} missing or not known")
+    for part, tensors in own.items():
+        shapes, saved = ({name: value.shape for name, value in each.items()} for each in (tensors, given[part]))
+        if wrong := [name for name in {**shapes, **saved} if shapes.get(name) != saved.get(name)]:
+            problem = f"{listed(wrong)} missing or of another shape"
+            raise SimulationError(f"the {part} that was saved is of other environments: {problem}")
+
+
+def _copied(made: Any) -> Any:
+    """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
+    if isinstance(made, Tensor):
+        return made.clone()
+    if isinstance(made, Mapping):
+        return {name: _copied(value) for name, value in made.items()}
+    return type(made)(*(_copied(value) for value in made))

@@ -7,33 +7,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
+from tgdsl.fields.models import SpecModel
 from tgdsl.rl.actuation import ONE, ZERO, Actuation, DriveSpec
 from tgdsl.rl.draws import whole
-from tgdsl.rl.spec import PushSpec, RandomSpec
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.spec import PlacedRandomSpec, PushSpec, RandomSpec, TaskSpec
 from tgdsl.rl.task import Setup
-from tgdsl.rl.terms import Drive, Event, EventTerm, Friction, Mass, Push, Term
+from tgdsl.rl.terms import CurriculumTerm, Drive, Event, EventTerm, Friction, Mass, Placement, Push, Term
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 
 
 def event_terms(random: RandomSpec, terms: Mapping[str, Term]) -> dict[str, EventTerm]:
-    """Return the events of a task's document by the names of their random numbers.
-
-    Args:
-        random: The document's `randomise`, the short form of events.
-        terms: The document's terms.
-    """
+    """Return the events of a task's document by the names of their random numbers."""
     events: dict[str, EventTerm] = {}
     if random.friction != ONE:
         events["friction"] = Friction(factor=random.friction)
     if random.mass != ZERO:
         events["mass"] = Mass(added=random.mass)
+    if isinstance(random, PlacedRandomSpec):
+        events["placement"] = Placement(xy=random.xy, yaw=random.yaw)
     if random.drive != DriveSpec():
         events["drive"] = Drive()
     if any(getattr(random.push, axis) != getattr(PushSpec(), axis) for axis in "xyz"):
@@ -68,13 +68,7 @@ class Events:
                 self.memory[f"{name}/{kind}"] = torch.zeros(setup.num_envs, dtype=torch.int64, device=setup.device)
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], is_placed: bool) -> None:
-        """Have events at a reset happen, end those that last, and draw when the others come first.
-
-        Args:
-            chosen: The environments.
-            episode: How often each was reset.
-            is_placed: Whether the scene was reset; before that, events happen that change what the scene is made of.
-        """
+        """Have events at a reset happen, end those that last, and draw when the others come first."""
         for name, term in self._terms.items():
             if term.mode == "reset":
                 if term.changes_model != is_placed:
@@ -104,3 +98,43 @@ class Events:
         purpose = f"{name} interval"
         share = self._setup.draws.shares({purpose: 1}, self.memory[f"{name}/count"], chosen)[purpose]
         put_rows(self.memory[f"{name}/left"], chosen, whole(share, first, last)[:, 0])
+
+
+M = TypeVar("M", bound=SpecModel)
+
+
+class Curricula:
+    """The curricula of a task's document.
+
+    Attributes:
+        values: The numbers that they change, by dotted path: tensors without axes.
+        spec: The task's document, with these tensors in place of its own numbers.
+        terms: The terms that it adds, in the same way.
+    """
+
+    def __init__(self, loaded: LoadedTask, like: Tensor):
+        self._terms = {name: term for name, term in loaded.terms.items() if isinstance(term, CurriculumTerm)}
+        self.values = {term.of: torch.zeros((), dtype=like.dtype, device=like.device) for term in self._terms.values()}
+        self.spec: TaskSpec = _with(loaded.spec, {path: v for path, v in self.values.items() if not path.startswith("terms.")})
+        other_terms = {name: term for name, term in loaded.terms.items() if name not in self._terms}
+        self.terms: Mapping[str, Term] = {
+            name: _with(term, _below(f"terms.{name}", self.values)) for name, term in other_terms.items()
+        }
+        self.advance(0, None)
+
+    def advance(self, iteration: int, score: float | None) -> None:
+        """Write the numbers at an iteration; a GPU is not waited for."""
+        for term in self._terms.values():
+            self.values[term.of].fill_(term.value(iteration, score))
+
+
+def _below(start: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {path.removeprefix(f"{start}."): value for path, value in values.items() if path.startswith(f"{start}.")}
+
+
+def _with(model: M, values: Mapping[str, Tensor]) -> M:
+    """Return a model with other values by dotted path, which are not checked."""
+    update: dict[str, Any] = {path: value for path, value in values.items() if "." not in path}
+    for name in {path.partition(".")[0] for path in values} - update.keys():
+        update[name] = _with(getattr(model, name), _below(name, values))
+    return model.model_copy(update=update)

@@ -8,12 +8,17 @@ Shapes: `env` environments, `feature` numbers of a group.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.rl.rotations import six_numbers
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.features import GoalPart
+from tgdsl.rl.rotations import Quat, between, inverse, product, six_numbers
+from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.task import HandNow, Now
 
 
@@ -25,13 +30,6 @@ class MeasuredVelocity:
     """
 
     def __init__(self, joint_pos: Float[Tensor, "env joint"], control_step: float, time_constant: float = 0.02):
-        """Begin at rest.
-
-        Args:
-            joint_pos: Positions now [rad].
-            control_step: Time from one reading to the next [s].
-            time_constant: The filter's time constant [s].
-        """
         self._before, self.value = joint_pos.clone(), torch.zeros_like(joint_pos)
         self._control_step = control_step
         self._share = -math.expm1(-control_step / time_constant)
@@ -47,23 +45,42 @@ class MeasuredVelocity:
         self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
 
     def memory(self) -> dict[str, Tensor]:
-        """Return the memory by name: live tensors."""
         return {"before": self._before, "value": self.value}
 
 
-def proprio(now: Now | HandNow, joint_vel: Float[Tensor, "env joint"] | None = None) -> Float[Tensor, "env feature"]:
-    """Return positions [rad], velocities [rad/s] and last action of the joints that the policy moves.
+def proprio(now: Now | HandNow, vel_scale: float = 1.0) -> Float[Tensor, "env feature"]:
+    """Return positions [rad], velocities [rad/s] times a factor, and last action of the joints that the policy moves."""
+    return torch.cat([now.joint_pos, vel_scale * now.joint_vel, now.action], dim=1)
+
+
+def noisy_proprio(now: Now, spec: ProprioSpec, draws: Draws, count: Int[Tensor, " env"]) -> Float[Tensor, "env feature"]:
+    """Return `proprio` with noise.
 
     Args:
         now: The instant.
-        joint_vel: Velocities in place of the instant's [rad/s].
+        spec: Noise and scale.
+        draws: Random numbers.
+        count: A count of each environment's own, another one at each control step.
     """
-    return torch.cat([now.joint_pos, now.joint_vel if joint_vel is None else joint_vel, now.action], dim=1)
+    if spec.pos_noise or spec.vel_noise:
+        pos, vel = draws.normal("proprio", count, 2 * now.joint_pos.shape[1]).to(now.joint_pos).chunk(2, dim=1)
+        now = replace(now, joint_pos=now.joint_pos + spec.pos_noise * pos, joint_vel=now.joint_vel + spec.vel_noise * vel)
+    return proprio(now, spec.vel_scale)
 
 
 def priv_proprio(now: Now, own: Float[Tensor, "env shared"]) -> Float[Tensor, "env feature"]:
     """Return `proprio`, which is `own` and exact, and the object's force on each link, in its frame [N], link by link."""
     return torch.cat([own, now.link_force.flatten(1)], dim=1)
+
+
+def goal(parts: Sequence[GoalPart], wanted: Quat, quat: Quat) -> Float[Tensor, "env feature"]:
+    """Return parts of a goal, the orientation `wanted` of an object that now has `quat`: see `PlacedTaskSpec.goal`."""
+    values = {
+        "orientation": lambda: six_numbers(wanted),
+        "difference": lambda: six_numbers(product(wanted, inverse(quat))),
+        "angle": lambda: between(wanted, quat)[:, None],
+    }
+    return torch.cat([values[part]() for part in parts], dim=1)
 
 
 def object_state(now: Now) -> Float[Tensor, "env feature"]:

@@ -33,29 +33,19 @@ REQUIRED = ("tgdsl", "task", "document", "object", "joints")
 
 @dataclass(frozen=True, eq=False)
 class LoadedTask:
-    """A task's document, as found and as read.
+    """A task's document, as found and as read."""
 
-    Attributes:
-        spec: The document.
-        task: The task's class.
-        source: Its text's values and places.
-        folder: Folder that file names in it are relative to.
-        terms: Terms that it adds to the task, by name.
-    """
-
-    spec: TaskSpec
-    task: type[Task[Any]]
-    source: Source
-    folder: Path
-    terms: Mapping[str, Term] = field(default_factory=dict)
+    spec: TaskSpec  # the document
+    task: type[Task[Any]]  # the task's class
+    source: Source  # its text's values and places
+    folder: Path  # folder that file names in it are relative to
+    terms: Mapping[str, Term] = field(default_factory=dict)  # terms that it adds to the task, by name
 
     @property
     def senses(self) -> tuple[str, ...]:
-        """Kinds of sensors that task and terms look at."""
         return tuple(dict.fromkeys(kind for part in (self.task, *self.terms.values()) for kind in part.senses))
 
     def error(self, place: Place, what: str, hint: str = "") -> SpecError:
-        """Return the error of a mistake at a place of the document."""
         return SpecError([self.source.problem(place, what, hint)])
 
 
@@ -83,7 +73,7 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
         if isinstance(source.value, dict) and "sensors" in source.value:
             problem = "this is a document of sensors, which a task's document names: `document: …`"
         raise SpecError([*source.problems, source.problem(("task",), problem, on_key=True)])
-    task = _task_class(source, folder)
+    task: type[Task[Any]] = _class_of(source, folder, ("task",), source.value["task"], Task, TASKS, "tasks")
     problems: list[Problem] = list(source.problems)
     spec = validate(source, (), task.Spec, problems, REQUIRED)
     terms = _terms(source, folder, task, spec, problems) if isinstance(spec, TaskSpec) else {}
@@ -142,25 +132,14 @@ def number_owners(task: type[Task[Any]], spec: TaskSpec, terms: Mapping[str, Ter
     return owners
 
 
-def _task_class(source: Source, folder: Path) -> type[Task[Any]]:
-    name = source.value["task"]
-    if name in TASKS:
-        place, class_ = TASKS[name]
-        return getattr(importlib.import_module(place), class_)
-    return _class_of(source, folder, ("task",), name, Task, TASKS, "tasks")
-
-
 def _class_of(
     source: Source, folder: Path, place: Place, name: str, base: type[C], known: Mapping[str, Any], which: str
 ) -> type[C]:
-    """Return the class that a document names: of `known`, or as `package.module:Class` or `file.py:Class`.
-
-    Raises:
-        SpecError: If there is none.
-    """
+    """Return the class that a document names: of `known`, or as `package.module:Class` or `file.py:Class`."""
     module, colon, class_ = name.partition(":")
     if name in known:
-        return known[name]
+        found = known[name]
+        return getattr(importlib.import_module(found[0]), found[1]) if isinstance(found, tuple) else found
     if not colon:
         hint = f"{did_you_mean(name, known, which)}; one of your own is package.module:Class or file.py:Class"
         raise SpecError([source.problem(place, f'there is no {which[:-1]} "{name}"', hint)])
@@ -173,9 +152,8 @@ def _class_of(
     result = getattr(user_module, class_, None)
     if result is None:
         classes = [key for key, value in vars(user_module).items() if isinstance(value, type) and issubclass(value, base)]
-        raise SpecError(
-            [source.problem(place, f'{module} has no class "{class_}"', did_you_mean(class_, classes, f"{which} in it"))]
-        )
+        hint = did_you_mean(class_, classes, f"{which} in it")
+        raise SpecError([source.problem(place, f'{module} has no class "{class_}"', hint)])
     if isinstance(result, FunctionType) and base is Term:
         return cast(type[C], event_term(result))
     if not (isinstance(result, type) and issubclass(result, base)):

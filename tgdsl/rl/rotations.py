@@ -12,7 +12,7 @@ from torch.linalg import vector_norm
 
 from tgdsl.geometry.rotations import Quat, Vector, product, rotated
 
-__all__ = ["about", "between", "inverse", "product", "rotated", "six_numbers", "swing", "twist"]
+__all__ = ["Quat", "about", "between", "inverse", "product", "rotated", "six_numbers", "swing", "twist"]
 
 
 def inverse(quat: Quat) -> Quat:

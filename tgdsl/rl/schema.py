@@ -19,21 +19,15 @@ def task_schema() -> dict[str, Any]:
     definitions: dict[str, Any] = {}
     for model in (TaskSpec, *dict.fromkeys(specs.values())):
         schema = model.model_json_schema(ref_template="#/$defs/{model}")
-        task_spec = schema.pop("$defs", {})
-        others = {name: f"{model.__name__}.{name}" for name, made in task_spec.items() if definitions.get(name, made) != made}
-        schema, task_spec = (
-            _renamed(schema, others),
-            _renamed({others.get(name, name): made for name, made in task_spec.items()}, others),
-        )
-        definitions |= task_spec
+        parts = schema.pop("$defs", {})
+        others = {name: f"{model.__name__}.{name}" for name, part in parts.items() if definitions.get(name, part) != part}
+        definitions |= _renamed({others.get(name, name): part for name, part in parts.items()}, others)
         schema.pop("title", None)
-        definitions[model.__name__] = schema
+        definitions[model.__name__] = _renamed(schema, others)
     task_spec = definitions["TaskSpec"]
     task_spec["additionalProperties"] = True
-    task_spec["properties"]["randomise"] = {
-        "type": "object",
-        "description": task_spec["properties"]["randomise"]["description"],
-    }
+    description = task_spec["properties"]["randomise"]["description"]
+    task_spec["properties"]["randomise"] = {"type": "object", "description": description}
     definitions = {name: conditional(definition, definitions) for name, definition in definitions.items()}
     chain: dict[str, Any] = {"$ref": "#/$defs/TaskSpec"}
     for name, model in reversed(specs.items()):
@@ -50,11 +44,13 @@ def task_schema() -> dict[str, Any]:
 
 
 def _renamed(schema: Any, others: Mapping[str, str]) -> Any:
-    if isinstance(schema, dict):
-        return {name: _reference(part, others) if name == "$ref" else _renamed(part, others) for name, part in schema.items()}
-    return [_renamed(part, others) for part in schema] if isinstance(schema, list) else schema
-
-
-def _reference(place: str, others: Mapping[str, str]) -> str:
-    folder, _, name = place.rpartition("/")
-    return f"{folder}/{others.get(name, name)}"
+    """Return a schema whose references name definitions as `others` renames them."""
+    if isinstance(schema, list):
+        return [_renamed(part, others) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    result = {name: _renamed(part, others) for name, part in schema.items()}
+    if isinstance(result.get("$ref"), str):
+        folder, _, name = result["$ref"].rpartition("/")
+        result["$ref"] = f"{folder}/{others.get(name, name)}"
+    return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,13 +32,7 @@ CLEAN = "clean"
 
 
 class Felt(NamedTuple):
-    """One of several things that policies feel in one simulation.
-
-    Attributes:
-        type: The type of touch, any `TouchType` except "none".
-        placement: Links that feel: a link group, or a link's name, with shell wildcards.
-        noise: A noise profile.
-    """
+    """What a policy feels: a `TouchType` except "none", a link group or name with shell wildcards, and a noise profile."""
 
     type: str
     placement: str
@@ -46,18 +40,17 @@ class Felt(NamedTuple):
 
     @property
     def group(self) -> str:
-        """Its group of observations."""
+        """Its group of observations, where policies feel several things in one simulation."""
         return f"{GROUP}/{self.type}/{self.placement}/{self.noise}"
+
+    @property
+    def observation(self) -> str:
+        """The module's observation that the group is taken from."""
+        return f"{GROUP}_{self.type}_{self.noise}"
 
 
 class Source(NamedTuple):
-    """Where a group of observations comes from.
-
-    Attributes:
-        observation: The module's observation.
-        columns: Those of its numbers that are taken; None: all.
-        layout: The taxels that they are of.
-    """
+    """Where a group comes from: the module's observation, which of its columns (None: all), and the taxels that they are of."""
 
     observation: str
     columns: Int[Tensor, " feature"] | None
@@ -66,37 +59,22 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sensed:
-    """What a task's environments feel.
-
-    Attributes:
-        touch: The module.
-        felt: Name of the sensor that the policy feels; None if it feels nothing.
-        contact: Name of the `link_contact` sensor; None if the task takes none.
-        channels: Names of its channels: those of the force, and of the normal force if the task wants it, among them.
-        distance: Name of the `surface_distance` sensor; None if the task takes none.
-        object: Body of the task's object in the scene.
-        by_kind: Name of the sensor of each kind that the task looks at.
-        groups: Groups of observations of what is felt.
-    """
+    """What a task's environments feel."""
 
     touch: TactileModule
-    felt: str | None
-    contact: str | None
+    felt: str | None  # name of the sensor that the policy feels; None if it feels nothing
+    contact: str | None  # name of the `link_contact` sensor; None if the task takes none
     channels: tuple[str, ...]
-    distance: str | None
-    object: str
-    by_kind: Mapping[str, str]
-    groups: Mapping[str, Source] = field(default_factory=dict)
+    """Names of its channels: those of the force, and of the normal force if the task wants it, among them."""
+    distance: str | None  # name of the `surface_distance` sensor; None if the task takes none
+    object: str  # body of the task's object in the scene
+    by_kind: Mapping[str, str]  # name of the sensor of each kind that the task looks at
+    groups: Mapping[str, Source]  # groups of observations of what is felt
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the groups of observations of what is felt."""
-        if not self.groups:
-            return {}
-        observed = self.touch.observe(readings)
-        columns_of = {name: (observed[source.observation], source.columns) for name, source in self.groups.items()}
-        return {
-            name: value if columns is None else value.index_select(1, columns) for name, (value, columns) in columns_of.items()
-        }
+        observed = self.touch.observe(readings) if self.groups else {}
+        parts = {name: (observed[source.observation], source.columns) for name, source in self.groups.items()}
+        return {name: value if columns is None else value.index_select(1, columns) for name, (value, columns) in parts.items()}
 
     def forces(
         self, readings: Mapping[str, Tensor], like: Float[Tensor, "env joint"]
@@ -133,53 +111,64 @@ def compile_sensed(
             of the sensors' document.
         RobotError: If a robot or scene file cannot be read.
     """
-    spec, file, document = loaded.spec, loaded.folder / loaded.spec.document, sensors_document(loaded)
-    kinds = _kinds(document)
+    spec, document = loaded.spec, sensors_document(loaded)
     senses = loaded.senses if only is None else only
     of_policy = [] if only is not None or spec.touch == "none" else [spec.touch]
     types = of_policy if feels is None else [each.type for each in feels]
-    sensor = _sensors_of(loaded, kinds, {"task": senses, "touch": [SENSED[type_][0] for type_ in types]})
+    sensor = _sensors_of(loaded, document, {"task": senses, "touch": [SENSED[type_][0] for type_ in types]})
     by_kind = {kind: sensor[kind] for kind in senses}
-    overrides: dict[str, Any] = {"observations": {}} | _sensor_overrides(loaded)
+    overrides, observations = _sensor_overrides(loaded), dict[str, Any]()
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
     if spec.variants is not None:
         overrides[f"objects.{spec.object}.variants"] = _variants(loaded, document)
     if spec.physics.collision is not None:
         overrides["robot.collision"] = spec.physics.collision
-    felt, felts = None, {}
+    felt, felts = None, {each: sensor[SENSED[each.type][0]] for each in feels or ()}
     if feels is not None:
-        felts = {each: sensor[SENSED[each.type][0]] for each in feels}
-        overrides |= _overrides(loaded, felts)
+        more, observations = _overrides(loaded, felts)
+        overrides |= more
     elif of_policy:
         kind, observed = SENSED[spec.touch]
         felt = sensor[kind]
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
-        overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
-    overrides["observations"] = {**overrides["observations"], **(also or {})}
+        observations = {GROUP: [{"type": observed, "of": felt}]}
     contact = by_kind.get("link_contact")
     if contact:
         outputs = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
         forces = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
         overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*outputs, *forces)))
-    touch = compile_document(file, sensors=set(sensor.values()) or None, overrides=overrides, device=device, progress=progress)
-    body = document.spec.objects[spec.object].body_of(spec.object)
-    channels = next((output.channels for output in touch.outputs if output.name == contact), ())
-    groups = {each.group: _source(loaded, touch, each, name) for each, name in felts.items()}
+    overrides = {"observations": observations | dict(also or {})} | overrides
+    touch = compile_document(
+        loaded.folder / spec.document,
+        sensors=set(sensor.values()) or None,
+        overrides=overrides,
+        device=device,
+        progress=progress,
+    )
+    layouts = {planned.name: touch.plan.layout_of(planned) for planned in touch.plan.sensors}
+    groups = {each.group: _source(loaded, touch, each, layouts[name]) for each, name in felts.items()}
     if felt:
-        groups[GROUP] = Source(GROUP, None, _layout(touch, felt))
-    return Sensed(touch, felt, contact, channels, by_kind.get("surface_distance"), body, by_kind, groups)
+        groups[GROUP] = Source(GROUP, None, layouts[felt])
+    return Sensed(
+        touch=touch,
+        felt=felt,
+        contact=contact,
+        channels=next((output.channels for output in touch.outputs if output.name == contact), ()),
+        distance=by_kind.get("surface_distance"),
+        object=document.spec.objects[spec.object].body_of(spec.object),
+        by_kind=by_kind,
+        groups=groups,
+    )
 
 
-def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
-    """Return what of the sensors' document is set for policies that feel several things: each sensor is computed once.
+def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what of the sensors' document is set for policies that feel several things, and the module's observations.
 
-    It is on all links that are asked for, of which a policy takes its own columns, and gives readings with and without noise.
-
-    Raises:
-        SpecError: If there are two profiles of noise beside `clean`.
+    Each sensor is computed once, on all links that are asked for, of which a policy takes its own columns, and gives readings
+    with and without noise: of one profile beside `clean`.
     """
-    result: dict[str, Any] = {"observations": {}}
+    result, observations = dict[str, Any](), dict[str, Any]()
     for sensor in dict.fromkeys(felts.values()):
         carried = [felt for felt, carrier in felts.items() if carrier == sensor]
         noises = list(dict.fromkeys(felt.noise for felt in carried if felt.noise != CLEAN))
@@ -192,31 +181,18 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
         result[f"sensors.{sensor}.readout"] = "both" if is_both else "measured"
         for felt in carried:
             reading = f"{sensor}/clean" if is_both and felt.noise == CLEAN else sensor
-            result["observations"][_observation(felt)] = [{"type": SENSED[felt.type][1], "of": reading}]
-    return result
+            observations[felt.observation] = [{"type": SENSED[felt.type][1], "of": reading}]
+    return result, observations
 
 
-def _observation(felt: Felt) -> str:
-    return f"{GROUP}_{felt.type}_{felt.noise}"
-
-
-def _layout(touch: TactileModule, sensor: str) -> Layout:
-    return touch.plan.layout_of(next(planned for planned in touch.plan.sensors if planned.name == sensor))
-
-
-def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, sensor: str) -> Source:
-    """Return where a group of observations comes from: of the sensor's taxels or links those of the placement.
-
-    Raises:
-        SpecError: If it feels on some of the links alone, and its numbers are not of taxels or links.
-    """
-    observation, layout = _observation(felt), _layout(touch, sensor)
+def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, layout: Layout) -> Source:
+    """Return where a group comes from: of the sensor's taxels or links those of the placement."""
     links = [link.name for link in layout.links]
     names = layout.groups.get(felt.placement) or tuple(matching(felt.placement, links))
     if set(names) == set(links):
-        return Source(observation, None, layout)
+        return Source(felt.observation, None, layout)
     taxels = layout.taxels_of(names)
-    size = sum(term.num_features for term in touch.plan.observations if term.group == observation)
+    size = sum(term.num_features for term in touch.plan.observations if term.group == felt.observation)
     is_per_link = felt.type in PER_LINK
     rows = np.flatnonzero([name in names for name in links]) if is_per_link else taxels
     num_rows = len(links) if is_per_link else layout.num_taxels
@@ -224,58 +200,40 @@ def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, sensor: str) -
         problem = f'"{felt.type}" cannot be felt at {felt.placement} beside other links: its numbers are not of taxels'
         raise loaded.error(("placement",), problem)
     columns = (np.arange(size // num_rows)[:, None] * num_rows + rows).ravel()
-    return Source(observation, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
+    return Source(felt.observation, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
 
 
 def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
-    """See that the sensors' document has a sensor for each of several things that are felt.
-
-    Raises:
-        SpecError: If not, or all mistakes of the sensors' document.
-    """
-    _sensors_of(loaded, _kinds(sensors_document(loaded)), {"touch": [SENSED[each.type][0] for each in feels]})
+    """Raise `SpecError` if the sensors' document lacks a sensor for something that is felt, or has mistakes."""
+    _sensors_of(loaded, sensors_document(loaded), {"touch": [SENSED[each.type][0] for each in feels]})
 
 
 def types_of(loaded: LoadedTask) -> list[str]:
-    """Return the types that the sensors' document has sensors for, and none.
-
-    Raises:
-        SpecError: All mistakes of the sensors' document.
-    """
-    kinds = _kinds(sensors_document(loaded)).values()
+    """Return the types that the sensors' document has sensors for, and none."""
+    kinds = {sensor.kind for sensor in sensors_document(loaded).spec.sensors.values()}  # type: ignore[attr-defined]
     return ["none", *(name for name, (kind, _) in SENSED.items() if kind in kinds)]
 
 
 def num_variants(loaded: LoadedTask) -> int:
-    """Return how many variants the task's object has; 1 if it has none.
-
-    Raises:
-        SpecError: All mistakes of the sensors' document, or if a variant that the task names is not there.
-    """
+    """Return how many variants the task's object has; 1 if it has none."""
     document, spec = sensors_document(loaded), loaded.spec
-    return (
-        len(document.spec.objects[spec.object].variants or ()) or 1
-        if spec.variants is None
-        else len(_variants(loaded, document))
-    )
+    if spec.variants is not None:
+        return len(_variants(loaded, document))
+    return len(document.spec.objects[spec.object].variants or ()) or 1
 
 
 def _variants(loaded: LoadedTask, document: Loaded) -> list[Any]:
-    """Return the variants of its object that a task takes, as the sensors' document has them.
-
-    Raises:
-        SpecError: If one is not there, or is named twice.
-    """
+    """Return the variants of its object that a task takes, as the sensors' document has them."""
     spec = loaded.spec
     assert spec.variants is not None
-    all_variants = document.raw(("objects", spec.object, "variants")) or []
-    if not all_variants:
+    variants = document.raw(("objects", spec.object, "variants")) or []
+    if not variants:
         raise loaded.error(("variants",), f'the object "{spec.object}" of "{spec.document}" has no variants', "leave it out")
     for place, variant in enumerate(spec.variants):
-        if variant >= len(all_variants) or variant in spec.variants[:place]:
-            problem = f"variant {variant}, expected each once, from 0 to {len(all_variants) - 1}"
+        if variant >= len(variants) or variant in spec.variants[:place]:
+            problem = f"variant {variant}, expected each once, from 0 to {len(variants) - 1}"
             raise loaded.error(("variants", place), problem)
-    return [all_variants[variant] for variant in spec.variants]
+    return [variants[variant] for variant in spec.variants]
 
 
 def sensors_document(loaded: LoadedTask) -> Loaded:
@@ -308,24 +266,11 @@ def _sensor_overrides(loaded: LoadedTask) -> dict[str, Any]:
     return {f"sensors.{name}.{key}": value for name, keys in loaded.spec.sensors.items() for key, value in keys.items()}
 
 
-def _kinds(document: Loaded) -> dict[str, str]:
-    return {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
-
-
-def _sensors_of(loaded: LoadedTask, kinds: Mapping[str, str], wanted: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Return the document's only sensor of each kind that is wanted, by kind.
-
-    Args:
-        loaded: The task's document.
-        kinds: Kind of each sensor.
-        wanted: Kinds, by the key of the task's document that wants them.
-
-    Raises:
-        SpecError: All kinds of which there is none, or several.
-    """
+def _sensors_of(loaded: LoadedTask, document: Loaded, wanted: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return the document's only sensor of each kind, by kind; `wanted` has them by the task's key that wants them."""
     sensor, problems = {}, []
     for key, kind in dict.fromkeys((key, kind) for key, some in wanted.items() for kind in some):
-        names = [name for name, other in kinds.items() if other == kind]
+        names = [name for name, other in document.spec.sensors.items() if other.kind == kind]  # type: ignore[attr-defined]
         if len(names) == 1:
             sensor[kind] = names[0]
             continue

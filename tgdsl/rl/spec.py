@@ -70,6 +70,8 @@ class PhysicsSpec(SpecModel):
     stiffness is also by the masses that meet, and by `solimp`."""
     solimp: tuple[Impedance, Impedance, Radius, Impedance, Power] | None = None
     """Of all contacts, as MuJoCo's geoms have it: impedances at first and at the width, width [m], midpoint, power."""
+    max_torque: dict[str, Annotated[float, Quantity("torque", gt=0.0)]] = {}
+    """By names or shell wildcards of joints, the largest torque of their drives in place of the robot's [N·m; slides: N]."""
     nconmax: Whole | None = None
     """On a GPU, capacity for contacts per environment."""
     njmax: Whole | None = None
@@ -86,11 +88,10 @@ class PhysicsSpec(SpecModel):
     def options(self) -> dict[str, Any]:
         """MuJoCo's options that differ from the scene's."""
         options = self.model_dump(exclude={"collision", "substeps", "nconmax", "njmax"}, exclude_none=True)
-        return {name: value.lower() if isinstance(value, str) else value for name, value in options.items()}
+        return {name: value.lower() if isinstance(value, str) else value for name, value in options.items() if value != {}}
 
     @property
     def capacities(self) -> dict[str, int]:
-        """Capacities of the GPU's simulator."""
         return self.model_dump(include={"nconmax", "njmax"}, exclude_none=True)
 
 
@@ -131,6 +132,17 @@ class PlacedRandomSpec(RandomSpec):
     """By how much the object is turned about the vertical [rad]."""
 
 
+class ProprioSpec(SpecModel):
+    """How a policy observes its joints, in the group `proprio`."""
+
+    pos_noise: Annotated[float, Quantity("angle", ge=0.0)] = 0.0
+    """Standard deviation of normal noise on positions, drawn at each control step [rad; slides: m]."""
+    vel_noise: NonNegative = 0.0
+    """The same on velocities, before they are scaled [rad/s; slides: m/s]."""
+    vel_scale: Positive = 1.0
+    """Factor on velocities."""
+
+
 class TaskSpec(SpecModel):
     """What all tasks have in common."""
 
@@ -164,6 +176,11 @@ class TaskSpec(SpecModel):
     joint_vel: Literal["exact", "measured"] = "exact"
     """What velocities `proprio` has: those of the simulation, or what a hand makes of the positions that it reports at each
     control step, by differences through a low-pass filter of 20 ms; `priv_proprio` always has the former."""
+    proprio: ProprioSpec = ProprioSpec()
+    """Noise and scale of `proprio`; `priv_proprio` has neither."""
+    temporal: Literal["last", "stack"] = "last"
+    """Which readings of a control step `tactile_sensors` has: that of its last physics step, or those of all of them, the
+    first one first."""
     noise: str = "clean"
     """A noise profile of the sensors' document, or the built-in `clean` or `noisy`."""
     action: ActionSpec = ActionSpec()

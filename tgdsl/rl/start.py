@@ -1,4 +1,4 @@
-"""The simulation of a task's environments, and what the task is told of it."""
+"""The simulation of a task's environments, and the setup that the task is made for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from tgdsl.errors import Problem, SimulationError, SpecError, did_you_mean
 from tgdsl.rl.actuation import Actuators
@@ -17,7 +16,7 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.events import event_terms
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed
-from tgdsl.rl.task import Setup
+from tgdsl.rl.task import Setup, free_qpos
 from tgdsl.runtime.connection import keyword_options
 from tgdsl.runtime.simulate import simulator_for
 from tgdsl.runtime.simulators.model_ids import keyframe_id
@@ -45,6 +44,10 @@ def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
         keyframe_id(model, loaded.spec.keyframe)
     except SimulationError as error:
         problems.append(loaded.source.problem(("keyframe",), str(error)))
+    for pattern in loaded.spec.physics.max_torque:
+        if not matching(pattern, joint_names):
+            place, problem = ("physics", "max_torque", pattern), f'no actuated joint matches "{pattern}"'
+            problems.append(loaded.source.problem(place, problem, did_you_mean(pattern, joint_names, "joints"), on_key=True))
     if problems:
         raise SpecError(problems)
     return tuple(name for name in joint_names if any(matching(pattern, [name]) for pattern in loaded.spec.joints))
@@ -62,16 +65,6 @@ def make_simulation(
 ) -> Simulation:
     """Simulate the task's scene; environments with faults wait for a reset.
 
-    Args:
-        loaded: The task's document.
-        sensed: Its module.
-        joints: The joints that the policy moves.
-        num_envs: Number of environments.
-        device: As for `tgdsl.simulate`.
-        simulator: As for `simulator_for`.
-        threads: CPU threads; 0: one per CPU.
-        first_env: Number of the first environment among those of all processes.
-
     Raises:
         SimulationError: If the scene cannot be simulated as the document says, or of no whole number of environments.
     """
@@ -79,8 +72,9 @@ def make_simulation(
         raise SimulationError(f"num_envs is {num_envs!r}, expected a whole number of at least 1")
     spec = loaded.spec
     own = loaded.task.watch(spec)
+    links = contact_links(sensed) if any(term.watches_links for term in loaded.terms.values()) else ()
     watch = Watch(
-        bodies=tuple(dict.fromkeys((sensed.object, *own.bodies))),
+        bodies=tuple(dict.fromkeys((sensed.object, *own.bodies, *links))),
         sites=own.sites,
         joints=tuple(dict.fromkeys((*joints, *own.joints, *sensed.touch.inputs.joints))),
         actuators=own.actuators,
@@ -102,7 +96,7 @@ def make_simulation(
 def make_setup(
     loaded: LoadedTask, sensed: Sensed, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
 ) -> Setup:
-    """Return what the task is told of its simulation.
+    """Return the setup of a task without grasps.
 
     Raises:
         SpecError: If a joint that the policy moves has no position actuator of its own, or no limits.
@@ -112,52 +106,50 @@ def make_setup(
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
     num_variants = _num_variants(sensed, loaded.spec.object)
-    rows = sensed.touch.rows[sensed.contact]["body"].tolist() if sensed.contact else ()
     friction, mass = (get(sensed.object).to(sim.qpos).clone() for get in (sim.properties.friction, sim.properties.mass))
+    keyframe = sim.qpos[0].double().cpu().numpy()
+    heights = [half_height(sim.env_model(i), sensed.object, keyframe) for i in range(min(num_variants, sim.num_envs))]
+    heights = torch.tensor(heights, dtype=sim.qpos.dtype)[torch.arange(sim.num_envs) % num_variants].to(sim.qpos.device)
+    start, free = sim.qpos[0].repeat(sim.num_envs, 1), free_qpos(sim.model, sensed.object)
+    if free is not None:
+        start[:, free.start + 2] += heights - half_height(
+            SceneModels(sensed.touch.plan.scene).model({}), sensed.object, keyframe
+        )
     return Setup(
         num_envs=sim.num_envs,
         device=sim.qpos.device,
         dtype=sim.qpos.dtype,
         control_step=sim.control_step,
         model=sim.model,
-        joints=sim.joints,
         actuators=actuators,
         low=torch.from_numpy(actuators.low).to(sim.qpos),
         high=torch.from_numpy(actuators.high).to(sim.qpos),
         max_torque=torch.from_numpy(actuators.limit).to(sim.qpos),
         object=sensed.object,
-        links=tuple(rows),
+        links=contact_links(sensed),
         qpos=sim.qpos[0].clone(),
-        half_height=_half_heights(sim, sensed, loaded.spec.object),
-        first_half_height=_first_half_height(sim, sensed),
+        start=start,
+        half_height=heights,
         variant=((torch.arange(sim.num_envs) + first_env) % num_variants).to(sim.qpos.device),
         num_variants=num_variants,
-        friction=friction.clone(),
-        mass=mass.clone(),
-        scene_friction=friction,
-        scene_mass=mass,
+        friction=friction,
+        mass=mass,
+        scene_start=start.clone(),
+        scene_friction=friction.clone(),
+        scene_mass=mass.clone(),
         draws=draws,
         rows={kind: (name, sensed.touch.rows[name]) for kind, name in sensed.by_kind.items()},
     )
 
 
+def contact_links(sensed: Sensed) -> tuple[str, ...]:
+    """Return the bodies of the `link_contact` sensor's rows; none if the task takes none."""
+    return tuple(sensed.touch.rows[sensed.contact]["body"].tolist()) if sensed.contact else ()
+
+
 def _num_variants(sensed: Sensed, name: str) -> int:
     inputs = sensed.touch.inputs
     return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
-
-
-def _half_heights(sim: Simulation, sensed: Sensed, name: str) -> Float[Tensor, " env"]:
-    """Return how far each environment's object reaches below its body's origin as the keyframe has it [m]."""
-    num = _num_variants(sensed, name)
-    qpos = sim.qpos[0].double().cpu().numpy()
-    each = [half_height(sim.env_model(env), sensed.object, qpos) for env in range(min(num, sim.num_envs))]
-    variants = torch.arange(sim.num_envs) % num
-    return torch.tensor(each, dtype=sim.qpos.dtype)[variants].to(sim.qpos.device)
-
-
-def _first_half_height(sim: Simulation, sensed: Sensed) -> float:
-    first = SceneModels(sensed.touch.plan.scene).model({})
-    return half_height(first, sensed.object, sim.qpos[0].double().cpu().numpy())
 
 
 def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:

@@ -18,7 +18,7 @@ probes of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -34,9 +34,10 @@ from tgdsl.errors import SimulationError
 from tgdsl.fields.models import SpecModel
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.grasps.table import GraspTable
+from tgdsl.rl.features import Features
+from tgdsl.rl.grasps.grasps import GraspTable
 from tgdsl.rl.spec import TaskSpec, Weight
-from tgdsl.runtime.simulators.model_ids import Joints
+from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.state_values import Contacts, StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
 from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
@@ -56,138 +57,111 @@ def checked(what: str, value: object, num_envs: int, ndim: int = 1) -> Tensor:
     raise SimulationError(f"{what} is {given}, expected a tensor ({num_envs},{' …' if ndim > 1 else ''})")
 
 
+def free_qpos(model: mujoco.MjModel, name: str) -> slice | None:
+    """Return where a free body's position and quaternion stand in `qpos`; None if it does not move freely."""
+    body = model.body(element_id(model, "body", name))
+    first = int(model.jnt_qposadr[int(body.jntadr[0])])
+    return slice(first, first + 7) if int(body.dofnum[0]) == 6 and int(body.jntnum[0]) == 1 else None
+
+
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What a task is made for.
+    """What a task is made for."""
 
-    Attributes:
-        num_envs: Number of environments.
-        device: Where physics runs, and a task's tensors are.
-        dtype: Dtype of physics: float64 on a CPU, float32 on a GPU.
-        control_step: Duration of a control step Δt [s].
-        model: The compiled scene.
-        joints: Where each joint stands in `qpos` and `qvel`.
-        actuators: The joints that the policy moves.
-        low: Lower ends of these joints' ranges [rad].
-        high: Upper ends [rad].
-        max_torque: Largest torques of their drives [N·m]; infinite where there is no limit.
-        object: Body of the task's object.
-        links: Bodies of the rows of `Now.link_force`.
-        qpos: Where episodes start, before anything is random: the keyframe.
-        half_height: How far each environment's object reaches below its body's origin when it stands upright [m].
-        first_half_height: That of its first variant, which stands where the keyframe has it [m].
-        variant: Which of its variants each environment's object is, from 0.
-        num_variants: How many there are; 1 if the object has none.
-        friction: Coefficient of sliding friction of each object: a live tensor, redrawn before `reset`.
-        mass: Mass of each object [kg], in the same way.
-        scene_friction: The same as the scene has it.
-        scene_mass: The same.
-        draws: Random numbers.
-        rows: By kind of sensor that the task looks at: its reading's name in `Now.readings`, and a table of that one's rows.
-        grasps: Grasps that episodes begin from; None if the task's document has none.
-    """
-
-    num_envs: int
-    device: torch.device
-    dtype: torch.dtype
-    control_step: float
-    model: mujoco.MjModel
-    joints: Joints
-    actuators: Actuators
-    low: Float[Tensor, " joint"]
-    high: Float[Tensor, " joint"]
-    max_torque: Float[Tensor, " joint"]
-    object: str
-    links: tuple[str, ...]
-    qpos: Float[Tensor, " nq"]
+    num_envs: int  # number of environments
+    device: torch.device  # where physics runs, and a task's tensors are
+    dtype: torch.dtype  # dtype of physics: float64 on a CPU, float32 on a GPU
+    control_step: float  # duration of a control step Δt [s]
+    model: mujoco.MjModel  # the compiled scene
+    actuators: Actuators  # the joints that the policy moves
+    low: Float[Tensor, " joint"]  # lower ends of these joints' ranges [rad]
+    high: Float[Tensor, " joint"]  # upper ends [rad]
+    max_torque: Float[Tensor, " joint"]  # largest torques of their drives [N·m]; infinite where there is no limit
+    object: str  # body of the task's object
+    links: tuple[str, ...]  # bodies of the rows of `Now.link_force`
+    qpos: Float[Tensor, " nq"]  # the keyframe
+    start: Float[Tensor, "env nq"]
+    """Where episodes start: the keyframe, with each object where the first variant stands; a live tensor, in which the event
+    `Placement` moves objects before `reset`."""
     half_height: Float[Tensor, " env"]
-    first_half_height: float
-    variant: Int[Tensor, " env"]
-    num_variants: int
+    """How far each environment's object reaches below its body's origin when it stands upright [m]."""
+    variant: Int[Tensor, " env"]  # which of its variants each environment's object is, from 0
+    num_variants: int  # how many there are; 1 if the object has none
     friction: Float[Tensor, " env"]
-    mass: Float[Tensor, " env"]
-    scene_friction: Float[Tensor, " env"]
-    scene_mass: Float[Tensor, " env"]
-    draws: Draws
+    """Coefficient of sliding friction of each object: a live tensor, redrawn before `reset`."""
+    mass: Float[Tensor, " env"]  # mass of each object [kg], in the same way
+    scene_start: Float[Tensor, "env nq"]  # `start` before anything is random
+    scene_friction: Float[Tensor, " env"]  # the same of `friction`
+    scene_mass: Float[Tensor, " env"]  # the same of `mass`
+    draws: Draws  # random numbers
     rows: Mapping[str, tuple[str, TaxelTable]]
-    grasps: GraspTable | None = None
+    """By kind of sensor that the task looks at: its reading's name in `Now.readings`, and a table of that one's rows."""
+    grasps: GraspTable | None = None  # grasps that episodes begin from; None if the task's document has none
+
+    def free_qpos(self, body: str | None = None) -> slice:
+        """Return where a free body's position and quaternion stand in `qpos`; default: the object's.
+
+        Raises:
+            SimulationError: If there is no such body, or it does not move freely.
+        """
+        name = body or self.object
+        free = free_qpos(self.model, name)
+        if free is None:
+            raise SimulationError(f'the object\'s body "{name}" has no free joint, by which it could be put elsewhere')
+        return free
 
 
 @dataclass(frozen=True, eq=False)
 class Now:
-    """One instant of all environments: that of the readings; world axes unless said.
+    """One instant of all environments: that of the readings; world axes unless said."""
 
-    Attributes:
-        watched: What the task watches, by name: see `Task.watch`.
-        object: Motion of the object's body: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s].
-        joint_pos: Positions of the joints that the policy moves [rad].
-        joint_vel: Their velocities [rad/s].
-        target: What their drives are to reach, after the last action [rad].
-        torque: What their drives exert [N·m].
-        action: What the policy has asked for last, from −1 to 1; zero at the start of an episode.
-        last_action: What it had asked for one control step before.
-        link_force: The object's force on each link, in the link's frame [N]; no links if the task takes no `link_contact`.
-        normal_force: Sum of the normal forces of the object's contacts with each link [N]; no links unless the task
-            `wants_normal_force`.
-        distance: Distance from each probe to the object's surface, negative inside [m]; no probes if the task takes no
-            `surface_distance`.
-        friction: Coefficient of sliding friction of the object.
-        mass: Mass of the object [kg].
-        readings: All readings of the module by name.
-        time: When the instant is, in each environment, by MuJoCo's clock [s]; that of a step is its last physics step's start.
-    """
-
-    watched: Watched
+    watched: Watched  # what the task watches, by name: see `Task.watch`
     object: BodyMotion
-    joint_pos: Float[Tensor, "env joint"]
-    joint_vel: Float[Tensor, "env joint"]
-    target: Float[Tensor, "env joint"]
-    torque: Float[Tensor, "env joint"]
+    """Motion of the object's body: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s]."""
+    joint_pos: Float[Tensor, "env joint"]  # positions of the joints that the policy moves [rad]
+    joint_vel: Float[Tensor, "env joint"]  # their velocities [rad/s]
+    target: Float[Tensor, "env joint"]  # what their drives are to reach, after the last action [rad]
+    torque: Float[Tensor, "env joint"]  # what their drives exert [N·m]
     action: Float[Tensor, "env joint"]
-    last_action: Float[Tensor, "env joint"]
+    """What the policy has asked for last, from −1 to 1; zero at the start of an episode."""
+    last_action: Float[Tensor, "env joint"]  # what it had asked for one control step before
     link_force: Float[Tensor, "env link 3"]
+    """The object's force on each link, in the link's frame [N]; no links if the task takes no `link_contact`."""
     normal_force: Float[Tensor, "env loaded"]
+    """Sum of the normal forces of the object's contacts with each link [N]; no links unless the task `wants_normal_force`."""
     distance: Float[Tensor, "env probe"]
-    friction: Float[Tensor, " env"]
-    mass: Float[Tensor, " env"]
-    readings: Mapping[str, Tensor]
+    """Distance from each probe to the object's surface, negative inside [m]; no probes without `surface_distance`."""
+    friction: Float[Tensor, " env"]  # coefficient of sliding friction of the object
+    mass: Float[Tensor, " env"]  # mass of the object [kg]
+    readings: Mapping[str, Tensor]  # all readings of the module by name
     time: Float[Tensor, " env"]
+    """When the instant is, in each environment, by MuJoCo's clock [s]; that of a step is its last physics step's start."""
+    score: Float[Tensor, " env"]
+    """Score of the episode up to now, in `Task.score_unit`; in `Task.advance`, up to the control step before."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandNow:
-    """One instant of a hand that acts without a scene: what is known of it, and what it is asked for.
+    """One instant of a hand that acts without a scene: what is known of it, and what it is asked for."""
 
-    Attributes:
-        joint_pos: Positions of the joints that the policy moves [rad].
-        joint_vel: Their velocities [rad/s].
-        target: What their drives are to reach, after the last action [rad].
-        action: What the policy has asked for last, from −1 to 1; zero at the start of an episode.
-        steps: Control steps since the start of the episode.
-        control_step: Duration of a control step Δt [s].
-        goal: What it is asked for, as `Task.asked` has it.
-    """
-
-    joint_pos: Float[Tensor, "env joint"]
-    joint_vel: Float[Tensor, "env joint"]
-    target: Float[Tensor, "env joint"]
+    joint_pos: Float[Tensor, "env joint"]  # positions of the joints that the policy moves [rad]
+    joint_vel: Float[Tensor, "env joint"]  # their velocities [rad/s]
+    target: Float[Tensor, "env joint"]  # what their drives are to reach, after the last action [rad]
     action: Float[Tensor, "env joint"]
-    steps: int
-    control_step: float
-    goal: Float[Tensor, "env goal"]
+    """What the policy has asked for last, from −1 to 1; zero at the start of an episode."""
+    steps: int  # control steps since the start of the episode
+    control_step: float  # duration of a control step Δt [s]
+    goal: Float[Tensor, "env goal"]  # what it is asked for, as `Task.asked` has it
 
 
 class Start(NamedTuple):
-    """How episodes begin.
-
-    Attributes:
-        values: MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing. With `ctrl`
-            among them drives begin with these targets; else they hold the positions of their joints.
-        contacts: As for `sim.reset`: "none" for an object that touches nothing yet, or what was stored with a grasp.
-    """
+    """How episodes begin."""
 
     values: StateValues
+    """MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing. With `ctrl` among
+    them drives begin with these targets; else they hold the positions of their joints."""
     contacts: Contacts = "none"
+    """As for `sim.reset`: "none" for an object that touches nothing yet, or what was stored with a grasp."""
 
 
 Rate = Callable[[Now], Float[Tensor, " env"]]
@@ -196,25 +170,16 @@ Rate = Callable[[Now], Float[Tensor, " env"]]
 
 @dataclass(frozen=True)
 class TaskReward:
-    """A term of a task's reward.
+    """A term of a task's reward."""
 
-    Attributes:
-        weight: Its weight unless the document gives another.
-        unit: Unit of the weight.
-        summary: What it is, in a line.
-        rate_of: Makes the term of a task.
-        name: Its name if it is not that of the attribute.
-        term: The shared term that it is, a `RewardTerm`; None: one of the task alone.
-        parameters: The shared term's parameters, each by the key of the task's document that has it.
-    """
-
-    weight: float
-    unit: str
-    summary: str
-    rate_of: Callable[[Any], Rate]
-    name: str | None = None
-    term: type[Any] | None = None
+    weight: float  # its weight unless the document gives another
+    unit: str  # unit of the weight
+    summary: str  # what it is, in a line
+    rate_of: Callable[[Any], Rate]  # makes the term of a task
+    name: str | None = None  # its name if it is not that of the attribute
+    term: type[Any] | None = None  # the shared term that it is, a `RewardTerm`; None: one of the task alone
     parameters: Mapping[str, str] = field(default_factory=dict)
+    """The shared term's parameters, each by the key of the task's document that has it."""
 
     def __get__(self, task: Task | None, owner: type[Task]) -> Any:
         return self if task is None else self.rate_of(task)
@@ -349,6 +314,10 @@ class Task(ABC, Generic[S]):
     @abstractmethod
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what the features of `observe` are, by group and in order; what is left out counts as not described."""
+        return {}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""

@@ -10,7 +10,8 @@ width of their ranges; f_l the object's force on link l, d_p the distance from p
 of the drives; v and ω the object's velocity and angular velocity.
 
 Source of the names: Chung et al., *Tactile Genesis*, appendix, "Reward terms", which prints no formulas: these are ours.
-`effort` and `object_speed` are ours altogether.
+`effort` and `object_speed` are ours altogether. That `near` may take the nearest probes alone, `net_force` and `score_limit`
+are choices of the authors' public code: see docs/paper.md.
 
 Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 """
@@ -20,7 +21,7 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -31,13 +32,16 @@ from pydantic import create_model, model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
+from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.fields.models import Number, PositiveLength, Quantity, Range, RangeOf, SpecModel
-from tgdsl.rl import groups
-from tgdsl.rl.actuation import Actuation, Factor
+from tgdsl.rl import features, groups, rotations
+from tgdsl.rl.actuation import ZERO, Actuation, Factor
 from tgdsl.rl.draws import within
-from tgdsl.rl.spec import PushSpec, TaskSpec
+from tgdsl.rl.features import Features
+from tgdsl.rl.spec import PushSpec, TaskSpec, Whole
 from tgdsl.rl.task import Now, Rate, Setup, Task, TaskReward
 from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.schema.select import matching
 from tgdsl.tensors.env_ids import put_rows
 
 FREE_SHARE = 0.95
@@ -58,6 +62,8 @@ class Term(SpecModel, ABC):
     """Kinds of sensors of the sensors' document that it looks at: see `Task.senses`."""
     constants: ClassVar[tuple[str, ...]] = ()
     """Parameters that no curriculum can change."""
+    watches_links: ClassVar[bool] = False
+    """Whether it looks at where the links of `Setup.links` are: `now.watched.body(link)`."""
     term: str | None = None
     """Which term it is: a name, or `package.module:Class` or `file.py:Class`; default: the name that it has in the document."""
 
@@ -110,26 +116,22 @@ class ObservationTerm(Term):
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
         """Return the group."""
 
+    def describe(self, setup: Setup) -> Sequence[Features]:
+        """Return what its features are, in order; none: they are not described."""
+        return ()
+
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """An event that happens now.
+    """An event that happens now."""
 
-    Attributes:
-        sim: The simulation; its `arrays` and `properties` may be changed, of the chosen environments alone.
-        setup: The setup of the environments.
-        actuation: The drives.
-        chosen: The environments in which it happens: decide by this mask, not by `if`.
-        count: How often each environment was reset; of events at intervals, how often it has happened, above that the episode.
-        stream: What its random numbers are for.
-    """
-
-    sim: Simulation
-    setup: Setup
-    actuation: Actuation
-    chosen: Bool[Tensor, " env"]
+    sim: Simulation  # the simulation; its `arrays` and `properties` may be changed, of the chosen environments alone
+    setup: Setup  # the setup of the environments
+    actuation: Actuation  # the drives
+    chosen: Bool[Tensor, " env"]  # the environments in which it happens: decide by this mask, not by `if`
     count: Int[Tensor, " env"]
-    stream: str
+    """How often each environment was reset; of events at intervals, how often it has happened, above that the episode."""
+    stream: str  # what its random numbers are for
 
     def shares(self, num: int) -> Float[Tensor, "env num"]:
         """Return random numbers between 0 and 1, float32: others each time that it happens."""
@@ -251,9 +253,31 @@ class Near(RewardTerm):
     senses = ("surface_distance",)
     width: PositiveLength = 0.02
     """λ, decay length [m]."""
+    nearest: Whole | None = None
+    """How many of the nearest probes count; null: all."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return torch.exp(-now.distance.clamp(min=0.0) / self.width).mean(dim=1)
+        distance = now.distance
+        if self.nearest is not None:
+            distance = distance.topk(min(self.nearest, distance.shape[1]), dim=1, largest=False).values
+        return torch.exp(-distance.clamp(min=0.0) / self.width).mean(dim=1)
+
+
+class NetForce(RewardTerm):
+    """Net force of the links on the object beyond what is free, min(max(0, |Σ_l f_l| − f_free), f_most)."""
+
+    senses = ("link_contact",)
+    watches_links = True
+    unit = "1/(N s)"
+    free: Force = 1.0
+    """f_free: a smaller net force costs nothing [N]."""
+    most: Force = 20.0
+    """f_most: what is more beyond it costs no more [N]."""
+
+    def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
+        quat = torch.stack([now.watched.body(link).quat for link in setup.links], dim=1)
+        net = rotations.rotated(quat, now.link_force).sum(dim=1)
+        return (vector_norm(net, dim=1) - self.free).clamp(min=0.0).clamp(max=self.most)
 
 
 class ObjectSpeed(RewardTerm):
@@ -293,13 +317,39 @@ class SpeedLimit(TerminationTerm):
         return vector_norm(now.object.linvel, dim=1) > self.max_speed
 
 
+class ScoreLimit(TerminationTerm):
+    """The episode's score has reached a number; of tasks whose score grows."""
+
+    most: Number
+    """The number, in the score's unit."""
+
+    def is_over(self, now: Now, setup: Setup) -> Bool[Tensor, " env"]:
+        return now.score >= self.most
+
+
 class LinkForce(ObservationTerm):
     """The object's force on each link, in the link's frame [N]."""
 
     senses = ("link_contact",)
+    links: tuple[str, ...] = ("*",)
+    """Names or shell wildcards of the links, which stand in the order of the `link_contact` sensor."""
 
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
-        return now.link_force.flatten(1)
+        return torch.cat([now.link_force[:, i] for i in self.rows(setup)], dim=1)
+
+    def describe(self, setup: Setup) -> Sequence[Features]:
+        return features.link_forces([setup.links[i] for i in self.rows(setup)])
+
+    def rows(self, setup: Setup) -> list[int]:
+        """Return which links are observed.
+
+        Raises:
+            SimulationError: If a name or wildcard matches none.
+        """
+        for pattern in self.links:
+            if not matching(pattern, setup.links):
+                raise SimulationError(f'no link matches "{pattern}"; {did_you_mean(pattern, setup.links, "links")}')
+        return [i for i, link in enumerate(setup.links) if any(matching(pattern, [link]) for pattern in self.links)]
 
 
 class ObjectState(ObservationTerm):
@@ -307,6 +357,9 @@ class ObjectState(ObservationTerm):
 
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
         return groups.object_state(now)
+
+    def describe(self, setup: Setup) -> Sequence[Features]:
+        return features.object_state(setup.object)
 
 
 class ObjectVelocity(EventTerm):
@@ -324,13 +377,18 @@ class ObjectVelocity(EventTerm):
         event.sim.arrays["qvel"][:, first : first + 6] += torch.where(event.chosen[:, None], added, 0.0)
 
 
-class Friction(EventTerm):
-    """The object's coefficient of sliding friction is the scene's times a factor."""
+class ResetEvent(EventTerm):
+    """Something that changes what the scene is made of, by default at each reset."""
 
     changes_model = True
-    per_env = ("friction",)
     mode: Literal["reset", "interval"] = "reset"
     """When it happens."""
+
+
+class Friction(ResetEvent):
+    """The object's coefficient of sliding friction is the scene's times a factor."""
+
+    per_env = ("friction",)
     factor: Factor
     """The factor."""
 
@@ -340,13 +398,10 @@ class Friction(EventTerm):
         event.sim.properties.set(event.chosen, friction={setup.object: setup.friction})
 
 
-class Mass(EventTerm):
+class Mass(ResetEvent):
     """The object's mass is the scene's and something more."""
 
-    changes_model = True
     per_env = ("mass",)
-    mode: Literal["reset", "interval"] = "reset"
-    """When it happens."""
     added: Annotated[Range, RangeOf("mass", ge=0.0)]
     """What is added [kg]."""
 
@@ -356,12 +411,29 @@ class Mass(EventTerm):
         event.sim.properties.set(event.chosen, mass={setup.object: setup.mass})
 
 
-class Drive(EventTerm):
-    """The drives are drawn again within `randomise.drive`."""
+class Placement(ResetEvent):
+    """The object, which moves freely, starts upright where the keyframe has the first variant, moved and turned at random."""
 
-    changes_model = True
-    mode: Literal["reset", "interval"] = "reset"
+    mode: Literal["reset"] = "reset"  # pyright: ignore[reportIncompatibleVariableOverride]
     """When it happens."""
+    xy: Annotated[Range, RangeOf("length")] = ZERO
+    """What is added to the object's place along the world's x and y, each [m]."""
+    yaw: Annotated[Range, RangeOf("angle")] = ZERO
+    """By how much the object is turned about the vertical [rad]."""
+
+    def apply(self, event: Event) -> None:
+        setup, item = event.setup, event.setup.free_qpos()
+        shares = setup.draws.shares({event.stream: 2, "yaw": 1}, event.count, event.chosen)
+        xy, yaw = (within(shares[name], *ends).to(setup.dtype) for name, ends in ((event.stream, self.xy), ("yaw", self.yaw)))
+        up = torch.eye(3, dtype=setup.dtype, device=setup.device)[2].expand(setup.num_envs, 3)
+        pos, quat = setup.scene_start[:, item].split([3, 4], dim=1)
+        pos = torch.cat([pos[:, :2] + xy, pos[:, 2:]], dim=1)
+        quat = rotations.product(rotations.about(up, yaw[:, 0]), quat)
+        put_rows(setup.start[:, item], event.chosen, torch.cat([pos, quat], dim=1))
+
+
+class Drive(ResetEvent):
+    """The drives are drawn again within `randomise.drive`."""
 
     def apply(self, event: Event) -> None:
         event.actuation.draw(event.chosen, event.count)
@@ -428,14 +500,17 @@ TERMS: Mapping[str, type[Term]] = {
     "effort": Effort,
     "contact_force": ContactForce,
     "near": Near,
+    "net_force": NetForce,
     "object_speed": ObjectSpeed,
     "force_limit": ForceLimit,
     "speed_limit": SpeedLimit,
+    "score_limit": ScoreLimit,
     "link_force": LinkForce,
     "object_state": ObjectState,
     "object_velocity": ObjectVelocity,
     "friction": Friction,
     "mass": Mass,
+    "placement": Placement,
     "drive": Drive,
     "push": Push,
     "linear": Linear,

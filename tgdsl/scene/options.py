@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Any
 
 import mujoco
@@ -10,9 +11,10 @@ import numpy as np
 
 from tgdsl.errors import SimulationError, did_you_mean
 
-Options = Mapping[str, float | int | str | Sequence[float | int]]
+Options = Mapping[str, float | int | str | Sequence[float | int] | Mapping[str, float]]
 """Values of fields of MuJoCo's `mjOption` by name; of those with keywords, the keyword that MJCF has. Also `solref` and
-`solimp`, which all geoms and pairs then have."""
+`solimp`, which all geoms and pairs then have, and `max_torque`, by names or shell wildcards of joints the largest torque of
+their actuators [N·m; slides: N]."""
 KEYWORDS: Mapping[str, Any] = {
     "cone": mujoco.mjtCone,
     "integrator": mujoco.mjtIntegrator,
@@ -44,7 +46,8 @@ def set_options(spec: mujoco.MjSpec, options: Options) -> None:
     Raises:
         SimulationError: If there is no such option or keyword, or a value does not fit, as MuJoCo would silently take another.
     """
-    option = spec.option
+    option, torques = spec.option, dict[str, Any](options).get("max_torque", {})
+    options = {name: given for name, given in options.items() if name != "max_torque"}
     values = {name: _value(option, name, given) for name, given in options.items() if name not in CONTACTS}
     steps = float(values.get("timestep", option.timestep)), int(values.get("disableflags", option.disableflags))
     contacts = {name: _contact(name, given, *steps) for name, given in options.items() if name in CONTACTS}
@@ -53,6 +56,10 @@ def set_options(spec: mujoco.MjSpec, options: Options) -> None:
     for name, value in contacts.items():
         for element in (*spec.geoms, *spec.pairs):
             setattr(element, name, value)
+    for actuator in spec.actuators:
+        for pattern, torque in torques.items():
+            if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and fnmatchcase(actuator.target, pattern):
+                actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-torque, torque]
 
 
 def _contact(name: str, given: Any, timestep: float, disabled: int) -> list[float]:

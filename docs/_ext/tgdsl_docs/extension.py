@@ -1,4 +1,4 @@
-"""Pages generated at build time from what they describe: kinds, grammar, command line, API, and the README as a page.
+"""Pages generated at build time from what they describe: kinds, grammar, commands, API, observations, the README as a page.
 
 They are written to `generated/` of the source folder, before Sphinx looks for pages.
 """
@@ -17,6 +17,7 @@ from tgdsl_docs.commands import command_pages
 from tgdsl_docs.grammar import grammar_pages
 from tgdsl_docs.kinds import kind_pages
 from tgdsl_docs.links import overview, resolve_links
+from tgdsl_docs.observations import observation_pages
 from tgdsl_docs.sections import add_others
 
 FOLDER = "generated"
@@ -28,7 +29,8 @@ def generate(app: Sphinx) -> None:
     source = Path(app.srcdir)
     accuracy = Accuracy()
     pages: dict[str, str] = {"accuracy.md": accuracy.page()}
-    for made in (kind_pages(source, accuracy), grammar_pages(), command_pages(), api_pages(), {"overview.md": overview()}):
+    others = (grammar_pages(), command_pages(), api_pages(), observation_pages(source), {"overview.md": overview()})
+    for made in (kind_pages(source, accuracy), *others):
         pages |= made
     shutil.rmtree(source / FOLDER, ignore_errors=True)
     for name, text in pages.items():

@@ -76,6 +76,8 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert float(rows[0]["score"]) == evaluation["depth-ends-clean-s0"]["score"]
     card = json.loads((folder / "default" / "students" / "depth-all-clean-s0.json").read_text())
     assert card["groups"] == {"proprio": 6, "tactile_sensors": 10, "goal": 7} and card["teacher"] == "teacher.pt"
+    names = [{file.stem for file in (folder / "default" / "students").glob(f"*.{ending}")} for ending in ("pt", "onnx")]
+    assert names[0] == names[1] and len(names[0]) == 5
     student = ("--policy", "out/task_students/default/students/depth-all-clean-s0.pt", "--episodes", "2", "--envs", "2")
     code, out, error = here(base, "evaluate", "task.yaml", *student, "--set", "touch=depth", "--set", "placement=all")
     assert code == 0 and out.startswith("score "), error

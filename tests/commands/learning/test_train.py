@@ -51,7 +51,16 @@ def test_from_nothing_to_a_policy_that_plays(base, here):
     assert lines[-1].startswith("score ") and "quarter turns" in lines[-1] and "in 6 episodes" in lines[-1]
     folder = base / "out" / "task"
     names = {file.name.split(".out.")[0] for file in folder.iterdir()}
-    assert names == {"checkpoint.pt", "curve.csv", "evaluation.json", "events", "policy.json", "policy.pt", "run.json"} | {
+    assert names == {
+        "checkpoint.pt",
+        "curve.csv",
+        "evaluation.json",
+        "events",
+        "policy.json",
+        "policy.onnx",
+        "policy.pt",
+        "run.json",
+    } | {
         "sensors.yaml",
         "task.yaml",
         "taxels.csv",
@@ -283,11 +292,11 @@ def test_a_folder_in_which_another_process_runs_is_left_alone(base, here, fails,
     begun = ("train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
     assert here(base, *begun)[0] == 0
     name, *options = command
-    with RunFolder(base / "other" / "run").held():
+    with RunFolder(base / "other" / "run").lock():
         said = fails(name, "task.yaml", "--device", "cpu", *options, "--out", "other/run")
         assert said == "tgdsl: other/run: another process runs in this folder; wait until it has ended, or give another --out\n"
     (base / "out" / "task" / "checkpoint.pt").write_bytes(b"half written")
-    with RunFolder(base / "out" / "task").held():
+    with RunFolder(base / "out" / "task").lock():
         assert "another process runs in this folder" in fails("train", "task.yaml", *ON, "--resume", "out/task")
 
 

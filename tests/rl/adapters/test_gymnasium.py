@@ -14,7 +14,7 @@ from gymnasium.wrappers import vector
 from small_tasks import STEPS, small_task
 
 from tgdsl.errors import SimulationError, TgdslError
-from tgdsl.rl.adapters.gymnasium import TOLD, TouchVectorEnv
+from tgdsl.rl.adapters.gymnasium import STEP_KEYS, TouchVectorEnv
 from tgdsl.rl.env import TouchEnv
 
 NUM_ENVS, NUM_STEPS = 4, 2 * STEPS + 3
@@ -180,7 +180,11 @@ def test_tensors_are_the_same_numbers(touch_env, actions):
         ended, info = terminated | truncated, made[4]
         same(info["_final_obs"].numpy(), ended)
         same(info["_score"].numpy(), ~ended)
-        assert set(info) == {*TOLD, *(f"_{name}" for name in TOLD), *("final_obs", "_final_obs", "final_info", "_final_info")}
+        assert set(info) == {
+            *STEP_KEYS,
+            *(f"_{name}" for name in STEP_KEYS),
+            *("final_obs", "_final_obs", "final_info", "_final_info"),
+        }
         if ended.any():
             terms = told["final_info"]["episode_terms"]
             for name, value in info["final_info"]["episode_terms"].items():
@@ -253,7 +257,7 @@ def test_infos_as_a_list(touch_env, truth, actions):
     for action, made in zip(actions, truth.steps, strict=True):
         for row, info in enumerate(env.step(action)[4]):
             ended = bool(made.info.ended[row])
-            assert set(info) == ({"final_obs", "final_info"} if ended else set(TOLD))
+            assert set(info) == ({"final_obs", "final_info"} if ended else set(STEP_KEYS))
             told = info["final_info"] if ended else info
             assert told["terms"]["tilt"] == made.info.terms["tilt"][row]
             assert told["episode_steps"] == made.info.episode_steps[row]

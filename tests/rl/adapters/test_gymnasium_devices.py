@@ -6,7 +6,7 @@ import torch
 from gymnasium.wrappers import vector
 from small_tasks import DEVICES, STEPS, have_a_fault, small_task
 
-from tgdsl.rl.adapters.gymnasium import TOLD, TouchVectorEnv
+from tgdsl.rl.adapters.gymnasium import STEP_KEYS, TouchVectorEnv
 from tgdsl.rl.env import TouchEnv
 
 NUM_ENVS, NUM_STEPS = 6, 2 * STEPS + 3
@@ -87,7 +87,7 @@ def test_tensors_are_where_the_environment_is(touch_env, made):
         pairs = [(reward, step.reward), (terminated, step.terminated), (truncated, step.truncated)]
         pairs += [(obs[name], value) for name, value in step.obs.items()]
         pairs += [(told["final_obs"][name], value) for name, value in step.info.final_obs.items()]
-        pairs += [(told[name], getattr(step.info, name)) for name in TOLD if name not in ("terms", "episode_terms")]
+        pairs += [(told[name], getattr(step.info, name)) for name in STEP_KEYS if name not in ("terms", "episode_terms")]
         pairs += [(told["_final_obs"], step.info.ended), (told["_score"], ~step.info.ended)]
         assert all(found.device == touch_env.device and torch.equal(found, expected) for found, expected in pairs)
 

@@ -6,8 +6,7 @@ from pressing_hands import CALIBRATION, Blind, press_policy, press_task
 from written_teachers import teacher
 
 from tgdsl.errors import HandError, ObservationError, SimulationError, SpecError, TgdslError
-from tgdsl.rl.deploying.deploy import Deployment
-from tgdsl.rl.deploying.prepared import DeployError
+from tgdsl.rl.deploying.deploy import DeployError, Deployment
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.policy import PolicyError
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, MotionError

@@ -11,9 +11,8 @@ from pincer_tasks import GRASPS, SENSORS, pincer_env, write_pincer
 from tgdsl.errors import FileError, SimulationError, SpecError
 from tgdsl.files import cache
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.grasps import load as loading
-from tgdsl.rl.grasps.grasps import Grasps, read_grasps, write_grasps
-from tgdsl.rl.grasps.table import GraspTable
+from tgdsl.rl.grasps import sampling as loading
+from tgdsl.rl.grasps.grasps import Grasps, GraspTable, read_grasps, write_grasps
 from tgdsl.rl.load import load_task
 from tgdsl.rl.sensed import compile_sensed
 from tgdsl.runtime.simulators.state_values import FIELDS

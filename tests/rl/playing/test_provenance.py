@@ -12,8 +12,7 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.policy import policy_for, read_policy
 from tgdsl.rl.playing.provenance import SCENE, changes_around, provenance
-from tgdsl.rl.train.folder import made_from
-from tgdsl.rl.train.policies import card_of, write_policy
+from tgdsl.rl.train.folder import run_origin
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 IN_SCENE = [
@@ -34,7 +33,7 @@ def learned(tmp_path_factory):
     """A policy's file, which nobody has taught anything."""
     folder = tmp_path_factory.mktemp("learned")
     learner, loaded = small_learner(folder)
-    write_policy(learner, card_of(learner, made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train"), folder / "policy.pt")
+    learner.write_policy(learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train"), folder / "policy.pt")
     return folder / "policy.pt"
 
 

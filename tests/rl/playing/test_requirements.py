@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from tgdsl.errors import TgdslError
-from tgdsl.rl.playing.requirements import parse_requirements
+from tgdsl.rl.playing.evaluation import parse_requirements
 
 
 def found(**gait):

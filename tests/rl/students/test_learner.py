@@ -276,7 +276,7 @@ def test_students_learn_what_they_can_see(make):
     }
     heads = "{goal_distance: {weight: 0.01, hidden: [4]}}"
     found = make(num_envs=40, sees=("proprio",), decoders=heads, **chosen)
-    told = [found.iterate().told for _ in range(12)]
+    told = [found.iterate().metrics for _ in range(12)]
     for key in found.keys:
         errors = [row[f"Loss/{key.name}"] for row in told]
         assert min(errors[-5:]) < 0.1 * errors[0]
@@ -295,7 +295,7 @@ def test_what_an_iteration_tells_is_of_each_block(make):
         return made
 
     found.env.step = recorded
-    told = found.iterate().told
+    told = found.iterate().metrics
     for i, key in enumerate(found.keys):
         own = slice(2 * i, 2 * i + 2)
         count = float(ended[own].sum())

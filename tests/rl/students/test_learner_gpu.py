@@ -83,4 +83,4 @@ def test_the_host_waits_for_nothing(distillers):
             found.learn()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert all(torch.isfinite(torch.tensor(list(found.iterate().told.values()))))
+    assert all(torch.isfinite(torch.tensor(list(found.iterate().metrics.values()))))

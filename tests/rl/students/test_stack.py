@@ -8,8 +8,7 @@ from torch import nn
 
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.encoders import Encoder, Grid, Lstm, network
-from tgdsl.rl.students.stack import Stack, made
-from tgdsl.rl.students.student import Architecture, deployed, forgotten
+from tgdsl.rl.students.student import Architecture, Stack, acting, deployed, forgotten, seeded_student
 from tgdsl.rl.train.checkpoint import FORMAT, KEYS, read_checkpoint, write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # what policies are written in
@@ -41,7 +40,7 @@ def inputs(stack, rows, dtype, seed=0):
 def test_a_stack_returns_what_single_students_do(kind):
     stack = Stack(architecture(kind), SEEDS, 1e-3, 1.0)
     x, memory = inputs(stack, 11, torch.float32)
-    stack.look(3.0 * x + 1.0)
+    stack.observe(3.0 * x + 1.0)
     found = stack(x, memory)
     for i in range(len(SEEDS)):
         expected = stack.student(i)(x[i], memory[i])
@@ -53,7 +52,7 @@ def test_a_stack_returns_what_single_students_do(kind):
 def test_updates_are_those_of_separate_trainings(kind):
     """Twenty of them, of two steps each through memory, with gradients that are clipped for some and not for others."""
     stack = Stack(architecture(kind), SEEDS, 1e-2, CLIP, dtype=torch.float64)
-    plain = [made(stack.architecture, seed).double() for seed in SEEDS]
+    plain = [seeded_student(stack.architecture, seed).double() for seed in SEEDS]
     optimisers = [torch.optim.Adam(student.parameters(), lr=1e-2) for student in plain]
     size = torch.tensor([1.0, 0.01, 5.0], dtype=torch.float64)
     scales, weights = torch.tensor([20.0, 1.0]).double(), torch.tensor([1.0, 0.5]).double()
@@ -101,7 +100,7 @@ def test_means_and_variances_are_those_of_all_rows_of_a_student():
     stack = Stack(architecture("mlp"), SEEDS, 1e-3, 1.0, dtype=torch.float64)
     parts = [inputs(stack, rows, torch.float64, rows)[0] * torch.tensor([1.0, 2.0, 3.0])[:, None, None] for rows in (5, 40, 7)]
     for part in parts:
-        stack.look(part)
+        stack.observe(part)
     seen = torch.cat(parts, dim=1)
     torch.testing.assert_close(stack.buffers["mean"], seen.mean(dim=1), rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(stack.buffers["var"], seen.var(dim=1, correction=0), rtol=1e-12, atol=1e-12)
@@ -113,10 +112,10 @@ def test_means_and_variances_follow_what_changes_late():
     stack, generator = Stack(architecture("mlp"), SEEDS, 1e-3, 1.0), torch.Generator().manual_seed(0)
     found = dict(stack.buffers)  # in place: a graph that was captured reads these
     x = torch.randn((3, 64, 17), generator=generator) + torch.linspace(0.0, 300.0, 17)
-    stack.look(x)
+    stack.observe(x)
     stack.seen.mul_(before)  # the same rows again and again change nothing else
     for _ in range(looks):
-        stack.look(x + 1.0)
+        stack.observe(x + 1.0)
     rows = x.double(), (x + 1.0).double()
     (mean, var), (late_mean, late_var) = ((own.mean(dim=1), own.var(dim=1, correction=0)) for own in rows)
     share = looks / (before + looks)
@@ -128,7 +127,7 @@ def test_means_and_variances_follow_what_changes_late():
 
 def test_moments_of_older_checkpoints_are_float32():
     one, other = (Stack(architecture("mlp"), SEEDS, 1e-3, 1.0) for _ in range(2))
-    one.look(3.0 * inputs(one, 40, torch.float32)[0] + 1.0)
+    one.observe(3.0 * inputs(one, 40, torch.float32)[0] + 1.0)
     state = copy.deepcopy(one.state_dict())
     state["seen"] |= {name: one.buffers[name].clone() for name in ("mean", "var")}
     assert state["seen"]["mean"].dtype == torch.float32
@@ -143,7 +142,7 @@ def test_adams_options_are_the_devices_own(monkeypatch):
     """Whatever they were where it was saved, and before `step` is placed: it lies by the weights if Adam is capturable."""
     one, other = (Stack(architecture("mlp"), SEEDS, 1e-3, 1.0) for _ in range(2))
     found = one(*inputs(one, 5, torch.float32))
-    one.descend(found.action.square().mean(dim=(1, 2)) + found.told.square().mean(dim=(1, 2)))
+    one.descend(found.action.square().mean(dim=(1, 2)) + found.decoded.square().mean(dim=(1, 2)))
     saved = one.state_dict()
     for group in saved["optimiser"]["param_groups"]:
         group |= {"lr": 1.0, "capturable": True, "fused": True}
@@ -190,7 +189,7 @@ def test_cells_without_a_taxel_tell_nothing_and_each_taxel_does(kind):
 @pytest.mark.parametrize("kind", ENCODERS)
 def test_a_deployed_student_acts_as_it_did_and_forgets_episode_by_episode(kind, tmp_path):
     stack = Stack(architecture(kind), SEEDS, 1e-3, 1.0)
-    torch.jit.save(deployed(stack.student(1)), tmp_path / "policy.pt")
+    torch.jit.save(deployed(acting(stack.student(1))), tmp_path / "policy.pt")
     policy = torch.jit.load(tmp_path / "policy.pt")
     assert not [name for name, _ in policy.named_parameters() if "decoder" in name]
     memory = torch.zeros((3, 4, stack.memory))
@@ -214,9 +213,9 @@ def test_what_is_saved_goes_on_to_the_bit(kind):
     def teach(stack, updates):
         for update in updates:
             x, memory = inputs(stack, 6, torch.float32, seed=update)
-            stack.look(x)
+            stack.observe(x)
             made = stack(x, memory)
-            stack.descend(torch.cat([made.action, made.told], dim=2).square().mean(dim=(1, 2)))
+            stack.descend(torch.cat([made.action, made.decoded], dim=2).square().mean(dim=(1, 2)))
 
     teach(one, range(3))
     other.load_state_dict(copy.deepcopy(one.state_dict()))
@@ -244,7 +243,7 @@ def test_a_slim_checkpoint_rounds_moments_alone(tmp_path):
     one, other = (Stack(architecture("mlp"), seeds, 1e-2, 0.1) for seeds in (SEEDS, (1, 2, 5)))
     x, memory = inputs(one, 6, torch.float32)
     made = one(x, memory)
-    one.descend(torch.cat([made.action, made.told], dim=2).square().mean(dim=(1, 2)))
+    one.descend(torch.cat([made.action, made.decoded], dim=2).square().mean(dim=(1, 2)))
     state = dict.fromkeys(KEYS) | {"format": FORMAT, "stacks": [one.state_dict()]}
     for slim in (False, True):
         write_checkpoint(state, tmp_path / f"{slim}.pt", slim)
@@ -263,7 +262,7 @@ def test_what_goes_on_at_another_rate_learns_at_it():
 
     def descend(stack):
         made = stack(x, memory)
-        stack.descend(torch.cat([made.action, made.told], dim=2).square().mean(dim=(1, 2)))
+        stack.descend(torch.cat([made.action, made.decoded], dim=2).square().mean(dim=(1, 2)))
 
     for _ in range(3):
         descend(before)

@@ -14,11 +14,10 @@ from written_teachers import teacher
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.students import rollout
+from tgdsl.rl.students import learner
 from tgdsl.rl.students.keys import feels, student_keys
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.stack import Stack
-from tgdsl.rl.students.student import Student
+from tgdsl.rl.students.student import Stack, Student
 from tgdsl.rl.students.teacher import Teacher
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
@@ -42,6 +41,7 @@ class Chosen(NamedTuple):
     num_decoders: int = 0
     aggregate: int = 1
     final_learning_rate: float | None = None
+    normalise: bool = False
 
 
 CHOSEN = {
@@ -49,6 +49,7 @@ CHOSEN = {
     "bounded": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0),
     "decoders": Chosen(num_decoders=2),
     "aggregate": Chosen(clip=0.02, aggregate=2),
+    "huber": Chosen("huber", clip=0.02, normalise=True),
     "falling": Chosen(final_learning_rate=1e-4),
     "all": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0, num_decoders=2, aggregate=2),
 }
@@ -72,6 +73,7 @@ class Alone:
         self.student, self.chosen = student, chosen
         self.optimiser = torch.optim.Adam(student.parameters(), lr=RATE)
         self.seen: list[Tensor] = []
+        self.label_std: Tensor | None = None  # of all that the teacher has done so far, in all environments
         self.norms: list[float] = []
 
     def fall(self, share: float) -> None:
@@ -115,11 +117,20 @@ class Alone:
 
     def behaviour(self, action: Tensor, label: Tensor, before: Tensor) -> Tensor:
         """The error of each action."""
-        error, bound = (action - label) ** 2, self.chosen.clip
+        bound = self.chosen.clip
+        error = self.loss(action - label)
         if bound is not None:
             bounded = torch.minimum(torch.maximum(action, before - bound), before + bound)
-            error = torch.maximum(error, (bounded - label) ** 2)
-        return error / torch.tensor(STD) ** 2 if self.chosen.loss == "inverse_variance" else error
+            error = torch.maximum(error, self.loss(bounded - label))
+        return error
+
+    def loss(self, error: Tensor) -> Tensor:
+        """The loss of a difference, as the docstring of `losses` has it."""
+        error = error / torch.tensor(STD) if self.chosen.loss == "inverse_variance" else error
+        error = error / self.label_std if self.label_std is not None else error
+        if self.chosen.loss == "huber":
+            return 2.0 * torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
+        return error**2
 
     def look(self, lesson: Lesson) -> None:
         """Normalise from now on by all rows that were seen."""
@@ -146,7 +157,7 @@ def make(files, monkeypatch):
         decoders = [f"{{scale: {scale}, weight: {weight}, hidden: [4]}}" for scale, weight in zip(SCALES, WEIGHTS, strict=True)]
         named = [f"{name}: {own}" for name, own in zip(("object_size", "goal_distance"), decoders, strict=True)]
         spec = {"steps": STEPS, "gradient_length": LENGTH, "epochs": EPOCHS, "learning_rate": RATE}
-        spec |= {"loss": chosen.loss, "aggregate": chosen.aggregate}
+        spec |= {"loss": chosen.loss, "aggregate": chosen.aggregate, "normalise": chosen.normalise}
         spec |= {name: getattr(chosen, name) or "null" for name in ("clip", "max_grad_norm", "final_learning_rate")}
         spec["decoders"] = "{" + ", ".join(named[: chosen.num_decoders]) + "}"
         widths = {"encoder.hidden": "[5]", "encoder.size": 4, "hidden": "[8]", "touch_encoder.hidden": "[6]"}
@@ -157,7 +168,7 @@ def make(files, monkeypatch):
         own = Teacher(file, loaded)
         made.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, feels=feels(keys, own.felt)))
         bound = own.bound(made[-1])
-        monkeypatch.setattr(rollout, "Stack", partial(Stack, dtype=torch.float64))
+        monkeypatch.setattr(learner, "Stack", partial(Stack, dtype=torch.float64))
         torch.set_default_dtype(torch.float64)
         return Distiller(made[-1], loaded, bound, keys, 0)
 
@@ -204,12 +215,17 @@ def test_an_update_is_that_of_separate_students(make, kind, chosen):
     found._chance.seed(5)
     alone = [Alone(found.student(i), own) for i in range(len(found.keys))]
     kept: list[list[Lesson]] = []
+    labels: list[Tensor] = []
     for number in range(NUM_UPDATES):
         found.set_rate(number / NUM_UPDATES)
         for each in alone:
             each.fall(number / NUM_UPDATES)
         kept = [*kept, filled(found, generator)][-own.aggregate :]
         latest = len(kept) - 1
+        if own.normalise:
+            labels += [lesson.label.flatten(0, 1) for lesson in kept[-1]]
+            for each in alone:
+                each.label_std = torch.cat(labels).std(dim=0, correction=0)
         passes = [latest] + [chance.randrange(len(kept)) if own.aggregate > 1 else latest for _ in range(EPOCHS - 1)]
         errors = [[each.passed(kept[i][n], i == latest) for i in passes] for n, each in enumerate(alone)]
         for each, lesson in zip(alone, kept[-1], strict=True):

@@ -254,8 +254,8 @@ def test_each_ball_has_a_place_and_the_hot_one_any():
     key = env.task.setup.qpos[env.task.places][:, :3]
     count, moved = torch.zeros(NUM_BALLS), []
     for _ in range(8):
-        start = env.task.reset(torch.ones(50, dtype=torch.bool), env._episodes.number.clone()).values["qpos"]
-        env._episodes.number += 1
+        start = env.task.reset(torch.ones(50, dtype=torch.bool), env.resets.clone()).values["qpos"]
+        env.resets += 1
         pos = start[:, env.task.places][:, :, :3]
         far = (pos[:, :, None] - key[None, None]).norm(dim=3)
         nearest = far.argmin(dim=2)

@@ -46,13 +46,22 @@ def random_actions(env, num, seed=0):
     return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
 
 
-def goal_axes(num_envs, episode, goal, kind="any", seed=0):
-    """Return the axes that the goals of some episode turn about, from the counted numbers."""
+def goal_steps(env, episode, goal, seed=0):
+    """Return how many control steps there are for a goal."""
+    low, high = env.spec.goal_timeout
+    share = Draws(seed, env.num_envs).shares({"goal timeout": 1}, torch.full((env.num_envs,), (episode << 32) + goal))
+    return np.round((low + (high - low) * share["goal timeout"][:, 0].numpy()) / env.control_step).astype(int)
+
+
+def goal_axes(num_envs, episode, goal, kind="any", seed=0, step=0.3):
+    """Return the axes that the goals of some episode turn about, from the counted numbers; of `xy` angles about both."""
     count = torch.full((num_envs,), (episode << 32) + goal)
     draws = Draws(seed, num_envs)
     if kind == "vertical":
         side = draws.integers("goal side", count, 1, 0, 1).double().numpy()
         return np.concatenate([0 * side, 0 * side, 2 * side - 1], axis=1)
+    if kind == "xy":
+        return draws.uniform("goal angles", count, 2, -step, step).double().numpy()
     axis = draws.normal("goal axis", count, 3).double().numpy()
     return axis / np.linalg.norm(axis, axis=1, keepdims=True)
 
@@ -78,7 +87,9 @@ def compare(env, recorder, first_episode=2, kind="any"):
             record, found = next(records)
             if number not in axes:
                 axes[number] = [goal_axes(env.num_envs, number, k, kind) for k in range(12)]
-            record["goal_axis"] = np.stack([axis[env_id] for axis in axes[number]])
+            name = "goal_angles" if kind == "xy" else "goal_axis"
+            record[name] = np.stack([axis[env_id] for axis in axes[number]])
+            record["goal_steps"] = [goal_steps(env, number, k)[env_id] for k in range(12)]
             expected = reference_rates(env.task, in_hand_repose, env.spec, record, env.control_step)
             assert expected.keys() == found.keys()
             for name, value in expected.items():
@@ -105,6 +116,25 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path, kind):
     assert {name for rows in seen for name, value in rows.items() if np.abs(value).max() > 1e-9} == terms
     assert max(np.abs(rows["progress"]).max() for rows in seen) > 0.2 * 2  # what is faster the wrong way costs more
     assert max(rows["progress"].max() for rows in seen) <= 0.2 * 2 + 1e-6
+
+
+def test_goals_about_x_and_y_and_times_that_are_drawn_equal_the_reference(tmp_path):
+    own = "drop_measure: below\nmin_spin: -1\nbackward: 2\ngoal: [orientation, difference, angle]\n"
+    env = repose(tmp_path, 4, QUICK.replace("goal_timeout: 0.3 s", "goal_timeout: [0.15 s, 0.4 s]") + own, "0 0 -9.81", "xy")
+    recorder = Recorder(env)
+    for i, action in enumerate(random_actions(env, 70)):
+        env.sim.qvel[1, 6:9] = 3.0 if i % 4 else -3.0
+        if i % 5 in (0, 1):
+            env.sim.qpos[0, 6:10] = env.task.goal[0]
+        recorder.step(action)
+    seen = compare(env, recorder, kind="xy")
+    assert max(rows["score"].max() for rows in seen) >= 2 and sum(rows["goal_timeout"].any() for rows in seen) >= 4
+    assert len({len(rows["score"]) for rows in seen if rows["goal_timeout"].any()}) > 3  # unlike times
+    assert min(rows["progress"].min() for rows in seen) == pytest.approx(0.2 * 2 * -1)
+    angles = np.concatenate([goal_axes(500, 1, k, "xy") for k in range(4)])
+    assert np.abs(angles).max() <= 0.3 and np.abs(angles.mean(axis=0)).max() < 0.02
+    np.testing.assert_allclose(angles.std(axis=0), 0.3 / math.sqrt(3), rtol=0.05)
+    env.close()
 
 
 @pytest.mark.slow

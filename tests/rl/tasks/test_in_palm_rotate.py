@@ -11,7 +11,7 @@ from task_references import in_palm_rotate
 from tiny_tasks import tiny_env
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.links import are_fingers
+from tgdsl.rl.tasks.holding import are_fingers
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "in_palm_rotate.yaml"
@@ -44,6 +44,33 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path, direction):
     assert sum(len(episodes) for episodes in recorder.episodes) >= 12
     every = {*InPalmRotate.Rewards.model_fields, "is_over", "score"}
     assert assert_reference(recorder, held_reference(env)) == every
+
+
+def test_bounds_backward_turns_tilts_and_falls_equal_the_reference(tmp_path):
+    own = {"max_spin": 1.5, "min_spin": -0.5, "backward": 5, "spin_tilt": 0.2, "drop_measure": "below", "drop_distance": "5 mm"}
+    env = tiny_env(tmp_path, 4, more=MORE, overrides=COSTS | own | {"episode": "10 s"})
+    recorder = Recorder(env)
+    for i, action in enumerate(random_actions(env, 60)):
+        env.sim.qvel[:, 8] = torch.tensor([4.0, -4.0, 0.3, -0.3]) * (1 if i % 7 else -1)
+        env.sim.qvel[3, 6] = 2.0 if i > 20 else 0.0  # tilts
+        if i == 50:
+            env.sim.qpos[:2, 5] = 0.022  # 8 mm lower
+        recorder.step(action)
+    seen = assert_reference(recorder, held_reference(env))
+    assert {"spin", "drop", "is_over", "tilt"} <= seen
+    rates = np.concatenate([rows["spin"] for _, rows in recorder.records()])
+    assert rates.min() == pytest.approx(2 * 5 * -0.5, rel=1e-5) and rates.max() == pytest.approx(2 * 1.5, rel=1e-5)
+    env.close()
+
+
+def test_a_document_says_what_is_seen_of_the_goal(tmp_path):
+    env = tiny_env(tmp_path, 2, more="goal: [angle, difference]\nrandomise: {yaw: [-1, 1]}\n")
+    goal = env.step(torch.zeros(2, 2)).obs["goal"]
+    assert goal.shape == (2, 7)
+    np.testing.assert_allclose(goal[:, 0], 0.5 * math.pi, atol=1e-3)
+    quarter = [0, 1, 0, -1, 0, 0]  # the turned x and y axes
+    np.testing.assert_allclose(goal[:, 1:], [quarter] * 2, atol=1e-3)
+    env.close()
 
 
 @pytest.mark.slow

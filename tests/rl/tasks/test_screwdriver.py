@@ -14,7 +14,7 @@ from task_references import screwdriver
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.links import are_fingers
+from tgdsl.rl.tasks.holding import are_fingers
 from tgdsl.rl.tasks.screwdriver import Screwdriver
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "screwdriver.yaml"
@@ -78,6 +78,26 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path):
     assert sum(len(episodes) for episodes in recorder.episodes) > 18
     found = assert_reference(recorder, by_tip(env, np.array([0, 0, 0.1]), LENGTH))
     assert found == {*Screwdriver.Rewards.model_fields, "is_over", "score"}
+    env.close()
+
+
+def test_bounds_and_stalled_episodes_equal_the_reference(tmp_path):
+    own = {
+        "max_spin": 0.2,
+        "min_spin": -0.2,
+        "stall": {"within": "0.25 s", "turn": 0.2},
+        "engagement": "5 cm",
+        "drop_tilt": 1.5,
+    }
+    env = pincer_env(tmp_path, 4, overrides=ODD | own | {"episode": "3 s", "randomise.push": "{}"})
+    recorder = Recorder(env)
+    for i, action in enumerate(random_actions(env, 60)):
+        env.sim.qvel[:, 8] = torch.tensor([-8.0, -0.5, 0.0, 3.0], dtype=torch.float64) * (i < 40)
+        recorder.step(action)
+    seen = assert_reference(recorder, by_tip(env, np.array([0, 0, 0.1]), LENGTH))
+    assert {"spin", "is_over"} <= seen
+    lengths = [[len(rows) for _, rows in episodes] for episodes in recorder.episodes]
+    assert max(lengths[0]) > 20 and max(lengths[2]) == 10, lengths
     env.close()
 
 

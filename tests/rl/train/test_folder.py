@@ -58,7 +58,7 @@ def is_held(folder):
     """Whether the folder is refused to who comes second."""
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(folder.held())
+            stack.enter_context(folder.lock())
         except TgdslError as error:
             return "run: another process runs in this folder; wait until it has ended" in str(error)
     return False
@@ -67,7 +67,7 @@ def is_held(folder):
 def test_two_processes_do_not_run_in_one_folder(tmp_path):
     """A run holds it, by a lock of the folder; when a process that holds one is killed, it is free."""
     folder = RunFolder(tmp_path / "run")
-    with folder.held():
+    with folder.lock():
         assert is_held(RunFolder(folder.path))
     assert not is_held(folder)
     folder.path.mkdir(exist_ok=True)

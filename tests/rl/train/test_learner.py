@@ -22,12 +22,12 @@ def test_an_iteration(tmp_path):
     learner.env.step = recorded
     found = [learner.iterate() for _ in range(4)]
     assert [made.episodes for made in found] == [0, 4, 0, 4]
-    assert "Episode/return" not in found[0].told and found[1].told["Episode/steps"] == STEPS
+    assert "Episode/return" not in found[0].metrics and found[1].metrics["Episode/steps"] == STEPS
     returns = torch.stack([made.reward for made in steps[:STEPS]]).sum(dim=0).mean()
-    assert found[1].told["Episode/return"] == pytest.approx(float(returns), rel=1e-5)
-    terms = sum(value for name, value in found[1].told.items() if name.startswith("Reward/"))
-    assert found[1].told["Episode/return"] == pytest.approx(terms, rel=1e-4)
-    assert found[1].told["Episode/dropped"] == 0.0
+    assert found[1].metrics["Episode/return"] == pytest.approx(float(returns), rel=1e-5)
+    terms = sum(value for name, value in found[1].metrics.items() if name.startswith("Reward/"))
+    assert found[1].metrics["Episode/return"] == pytest.approx(terms, rel=1e-4)
+    assert found[1].metrics["Episode/dropped"] == 0.0
     assert learner.samples == 4 * 4 * 4 and learner.iteration == 4
     assert all(made.rollout > 0 and made.update > 0 for made in found)
 
@@ -39,11 +39,11 @@ def test_curricula_follow_iterations_and_scores(tmp_path):
     learner, _ = small_learner(tmp_path, train__desynchronise=False, terms=terms)
     values, found = learner.env.curricula.values, []
     for i in range(4):
-        score = next((made.told["Episode/score"] for made in reversed(found) if "Episode/score" in made.told), 0.0)
+        score = next((made.metrics["Episode/score"] for made in reversed(found) if "Episode/score" in made.metrics), 0.0)
         found.append(learner.iterate())
         assert values["rewards.effort"].item() == pytest.approx(-i / 4)
         assert values["rewards.near"].item() == pytest.approx(-min(1.0, max(0.0, score / 10)))
-    assert learner.state_dict()["score"] == found[-1].told["Episode/score"]
+    assert learner.state_dict()["score"] == found[-1].metrics["Episode/score"]
 
 
 def test_only_what_somebody_sees_is_kept(tmp_path):
@@ -109,9 +109,9 @@ def test_it_learns(tmp_path):
     options = {"num_envs": 32, "train__rnd": "off", "train__steps": 8, "train__entropy": 0, "rewards__action_rate": -10}
     learner, _ = small_learner(tmp_path, **zero, **options)
     found = [learner.iterate() for _ in range(40)]
-    first, last = (sum(made.told["Episode/return"] for made in part) / 5 for part in (found[:5], found[-5:]))
+    first, last = (sum(made.metrics["Episode/return"] for made in part) / 5 for part in (found[:5], found[-5:]))
     assert first < 0 and last > 0.6 * first
-    assert found[-1].told["Policy/mean_std"] < 0.9 * found[0].told["Policy/mean_std"]
+    assert found[-1].metrics["Policy/mean_std"] < 0.9 * found[0].metrics["Policy/mean_std"]
 
 
 def test_no_episode_no_means():

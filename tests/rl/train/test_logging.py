@@ -6,7 +6,7 @@ import os
 import pytest
 
 from tgdsl.errors import FileError
-from tgdsl.rl.train.logging import Board, ProgressBar
+from tgdsl.rl.train.run import Board, ProgressBar
 
 
 @pytest.mark.parametrize("at", ["add", "close"])

@@ -6,8 +6,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalDiscountedVariationNormalization, EmpiricalNormalization
 from tensordict import TensorDict
 
-from tgdsl.rl.train.model import EncodedModel, Gaussian
-from tgdsl.rl.train.normalising import Normalisation, RewardNormalisation
+from tgdsl.rl.train.model import EncodedModel, Gaussian, Normalisation, RewardNormalisation
 
 GROUPS = {"tactile_sensors": 6, "goal": 3, "proprio": 4}
 MOMENTS = 1e-4

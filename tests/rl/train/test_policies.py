@@ -8,8 +8,7 @@ import torch
 from small_runs import small_learner
 
 from tgdsl.rl.playing.policy import PolicyError, policy_for, read_policy
-from tgdsl.rl.train.folder import made_from
-from tgdsl.rl.train.policies import card_of, write_policy
+from tgdsl.rl.train.folder import run_origin
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
@@ -18,8 +17,8 @@ def test_sensors_that_environments_lack_are_not_compared(tmp_path):
     """On a hand there is what the policy feels with, and not what only its task reads; but something must be there."""
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     file = tmp_path / "policy.pt"
-    card = card_of(learner, made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
-    write_policy(learner, card, file)
+    card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
+    learner.write_policy(card, file)
     extra = {"card.json": "", "taxels.csv": ""}
     module = torch.jit.load(file, _extra_files=extra)
     head, *rows = extra["taxels.csv"].decode().splitlines(keepends=True)
@@ -37,8 +36,8 @@ def test_taxels_may_differ_by_rounding(tmp_path):
     """The table in the file says by how much."""
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     file, touch = tmp_path / "policy.pt", learner.env.touch
-    card = card_of(learner, made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
-    write_policy(learner, card, file)
+    card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
+    learner.write_policy(card, file)
     saved = read_policy(file)
     for name, table in touch.taxels.items():
         for column in ("link", "body", "pos", "normal", "tangent", "radius", "area", "row", "column"):
@@ -65,9 +64,9 @@ def test_a_policy_brings_its_card(tmp_path):
     """
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     learner.iterate()
-    card = card_of(learner, made_from(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
+    card = learner.card(run_origin(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
     file = tmp_path / "a policy.pt"
-    write_policy(learner, card, file)
+    learner.write_policy(card, file)
     assert read_policy(file).card == card == json.loads((tmp_path / "a policy.json").read_text())
     assert card["groups"] == {"tactile_sensors": 4, "proprio": 6} and card["minutes"] == 1.5 and card["samples"] == 16
     env = learner.env
@@ -75,7 +74,7 @@ def test_a_policy_brings_its_card(tmp_path):
     assert policy.groups == ("tactile_sensors", "proprio")
     with torch.no_grad():
         torch.testing.assert_close(policy(obs), learner.algorithm.actor(learner._seen(obs)))
-    write_policy(learner, card | {"joints": ["bend", "swing"]}, file)
+    learner.write_policy(card | {"joints": ["bend", "swing"]}, file)
     with pytest.raises(PolicyError, match="this policy moves bend, swing, not swing, bend"):
         policy_for(env, read_policy(file))
     learned = card["spec"]
@@ -84,16 +83,16 @@ def test_a_policy_brings_its_card(tmp_path):
         ({"action": learned["action"] | {"smoothing": 0.5}}, "was learned with other actions: "),
         ({"physics": learned["physics"] | {"timestep": 0.001}}, "was learned with other control steps "),
     ):
-        write_policy(learner, card | {"spec": learned | other}, file)
+        learner.write_policy(card | {"spec": learned | other}, file)
         with pytest.raises(PolicyError, match=message):
             policy_for(env, read_policy(file))
-    write_policy(learner, card | {"spec": learned | {"touch": "depth"}}, file)
+    learner.write_policy(card | {"spec": learned | {"touch": "depth"}}, file)
     with pytest.raises(PolicyError, match=f"this policy feels depth, not {learned['touch']}; try --set touch=depth"):
         policy_for(env, read_policy(file))
-    write_policy(learner, card | {"spec": learned | {"action": {"mode": "other"}}}, file)
+    learner.write_policy(card | {"spec": learned | {"action": {"mode": "other"}}}, file)
     with pytest.raises(PolicyError, match=r'was learned with other actions: {"mode": "other"}, here'):
         policy_for(env, read_policy(file))
-    write_policy(learner, card, file)
+    learner.write_policy(card, file)
     with pytest.raises(
         PolicyError, match=r"takes tactile_sensors \(4\) \+ proprio \(6\) = 10, not proprio \(6\) \+ tactile_sensors"
     ):
@@ -101,14 +100,14 @@ def test_a_policy_brings_its_card(tmp_path):
     less = {name: value for name, value in learned["action"].items() if name != "smoothing"}  # of an older tgdsl
     rounded = learned["action"] | {"scale": learned["action"]["scale"] * (1.0 + 1e-15)}  # 0.7 cm are not quite 7 mm
     for action in (less, rounded):
-        write_policy(learner, card | {"spec": learned | {"action": action}}, file)
+        learner.write_policy(card | {"spec": learned | {"action": action}}, file)
         assert policy_for(env, read_policy(file)).groups == ("tactile_sensors", "proprio")
     pushes = {"push": {**learned["randomise"]["push"], "interval": [2.0 * (1.0 + 1e-15), 4.0]}}
     for before, expected in (
         ({"episode": learned["episode"] * (1.0 + 1e-15), "randomise": learned["randomise"] | pushes}, []),
         ({"episode": 2.0 * learned["episode"]}, [f"episode: {2.0 * learned['episode']}, now {learned['episode']}"]),
     ):
-        write_policy(learner, card | {"spec": learned | before}, file)
+        learner.write_policy(card | {"spec": learned | before}, file)
         assert policy_for(env, read_policy(file)).changes == expected
     for lacking, message in (
         ({**card, "spec": {}}, "has no spec.task"),
@@ -120,7 +119,7 @@ def test_a_policy_brings_its_card(tmp_path):
         with pytest.raises(PolicyError, match=f"its card.json {message}: this is not what tgdsl train writes"):
             read_policy(file)
     blind, _ = small_learner(tmp_path)
-    write_policy(blind, card | {"taxels": "0", "groups": {name: env.groups[name] for name in blind.groups["actor"]}}, file)
+    blind.write_policy(card | {"taxels": "0", "groups": {name: env.groups[name] for name in blind.groups["actor"]}}, file)
     assert policy_for(env, read_policy(file)).groups == ("priv_proprio", "goal", "priv_obj_state")
     with pytest.raises(PolicyError, match=r"this policy takes .* = 31, not proprio"):
         policy_for(env, read_policy(file), ("proprio",))

@@ -109,5 +109,5 @@ def test_the_host_waits_for_nothing(tmp_path):
     finally:
         torch.cuda.set_sync_debug_mode("default")
     found = learner.iterate()
-    assert all(torch.isfinite(torch.tensor(list(found.told.values()))))
+    assert all(torch.isfinite(torch.tensor(list(found.metrics.values()))))
     env.close()

@@ -20,7 +20,7 @@ from tgdsl.errors import FileError, TgdslError
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.provenance import differences
 from tgdsl.rl.train.checkpoint import CheckpointError, read_checkpoint, restore, state_of, write_checkpoint
-from tgdsl.rl.train.folder import RunFolder, documents, made_from
+from tgdsl.rl.train.folder import RunFolder, documents, run_origin
 from tgdsl.rl.train.run import DivergedError, Run
 
 EVERY = 1e-9
@@ -32,7 +32,7 @@ def begun(base, name="run", every=EVERY, **overrides):
     learner, loaded = small_learner(base, **overrides)
     folder = RunFolder(base / name)
     folder.check(is_resumed=False)
-    folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+    folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
     return Run(learner, folder, every), learner
 
 
@@ -110,7 +110,7 @@ def test_distillation_is_turned_on_and_off_where_a_run_goes_on(tmp_path, before,
         assert all(torch.equal(one[name], two[name]) for name in one)
     rnd = other.algorithm.rnd
     assert rnd is None if now else rnd.update_counter == 0
-    found = other.iterate().told
+    found = other.iterate().metrics
     assert found["Loss/value"] > 0 and (found["Loss/rnd"] > 0) == (not now)
 
 
@@ -321,13 +321,13 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from small_runs import small_learner
 from tgdsl.rl.train import checkpoint
-from tgdsl.rl.train.folder import RunFolder, made_from
+from tgdsl.rl.train.folder import RunFolder, run_origin
 from tgdsl.rl.train.run import Run
 
 base, place = Path(sys.argv[2]), sys.argv[3]
 learner, loaded = small_learner(base)
 folder = RunFolder(base / "run")
-folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
 run = Run(learner, folder, 1e-9)
 run.learn(2, float("inf"))
 owner, name = {
@@ -373,7 +373,7 @@ def test_a_run_that_is_killed_goes_on(tmp_path, place, iteration):
     assert state["iteration"] == iteration
     assert len([file for file in folder.path.iterdir() if file.name.startswith(".")]) == (place == "writing")
     restore(learner, state, folder.checkpoint)
-    folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+    folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
     assert not [file for file in folder.path.iterdir() if file.name.startswith(".")]
     Run(learner, folder, EVERY, state["seconds"]).learn(5, float("inf"))
     assert [row["iteration"] for row in folder.rows()] == ["1", "2", "3", "4", "5"]
@@ -395,7 +395,7 @@ def test_a_folder_that_cannot_be_written_is_named_before_a_run_begins(tmp_path):
 def test_a_disk_that_is_full_is_named_before_a_run_begins(tmp_path):
     learner, loaded = small_learner(tmp_path)
     folder = RunFolder(tmp_path / "run")
-    folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+    folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))

@@ -128,3 +128,18 @@ def test_an_unknown_option_is_named(tmp_path):
     for simulate, name in ((tgdsl.simulate, "simulate"), (BatchSimulation, "BatchSimulation"), (warp, "WarpSimulation")):
         with pytest.raises(SimulationError, match=f'^{name} has no option "subtseps"; did you mean "substeps"\\?$'):
             simulate(touch, 1, subtseps=2)
+
+
+def test_the_largest_torques_are_those_of_the_last_pattern_that_matches():
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody>"
+        + "".join(f"<body name='{n}'><joint name='{n}'/><geom size='.1' mass='1'/></body>" for n in ("left", "right", "lift"))
+        + "</worldbody><actuator>"
+        + "".join(f"<position joint='{n}' kp='1'/>" for n in ("left", "right", "lift"))
+        + "</actuator></mujoco>"
+    )
+    set_options(spec, {"timestep": 0.004, "max_torque": {"l*": 2.0, "left": 0.5}})
+    model = spec.compile()
+    assert model.opt.timestep == 0.004
+    assert model.actuator_forcelimited.tolist() == [1, 0, 1]
+    assert model.actuator_forcerange.tolist() == [[-0.5, 0.5], [0, 0], [-2, 2]]

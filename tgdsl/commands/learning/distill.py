@@ -90,7 +90,7 @@ class Distill:
         settings = self._asked(loaded, last_start, folder)
         prepared = [_Part(self, name, settings, overrides, folder / name) for name in settings["resolutions"]]
         settings["envs"] = prepared[0].envs
-        with RunFolder(folder).held():
+        with RunFolder(folder).lock():
             self._teach(loaded, folder, prepared)
 
     def _teach(self, loaded: LoadedTask, folder: Path, prepared: list[_Part]) -> None:
@@ -198,13 +198,13 @@ class _Part:
         from tgdsl.rl.load import load_task
         from tgdsl.rl.sensed import check_felt, num_variants
         from tgdsl.rl.students.keys import check_blocks, feels, student_keys
-        from tgdsl.rl.students.teacher import Teacher
+        from tgdsl.rl.students.teacher import Teacher, students_task
         from tgdsl.rl.train.folder import RunFolder
 
         self._command, self.resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
         override = {} if resolution == "default" else {"resolution": resolution}
         self._given, self._overrides = overrides, overrides | override
-        self._loaded = load_task(command.task, self._overrides)
+        self._loaded = students_task(load_task(command.task, self._overrides))
         types = _known(self._loaded, asked["types"])
         self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
         self.teacher = Teacher(Path(asked["teacher"]), self._loaded)
@@ -243,9 +243,8 @@ class _Part:
         from tgdsl.rl.playing.provenance import changes_around
         from tgdsl.rl.students.learner import Distiller
         from tgdsl.rl.train.checkpoint import restore
-        from tgdsl.rl.train.folder import made_from
-        from tgdsl.rl.train.logging import ProgressBar
-        from tgdsl.rl.train.run import Run
+        from tgdsl.rl.train.folder import run_origin
+        from tgdsl.rl.train.run import ProgressBar, Run
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
         state = self._state
@@ -257,7 +256,7 @@ class _Part:
                 print(f"changed since the teacher was learned: {line}")
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
-            origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
+            origin = run_origin(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
             origin["teacher_sha256"] = hashlib.sha256(self.teacher.saved.content).hexdigest()
             taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
             for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():

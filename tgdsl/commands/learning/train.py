@@ -78,7 +78,7 @@ class Train:
         overrides = joined_overrides(last_start.get("overrides", {}) if is_same else {}, parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
         self._check()
-        with folder.held() if ranks.is_first else nullcontext():
+        with folder.lock() if ranks.is_first else nullcontext():
             if ranks.is_first:
                 folder.check(is_resumed=is_same)
             state = read_checkpoint(source.checkpoint) if source else None
@@ -111,10 +111,9 @@ class Train:
     ) -> None:
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.train.checkpoint import restore
-        from tgdsl.rl.train.folder import changes, made_from
+        from tgdsl.rl.train.folder import changes, run_origin
         from tgdsl.rl.train.learner import Learner
-        from tgdsl.rl.train.logging import ProgressBar
-        from tgdsl.rl.train.run import Run
+        from tgdsl.rl.train.run import ProgressBar, Run
 
         envs = self.envs or before.get("envs", ENVS)
         seed = self.seed if self.seed is not None else before.get("seed", 0)
@@ -125,7 +124,7 @@ class Train:
             if state is not None and self.resume is not None:
                 restore(learner, state, self.resume / "checkpoint.pt")
                 learner.change_rates(before.get("spec", {}).get("train", {}))
-            origin = made_from(loaded, env, seed, overrides, ranks.size)
+            origin = run_origin(loaded, env, seed, overrides, ranks.size)
             if self.resume is not None:
                 origin["goes_on_from"] = str(self.resume)
             if ranks.is_first:
@@ -155,12 +154,11 @@ class Train:
         from tgdsl.files.write import atomic_write
         from tgdsl.rl.playing.evaluation import evaluate
         from tgdsl.rl.playing.policy import policy_for, read_policy
-        from tgdsl.rl.train.policies import card_of, write_policy
         from tgdsl.rl.train.run import end_if_stopped
 
         command = shlex.join(["tgdsl", *sys.argv[1:]])
-        card = card_of(learner, origin, run.seconds, command)
-        write_policy(learner, card, folder.policy)
+        card = learner.card(origin, run.seconds, command)
+        learner.write_policy(card, folder.policy)
         folder.evaluation.unlink(missing_ok=True)  # of what the policy was before
         summary = f"{learner.iteration} iterations, {learner.samples:,} steps, {run.seconds / 60:.1f} min"
         print(f"policy: {folder.policy}, after {summary}")
@@ -170,6 +168,6 @@ class Train:
             with StatusLine() as progress:
                 actor = policy_for(learner.env, read_policy(folder.policy))
                 evaluation = evaluate(learner.env, actor, self.episodes, progress=progress)
-            write_policy(learner, card | {"score": evaluation.plain()}, folder.policy)
+            learner.write_policy(card | {"score": evaluation.plain()}, folder.policy)
             atomic_write(folder.evaluation, (json.dumps(evaluation.plain(), indent=2, allow_nan=False) + "\n").encode())
             print(evaluation)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
 import zipfile
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -54,7 +57,8 @@ def write(program: torch.export.ExportedProgram, signature: Signature, path: Pat
     """
     with atomic_path(path) as temporary:
         if to == "onnx":
-            _write_onnx(program, signature, temporary)
+            inputs, outputs = ([port.name for port in ports] for ports in (signature.inputs, signature.outputs))
+            write_onnx(without_strides(program), inputs, outputs, {Path(ENTRY).stem: signature.to_json()}, temporary)
         elif to == "pt2":
             torch.export.save(program, str(temporary), extra_files={ENTRY: signature.to_json()})
         else:
@@ -65,19 +69,36 @@ def write(program: torch.export.ExportedProgram, signature: Signature, path: Pat
                 archive.writestr(f"{folder}/extra/{ENTRY}", signature.to_json())
 
 
-def _write_onnx(program: torch.export.ExportedProgram, signature: Signature, path: Path) -> None:
+def write_onnx(
+    program: torch.export.ExportedProgram,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    metadata: dict[str, str],
+    path: Path,
+) -> None:
+    """Write a graph as ONNX.
+
+    Args:
+        program: The graph.
+        inputs: Names of its inputs, in order.
+        outputs: Names of its outputs, in order.
+        metadata: Texts that the file holds, by name.
+        path: The file.
+    """
     import onnx
 
-    names = [[port.name for port in ports] for ports in (signature.inputs, signature.outputs)]
-    converted: Any = torch.onnx.export(
-        without_strides(program),
-        input_names=names[0],
-        output_names=names[1],
-        opset_version=OPSET,
-        dynamo=True,
-        optimize=False,  # it takes x + 1e-24 for x
-        verbose=False,
-    )
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # that torchvision is not installed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch's own use of a part of torch that it has deprecated
+        converted: Any = torch.onnx.export(
+            program,
+            input_names=inputs,
+            output_names=outputs,
+            opset_version=OPSET,
+            dynamo=True,
+            optimize=False,  # it takes x + 1e-24 for x
+            verbose=False,
+        )
     model = converted.model_proto
-    onnx.helper.set_model_props(model, {Path(ENTRY).stem: signature.to_json()})
+    onnx.helper.set_model_props(model, metadata)
     onnx.save(model, str(path))

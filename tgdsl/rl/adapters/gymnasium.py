@@ -2,7 +2,7 @@
 
 Observations are a dictionary of groups, actions from −1 to 1 for each joint. An environment whose episode ends begins the next
 one in the same step (`AutoresetMode.SAME_STEP`): `info["final_obs"]` has the last observations of the old one,
-`info["final_info"]` what is told of its last step. Entries of `info` are those of `StepInfo`, each with its mask under `_` and
+`info["final_info"]` those of its last step. Entries of `info` are those of `StepInfo`, each with its mask under `_` and
 its name.
 
 Of gymnasium's wrappers, those of observations (`FlattenObservation`, `NormalizeObservation`, …) refuse every environment of
@@ -34,7 +34,7 @@ except ImportError as error:
     raise TgdslError(f'an environment of gymnasium needs gymnasium: pip install "tgdsl[rl]" ({error})') from error
 
 Output = Literal["numpy", "torch"]
-TOLD = ("terms", "score", "episode_return", "episode_steps", "episode_terms", "faults")
+STEP_KEYS = ("terms", "score", "episode_return", "episode_steps", "episode_terms", "faults")
 """What `info` has of each step: see `StepInfo`."""
 
 
@@ -112,30 +112,32 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         """
         action = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
         obs, reward, terminated, truncated, info = self.touch_env.step(action)
-        entries = self._told_in_numpy(info) if self._is_numpy else self._told_in_torch(info)
+        entries = self._numpy_info(info) if self._is_numpy else self._torch_info(info)
         return self._obs(obs), self._given(reward), self._given(terminated), self._given(truncated), entries
 
     def close_extras(self, **_: Any) -> None:
         """Close the environments."""
         self.touch_env.close()
 
-    def _given(self, tensor: Tensor) -> Any:
-        return tensor.cpu().numpy() if self._is_numpy else tensor
+    def _given(self, value: Tensor | Mapping[str, Tensor]) -> Any:
+        if isinstance(value, Mapping):
+            return {name: self._given(part) for name, part in value.items()}
+        return value.cpu().numpy() if self._is_numpy else value
 
     def _obs(self, obs: Mapping[str, Tensor]) -> dict[str, Any]:
-        return {group: self._given(obs[group]) for group in self._groups}
+        return self._given({group: obs[group] for group in self._groups})
 
-    def _told_in_torch(self, info: StepInfo) -> dict[str, Any]:
-        entries = {name: getattr(info, name) for name in TOLD}
+    def _torch_info(self, info: StepInfo) -> dict[str, Any]:
+        entries = {name: getattr(info, name) for name in STEP_KEYS}
         final = {
             "final_obs": {group: info.final_obs[group] for group in self._groups},
             "final_info": _masked(entries, info.ended),
         }
         return _masked(entries, ~info.ended) | final | {f"_{name}": info.ended for name in final}
 
-    def _told_in_numpy(self, info: StepInfo) -> dict[str, Any]:
+    def _numpy_info(self, info: StepInfo) -> dict[str, Any]:
         ended = info.ended.cpu().numpy()
-        entries = {name: _in_numpy(getattr(info, name)) for name in TOLD}
+        entries = {name: self._given(getattr(info, name)) for name in STEP_KEYS}
         present = {} if ended.all() else _masked(entries, ~ended)
         if not ended.any():
             return present
@@ -146,12 +148,6 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
             final_obs[row] = {group: values[i] for group, values in last.items()}
         final = {"final_obs": final_obs, "final_info": _masked(entries, ended)}
         return present | final | {f"_{name}": ended.copy() for name in final}
-
-
-def _in_numpy(value: Tensor | Mapping[str, Tensor]) -> Any:
-    if isinstance(value, Mapping):
-        return {name: part.cpu().numpy() for name, part in value.items()}
-    return value.cpu().numpy()
 
 
 def _masked(values: Mapping[str, Any], mask: Any) -> dict[str, Any]:

@@ -108,7 +108,7 @@ class TouchVecEnv(VecEnv):
 
 
 def _log(info: StepInfo, ids: Int[Tensor, " ended"]) -> dict[str, Tensor]:
-    """Return what is told of episodes that have ended, one number each: rsl_rl takes the mean over an iteration's."""
+    """Return the numbers of episodes that have ended: rsl_rl takes the mean over an iteration's."""
     entries = {
         "Episode/return": info.episode_return,
         "Episode/steps": info.episode_steps.float(),

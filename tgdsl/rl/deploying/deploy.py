@@ -1,4 +1,4 @@
-"""Run a policy on a source, whatever it is: observe, choose, command, at the task's control rate.
+"""Run a policy on a source, whatever it is: observe, choose, command, at the task's control rate; and report what came of it.
 
 Shapes: `actuator` actuators of the scene, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,12 +20,9 @@ from torch import Tensor
 
 from tgdsl.console.progress import Progress
 from tgdsl.console.tables import text_table
-from tgdsl.rl.deploying.hand import EVERYONE, Hand
-from tgdsl.rl.deploying.prepared import DeployError, Prepared, prepare
-from tgdsl.rl.deploying.report import Quantiles, Report, Scores
-from tgdsl.rl.deploying.scene import TaskScene, first_step
+from tgdsl.rl.deploying.hand import EVERYONE, DeployError, Hand, TaskScene, empty_step, prepare
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.evaluation import SEED
+from tgdsl.rl.playing.evaluation import SEED, mean_interval, share_interval
 from tgdsl.rl.playing.policy import Policy
 from tgdsl.rl.playing.record import Record
 from tgdsl.rl.playing.rollout import Moment, rollout
@@ -35,25 +32,19 @@ from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
 
-EMULATED_SPEED, EMULATED_CURRENT, EMULATED_GAIN, EMULATED_WATCHDOG_S = 1e6, 300, 100, 1.0
-"""Limits of an emulated hand: its drives are those of the scene, and it is not to wait for them."""
+EMULATED_LIMITS = {"speed": 1e6, "current_limit": 300, "kp": 100, "watchdog_s": 1.0}
+"""Limits of an emulated hand: its drives are those of the scene, and it is not to wait for them. Do not use these figures on a
+real one: what its gains do is not published."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandMoment(Moment):
-    """One control step of a policy on a source; `step` is what a scene's task says of it.
+    """One control step of a policy on a source; `step` is what a scene's task says of it."""
 
-    Attributes:
-        episode: Number of the episode, from 0.
-        target: Set-points of the joints that it moves [rad].
-        age_s: How old the sample was [s]; None where nothing runs in real time.
-        inference_s: From then until the set-points were there [s].
-    """
-
-    episode: int
-    target: Float[Tensor, "env joint"]
-    age_s: float | None
-    inference_s: float
+    episode: int  # number of the episode, from 0
+    target: Float[Tensor, "env joint"]  # set-points of the joints that it moves [rad]
+    age_s: float | None  # how old the sample was [s]; None where nothing runs in real time
+    inference_s: float  # from then until the set-points were there [s]
 
 
 class DeployRecord(Record):
@@ -84,16 +75,93 @@ class DeployRecord(Record):
         return text_table(("joint", "mean action", "spread", "targets [rad]"), rows).splitlines()
 
 
+class Quantiles(NamedTuple):
+    """Median and 99th percentile [ms]."""
+
+    median: float
+    p99: float
+
+    @classmethod
+    def of(cls, seconds: Sequence[float]) -> Quantiles | None:
+        """Return those of times [s]; None if there are none."""
+        return cls(*(1e3 * np.quantile(seconds, (0.5, 0.99))).tolist()) if seconds else None
+
+    def __str__(self) -> str:
+        return f"{self.median:.2f} ms (99 %: {self.p99:.2f} ms)"
+
+
+class Scores(NamedTuple):
+    """Scores of the episodes that a scene has judged, and their mean; `held` and the intervals as `Evaluation` has them."""
+
+    each: tuple[float, ...]
+    mean: float
+    interval: tuple[float, float]
+    held: float
+    held_interval: tuple[float, float]
+
+    @classmethod
+    def of(cls, scores: Sequence[float], are_held: Sequence[bool]) -> Scores:
+        num = len(scores)
+        mean, share = math.fsum(scores) / num, sum(are_held) / num
+        interval = mean_interval(mean, math.fsum(score**2 for score in scores), num)
+        return cls(tuple(scores), mean, interval, share, share_interval(share, num))
+
+
+@dataclass(frozen=True)
+class Report:
+    """What came of a policy that acted."""
+
+    task: str
+    policy: str
+    source: str  # on what it acted, as `tgdsl.connect` takes it
+    unit: str
+    episodes: int
+    steps: int  # control steps of all episodes
+    scores: Scores | None
+    """None where no scene says what happened, as on a real hand and of a log, or no episode was whole."""
+    has_scene: bool  # whether a scene says what happened
+    age: Quantiles | None
+    """How old the sample was that an action was chosen from; None where nothing runs in real time."""
+    inference: Quantiles | None  # from a sample to set-points: what it took to observe and to choose
+    latency: Quantiles | None  # age and inference, of each step together; None where there is no age
+    control_rate: float  # control steps per second that the task asks for [Hz]
+    rate: float  # achieved rate [Hz]
+    late_steps: int  # control steps that began after they should have ended
+    moves: bool  # whether set-points went to joints
+
+    def __str__(self) -> str:
+        lines = [self._scored(), self._timed()]
+        if not self.moves:
+            lines.append(f"{self.source} was not moved: actions were computed, and went nowhere")
+        return "\n".join(lines)
+
+    def _scored(self) -> str:
+        count = f"{self.episodes:,} episode{'' if self.episodes == 1 else 's'}, {self.steps:,} control steps"
+        if self.scores is None:
+            why = "no episode has ended" if self.has_scene else f"{self.source} has no scene that knows what happened"
+            return f"no score: {why}; {count}"
+        scores = self.scores
+        between = f" (95 %: {scores.interval[0]:.4f} to {scores.interval[1]:.4f})" if len(scores.each) > 1 else ""
+        return f"score {scores.mean:.4f} {self.unit}{between}, {scores.held:.1%} of full length; {count}"
+
+    def _timed(self) -> str:
+        rate = f"{self.rate:.1f} of {self.control_rate:.1f} control steps per second"
+        if self.latency is None:
+            return f"inference {self.inference}; {rate}, not in real time"
+        parts = f"latency {self.latency}: sample age {self.age}, inference {self.inference}"
+        return f"{parts}; {rate}, {self.late_steps} late"
+
+
 @dataclass
-class _Sums:
-    """What is added up of all steps."""
+class _Steps:
+    """The steps that were made."""
 
     ages: list[float | None] = field(default_factory=list)
     inferences: list[float] = field(default_factory=list)
     scores: list[float] = field(default_factory=list)
     are_held: list[bool] = field(default_factory=list)
     seconds: float = 0.0
-    late_steps: int = 0
+    late: int = 0
 
 
 class Deployment:
@@ -129,7 +197,8 @@ class Deployment:
             task: The task's document.
             policy: The policy's file.
             source: `simulation`, `warp`, `emulator`, `xhand1:PORT`, a log, or another kind that is installed.
-            groups: Groups of observations that the policy takes, in its order; default: see `prepare`.
+            groups: Groups of observations that the policy takes, in its order; default: as its card says, or `proprio`,
+                `tactile_sensors` and `goal`, of those that there are.
             goal: What it is asked for, in the task's units; default: what the scene's task asks for.
             overrides: Values of the document to set first by dotted path.
             seed: What is random in a scene follows from it: episode i is the first one of environment i of `tgdsl evaluate`.
@@ -149,60 +218,38 @@ class Deployment:
         """
         kind = kind_of(source)
         self.source, self.has_scene = source, "scene" in kind.options
-        self._is_emulated = is_emulated = self.has_scene and "motion" in kind.options
-        self._device, self._simulator = "cpu", "mujoco"
-        if kind.name == "warp":
-            self._device, self._simulator = source.partition(":")[2] or "cuda", "warp"
-        self.prepared = prepare(
+        self._is_emulated, self._is_log = self.has_scene and "motion" in kind.options, kind.name == "log"
+        is_warp = kind.name == "warp"
+        self._env_options: dict[str, Any] = {"seed": seed, "simulator": "warp" if is_warp else "mujoco", "progress": progress}
+        self._env_options["device"] = device = source.partition(":")[2] or "cuda" if is_warp else "cpu"
+        self.prepared = prepared = prepare(
             task,
             Path(policy),
             groups=groups,
             goal=goal,
             overrides=overrides,
-            device=self._device,
-            is_emulated=is_emulated,
+            device=device,
+            is_emulated=self._is_emulated,
             progress=progress,
         )
-        prepared = self.prepared
-        if not self.has_scene and prepared.loaded.task.goal_units and prepared.goal is None and _needs_goal(prepared):
+        asks = prepared.loaded.task.goal_units and any(name in prepared.loaded.task.hand_groups for name in prepared.groups)
+        if not self.has_scene and asks and prepared.goal is None:
+            problem = f'the task "{prepared.loaded.spec.task}" draws what it asks for by what is in its scene'
             units = ", ".join(prepared.loaded.task.goal_units)
-            problem = (
-                f'the task "{prepared.loaded.spec.task}" draws what it asks for by what is in its scene, and {source} has none'
-            )
-            raise DeployError(f"{policy}: {problem}; say what to ask for: a goal [{units}]")
+            raise DeployError(f"{policy}: {problem}, and {source} has none; say what to ask for: a goal [{units}]")
         motion = motion(prepared.model) if callable(motion) else motion
-        if is_emulated and motion is None:
-            motion = emulated_limits(prepared)
-        self.moves = kind.name != "log" and (motion is not None or "motion" not in kind.options)
+        if self._is_emulated and motion is None:
+            motion = MotionLimits.of_robot(prepared.model, **EMULATED_LIMITS)
+        self.moves = not self._is_log and (motion is not None or "motion" not in kind.options)
         self._start = None if start is None else prepared.model.key_ctrl[keyframe_id(prepared.model, start)]
-        self._seed, self._progress = seed, progress
         self._options = options | {"calibration": calibration, "motion": motion, "lockstep": lockstep}
-        self._sums = _Sums()
-
-    def scene(self, episode: int) -> TaskScene:
-        """Return the scene of an episode: that of the environment of this number."""
-        prepared = self.prepared
-        env = TouchEnv(
-            prepared.loaded,
-            1,
-            device=self._device,
-            seed=self._seed,
-            simulator=self._simulator,
-            threads=1,
-            first_env=episode,
-            sensed=prepared.sensed,
-            progress=self._progress,
-        )
-        return TaskScene(env)
+        self._steps = _Steps()
 
     def steps(self, episodes: int = 1, seconds: float | None = None) -> Iterator[HandMoment]:
         """Act, and yield each control step.
 
-        A scene's episodes end as the task says; others, and a log that is not over, after some time.
-
-        Args:
-            episodes: How many.
-            seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
+        A scene's episodes end as the task says; others, and a log that is not over, after so many seconds: by default an
+        episode's, and all of a log.
 
         Raises:
             DeployError: If there is nothing to do.
@@ -211,13 +258,14 @@ class Deployment:
         """
         if episodes < 1 or not (seconds is None or 0 < seconds < math.inf):
             raise DeployError(f"{episodes} episodes of {seconds} s, expected at least 1, and more than 0 s")
-        longest = self.prepared.loaded.spec.episode if seconds is None else seconds
-        is_whole = seconds is None and kind_of(self.source).name == "log"
-        num_steps = None if is_whole else max(1, round(longest / self.prepared.control_step))
-        self._sums, policy = _Sums(), self.prepared.policy()
+        prepared = self.prepared
+        longest = prepared.loaded.spec.episode if seconds is None else seconds
+        num_steps = None if seconds is None and self._is_log else max(1, round(longest / prepared.control_step))
+        self._steps, policy = _Steps(), prepared.policy()
         if self.has_scene:
             for episode in range(episodes):
-                scene = self.scene(episode)
+                env = TouchEnv(prepared.loaded, 1, threads=1, first_env=episode, sensed=prepared.sensed, **self._env_options)
+                scene = TaskScene(env)
                 with self._connected(scene) as connection:
                     yield from self._episode(episode, connection, policy, num_steps, scene)
             return
@@ -230,68 +278,62 @@ class Deployment:
                 yield from self._episode(episode, connection, policy, num_steps, None)
 
     def report(self) -> Report:
-        """Return what came of the steps that were made.
-
-        Raises:
-            DeployError: If none was made.
-        """
-        sums, spec = self._sums, self.prepared.loaded.spec
-        if not sums.inferences:
+        """Return what came of the steps that were made; raise `DeployError` if none was made."""
+        steps, prepared = self._steps, self.prepared
+        num = len(steps.inferences)
+        if not num:
             raise DeployError(f"{self.source}: not one control step was made")
-        ages = [age for age in sums.ages if age is not None]
-        pairs = [age + inference for age, inference in zip(sums.ages, sums.inferences, strict=True) if age is not None]
         return Report(
-            task=spec.task,
-            policy=str(self.prepared.saved.file),
+            task=prepared.loaded.spec.task,
+            policy=str(prepared.saved.file),
             source=self.source,
-            unit=self.prepared.loaded.task.score_unit,
-            episodes=len(sums.scores) if self.has_scene else max(1, len(sums.are_held)),
-            steps=len(sums.inferences),
-            scores=Scores.of(sums.scores, sums.are_held) if sums.scores else None,
+            unit=prepared.loaded.task.score_unit,
+            episodes=len(steps.scores) if self.has_scene else max(1, len(steps.are_held)),
+            steps=num,
+            scores=Scores.of(steps.scores, steps.are_held) if steps.scores else None,
             has_scene=self.has_scene,
-            age=Quantiles.of(ages) if ages else None,
-            inference=Quantiles.of(sums.inferences),
-            latency=Quantiles.of(pairs) if ages else None,
-            control_rate=1.0 / self.prepared.control_step,
-            rate=len(sums.inferences) / sums.seconds,
-            late_steps=sums.late_steps,
+            age=Quantiles.of([age for age in steps.ages if age is not None]),
+            inference=Quantiles.of(steps.inferences),
+            latency=Quantiles.of([a + b for a, b in zip(steps.ages, steps.inferences, strict=True) if a is not None]),
+            control_rate=1.0 / prepared.control_step,
+            rate=num / steps.seconds,
+            late_steps=steps.late,
             moves=self.moves,
         )
 
     def _connected(self, scene: TaskScene | None) -> Connection:
         """Connect; a scene is closed with the connection, or if there is none."""
+        touch, control_step = self.prepared.sensed.touch, self.prepared.control_step
         with ExitStack() as opened:
             if scene is not None:
                 opened.callback(scene.close)
-            prepared = self.prepared
-            result = connect(
-                prepared.sensed.touch, self.source, control_step=prepared.control_step, scene=scene, **self._options
-            )
+            connection = connect(touch, self.source, control_step=control_step, scene=scene, **self._options)
             opened.pop_all()
-        return result
+        return connection
 
     def _episode(
         self, episode: int, connection: Connection, policy: Policy, num_steps: int | None, scene: TaskScene | None
     ) -> Iterator[HandMoment]:
         """Make the steps of one episode."""
-        sums, late = self._sums, getattr(connection.source, "num_late_steps", 0)
+        steps, late = self._steps, getattr(connection.source, "num_late_steps", 0)
         hand = Hand(self.prepared, connection, scene, is_exact=self.has_scene and not self._is_emulated)
         hand.begin(self._start, self.moves)
         policy.begin(EVERYONE)
-        info = first_step().info
+        info = empty_step().info
         for moment in rollout(policy, hand, num_steps):
             info = moment.step.info
-            sums.seconds += hand.seconds
-            sums.ages.append(hand.age_s)
-            sums.inferences.append(hand.inference_s)
-            asked = {"episode": episode, "target": hand.target, "age_s": hand.age_s, "inference_s": hand.inference_s}
-            yield HandMoment(**vars(moment), **asked)
+            steps.seconds += hand.seconds
+            steps.ages.append(hand.age_s)
+            steps.inferences.append(hand.inference_s)
+            yield HandMoment(
+                **vars(moment), episode=episode, target=hand.target, age_s=hand.age_s, inference_s=hand.inference_s
+            )
             if info.ended or connection.is_over:
                 break
-        sums.late_steps += getattr(connection.source, "num_late_steps", 0) - late
-        sums.are_held.append(bool(~info.ended | (scene is not None and info.is_whole(scene.max_steps))))
+        steps.late += getattr(connection.source, "num_late_steps", 0) - late
+        steps.are_held.append(bool(~info.ended | (scene is not None and info.is_whole(scene.max_steps))))
         if scene is not None:
-            sums.scores.append(float(info.score))
+            steps.scores.append(float(info.score))
 
 
 def deploy(
@@ -312,7 +354,7 @@ def deploy(
         source: As `tgdsl.connect` takes it.
         episodes: How many.
         seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
-        watch: Is told of each control step.
+        watch: Called with each control step.
         **options: As for `Deployment`.
 
     Raises:
@@ -323,22 +365,3 @@ def deploy(
         if watch is not None:
             watch(moment)
     return result.report()
-
-
-def emulated_limits(prepared: Prepared) -> MotionLimits:
-    """Return limits of an emulated hand. Do not use these figures on a real one: what its gains do is not published.
-
-    Raises:
-        MotionError: If the scene is not of an XHand1.
-    """
-    return MotionLimits.of_robot(
-        prepared.model,
-        speed=EMULATED_SPEED,
-        current_limit=EMULATED_CURRENT,
-        kp=EMULATED_GAIN,
-        watchdog_s=EMULATED_WATCHDOG_S,
-    )
-
-
-def _needs_goal(prepared: Prepared) -> bool:
-    return any(name in prepared.loaded.task.hand_groups for name in prepared.groups)

@@ -6,28 +6,218 @@ group.
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from tgdsl.console.progress import Progress
+from tgdsl.errors import LowerError, SimulationError, TgdslError, listed
 from tgdsl.rl import groups
-from tgdsl.rl.actuation import Actuation, DriveSpec
-from tgdsl.rl.deploying.prepared import JOINT_POS, JOINT_VEL, Prepared
-from tgdsl.rl.deploying.scene import TaskScene, first_step
+from tgdsl.rl.actuation import Actuation, Actuators, DriveSpec
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.episodes import Observations, Step
-from tgdsl.rl.playing.policy import PolicyError
-from tgdsl.rl.sensed import GROUP
+from tgdsl.rl.env import Observations, Step, StepInfo, TouchEnv
+from tgdsl.rl.load import LoadedTask, load_task
+from tgdsl.rl.playing.policy import (
+    ACTOR_GROUPS,
+    Policy,
+    PolicyError,
+    PolicyFile,
+    changes_since,
+    check_card,
+    check_learned,
+    read_policy,
+)
+from tgdsl.rl.playing.provenance import changes_around
+from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
+from tgdsl.rl.start import moved_joints
 from tgdsl.rl.task import HandNow
 from tgdsl.runtime.connection import Connection
+from tgdsl.runtime.stepped_scene import SteppedScene
+from tgdsl.scene.scene import SceneModels
 
+JOINT_POS, JOINT_VEL = "joint_pos", "joint_vel"
+"""Groups of the module that proprioception is made of: all actuated joints, in the order of the actuators."""
+EMULATED = "agg_force"
+"""What an emulated hand's fingertips feel, whatever a policy makes of it."""
+CARD_KEYS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel", "proprio")
+"""What of a task's document is as it was where the policy was learned."""
 EVERYONE = torch.ones(1, dtype=torch.bool)
 APPROACH_S = 2.0
 """Time in which a hand that may move goes to the keyframe from which it shall act [s]."""
+
+
+class DeployError(TgdslError):
+    """A policy that cannot act on a source."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A policy with all that is needed to connect it."""
+
+    saved: PolicyFile
+    loaded: LoadedTask  # the task's document, with what the policy feels and is asked for
+    sensed: Sensed  # its module: what the policy feels and the task looks at, and the joints
+    felt: Felt | None  # what the policy feels; None: nothing
+    groups: Mapping[str, int]  # groups of observations that it takes, in its order, with their sizes
+    goal: tuple[float, ...] | None  # what a user asks for; None: what the scene's task does
+    model: mujoco.MjModel
+    moved: Actuators  # the joints that the policy moves
+    changes: Sequence[str]  # what of the task was otherwise when the policy was learned, a line each
+
+    @property
+    def control_step(self) -> float:
+        """Duration of a control step [s]."""
+        physics = self.loaded.spec.physics
+        return physics.timestep * physics.substeps
+
+    def policy(self) -> Policy:
+        """Return the policy, to act in one environment; raise `PolicyError` if it does not take its groups."""
+        return Policy(self.saved, self.groups, 1, len(self.moved.names))
+
+
+def prepare(
+    task: str | PathLike[str] | Mapping[str, Any],
+    policy: Path,
+    *,
+    groups: Sequence[str] = (),
+    goal: Sequence[float] = (),
+    overrides: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    is_emulated: bool = False,
+    progress: Progress | None = None,
+) -> Prepared:
+    """Read a task's document and a policy, and compile the module with which the policy feels.
+
+    What it feels, where, how densely and with what noise stand in its card; the document's `touch`, `placement`, `resolution`
+    and `noise` count for a policy without one. An emulated hand has to feel what the fingertips would. For the other arguments
+    see `Deployment`.
+
+    Raises:
+        SpecError: All mistakes of the documents, at their places.
+        PolicyError: If the policy cannot be read, or was learned in another task, with other actions, joints or taxels.
+        DeployError: If it sees what no hand can know, or is asked for what it cannot be.
+    """
+    loaded, saved = load_task(task, overrides), read_policy(policy)
+    card, changes = saved.card, list[str]()
+    if card is not None:
+        check_learned(card, policy, loaded.spec)
+        from_card = {name: card["spec"][name] for name in CARD_KEYS if name in card["spec"]}
+        loaded = replace(loaded, spec=loaded.spec.model_copy(update=from_card))
+        changes += changes_since(card, loaded.spec)
+    of_hand = loaded.task.hand_groups
+    known = ("proprio", *([GROUP] if loaded.spec.touch != "none" else []), *of_hand)
+    names = tuple(groups) or tuple(card["groups"] if card else [name for name in ACTOR_GROUPS if name in known])
+    if unknown := [name for name in names if name not in (*known, GROUP)]:
+        problem = f'this policy sees {listed(unknown)} of the task "{loaded.spec.task}", which only a scene knows'
+        hint = f"on a hand there are {listed(['proprio', GROUP, *of_hand])}"
+        raise DeployError(f"{policy}: {problem}; {hint}; teach a student that sees no more: tgdsl distill")
+    if goal:
+        loaded = _with_goal(loaded, tuple(goal))
+    spec = loaded.spec
+    felt = Felt(spec.touch, spec.placement, spec.noise) if GROUP in names and spec.touch != "none" else None
+    if felt is not None and spec.temporal == "stack":
+        problem = f"this policy feels at each of {spec.physics.substeps} physics steps of a control step (temporal: stack)"
+        raise DeployError(f"{policy}: {problem}, and a hand feels once; teach one with temporal: last")
+    feels = [] if felt is None else [felt]
+    if is_emulated and felt is not None and felt.type in PER_LINK and felt.type != EMULATED:
+        feels.append(felt._replace(type=EMULATED))
+    also = {name: [{"type": name}] for name in (JOINT_POS, JOINT_VEL)}
+    sensed = compile_sensed(loaded, device, progress, feels=feels, also=also)
+    moved, model = moved_joints(loaded, sensed), SceneModels(sensed.touch.plan.scene).model({})
+    if card is not None:
+        check_card(saved, moved, sensed.touch)
+        changes += changes_around(card, loaded, model)
+    try:
+        actuators = Actuators.of(model, moved)
+    except SimulationError as error:
+        raise loaded.error(("joints",), str(error)) from error
+    sizes = {name: int(card["groups"][name]) if card and name in card["groups"] else len(goal) for name in names}
+    if "proprio" in sizes:
+        sizes["proprio"] = 3 * len(moved)
+    if felt is not None:
+        observation = sensed.groups[felt.group].observation
+        sizes[GROUP] = sum(term.num_features for term in sensed.touch.plan.observations if term.group == observation)
+    result = Prepared(saved, loaded, sensed, felt, sizes, tuple(goal) or None, model, actuators, changes)
+    result.policy()
+    return result
+
+
+def _with_goal(loaded: LoadedTask, goal: tuple[float, ...]) -> LoadedTask:
+    """Return the document in which a user's goal is asked for."""
+    units = loaded.task.goal_units
+    if len(goal) != len(units):
+        expected = f"expected {len(units)} [{', '.join(units)}]" if units else "and nothing can be asked for"
+        raise DeployError(f'goal: found {len(goal)} numbers, but of the task "{loaded.spec.task}" {expected}')
+    try:
+        return replace(loaded, spec=loaded.task.asked_for(loaded.spec, goal))
+    except LowerError as error:
+        raise DeployError(f"goal: {error} (`{error.field}` of the task's document)") from error
+
+
+def empty_step(score: float = math.nan) -> Step:
+    """Return a step of one environment that brings nothing and ends nothing."""
+    false, count, zero = torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int64), torch.zeros(1)
+    return Step({}, zero, false, false, StepInfo(false, {}, {}, zero + score, zero, count, {}, false))
+
+
+class TaskScene(SteppedScene):
+    """One environment of a task: its objects, pushes and drives are simulated, and the task judges what happens.
+
+    An episode that is over stands still until it is reset.
+
+    Attributes:
+        goal: What the task asks for now.
+        last_step: What the task says: of the instant that the readings are of.
+    """
+
+    def __init__(self, env: TouchEnv):
+        """Take environments of one, at the start of an episode; they are closed with the scene."""
+        self._env = env
+        super().__init__(env.touch, env.sim)
+        self.max_steps = env.max_steps
+        self._note_start()
+
+    @property
+    def start(self) -> Float[Tensor, " actuator"]:
+        """Set-points at the start of an episode, or as `put` has changed them since [rad]: a copy."""
+        return self._setpoints[0].cpu().clone()
+
+    def put(self, actuators: Int[np.ndarray, " n"], setpoints: Float[np.ndarray, " n"]) -> None:
+        self._setpoints[0, torch.from_numpy(actuators)] = torch.from_numpy(setpoints).to(self._setpoints)
+
+    def advance(self) -> dict[str, Tensor]:
+        if self.last_step.info.ended:
+            return self.readings
+        self.last_step = self._env.follow(self._setpoints)
+        self.goal = self._env.task.asked().cpu().clone()
+        return self.read()
+
+    def begin(self) -> dict[str, Tensor]:
+        self._env.reset()
+        self._note_start()
+        return self.read()
+
+    def read(self) -> dict[str, Tensor]:
+        return dict(self._env.now.readings)
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _note_start(self) -> None:
+        env = self._env
+        self._setpoints = env.sim.ctrl.clone()
+        self._setpoints[:, torch.from_numpy(env.task.setup.actuators.actuator)] = env.actuation.target
+        self.goal, self.last_step = env.task.asked().cpu().clone(), empty_step(float(env.task.score()))
 
 
 class Hand:
@@ -44,20 +234,14 @@ class Hand:
     """
 
     def __init__(self, prepared: Prepared, connection: Connection, scene: TaskScene | None, is_exact: bool):
-        """Begin with all targets at zero; call `begin`.
-
-        Args:
-            prepared: The policy.
-            connection: The source.
-            scene: The task's scene, if the source has one.
-            is_exact: Whether velocities that are observed are a simulation's, and not measured as a hand does.
-        """
+        """Begin with all targets at zero; if exact, the source's velocities are a simulation's, and not measured."""
         self._prepared, self._connection, self._scene = prepared, connection, scene
         model, spec = prepared.model, prepared.loaded.spec
         sizes = {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu, "qfrc_applied": model.nv}
         self._arrays = {name: torch.zeros((1, size), dtype=torch.float64) for name, size in sizes.items()}
         self._actuation = Actuation(prepared.moved, self._arrays, spec.action, DriveSpec(), Draws(0, 1))
-        self._rows = torch.tensor([prepared.joints.index(name) for name in prepared.moved.names])
+        self._joints = prepared.sensed.touch.inputs.joints  # as the groups `joint_pos` and `joint_vel` have them
+        self._rows = torch.tensor([self._joints.index(name) for name in prepared.moved.names])
         self._goal = torch.tensor([prepared.goal or ()], dtype=torch.float64)
         self._measures = is_exact and spec.joint_vel == "measured"
         self._speeds: groups.MeasuredVelocity | None = None
@@ -73,12 +257,7 @@ class Hand:
         return self._actuation.target.clone()
 
     def begin(self, start: Float[np.ndarray, " actuator"] | None, moves: bool) -> None:
-        """Begin where the scene or the hand is.
-
-        Args:
-            start: Set-points to begin with without a scene [rad]; None: those that hold the joints where they are.
-            moves: Whether the hand goes there first.
-        """
+        """Begin where the scene is; without one at set-points [rad], to which a hand that moves goes first, or where it is."""
         if self._scene is not None:
             control = self._scene.start
         elif start is None:
@@ -112,10 +291,9 @@ class Hand:
             control_step=prepared.control_step,
             goal=self._goal if self._scene is None else self._scene.goal,
         )
-        result = {"proprio": groups.proprio(now)} | prepared.loaded.task.observe_hand(spec, now)
+        result = {"proprio": groups.proprio(now, spec.proprio.vel_scale)} | prepared.loaded.task.observe_hand(spec, now)
         if prepared.felt is not None:
-            source = prepared.sensed.groups[prepared.felt.group]
-            result[GROUP] = observed[source.observation].cpu()
+            result[GROUP] = observed[prepared.sensed.groups[prepared.felt.group].observation].cpu()
         return {name: result[name].float() for name in prepared.groups}
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:
@@ -134,15 +312,15 @@ class Hand:
         self.inference_s = time.monotonic() - self._began
         self._connection.step(self._arrays["ctrl"].clone())
         self.seconds = time.monotonic() - self._began
-        return first_step() if self._scene is None else self._scene.last_step
+        return empty_step() if self._scene is None else self._scene.last_step
 
     def _holding(self, joint_pos: Float[Tensor, "env joint"]) -> Float[Tensor, " actuator"]:
         """Return set-points that hold all joints where they are, within their ranges [rad]."""
         model = self._prepared.model
-        joints = [model.joint(name).id for name in self._prepared.joints]
+        joints = [model.joint(name).id for name in self._joints]
         is_of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
         ids = [np.flatnonzero(is_of_joint & (model.actuator_trnid[:, 0] == joint))[0] for joint in joints]
-        held = np.zeros(model.nu)
+        control = np.zeros(model.nu)
         low, high = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf]).T
-        held[ids] = joint_pos[0].double().numpy().clip(low, high)
-        return torch.from_numpy(held)
+        control[ids] = joint_pos[0].double().numpy().clip(low, high)
+        return torch.from_numpy(control)

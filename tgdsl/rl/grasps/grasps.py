@@ -10,44 +10,92 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
+from pydantic import Field, StrictInt
+from torch import Tensor
 
-from tgdsl.errors import SimulationError
+from tgdsl.errors import SimulationError, listed
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.files.cache import digest
 from tgdsl.files.write import atomic_open, with_folder
-from tgdsl.rl.grasps.spec import grasp_spec
-from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.actuation import ZERO
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.spec import TaskSpec, Time, Whole
+from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.simulators.state_values import FIELDS, StateValues
+
+NonNegativeAngle = Annotated[float, Quantity("angle", ge=0.0)]
+NonNegativeForce = Annotated[float, Quantity("force", ge=0.0)]
+
+
+class GraspSpec(SpecModel):
+    """How grasps are sampled, and which of them are kept: see `tgdsl.rl.grasps.sampling`."""
+
+    closed: str = "closed"
+    """The scene's keyframe to whose controls the joints that the policy moves close; they start near the task's keyframe."""
+    file: str | None = None
+    """A file that `tgdsl grasps --out` wrote, relative to this document; default: the user's cache, sampled if it has none."""
+    num: Whole = 512
+    """How many are kept, as many of each variant of the object."""
+    seed: Annotated[StrictInt, Field(ge=0)] = 0
+    """What all that is random follows from."""
+    spread: NonNegativeAngle = 0.2
+    """How far joints start from the keyframe, and how far from the closed hand's controls they are told to go, at most [rad];
+    but no more than a quarter of a joint's range."""
+    squeeze: Annotated[Range, RangeOf("angle", gt=0.0)] = (0.05, 0.2)
+    """How far a joint's target may lead its position: what it presses with, over the gain of its servo [rad]."""
+    yaw: Annotated[Range, RangeOf("angle")] = ZERO
+    """By how much the object is turned about the vertical; it needs a free or ball joint [rad]."""
+    offset: Annotated[Range, RangeOf("length")] = ZERO
+    """What is added to the object's place along each of the world's axes; it needs a free joint [m]."""
+    close: Time = 0.8
+    """For how long the hand closes, while the object is held where it is [s]."""
+    settle: Time = 0.6
+    """For how long the hand then has the object to itself, until it is kept [s]."""
+    hold: Time = 1.2
+    """For how long it is pushed afterwards, to see whether the hand holds it [s]."""
+    push: NonNegativeForce = 1.0
+    """Force of the pushes, each in a direction of its own and for a quarter of `hold` [N]."""
+    max_tilt: Angle = 0.1
+    """By how much the object may then be tilted from where it was held [rad]."""
+    max_shift: PositiveLength = 0.01
+    """How far it may be from there [m]."""
+    min_links: Whole = 2
+    """On how many links it must press with `min_force`."""
+    min_force: Annotated[float, Quantity("force", gt=0.0)] = 0.1
+    """Force with which a link counts [N]."""
+    opposite: Angle = 2.0
+    """Least angle between two such forces, so that links press from opposite sides [rad]."""
+
+
+def grasp_spec(spec: TaskSpec) -> GraspSpec | None:
+    """Return how a task's grasps are sampled; None if its episodes do not begin with grasps."""
+    result = getattr(spec, "grasps", None)
+    return result if isinstance(result, GraspSpec) else None
+
 
 FORMAT = "tgdsl grasps 1"
 
 
 @dataclass(frozen=True, eq=False)
 class Grasps:
-    """Grasps of an object, at rest.
+    """Grasps of an object, at rest."""
 
-    Attributes:
-        qpos: Positions of all joints.
-        ctrl: Controls of all actuators, with which the hand presses.
-        variant: Which of the object's variants each holds.
-        scene: Digest of the scene: see `tgdsl.scene.digest`.
-        object: The document's name of the object.
-        settings: How they were sampled, as JSON.
-    """
-
-    qpos: Float[np.ndarray, "grasp nq"]
-    ctrl: Float[np.ndarray, "grasp nu"]
-    variant: Int[np.ndarray, " grasp"]
-    scene: str
-    object: str
-    settings: str
+    qpos: Float[np.ndarray, "grasp nq"]  # positions of all joints
+    ctrl: Float[np.ndarray, "grasp nu"]  # controls of all actuators, with which the hand presses
+    variant: Int[np.ndarray, " grasp"]  # which of the object's variants each holds
+    scene: str  # digest of the scene: see `tgdsl.scene.digest`
+    object: str  # the document's name of the object
+    settings: str  # how they were sampled, as JSON
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def packed(self) -> dict[str, np.ndarray]:
-        """Return them as arrays."""
         words = {"format": FORMAT, "scene": self.scene, "object": self.object, "settings": self.settings}
         arrays = {"qpos": self.qpos, "ctrl": self.ctrl, "variant": self.variant}
         return {name: np.array(word) for name, word in words.items()} | arrays
@@ -70,12 +118,7 @@ class Grasps:
 
 
 def settings_of(spec: TaskSpec, joints: tuple[str, ...]) -> str:
-    """Return all that grasps follow from besides the scene, as JSON.
-
-    Args:
-        spec: The task's document.
-        joints: The joints that the policy moves.
-    """
+    """Return all that grasps follow from besides the scene, as JSON."""
     grasps = grasp_spec(spec)
     assert grasps is not None
     physics = {"options": spec.physics.options, "substeps": spec.physics.substeps}
@@ -101,11 +144,6 @@ def write_grasps(grasps: Grasps, file: Path) -> None:
 def read_grasps(file: Path, scene: str, object: str) -> Grasps:
     """Read grasps of an object in a scene from a file.
 
-    Args:
-        file: The file.
-        scene: Digest of the scene.
-        object: The document's name of the object.
-
     Raises:
         SimulationError: If it cannot be read, or holds something else.
     """
@@ -122,3 +160,86 @@ def read_grasps(file: Path, scene: str, object: str) -> Grasps:
         problem = f"grasps of another scene ({grasps.scene[:12]}, expected {scene[:12]})"
         raise SimulationError(f"{file}: {problem}: robot, scene or object have changed; sample them again with `tgdsl grasps`")
     return grasps
+
+
+class Drawn(NamedTuple):
+    """A grasp of each environment: MuJoCo's `qpos` and `ctrl`, contact fields of a state, and the object's world pose."""
+
+    values: StateValues
+    contacts: dict[str, Tensor]
+    pos: Float[Tensor, "env 3"]
+    quat: Float[Tensor, "env 4"]
+
+
+class GraspTable:
+    """Grasps as environments draw them: each those of its own variant of the object, ordered by variant.
+
+    Attributes:
+        ctrl: Controls of all actuators, with which the hand presses.
+        contacts: Fields of a state that follow from forces, by name, (grasp, …): those that the module wants.
+        pos: Position of the object's body in each, in the world [m].
+        quat: Its orientation, w, x, y, z.
+        first: The first grasp of each environment's variant.
+        count: How many that variant has.
+    """
+
+    qpos: Float[Tensor, "grasp nq"]
+    ctrl: Float[Tensor, "grasp nu"]
+    contacts: dict[str, Tensor]
+    pos: Float[Tensor, "grasp 3"]
+    quat: Float[Tensor, "grasp 4"]
+    first: Int[Tensor, " env"]
+    count: Int[Tensor, " env"]
+
+    def __init__(self, grasps: Grasps, sim: Simulation, body: str, variant: Int[Tensor, " env"], draws: Draws):
+        """Evaluate the contacts of all grasps, in the simulation; it has to be reset afterwards.
+
+        Its objects have to be as those that the grasps were sampled with, and not yet of a mass and friction of their own.
+
+        Raises:
+            SimulationError: If the grasps are of other joints or actuators, or a variant that some environment has is lacking.
+        """
+        shape = (sim.model.nq, sim.model.nu)
+        sizes = (grasps.qpos.shape[1], grasps.ctrl.shape[1])
+        if sizes != shape:
+            raise SimulationError(f"grasps of {sizes[0]} positions and {sizes[1]} controls, expected {shape[0]} and {shape[1]}")
+        variants = variant.cpu().numpy()
+        if lacking := sorted({*variants.tolist()} - {*grasps.variant.tolist()}):
+            problem = f"there are no grasps of variant {listed([str(v) for v in lacking])} of {grasps.object}"
+            raise SimulationError(f"{problem}; sample as many as it has variants, or more")
+        order = np.argsort(grasps.variant, kind="stable")
+        variants_in_order = grasps.variant[order]
+        device, dtype = sim.qpos.device, sim.qpos.dtype
+        self.qpos = torch.from_numpy(grasps.qpos[order]).to(device, dtype)
+        self.ctrl = torch.from_numpy(grasps.ctrl[order]).to(device, dtype)
+        self.first = torch.from_numpy(np.searchsorted(variants_in_order, variants)).to(device)
+        self.count = torch.from_numpy(np.searchsorted(variants_in_order, variants, side="right")).to(device) - self.first
+        self._draws = draws
+        self.contacts = self._evaluated(sim, body, variants)
+        self.pos, self.quat = self.contacts.pop("pos"), self.contacts.pop("quat")
+
+    def draw(self, episode: Int[Tensor, " env"]) -> Drawn:
+        """Return a grasp of each environment, drawn by its count of episodes."""
+        share = self._draws.uniform("grasp", episode, 1)[:, 0]
+        index = self.first + torch.minimum((share * self.count).to(torch.int64), self.count - 1)
+        contacts = {name: value[index] for name, value in self.contacts.items()}
+        return Drawn({"qpos": self.qpos[index], "ctrl": self.ctrl[index]}, contacts, self.pos[index], self.quat[index])
+
+    def _evaluated(self, sim: Simulation, body: str, variants: Int[np.ndarray, " env"]) -> dict[str, Tensor]:
+        """Return the touch in each grasp, and the object's place: zeros for variants that no environment has."""
+        rank, num = np.zeros_like(variants), np.zeros_like(variants)
+        for v in np.unique(variants):
+            rank[variants == v], num[variants == v] = np.arange((variants == v).sum()), (variants == v).sum()
+        result: dict[str, Tensor] = {}
+        device = self.qpos.device
+        step, place = torch.from_numpy(num).to(device), torch.from_numpy(rank).to(device)
+        for i in range(int((self.count / step).ceil().max())):
+            index = self.first + torch.minimum(place + i * step, self.count - 1)
+            sim.reset(contacts="evaluate", qpos=self.qpos[index], ctrl=self.ctrl[index])
+            state, motion = sim.state(), sim.watched().body(body)
+            each = {name: getattr(state, name) for name in FIELDS} | {"pos": motion.pos, "quat": motion.quat}
+            for name, value in each.items():
+                if value is not None:
+                    empty = torch.zeros((len(self.qpos), *value.shape[1:]), dtype=value.dtype, device=device)
+                    result.setdefault(name, empty)[index] = value.to(device)
+        return result

@@ -19,9 +19,8 @@ MuJoCo's model.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -29,18 +28,21 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.console.progress import Progress
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SimulationError
+from tgdsl.files.cache import cached
+from tgdsl.plan.scene import SceneFile
 from tgdsl.rl import rotations
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.grasps.grasps import Grasps, settings_of
-from tgdsl.rl.grasps.spec import GraspSpec, grasp_spec
+from tgdsl.rl.grasps.grasps import Grasps, GraspSpec, GraspTable, cache_key, grasp_spec, read_grasps, settings_of
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed, compile_sensed
 from tgdsl.rl.start import make_simulation, moved_joints
+from tgdsl.rl.task import Setup
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.digest import scene_digest
 from tgdsl.schema.yaml import Path
 
@@ -59,11 +61,6 @@ Found = Callable[[int, int], None]
 def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -> Grasps:
     """Sample a task's grasps, on the CPU.
 
-    Args:
-        loaded: The task's document.
-        found: Is told how many were found.
-        progress: Called with a line of text for each long job.
-
     Raises:
         SpecError: If there is no such keyframe, the object cannot be turned or moved as asked, or hardly any trial holds.
     """
@@ -71,50 +68,35 @@ def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -
     assert spec is not None
     trials = _Trials(loaded, sensed, spec)
     num = trials.num_variants
-    counts = [spec.num // num + (v < spec.num % num) for v in range(num)]
-    of_variant: list[list[_Kept]] = [[] for _ in range(num)]
-    for round_ in itertools.count():
-        grasps = trials.made(round_)
-        for v in range(num):
-            of_variant[v] += [grasp for grasp in grasps if grasp.variant == v]
-            tried = (round_ + 1) * int((trials.variant == v).sum())
-            if len(of_variant[v]) < min(counts[v], LEAST_SHARE * tried) and tried >= ENOUGH:
-                which = f"{tried} grasps of variant {v} of {loaded.spec.object}"
-                problem = f"only {len(of_variant[v])} of {which} hold: {trials.failures}"
+    wanted = torch.tensor([spec.num // num + (v < spec.num % num) for v in range(num)])
+    kept, rounds, trials_of = torch.zeros_like(wanted), [], torch.bincount(trials.variant)
+    while not rounds or bool((kept < wanted).any()):
+        rounds.append(trials.made(len(rounds)))
+        kept += torch.bincount(rounds[-1][0], minlength=num)
+        for v, tried in enumerate((len(rounds) * trials_of).tolist()):
+            if kept[v] < min(int(wanted[v]), LEAST_SHARE * tried) and tried >= ENOUGH:
+                problem = (
+                    f"only {int(kept[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
+                )
                 raise loaded.error(("grasps",), problem, "start the hand nearer to the object, or ask for less")
-        found(sum(min(len(grasps_of), most) for grasps_of, most in zip(of_variant, counts, strict=True)), spec.num)
-        if all(len(grasps_of) >= most for grasps_of, most in zip(of_variant, counts, strict=True)):
-            break
+        found(int(torch.minimum(kept, wanted).sum()), spec.num)
     trials.sim.close()
-    selected = [grasp for each, most in zip(of_variant, counts, strict=True) for grasp in each[:most]]
+    variant, qpos, ctrl = (torch.cat(parts) for parts in zip(*rounds, strict=True))
+    ids = torch.cat([torch.nonzero(variant == v).flatten()[: int(wanted[v])] for v in range(num)])
     return Grasps(
-        qpos=np.stack([grasp.qpos for grasp in selected]),
-        ctrl=np.stack([grasp.ctrl for grasp in selected]),
-        variant=np.array([grasp.variant for grasp in selected], dtype=np.int64),
+        qpos=qpos[ids].numpy(),
+        ctrl=ctrl[ids].numpy(),
+        variant=variant[ids].numpy(),
         scene=scene_digest(sensed.touch.plan.scene),
         object=loaded.spec.object,
         settings=settings_of(loaded.spec, trials.joints),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Kept:
-    """One grasp that holds."""
-
-    variant: int
-    qpos: Float[np.ndarray, " nq"]
-    ctrl: Float[np.ndarray, " nu"]
-
-
 class _Trials:
     """Trials side by side, one per environment."""
 
     def __init__(self, loaded: LoadedTask, sensed: Sensed, spec: GraspSpec):
-        """Make their simulation.
-
-        Raises:
-            SpecError: See `sample`.
-        """
         inputs, task = sensed.touch.inputs, loaded.spec
         self.spec, self.joints = spec, moved_joints(loaded, sensed)
         self.num_variants = inputs.num_variants[inputs.objects.index(task.object)] if task.object in inputs.objects else 1
@@ -136,7 +118,7 @@ class _Trials:
         self._closed = torch.from_numpy(model.key_ctrl[closed])[self._actuator]
         self._open, self._ctrl = sim.qpos[0].clone(), sim.ctrl[0].clone()
         self._body = sensed.object
-        self._place = _Place(loaded, model, sensed.object)
+        self._place = _Place(loaded, spec, model, sensed.object)
         self._pairs = [i for i, pair in enumerate(inputs.pairs) if pair.object == task.object]
         self._draws = Draws(spec.seed, num_envs)
         self._failed = dict.fromkeys(("diverged", "tilted", "moved away", "held by too few links or from one side"), 0)
@@ -146,8 +128,8 @@ class _Trials:
         """Why trials were not kept, in words."""
         return ", ".join(f"{num} {reason}" for reason, num in self._failed.items())
 
-    def made(self, round_: int) -> list[_Kept]:
-        """Make a round of trials, and return the grasps that hold."""
+    def made(self, round_: int) -> tuple[Int[Tensor, " grasp"], Float[Tensor, "grasp nq"], Float[Tensor, "grasp nu"]]:
+        """Make a round of trials; return variant, positions and controls of the grasps that hold."""
         sim, spec = self.sim, self.spec
         count = torch.full((sim.num_envs,), round_)
         qpos = self._start(count)
@@ -166,10 +148,9 @@ class _Trials:
         for reason, failed in zip(self._failed, reasons, strict=True):
             self._failed[reason] += int((holds & failed).sum())
             holds &= ~failed
-        return [_Kept(int(self.variant[i]), grasp[i].numpy(), ctrl[i].numpy()) for i in torch.nonzero(holds).flatten().tolist()]
+        return self.variant[holds], grasp[holds], ctrl[holds]
 
     def _start(self, count: Int[Tensor, " env"]) -> Float[Tensor, "env nq"]:
-        """Return where trials start."""
         spread = self._spread * self._draws.uniform("start", count, len(self.joints), -1.0, 1.0).double()
         qpos = self._open.repeat(len(count), 1)
         qpos[:, self._joint] = torch.minimum(torch.maximum(qpos[:, self._joint] + spread, self._low), self._high)
@@ -239,14 +220,8 @@ class _Trials:
 class _Place:
     """Where an object is held while the hand closes."""
 
-    def __init__(self, loaded: LoadedTask, model: mujoco.MjModel, body: str):
-        """Look up its joints.
-
-        Raises:
-            SpecError: If it has no joints, or none that can turn or move it as asked.
-        """
-        spec = grasp_spec(loaded.spec)
-        assert spec is not None
+    def __init__(self, loaded: LoadedTask, spec: GraspSpec, model: mujoco.MjModel, body: str):
+        """Look up its joints; raise `SpecError` if it has none, or none that can turn or move it as asked."""
         mj_body = model.body(body)
         self._yaw, self._offset = spec.yaw, spec.offset
         joints = range(int(mj_body.jntadr[0]), int(mj_body.jntadr[0]) + int(mj_body.jntnum[0]))
@@ -279,3 +254,37 @@ class _Place:
         """Put objects back where they were, at rest."""
         sim.qpos[:, self._qpos] = start[:, self._qpos]
         sim.qvel[:, self._qvel] = 0.0
+
+
+def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None = None) -> Setup:
+    """Return a setup with the grasps of its document, if it has any; the simulation has to be reset afterwards.
+
+    Raises:
+        SpecError: If the document's file of grasps is none of this scene, hardly any grasp holds, or a variant has none.
+    """
+    spec, tell = grasp_spec(loaded.spec), progress or silent
+    if spec is None:
+        return setup
+    try:
+        if spec.file is not None:
+            grasps = read_grasps(loaded.folder / spec.file, scene_digest(scene), loaded.spec.object)
+        else:
+            joints = setup.actuators.names
+            grasps = kept_grasps(loaded, scene, joints, lambda num, of: tell(f"sampling grasps: {num} of {of}"), progress)
+        return replace(setup, grasps=GraspTable(grasps, sim, setup.object, setup.variant, setup.draws))
+    except SimulationError as error:
+        raise loaded.error(("grasps",) if spec.file is None else ("grasps", "file"), str(error)) from error
+
+
+def kept_grasps(
+    loaded: LoadedTask, scene: SceneFile, joints: tuple[str, ...], found: Found, progress: Progress | None = None
+) -> Grasps:
+    """Return the grasps of the user's cache; those that it does not have are sampled now, which takes a minute or more.
+
+    They are kept under a hash of the scene and of all settings, so these are found again.
+
+    Raises:
+        SpecError: If there is no such keyframe, the object cannot be held as asked, or hardly any grasp holds.
+    """
+    key = cache_key(scene_digest(scene), settings_of(loaded.spec, joints))
+    return cached(key, lambda: sample(loaded, found, progress), Grasps.packed, Grasps.unpacked)

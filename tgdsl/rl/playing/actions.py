@@ -1,4 +1,4 @@
-"""Actions that nobody has learned: none, random ones, those of a script.
+"""Actors that nobody has learned: zeros, random numbers, scripts.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -30,18 +30,17 @@ class ScriptError(TgdslError):
 
 
 class ZeroActor(Actor):
-    """Asks for nothing: zeros."""
+    """Returns zeros."""
 
     def __init__(self, env: TouchEnv):
         self._action = torch.zeros((env.num_envs, env.num_actions), dtype=torch.float32, device=env.device)
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return zeros."""
         return self._action
 
 
 class RandomActor(Actor):
-    """Numbers from −1 to 1, the same for an environment however many there are."""
+    """Returns numbers from −1 to 1, the same for an environment however many there are."""
 
     def __init__(self, env: TouchEnv, seed: int):
         self._draws = Draws(seed, env.num_envs, env.device)
@@ -49,24 +48,17 @@ class RandomActor(Actor):
         self._num = env.num_actions
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return other numbers at each call."""
         self._count += 1
         return self._draws.uniform("played actions", self._count, self._num, -1.0, 1.0)
 
 
 class ScriptActor(Actor):
-    """A function of the environment and its observations."""
+    """Returns what a function of the environment and its observations does; `file` is where errors look for the line."""
 
     def __init__(self, env: TouchEnv, function: ScriptFunction, name: str, file: str = ""):
-        """Take a function, what errors call it, and the file that it is in, if errors shall name the line in it."""
         self._env, self._function, self._name, self._file = env, function, name, file
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return what the function returns.
-
-        Raises:
-            ScriptError: If it raises anything, or what it returns does not fit.
-        """
         env, shape = self._env, (self._env.num_envs, self._env.num_actions)
         try:
             output = self._function(env, obs)
@@ -83,12 +75,7 @@ class ScriptActor(Actor):
 
 
 def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
-    """Return who acts.
-
-    Args:
-        env: The environment.
-        actions: One of `KINDS`, `script` being the task's own method `script(obs)`; or `FILE.py:FUNCTION`, a `ScriptFunction`.
-        seed: What random actions follow from.
+    """Return the actor of one of `KINDS`, `script` being the task's own method `script(obs)`, or of `FILE.py:FUNCTION`.
 
     Raises:
         ScriptError: If there is no such script.
@@ -98,8 +85,7 @@ def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
     if actions == "random":
         return RandomActor(env, seed)
     if actions != "script":
-        function, file, name = _script_of(actions)
-        return ScriptActor(env, function, name, file)
+        return ScriptActor(env, *_script_of(actions))
     script = getattr(env.task, "script", None)
     if script is None:
         raise ScriptError(f'the task "{env.spec.task}" brings no script of its own; name one as FILE.py:FUNCTION')
@@ -107,21 +93,13 @@ def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
 
 
 def check_actions(actions: str) -> None:
-    """See that actions can be had, before an environment is made.
-
-    Raises:
-        ScriptError: If there is no such script.
-    """
+    """Raise `ScriptError` if there is no such script, before an environment is made."""
     if actions not in KINDS:
         _script_of(actions)
 
 
 def _script_of(actions: str) -> tuple[ScriptFunction, str, str]:
-    """Return the function that `FILE.py:FUNCTION` names, the file and the function's name.
-
-    Raises:
-        ScriptError: If there is none.
-    """
+    """Return the function that `FILE.py:FUNCTION` names, its name and the file."""
     file, _, name = actions.rpartition(":")
     if not file.endswith(".py"):
         raise ScriptError(f'there are no actions "{actions}", expected {", ".join(KINDS)} or FILE.py:FUNCTION')
@@ -134,4 +112,4 @@ def _script_of(actions: str) -> tuple[ScriptFunction, str, str]:
     functions = [key for key, value in result.items() if callable(value) and not key.startswith("_")]
     if not callable(result.get(name)):
         raise ScriptError(f'{file}: there is no function "{name}"; {did_you_mean(name, functions, "functions")}')
-    return result[name], file, name
+    return result[name], name, file

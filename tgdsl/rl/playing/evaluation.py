@@ -1,4 +1,4 @@
-"""How good a policy is: episodes without exploration, the same for all policies.
+"""How good a policy is: episodes without exploration, the same for all policies; and what may be required of it.
 
 Shapes: `env` environments.
 """
@@ -6,16 +6,20 @@ Shapes: `env` environments.
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from operator import ge, gt, le, lt
 from typing import Any
 
 import torch
 from scipy.stats import t as student_t
 
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import TgdslError
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.fields.units import parse
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.gait import Gait, GaitMeter
+from tgdsl.rl.playing.gait import METRICS, SHARE, UNITS, Gait, GaitMeter
 from tgdsl.rl.playing.rollout import Actor, rollout
 
 SEED = 1_000_003
@@ -23,26 +27,18 @@ SEED = 1_000_003
 Z95 = 1.959963984540054
 CHECKED_EVERY = 40
 """Control steps after which the host looks whether all episodes have ended."""
+DIMENSIONS = {"score": "number", "held": SHARE} | {name: dimension for name, (_, dimension) in METRICS.items()}
+"""What may be required of a policy: names of `Evaluation` and `Gait`, and what each is."""
+COMPARISONS: dict[str, Callable[[float, float], bool]] = {"<=": le, ">=": ge, "<": lt, ">": gt}
+_PART = re.compile(r"\s*(?P<name>[^\s<>=]+)\s*(?P<sign><=|>=|<|>)\s*(?P<value>[^<>=]+?)\s*\Z")
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What episodes were; intervals are of 95 %.
+    """How good a policy was in some episodes, the mean of each; intervals are of 95 %: Student's, and Wilson's of `held`.
 
-    Attributes:
-        task: The task.
-        unit: Unit of the score.
-        episodes: How many there were.
-        envs: In how many environments.
-        seed: What was random in them follows from it.
-        score: Mean of the score.
-        score_interval: Its interval.
-        held: Share of the episodes that lasted as long as one may: without a drop, or whatever else ends them before.
-        held_interval: Its interval, Wilson's.
-        episode_return: Mean of the sum of rewards.
-        seconds: Mean of the duration [s].
-        faults: How many a fault ended.
-        gait: How the object was moved.
+    `held` is the share of the episodes that lasted as long as one may, without a drop or whatever else ends them before;
+    `seconds` is their duration [s], `faults` how many a fault ended.
     """
 
     task: str
@@ -61,7 +57,7 @@ class Evaluation:
 
     def plain(self) -> dict[str, Any]:
         """Return plain values as JSON has them: None for what is not finite, such as the interval of one episode."""
-        return {name: _finite(value) for name, value in asdict(self).items()}
+        return _finite(asdict(self))
 
     def __str__(self) -> str:
         low, high = self.score_interval
@@ -96,7 +92,7 @@ def evaluate_each(
         blocks: How many blocks they are: as many environments each, one block after the other.
         episodes: How many episodes count of each block.
         seed: What all that is random in the environments follows from.
-        progress: Is told how many episodes have ended.
+        progress: Called with the number of episodes that have ended.
 
     Raises:
         TgdslError: If no episode is asked for.
@@ -125,43 +121,76 @@ def evaluate_each(
             progress(f"evaluating: {blocks * episodes - left:,} of {blocks * episodes:,} episodes")
             if not left:
                 break
-    each = sums.view(6, blocks, size).sum(dim=2).T.tolist()
-    count = min(size, episodes)
-    return [
-        _evaluation(env, block_sums, episodes, count, seed, gait) for block_sums, gait in zip(each, meter.gaits(), strict=True)
-    ]
+    results = []
+    for block_sums, gait in zip(sums.view(6, blocks, size).sum(dim=2).T.tolist(), meter.gaits(), strict=True):
+        total, squares, whole, paid, steps, faults = block_sums
+        score, held = total / episodes, whole / episodes
+        results.append(
+            Evaluation(
+                task=env.spec.task,
+                unit=env.task.score_unit,
+                episodes=episodes,
+                envs=min(size, episodes),
+                seed=seed,
+                score=score,
+                score_interval=mean_interval(score, squares, episodes),
+                held=held,
+                held_interval=share_interval(held, episodes),
+                episode_return=paid / episodes,
+                seconds=steps / episodes * env.control_step,
+                faults=round(faults),
+                gait=gait,
+            )
+        )
+    return results
 
 
-def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed: int, gait: Gait) -> Evaluation:
-    """Return what episodes were, by sums over them, and how the object was moved in them."""
-    total, squares, held, paid, steps, faults = sums
-    mean = total / episodes
-    share = held / episodes
-    return Evaluation(
-        task=env.spec.task,
-        unit=env.task.score_unit,
-        episodes=episodes,
-        envs=envs,
-        seed=seed,
-        score=mean,
-        score_interval=mean_interval(mean, squares, episodes),
-        held=share,
-        held_interval=share_interval(share, episodes),
-        episode_return=paid / episodes,
-        seconds=steps / episodes * env.control_step,
-        faults=round(faults),
-        gait=gait,
-    )
+@dataclass(frozen=True)
+class Requirement:
+    """One thing that is required of a policy, as in `coasting<0.1`: `name` is a key of `DIMENSIONS`, the bound in SI units."""
+
+    text: str
+    name: str
+    sign: str
+    bound: float
+
+    def failure(self, found: Evaluation) -> str | None:
+        """Return why an evaluation does not meet this; None if it does."""
+        value = getattr(found if self.name in ("score", "held") else found.gait, self.name)
+        if value is None:
+            return f"not met: {self.text}: it was not measured: the task has none, or nothing was touched"
+        unit = UNITS.get(DIMENSIONS[self.name], "")
+        return None if COMPARISONS[self.sign](value, self.bound) else f"not met: {self.text}: found {value:.4g} {unit}".rstrip()
+
+
+def parse_requirements(text: str) -> list[Requirement]:
+    """Return what a text requires, its parts separated by commas: `coasting<0.1, penetration<2 mm, held>=95 %`.
+
+    Raises:
+        TgdslError: If a part is not NAME<VALUE with a name and a unit that are known.
+    """
+    return [_requirement(part.strip()) for part in text.split(",")]
+
+
+def _requirement(part: str) -> Requirement:
+    match = _PART.match(part)
+    if not match:
+        expected = 'expected NAME<VALUE, such as "coasting<0.1, penetration<2 mm", with <, <=, > or >='
+        raise TgdslError(f'--require "{part}": {expected}')
+    name, value = match["name"], match["value"]
+    if name not in DIMENSIONS:
+        raise TgdslError(f'--require "{part}": nothing is called "{name}"; {did_you_mean(name, DIMENSIONS, "names")}')
+    dimension = DIMENSIONS[name]
+    is_percent = dimension == SHARE and value.endswith("%")
+    try:
+        bound = parse(value.removesuffix("%") if is_percent else value, "number" if dimension == SHARE else dimension)
+    except ValueError as error:
+        raise TgdslError(f'--require "{part}": {error}') from error
+    return Requirement(part, name, match["sign"], 0.01 * bound if is_percent else bound)
 
 
 def mean_interval(mean: float, squares: float, num: int) -> tuple[float, float]:
-    """Return the 95 % interval of a mean, Student's.
-
-    Args:
-        mean: The mean.
-        squares: Sum of the squares.
-        num: How many numbers there were; of one alone nothing is known.
-    """
+    """Return the 95 % interval of a mean, Student's."""
     if num < 2:
         return -math.inf, math.inf
     half = float(student_t.ppf(0.975, num - 1)) * math.sqrt(max(0.0, squares - num * mean**2) / (num - 1) / num)

@@ -35,9 +35,10 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from tgdsl.console.tables import text_table
+from tgdsl.fields.units import Dimension
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.links import are_fingers
 from tgdsl.rl.task import Now
+from tgdsl.rl.tasks.holding import are_fingers
 
 TOUCH = 0.01
 """Force above which a link touches the object [N]."""
@@ -46,29 +47,29 @@ SATURATED = 0.98
 LEAST, WIDTH, NUM_BINS = 1e-6, math.log(1.01), 2800
 """Lower end of the first bin, width of the bins of the logarithm, and their number: up to 1.3e6."""
 PERCENTILE = 0.99
+SHARE = "share"
+"""A plain number, or one in percent."""
+SPIN = Dimension("angular speed", {"rad/s": 1.0})
+UNITS: dict[str | Dimension, str] = {"length": "m", "force": "N", "speed": "m/s", SPIN: "rad/s"}
+METRICS: dict[str, tuple[str, str | Dimension]] = {
+    "coasting": ("progress while no finger touches the object", SHARE),
+    "untouched": ("time without a finger at the object", SHARE),
+    "saturation": ("time at the torque limit, joint with the most", SHARE),
+    "any_saturation": ("time with any joint at its torque limit", SHARE),
+    "penetration": ("penetration, 99 % below", "length"),
+    "force": ("force on links, 99 % below", "force"),
+    "speed": ("object's speed, 99 % below", "speed"),
+    "max_speed": ("object's speed, largest", "speed"),
+    "spin": ("object's spin, 99 % below", SPIN),
+    "max_spin": ("object's spin, largest", SPIN),
+    "joint_speed": ("joint speed over rated speed, 99 % below", SHARE),
+}
+"""The numbers of a gait: what tables call each, and its dimension."""
 
 
 @dataclass(frozen=True)
 class Gait:
-    """How a policy moves an object: see the top of this page.
-
-    Attributes:
-        coasting: Share of the progress that was made while no finger touched the object.
-        untouched: Share of time without a finger at the object.
-        saturation: Share of time at its largest torque, of the joint with the largest share.
-        any_saturation: Share of time in which any joint is.
-        penetration: Depth of the deepest probe in the object, 99th percentile [m].
-        force: Force on links, 99th percentile [N].
-        speed: Object's speed, 99th percentile [m/s].
-        spin: Object's angular speed, 99th percentile [rad/s].
-        max_speed: Largest speed of the object [m/s].
-        max_spin: Largest angular speed of the object [rad/s].
-        joint_speed: Joint speed as a share of the rated one, 99th percentile of the joint with the largest.
-        saturations: Share of time at its largest torque of each joint.
-        link_forces: 99th percentile of the force on each link that was touched [N].
-        joint_speeds: 99th percentile of each joint's speed [rad/s].
-        rated_speeds: Rated speeds of joints, where they are known [rad/s].
-    """
+    """How a policy moves an object: see the top of this page; by name, what each link and joint bears."""
 
     coasting: float | None
     untouched: float | None
@@ -87,52 +88,31 @@ class Gait:
     rated_speeds: dict[str, float]
 
     def __str__(self) -> str:
-        rows = [
-            ("progress while no finger touches the object", _percent(self.coasting)),
-            ("time without a finger at the object", _percent(self.untouched)),
-            ("time at the torque limit, joint with the most", _percent(self.saturation)),
-            ("time with any joint at its torque limit", _percent(self.any_saturation)),
-            ("penetration, 99 % below", _number(self.penetration, 1e3, "mm")),
-            ("force on links, 99 % below", _number(self.force, 1.0, "N")),
-            ("object's speed, 99 % below", _number(self.speed, 1.0, "m/s")),
-            ("object's speed, largest", _number(self.max_speed, 1.0, "m/s")),
-            ("object's spin, 99 % below", _number(self.spin, 1.0, "rad/s")),
-            ("object's spin, largest", _number(self.max_spin, 1.0, "rad/s")),
-            ("joint speed over rated speed, 99 % below", _percent(self.joint_speed)),
-        ]
+        rows = [(label, _cell(getattr(self, name), dimension)) for name, (label, dimension) in METRICS.items()]
         parts = [text_table(("gait", ""), rows)]
         if self.link_forces:
-            parts.append(text_table(("link", "force, 99 % below [N]"), _cells(self.link_forces)))
+            forces = [(name, f"{force:.3g}") for name, force in self.link_forces.items()]
+            parts.append(text_table(("link", "force, 99 % below [N]"), forces))
         joints = [
-            (name, _percent(self.saturations.get(name)), f"{speed:.3g}", _number(self.rated_speeds.get(name), 1.0, ""))
+            (name, _cell(self.saturations.get(name), SHARE), f"{speed:.3g}", _cell(self.rated_speeds.get(name), "number"))
             for name, speed in self.joint_speeds.items()
         ]
         parts.append(text_table(("joint", "at its torque limit", "speed, 99 % below [rad/s]", "rated speed [rad/s]"), joints))
         return "\n\n".join(parts)
 
 
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{share:.1%}"
-
-
-def _number(value: float | None, factor: float, unit: str) -> str:
-    return "–" if value is None else f"{factor * value:.3g} {unit}".rstrip()
-
-
-def _cells(values: dict[str, float]) -> list[tuple[str, str]]:
-    return [(name, f"{value:.3g}") for name, value in values.items()]
+def _cell(value: float | None, dimension: str | Dimension) -> str:
+    if value is None:
+        return "–"
+    if dimension == SHARE:
+        return f"{value:.1%}"
+    return f"{1e3 * value:.3g} mm" if dimension == "length" else f"{value:.3g} {UNITS.get(dimension, '')}".rstrip()
 
 
 class GaitMeter:
     """Adds up how policies move objects, each in a block of environments."""
 
     def __init__(self, env: TouchEnv, blocks: int = 1):
-        """Begin.
-
-        Args:
-            env: The environments.
-            blocks: How many blocks they are: as many environments each, one block after the other.
-        """
         setup, num, device = env.task.setup, env.num_envs, env.sim.qpos.device
         self._env, self._blocks, actuators = env, blocks, setup.actuators
         self._links, self._joints = setup.links, actuators.names
@@ -152,11 +132,7 @@ class GaitMeter:
         self._most = torch.zeros((num, 2), dtype=torch.float64, device=device)
 
     def add(self, counts: Bool[Tensor, " env"]) -> None:
-        """Add the instant after a step of the environments.
-
-        Args:
-            counts: Environments whose instant counts: not those whose episode has just ended.
-        """
+        """Add the instant after a step of the environments."""
         actuation = self._env.actuation
         strength = SATURATED * actuation.drawn["strength"] - actuation.spec.torque_noise
         self.add_instant(self._env.now, self._env.task.step_progress(), strength, counts)
@@ -168,14 +144,7 @@ class GaitMeter:
         strength: Float[Tensor, "env joint"],
         counts: Bool[Tensor, " env"],
     ) -> None:
-        """Add an instant.
-
-        Args:
-            now: The instant.
-            progress: What the step before it has brought; None: the task has no progress.
-            strength: Share of its largest torque from which on each joint is at its torque limit.
-            counts: Environments that count.
-        """
+        """Add an instant."""
         counts = counts.to(now.joint_pos.device)
         force, torque = vector_norm(now.link_force, dim=2).double(), now.torque.double().abs()
         is_untouched = ~((force > TOUCH) & self._fingers).any(dim=1)
@@ -197,11 +166,9 @@ class GaitMeter:
         self._count(torch.cat([deepest, loads, motion, now.joint_vel.double().abs()], dim=1), counts)
 
     def _count(self, values: Float[Tensor, "env row"], counts: Bool[Tensor, " env"]) -> None:
-        """Add values above 0 to the histograms; those of forces and depths that are 0 are of no contact."""
-        always = torch.zeros(values.shape[1], dtype=torch.bool, device=values.device)
-        for name in ("speed", "spin", "joint_speed"):
-            always[self._rows[name]] = True
-        is_counted = counts[:, None] & ((values > 0) | always) & values.isfinite()
+        """Add values to the histograms, but depths and forces of 0, which are of no contact."""
+        is_moving = torch.arange(values.shape[1], device=values.device) >= self._rows["speed"].start
+        is_counted = counts[:, None] & ((values > 0) | is_moving) & values.isfinite()
         place = (values.clamp(min=LEAST) / LEAST).log().div(WIDTH).nan_to_num(0.0).clamp(max=NUM_BINS - 1).to(torch.int64)
         self._counts.view(-1).scatter_add_(0, self._first + place.flatten(), is_counted.flatten().to(torch.int64))
 
@@ -211,11 +178,10 @@ class GaitMeter:
         sums = {name: value.view(self._blocks, size).sum(dim=1).tolist() for name, value in self._sums.items()}
         saturated = self._saturated.view(self._blocks, size, -1).sum(dim=1).tolist()
         most, counts = self._most.view(self._blocks, size, 2).amax(dim=1).tolist(), self._counts.cpu()
-        results = []
-        for block in range(self._blocks):
-            block_sums = {name: value[block] for name, value in sums.items()}
-            results.append(self._gait(block_sums, saturated[block], most[block], counts[block]))
-        return results
+        return [
+            self._gait({name: value[i] for name, value in sums.items()}, saturated[i], most[i], counts[i])
+            for i in range(self._blocks)
+        ]
 
     def _gait(self, sums: dict[str, float], saturated: list[float], most: list[float], counts: Tensor) -> Gait:
         """Return the gait of one block, by its sums."""
@@ -250,12 +216,7 @@ class GaitMeter:
 
 
 def percentile(counts: Tensor, share: float = PERCENTILE) -> float | None:
-    """Return the middle of the bin below whose upper end a share of all values lies; None if there are none.
-
-    Args:
-        counts: Values in each bin, (bin,).
-        share: The share.
-    """
+    """Return the middle of the bin below whose upper end a share of all values lies; None if there are none."""
     total = int(counts.sum())
     if not total:
         return None

@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import warnings
-import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile, is_zipfile
 
 import numpy as np
 import torch
@@ -29,7 +30,9 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from tgdsl.errors import TaxelError, TgdslError, did_you_mean
+from tgdsl.files.write import atomic_write
 from tgdsl.layout.identity import Columns
+from tgdsl.module.module import TactileModule
 from tgdsl.module.taxels.identity import HasPlan, check_taxels, plan_tables
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.provenance import changes_around, is_close, spec_differences
@@ -59,34 +62,20 @@ class PolicyError(TgdslError):
 
 @dataclass(frozen=True, eq=False)
 class PolicyFile:
-    """A policy's file as it was when it was read; what is written into it later is another policy.
+    """A policy's file as it was when it was read; what is written into it later is another policy."""
 
-    Attributes:
-        file: The file.
-        content: Its bytes.
-        card: Its card; None: it has none.
-        taxels: The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none.
-    """
-
-    file: Path
-    content: bytes
-    card: dict[str, Any] | None
+    file: Path  # the file
+    content: bytes  # its bytes
+    card: dict[str, Any] | None  # its card; None: it has none
     taxels: Mapping[str, Columns]
+    """The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none."""
 
     def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
-        """Return the network, with a memory of its own."""
         return _module(self.content, device)
 
 
 def read_policy(file: Path) -> PolicyFile:
-    """Read a policy's file, once.
-
-    Args:
-        file: The file; or the folder of a run, whose `policy.pt` is read.
-
-    Raises:
-        PolicyError: If it cannot be read, or is no TorchScript.
-    """
+    """Read a policy's file, once; raise `PolicyError` if it cannot be read, or is no TorchScript."""
     file = file / POLICY if file.is_dir() else file
     try:
         content = file.read_bytes()
@@ -97,18 +86,58 @@ def read_policy(file: Path) -> PolicyFile:
         _module(content, "cpu", extra)
         card = json.loads(extra[CARD]) if extra[CARD] else None
     except (RuntimeError, ValueError) as error:
-        if _is_checkpoint(content):
+        archive = io.BytesIO(content)
+        files = {Path(name).name for name in ZipFile(archive).namelist()} if is_zipfile(archive) else set()
+        if "data.pkl" in files and "constants.pkl" not in files:  # `torch.save`, where TorchScript has a file of constants
             policy = f"the policy of a run is its {POLICY}, that of rsl_rl's runner what `export_policy_to_jit` writes"
             raise PolicyError(f"{file}: this is a checkpoint, from which learning goes on; {policy}") from error
         problem = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
         raise PolicyError(f"{file}: {problem}: {str(error).strip().splitlines()[0]}") from error
-    if card is not None:
-        _check_fields(card, file)
+    for path in FIELDS if card is not None else ():
+        part = card
+        for key in path.split("."):
+            if not isinstance(part, dict) or key not in part:
+                raise PolicyError(f"{file}: its {CARD} has no {path}: this is not what tgdsl train writes")
+            part = part[key]
     return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
 
 
+def write_policy(scripted: torch.nn.Module, touch: TactileModule, card: Mapping[str, Any], file: Path) -> None:
+    """Write a policy as TorchScript, in it its card and the taxels that it feels with, and the card beside it.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    content, texts = io.BytesIO(), card_texts(touch, card)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
+        torch.jit.save(scripted, content, _extra_files=dict(texts))
+    atomic_write(file, content.getvalue())
+    atomic_write(file.with_suffix(".json"), texts[CARD].encode())
+
+
+def card_texts(touch: TactileModule, card: Mapping[str, Any]) -> dict[str, str]:
+    """Return the texts that a policy's file holds, by name: its card, and the taxels that it feels with."""
+    return {CARD: json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n", TAXELS: taxel_csv(touch)}
+
+
+def taxel_csv(touch: TactileModule) -> str:
+    """Return the taxels of all sensors as a table: sensor, and the columns of `touch.taxels`, vectors by their components."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for i, (sensor, table) in enumerate(touch.taxels.items()):
+        columns = {name: np.asarray(table[name]) for name in table.dtype.names or ()}
+        if i == 0:
+            parts = [name if a.ndim == 1 else [f"{name}_{k}" for k in range(a.shape[1])] for name, a in columns.items()]
+            writer.writerow(["sensor", *np.hstack(parts)])
+        for row in table.tolist():
+            cells = [[repr(x) for x in value.tolist()] if isinstance(value, np.ndarray) else [str(value)] for value in row]
+            writer.writerow([sensor, *itertools.chain(*cells)])
+    return text.getvalue()
+
+
 def taxel_tables(text: str) -> dict[str, Columns]:
-    """Return the taxels of each sensor of a table as `tgdsl train` writes it, vectors joined of their components."""
+    """Return the taxels of each sensor of what `taxel_csv` returned."""
     rows, tables = list(csv.DictReader(io.StringIO(text))), dict[str, Columns]()
     for sensor in dict.fromkeys(row["sensor"] for row in rows):
         columns = {name: np.array([row[name] for row in rows if row["sensor"] == sensor]) for name in rows[0]}
@@ -120,27 +149,10 @@ def taxel_tables(text: str) -> dict[str, Columns]:
     return tables
 
 
-def _is_checkpoint(content: bytes) -> bool:
-    """Return whether a file is what `torch.save` writes: TorchScript has its constants in a file of their own."""
-    if not zipfile.is_zipfile(io.BytesIO(content)):
-        return False
-    names = {Path(name).name for name in zipfile.ZipFile(io.BytesIO(content)).namelist()}
-    return "data.pkl" in names and "constants.pkl" not in names
-
-
 def actor_groups(
     groups: Mapping[str, int], named: Sequence[str] = (), card: Mapping[str, Any] | None = None
 ) -> tuple[str, ...]:
-    """Return the groups of observations that a policy takes.
-
-    Args:
-        groups: Size of each group that there is.
-        named: The groups, in their order; default: those of the card, or of `ACTOR_GROUPS` that there are.
-        card: The policy's card, if it has one.
-
-    Raises:
-        PolicyError: If there is no such group.
-    """
+    """Return the groups of observations that a policy takes; raise `PolicyError` if there is no such group."""
     named = tuple(named) or tuple((card or {}).get("groups", ()))
     for name in named:
         if name not in groups:
@@ -153,25 +165,17 @@ class Policy(Actor):
 
     Attributes:
         groups: Groups of observations that it takes, in their order.
+        std: Standard deviation of its actions while it was learned; None if its card does not have it.
     """
 
     def __init__(
         self, saved: PolicyFile, groups: Mapping[str, int], num_envs: int, num_actions: int, device: torch.device | str = "cpu"
     ):
-        """See that a policy fits.
-
-        Args:
-            saved: Its file.
-            groups: Size of each group of observations that it takes, in its order.
-            num_envs: Number of environments.
-            num_actions: Number of joints that it moves.
-            device: Where it computes.
-
-        Raises:
-            PolicyError: If it does not fit.
-        """
+        """See that a policy fits; raise `PolicyError` if it does not fit."""
         self.groups = tuple(groups)
         self._module, card, file = saved.module(device), saved.card, saved.file
+        std = (card or {}).get("std")
+        self.std = torch.tensor(std, dtype=torch.float32, device=device) if std else None
         total, taken = sum(groups.values()), _summands(groups)
         first = next((weight.shape[1] for weight in self._module.parameters() if weight.ndim == 2), total)
         theirs = f"{first} numbers" if card is None else _summands(card["groups"])
@@ -190,12 +194,10 @@ class Policy(Actor):
         self.begin(torch.ones(num_envs, dtype=torch.bool))
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return the actions for observations."""
         with torch.no_grad():
             return self._module(torch.cat([obs[name] for name in self.groups], dim=1))
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget episodes that have ended; a recurrent policy of rsl_rl, which takes one environment alone, if all have."""
         if hasattr(self._module, "begin"):
             self._module.begin(ended)
         elif hasattr(self._module, "reset") and bool(ended.all()):
@@ -204,11 +206,6 @@ class Policy(Actor):
 
 def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> Policy:
     """Return a policy that acts in some environments.
-
-    Args:
-        env: The environments.
-        saved: The policy's file.
-        named: Groups of observations that it takes, in its order; default: see `actor_groups`.
 
     Raises:
         PolicyError: If it is for other environments, or feels something else than they do.
@@ -228,23 +225,13 @@ def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> P
 
 
 def changes_since(card: Mapping[str, Any], spec: TaskSpec, leave_out: tuple[str, ...] = ()) -> list[str]:
-    """Return what of a task's document is otherwise than where a policy was learned, a line each.
-
-    Args:
-        card: The policy's card.
-        spec: The task's document.
-        leave_out: Names at the top that do not count; those of learning, and of touch where the policy has none, never do.
-    """
+    """Return what of a task's document is otherwise than where a policy was learned, a line each."""
     unfelt = () if GROUP in card["groups"] else OF_TOUCH
     return spec_differences(card["spec"], spec.model_dump(mode="json"), type(spec), (*OF_LEARNING, *unfelt, *leave_out))
 
 
 def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str = "policy") -> None:
-    """See that a policy was learned in a task, with its actions and control steps.
-
-    Raises:
-        PolicyError: If not.
-    """
+    """See that a policy was learned in a task, with its actions and control steps; raise `PolicyError` if not."""
     theirs, ours = dict(card["spec"]), spec.model_dump(mode="json")
     with suppress(ValidationError):  # what is no action here differs
         theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
@@ -258,7 +245,6 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
 
 
 def _without_folder(task: str) -> str:
-    """Return a task's name; of one in a file without the folder, which is relative to the document: `task.py:Class`."""
     file, colon, class_ = task.rpartition(":")
     return f"{Path(file).name}{colon}{class_}"
 
@@ -281,11 +267,6 @@ def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None
 
     Taxels may differ by rounding, as those of a robot that was exported do. Sensors that the environments lack, such as those
     that only the task reads, are not compared.
-
-    Args:
-        saved: The policy's file.
-        joints: The joints that the environments' actions move.
-        touch: The module that senses with their taxels.
 
     Raises:
         PolicyError: If joints are others, or taxels are, and it feels with them.
@@ -312,13 +293,3 @@ def _module(content: bytes, device: torch.device | str, extra_files: dict[str, A
         if weight.dtype == torch.float16:
             weight.data = weight.data.float()
     return module
-
-
-def _check_fields(card: Any, file: Path) -> None:
-    """Raise `PolicyError` if a card lacks what is asked of it."""
-    for path in FIELDS:
-        part = card
-        for key in path.split("."):
-            if not isinstance(part, dict) or key not in part:
-                raise PolicyError(f"{file}: its {CARD} has no {path}: this is not what tgdsl train writes")
-            part = part[key]

@@ -60,7 +60,6 @@ def changes_around(card: Mapping[str, Any], loaded: LoadedTask, model: mujoco.Mj
 
 
 def _known(before: Any, now: Any) -> Any:
-    """Return what there was before: neither new sensors nor fields that its version of tgdsl did not know."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return now
     return {name: _known(before[name], value) for name, value in now.items() if name in before}
@@ -101,15 +100,8 @@ def is_close(one: Any, other: Any) -> bool:
 def spec_differences(
     before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec], leave_out: tuple[str, ...] = ()
 ) -> list[str]:
-    """Return how two documents differ.
-
-    Args:
-        before: The earlier one; what its version of tgdsl did not know has its default.
-        now: The later one, of today's fields.
-        model: Model of the task's document.
-        leave_out: Names at the top that may differ.
-    """
-    with suppress(ValidationError):  # of a version with other names: what it had is told as it was
+    """Return how two documents differ."""
+    with suppress(ValidationError):  # of a version with other names: its values stand as they are
         before = model.model_validate(before).model_dump(mode="json")
     left, other = ({name: value for name, value in spec.items() if name not in leave_out} for spec in (before, now))
     return differences(left, other)

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from tgdsl.console.tables import text_table
 from tgdsl.files.write import atomic_open, with_folder
-from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.env import StepInfo, TouchEnv
 from tgdsl.rl.playing.rollout import Moment
 from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 
@@ -22,18 +23,13 @@ Column = Shaped[np.ndarray, "row ..."]
 
 
 class Record:
-    """Columns to which rows are added, and which are written with the names of the joints.
-
-    Attributes:
-        joints: The joints that the policy moves.
-    """
+    """Columns to which rows are added, and which are written with the names of the joints that the policy moves."""
 
     def __init__(self, joints: Sequence[str]):
         self.joints = tuple(joints)
         self._columns: dict[str, list[Column]] = {}
 
     def __getitem__(self, name: str) -> Column:
-        """Return a column."""
         return np.concatenate(self._columns[name])
 
     def __len__(self) -> int:
@@ -41,17 +37,11 @@ class Record:
         return len(next(iter(self._columns.values()), ()))
 
     def add_rows(self, columns: Mapping[str, Column]) -> None:
-        """Add rows, as many of each column."""
         for name, rows in columns.items():
             self._columns.setdefault(name, []).append(rows)
 
     def write(self, path: Path, **words: str) -> None:
-        """Write the file; it appears whole or not at all.
-
-        Args:
-            path: The file.
-            words: Words to write with the columns, by name.
-        """
+        """Write the file; it appears whole or not at all."""
         columns = {name: self[name] for name in self._columns} | {"joints": np.array(self.joints)}
         with atomic_open(with_folder(path)) as file:
             np.savez_compressed(file, **columns, **{name: np.array(word) for name, word in words.items()})  # type: ignore[arg-type]
@@ -114,3 +104,30 @@ class PlayRecord(Record):
 
 def _numpy(tensor: Tensor) -> np.ndarray:
     return np.array(tensor.detach().cpu().numpy())  # a copy: an environment's own tensors change
+
+
+class Tally:
+    """A table of means over environments: of the present episodes so far, and of those that have ended."""
+
+    def __init__(self, env: TouchEnv):
+        self._env = env
+        self.num_ended = self.num_faults = 0
+        self._now: dict[str, float] = {}
+        self._sums: dict[str, float] = {}
+
+    def add(self, info: StepInfo) -> None:
+        """Add one step."""
+        values = {f"score [{self._env.task.score_unit}]": info.score, "return": info.episode_return}
+        values |= {f"  {name}": total for name, total in info.episode_terms.items()}
+        self.num_ended += int(info.ended.sum())
+        self.num_faults += int(info.faults.sum())
+        self._now = {name: float(value.double().mean()) for name, value in values.items()}
+        for name, value in values.items():
+            self._sums[name] = self._sums.get(name, 0.0) + float(value[info.ended].double().sum())
+
+    def lines(self, time: float) -> list[str]:
+        faults = f", {self.num_faults} by a fault" if self.num_faults else ""
+        first = f"t = {time:.2f} s, {self._env.num_envs} environments, {self.num_ended} episodes ended{faults}"
+        count = self.num_ended
+        rows = [(name, f"{now:.3g}", f"{self._sums[name] / count:.3g}" if count else "–") for name, now in self._now.items()]
+        return [first, *text_table(("mean over environments", "so far", "ended"), rows).splitlines()]

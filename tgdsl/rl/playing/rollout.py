@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.episodes import Observations, Step
+from tgdsl.rl.env import Observations, Step, TouchEnv
 
 
 class Actor(ABC):
@@ -50,29 +49,16 @@ class Environments(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """One control step of a policy.
+    """One control step of a policy."""
 
-    Attributes:
-        index: Its number, from 0.
-        obs: Observations that the action was chosen from, by group.
-        action: The action.
-        step: What came of it.
-    """
-
-    index: int
-    obs: Mapping[str, Float[Tensor, "env feature"]]
-    action: Float[Tensor, "env joint"]
-    step: Step
+    index: int  # its number, from 0
+    obs: Mapping[str, Float[Tensor, "env feature"]]  # observations that the action was chosen from, by group
+    action: Float[Tensor, "env joint"]  # the action
+    step: Step  # what came of it
 
 
 def rollout(actor: Actor, env: Environments, num_steps: int | None = None) -> Iterator[Moment]:
-    """Let an actor act from where the environments are, and yield each control step.
-
-    Args:
-        actor: Who acts; in environments that have just been reset, call its `begin` first.
-        env: Where.
-        num_steps: Number of control steps; None: without an end.
-    """
+    """Let an actor act from where the environments are, and yield each control step."""
     for index in count() if num_steps is None else range(num_steps):
         obs = env.observe()
         action = actor(obs)

@@ -35,11 +35,7 @@ class VideoError(TgdslError):
 
 
 def check_camera(model: mujoco.MjModel, camera: str | None) -> None:
-    """See that a scene has a camera.
-
-    Raises:
-        VideoError: If it has not.
-    """
+    """See that a scene has a camera; raise `VideoError` if it has not."""
     names = [model.camera(i).name for i in range(model.ncam)]
     if camera is not None and camera not in names:
         raise VideoError(f'the scene has no camera "{camera}"; {did_you_mean(camera, names, "cameras")}')
@@ -56,15 +52,6 @@ def video(
 ) -> Path:
     """Draw an environment in real time; return the file.
 
-    Args:
-        model: The environment's model.
-        poses: Where everything was at each control step, by MuJoCo's names: `qpos`, and `mocap_pos`, `mocap_quat`.
-        control_step: Duration of a control step [s].
-        path: The file to write, `.mp4`.
-        camera: A camera of the scene; default: its first one, or MuJoCo's free camera where it has none.
-        progress: Called with a line of text for each long job.
-        trace: What the taxels read at each control step: they are drawn, and a bar for each link.
-
     Raises:
         VideoError: If the scene has no such camera, OpenGL cannot be started, or imageio-ffmpeg is missing.
         FileError: If the file cannot be written.
@@ -73,7 +60,7 @@ def video(
     every = max(1, math.ceil(1.0 / (MAX_RATE * control_step) - 1e-9))
     steps, encoder = range(0, len(poses["qpos"]), every), _encoder()
     with closing(_renderer(model)) as renderer, atomic_path(path) as temporary:
-        frames = _told(_frames(model, poses, steps, renderer, camera, trace), len(steps), progress)
+        frames = _frames(model, poses, steps, renderer, camera, trace, progress)
         _encode(encoder, frames, 1.0 / (every * control_step), temporary, path)
     return path
 
@@ -85,10 +72,12 @@ def _frames(
     renderer: mujoco.Renderer,
     camera: str | None,
     trace: TouchTrace | None,
+    progress: Progress,
 ) -> Iterator[Frame]:
     data, bars = mujoco.MjData(model), None if trace is None else trace.bars()
     seen_from = camera if camera is not None else (0 if model.ncam else -1)
-    for i in steps:
+    for number, i in enumerate(steps):
+        progress(f"drawing the video: frame {number + 1} of {len(steps)}")
         for name, values in poses.items():
             getattr(data, name)[:] = values[i]
         mujoco.mj_forward(model, data)
@@ -100,18 +89,8 @@ def _frames(
             yield bars.draw(renderer.render(), i)
 
 
-def _told(frames: Iterable[Frame], count: int, progress: Progress) -> Iterator[Frame]:
-    for i, frame in enumerate(frames):
-        progress(f"drawing the video: frame {i + 1} of {count}")
-        yield frame
-
-
 def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
-    """Return what draws.
-
-    Raises:
-        VideoError: If OpenGL cannot be started.
-    """
+    """Return what draws."""
     drawn = copy.copy(model)
     drawn.vis.global_.offwidth, drawn.vis.global_.offheight = WIDTH, HEIGHT
     try:
@@ -124,11 +103,7 @@ def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
 
 
 def _encoder() -> str:
-    """Return the path of ffmpeg's program.
-
-    Raises:
-        VideoError: If there is none.
-    """
+    """Return the path of ffmpeg's program."""
     try:
         import imageio_ffmpeg
 
@@ -138,11 +113,7 @@ def _encoder() -> str:
 
 
 def _encode(encoder: str, frames: Iterable[Frame], rate: float, file: Path, target: Path) -> None:
-    """Write frames as H.264.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
+    """Write frames as H.264."""
     input_options = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{rate:.9g}", "-i", "-"]
     output_options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file)]
     command = [encoder, "-y", "-v", "error", *input_options, *output_options]

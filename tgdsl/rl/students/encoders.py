@@ -22,11 +22,8 @@ Kind = Literal["mlp", "lstm", "cnn", "convrnn"]
 class Grid:
     """Where taxels stand in the images of their links; links whose grids are smaller than the largest fill a corner.
 
-    Attributes:
-        channels: Numbers per taxel; features are those of all taxels of the first channel, then of the second.
-        num_taxels: Number of taxels.
-        shape: Links, rows, columns.
-        taxels: The taxel of each cell, −1 where there is none.
+    Features are the `channels` numbers of a taxel, those of all taxels of the first channel, then of the second. The shape is
+    links, rows, columns; of each cell there is the taxel, −1 where there is none.
     """
 
     channels: int
@@ -39,12 +36,8 @@ class Grid:
 class Encoder:
     """What network embeds a group.
 
-    Attributes:
-        kind: Its kind.
-        hidden: Widths of an `mlp`'s hidden layers, the one of an `lstm`; channels of `cnn` and of `convrnn`.
-        size: Size of the embedding.
-        kernel: Width of the kernels of images [taxel].
-        grid: Where taxels stand in images.
+    `hidden` are widths of an `mlp`'s hidden layers, the one of an `lstm`, channels of `cnn` and of `convrnn`; `size` is that of
+    the embedding, `kernel` the width of the kernels of images [taxel].
     """
 
     kind: Kind
@@ -73,11 +66,7 @@ def network(size: int, encoder: Encoder) -> Embedding:
 
 
 class Embedding(nn.Module):
-    """A network that embeds a group.
-
-    Attributes:
-        memory: How many numbers it remembers.
-    """
+    """A network that embeds a group, and remembers so many numbers of an episode."""
 
     memory: int = 0
 
@@ -90,7 +79,6 @@ class Mlp(Embedding):
         self.layers = mlp(size, encoder.hidden, encoder.size)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embedding."""
         return self.layers(x), memory
 
 
@@ -107,7 +95,6 @@ class Lstm(Embedding):
         self.projection, self.memory = nn.Linear(width, encoder.size), 2 * width
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embedding, and h and c."""
         h, c = memory.chunk(2, dim=1)
         h, c = gated(self.of_input(x) + self.of_memory(h), c)
         return self.projection(h), torch.cat([h, c], dim=1)
@@ -154,7 +141,6 @@ class Convolution(Images):
         self.projection = nn.Linear(channels[-1] * len(encoder.grid.taxels), encoder.size)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embedding."""
         images = self.marked(x)
         for layer in self.layers:
             images = nn.functional.elu(layer(images))
@@ -175,7 +161,6 @@ class RecurrentConvolution(Images):
         self.projection, self.memory = nn.Linear(self.width * cells, encoder.size), 2 * self.width * cells
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embedding, and h and c of all images."""
         links, *image = self.grid.shape
         held = memory.unflatten(1, (2, links, self.width, *image)).transpose(0, 1).flatten(1, 2)
         h, c = gated(self.norm(self.gates(torch.cat([self.marked(x), held[0]], dim=1))), held[1])

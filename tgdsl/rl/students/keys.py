@@ -31,12 +31,7 @@ class StudentError(TgdslError):
 
 @dataclass(frozen=True)
 class StudentKey:
-    """Who is taught.
-
-    Attributes:
-        felt: What it feels; None: nothing.
-        seed: What its first weights follow from.
-    """
+    """Who is taught: what it feels (None: nothing), and the seed of its first weights."""
 
     felt: Felt | None
     seed: int
@@ -48,18 +43,11 @@ class StudentKey:
 
     @property
     def name(self) -> str:
-        """Its name, which is a file's too."""
         return "-".join([*(part for part in self.kind if part), f"s{self.seed}"]).replace("*", "_").replace("/", "_")
 
 
 def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequence[str], seeds: int) -> list[StudentKey]:
     """Return a student per type, placement, noise and seed; of those that feel nothing, one per seed.
-
-    Args:
-        types: Types by name; `all`: those that there are.
-        placements: Where they feel.
-        noises: Profiles of noise.
-        seeds: How many of each.
 
     Raises:
         StudentError: If there is no such type, something is named twice, two have one name, or nobody is taught.
@@ -160,16 +148,7 @@ def _touch_encoder(own: StudentNetworksSpec, felt: Felt, layout: Layout, size: i
 
 
 def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
-    """Return where the taxels of a group stand in images.
-
-    Args:
-        layout: The taxels.
-        size: Size of the group.
-        felt: What it is of, for errors.
-
-    Raises:
-        StudentError: If the taxels of a link are on no grid.
-    """
+    """Return where the taxels of a group stand in images; raise `StudentError` if the taxels of a link are on no grid."""
     try:
         images = image_indices(layout)
     except TgdslError as error:

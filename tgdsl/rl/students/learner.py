@@ -15,22 +15,75 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from tgdsl.errors import did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.policy import Policy
 from tgdsl.rl.playing.rollout import Actor, Moment
 from tgdsl.rl.students import losses
 from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
-from tgdsl.rl.students.rollout import Rollout, joined
-from tgdsl.rl.students.student import Architecture, Student, forgotten
-from tgdsl.rl.students.teacher import BoundTeacher
+from tgdsl.rl.students.spec import DistillSpec
+from tgdsl.rl.students.student import Architecture, Stack, Student, forgotten
 from tgdsl.rl.train.graphs import Captured, SideBySide
 from tgdsl.rl.train.iteration import Learning
+from tgdsl.rl.train.model import Normalisation
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
+
+LEAST_STD = 1e-3
+"""Least deviation of the teacher's actions by which an error is divided."""
+
+
+class Rollout:
+    """Students of one stack in the blocks of `rows` environments that begin with environment `first`.
+
+    Attributes:
+        seen: Groups of observations of each.
+        memory: What they remember now, (student, row, memory).
+        begun: What they remembered when the rollout began.
+        x: What they saw in it, (step, student, row, feature).
+        before: What they asked for in it, (step, student, row, joint).
+    """
+
+    def __init__(
+        self,
+        networks: Architecture,
+        keys: Sequence[StudentKey],
+        seen: Sequence[Sequence[str]],
+        first: int,
+        rows: int,
+        spec: DistillSpec,
+        device: torch.device,
+    ):
+        self.keys, self.seen, self.first, self.rows = keys, seen, first, rows
+        self.stack = Stack(networks, [key.seed for key in keys], spec.learning_rate, spec.max_grad_norm, device)
+        shape = (len(keys), rows)
+        self.memory, self.begun = (torch.zeros((*shape, self.stack.memory), device=device) for _ in range(2))
+        self.x = torch.zeros((spec.steps, *shape, networks.num_features), device=device)
+        self.before = torch.zeros((spec.steps, *shape, networks.actions), device=device)
+
+    @property
+    def envs(self) -> slice:
+        return slice(self.first, self.first + self.rows * len(self.keys))
+
+    def split(self, values: Tensor, dim: int = 0) -> Tensor:
+        """Return what is of each environment, (…, env, …), as (…, student, row, …)."""
+        own = values.narrow(dim, self.first, self.rows * len(self.keys))
+        return own.unflatten(dim, (len(self.keys), self.rows))
+
+    def inputs(self, obs: Mapping[str, Tensor]) -> Tensor:
+        """Return what each student sees: of its own environments its own groups, (student, row, feature)."""
+        blocks = [slice(self.first + i * self.rows, self.first + (i + 1) * self.rows) for i in range(len(self.keys))]
+        each = zip(blocks, self.seen, strict=True)
+        return torch.stack([torch.cat([obs[name][block] for name in names], dim=1) for block, names in each])
+
+
+def joined(values: Shaped[Tensor, "step student row feature"]) -> Shaped[Tensor, "student rows feature"]:
+    """Return the rows of all steps side by side."""
+    return values.transpose(0, 1).flatten(1, 2)
 
 
 class Distiller(Learning):
@@ -43,15 +96,8 @@ class Distiller(Learning):
 
     rates = "distill.learning_rate"
 
-    def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: BoundTeacher, keys: Sequence[StudentKey], seed: int):
+    def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: Policy, keys: Sequence[StudentKey], seed: int):
         """Make the students; torch's own random generators are seeded.
-
-        Args:
-            env: The environments; they divide by the number of students.
-            loaded: Their task's document.
-            teacher: The teacher.
-            keys: The students.
-            seed: What is random in their actions follows from.
 
         Raises:
             SpecError: If a group of observations or a privileged number that is named is not there.
@@ -59,7 +105,12 @@ class Distiller(Learning):
         """
         self._teacher, self._spec = teacher, loaded.spec.distill
         super().__init__(env, Ranks(), self._spec.steps)
-        self._targets = self._checked_targets(loaded)
+        self._targets = list(self._spec.decoders)
+        numbers = list(env.task.decoded(env.now)) if self._targets else []
+        for name in self._targets:
+            if name not in numbers:
+                problem = f'the task has no privileged number "{name}"'
+                raise loaded.error(("distill", "decoders", name), problem, did_you_mean(name, numbers, "numbers"))
         names = groups_of(loaded, env.groups)
         stacked: dict[Architecture, list[StudentKey]] = {}
         for key in keys:
@@ -102,19 +153,19 @@ class Distiller(Learning):
         return self._action
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget what is remembered of episodes that have ended."""
         for each in self.rollouts:
             each.memory.copy_(forgotten(each.memory, each.split(ended)))
         self._teacher.begin(ended)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what is learned, and what learning goes on from."""
-        return {"stacks": [rollout.stack.state_dict() for rollout in self.rollouts]}
+        actions = {} if self._teacher_actions is None else {"actions": self._teacher_actions.state_dict()}
+        return {"stacks": [rollout.stack.state_dict() for rollout in self.rollouts]} | actions
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved: see `Learning`."""
         for rollout, saved in zip(self.rollouts, state["stacks"], strict=True):
             rollout.stack.load_state_dict(saved)
+        if self._teacher_actions is not None and "actions" in state:
+            self._teacher_actions.load_state_dict(state["actions"])
         for captured in (self._chosen, self._answered, self._learned, self._looked):
             captured.forget()
 
@@ -142,7 +193,6 @@ class Distiller(Learning):
                 self._action.add_(torch.randn_like(self._action), alpha=self._spec.std)
 
     def _act(self, own: Rollout, x: Tensor) -> None:
-        """Have a stack act."""
         x.copy_(own.inputs(self._seen))
         action = own.stack(x, own.memory)
         own.memory.copy_(action.memory)
@@ -150,15 +200,16 @@ class Distiller(Learning):
 
     def _answer(self) -> None:
         """Have the students say what they would ask for now: an earlier rollout's a_0 bounds nothing any more."""
-        with torch.no_grad():
-            self._beside([partial(self._answer_by, rollout) for rollout in self.rollouts])
 
-    def _answer_by(self, own: Rollout) -> None:
-        memory = own.begun
-        for x, target, ended in zip(own.x, own.before, self._ended, strict=True):
-            action = own.stack(x, memory)
-            target.copy_(action.action)
-            memory = forgotten(action.memory, own.split(ended))
+        def answer(own: Rollout) -> None:
+            memory = own.begun
+            for x, before, ended in zip(own.x, own.before, self._ended, strict=True):
+                output = own.stack(x, memory)
+                before.copy_(output.action)
+                memory = forgotten(output.memory, own.split(ended))
+
+        with torch.no_grad():
+            self._beside([partial(answer, rollout) for rollout in self.rollouts])
 
     def _epoch(self) -> None:
         each = self._losses.split([len(rollout.keys) for rollout in self.rollouts])
@@ -183,21 +234,23 @@ class Distiller(Learning):
                     joined(own.split(values[part], 1)) for values in (self._labels, self._privileged, self._ended[..., None])
                 )
                 outputs = own.stack(x, memory if own.stack.memory else x[..., :0])
-                error = losses.behaviour(outputs.action, label, target, self._std, spec.clip) / len(parts)
+                error = losses.behaviour(
+                    outputs.action, label, target, self._std, spec.clip, is_huber=spec.loss == "huber"
+                ) / len(parts)
                 detached = detached + error.detach()
                 total = total + error
                 if self._targets:
-                    total = total + losses.decoded(outputs.told, targets, self._scales, self._weights) / len(parts)
+                    total = total + losses.decoded(outputs.decoded, targets, self._scales, self._weights) / len(parts)
                 memory = forgotten(outputs.memory, ended[..., 0]) if own.stack.memory else memory
             own.stack.descend(total)
         return detached, memory.detach()
 
     def _look(self) -> None:
-        self._beside([partial(self._look_by, rollout) for rollout in self.rollouts])
+        def look(own: Rollout) -> None:
+            for x in own.x:
+                own.stack.observe(x)
 
-    def _look_by(self, own: Rollout) -> None:
-        for x in own.x:
-            own.stack.look(x)
+        self._beside([partial(look, rollout) for rollout in self.rollouts])
 
     # The rest
 
@@ -214,6 +267,9 @@ class Distiller(Learning):
 
     def _update(self) -> None:
         self._losses.zero_()
+        if self._teacher_actions is not None and self._std is not None:
+            self._teacher_actions.update(self._labels.flatten(0, 1))
+            self._std.copy_(self._teacher_actions.std).clamp_(min=LEAST_STD)
         if self._spec.aggregate > 1:
             self._gathered.append([value.clone() for value in self._of_rollout()])
         for i in range(self._spec.epochs):
@@ -251,7 +307,10 @@ class Distiller(Learning):
         self._scales, self._weights = (
             torch.tensor([getattr(head, name) for head in heads], device=device) for name in ("scale", "weight")
         )
+        self._teacher_actions = Normalisation(actions).to(device) if spec.normalise else None
         self._std = self._teacher.std if spec.loss == "inverse_variance" else None
+        if spec.normalise:
+            self._std = torch.ones(actions, device=device)
         self._losses = torch.zeros(len(self.keys), device=device)
         self._scores = torch.zeros((2, num), dtype=torch.float64, device=device)
         has_tf32 = spec.precision == "tf32"
@@ -267,20 +326,6 @@ class Distiller(Learning):
     def _of_rollout(self) -> list[Tensor]:
         buffers = [value for each in self.rollouts for value in (each.x, each.before, each.begun)]
         return [*buffers, self._labels, self._privileged, self._ended]
-
-    def _checked_targets(self, loaded: LoadedTask) -> list[str]:
-        """Return the privileged numbers that decoders tell.
-
-        Raises:
-            SpecError: If the task has no such number.
-        """
-        named = list(self._spec.decoders)
-        numbers = list(self.env.task.decoded(self.env.now)) if named else []
-        for name in named:
-            if name not in numbers:
-                problem = f'the task has no privileged number "{name}"'
-                raise loaded.error(("distill", "decoders", name), problem, did_you_mean(name, numbers, "numbers"))
-        return named
 
 
 class ActingStudents(Actor):
@@ -301,7 +346,6 @@ class ActingStudents(Actor):
         return torch.cat(actions)
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget episodes that have ended."""
         self._memory = [
             forgotten(memory, stack.split(ended)) for memory, stack in zip(self._memory, self._rollouts, strict=True)
         ]

@@ -1,14 +1,15 @@
 """What students are taught by: errors of their actions, and of what their decoders tell; a loss per student.
 
-With a_s a student's action, a_t the teacher's, σ_t the standard deviation of the teacher's (1 for `mse`), a_0 what the student
-asked for in the rollout (in an earlier one that is kept: would ask for when the pass begins), and
-a_c = a_0 + clamp(a_s − a_0, ±clip):
+With a_s a student's action, a_t the teacher's, σ_t the standard deviation of the teacher's exploration (`inverse_variance`) or
+actions (`normalise`), else 1, a_0 what the student asked for in the rollout (in an earlier one that is kept: would ask for when
+the pass begins), a_c = a_0 + clamp(a_s − a_0, ±clip), and h(e) = e², or for `huber` e² up to |e| = 1 and 2|e| − 1 beyond:
 
-    behaviour    mean of (a_s − a_t)²/σ_t²;  with a clip, of max((a_s − a_t)², (a_c − a_t)²)/σ_t²
+    behaviour    mean of h((a_s − a_t)/σ_t);  with a clip, of max(h((a_s − a_t)/σ_t), h((a_c − a_t)/σ_t))
     decoder k    w_k · mean of (d_k − s_k y_k)²,  y_k being the privileged number
 
 Source: Chung et al., *Tactile Genesis*, appendix. It names the loss, "inv-var MSE", and a clip parameter of 0.1; the formulas
-are ours: σ_t² as the variance, and the clip as PPO bounds values.
+are ours: σ_t² as the variance, and the clip as PPO bounds values. Normalised actions and Huber's loss are of the authors'
+public code: see docs/paper.md; its bound of 1 is ours.
 
 Shapes: `student` students of a stack, `row` rows of each, `joint` joints, `target` privileged numbers.
 """
@@ -24,7 +25,13 @@ Told = Float[Tensor, "student row target"]
 
 
 def behaviour(
-    action: Actions, label: Actions, before: Actions, std: Float[Tensor, " joint"] | None = None, clip: float | None = None
+    action: Actions,
+    label: Actions,
+    before: Actions,
+    std: Float[Tensor, " joint"] | None = None,
+    clip: float | None = None,
+    *,
+    is_huber: bool = False,
 ) -> Float[Tensor, " student"]:
     """Return the error of actions.
 
@@ -34,14 +41,16 @@ def behaviour(
         before: a_0.
         std: σ_t; None: 1.
         clip: Bound of a_s − a_0; None: there is none.
+        is_huber: Whether h is Huber's loss.
     """
-    error = (action - label).square()
+    error = (action - label).abs()
     if clip is not None:
         bounded = before + (action - before).clamp(-clip, clip)
-        error = torch.maximum(error, (bounded - label).square())
+        error = torch.maximum(error, (bounded - label).abs())
     if std is not None:
-        error = error / std.square()
-    return error.mean(dim=(1, 2))
+        error = error / std
+    loss = torch.where(error <= 1.0, error.square(), 2.0 * error - 1.0) if is_huber else error.square()
+    return loss.mean(dim=(1, 2))
 
 
 def decoded(

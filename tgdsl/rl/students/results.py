@@ -22,30 +22,20 @@ from tgdsl.console.tables import text_table
 from tgdsl.files.write import atomic_write, with_folder
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.evaluation import Evaluation
+from tgdsl.rl.playing.onnx_policy import write_onnx_policy
+from tgdsl.rl.playing.policy import card_texts, write_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 from tgdsl.rl.students.keys import StudentKey
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.student import deployed
+from tgdsl.rl.students.student import acting, deployed
 from tgdsl.rl.students.teacher import own_task
-from tgdsl.rl.train.policies import card_of, write_module
 
 
 class Row(NamedTuple):
-    """Students that differ in their seeds alone.
+    """Students that differ in their seeds alone: what they feel, their mean score with its 95 % interval, `low` to `high`.
 
-    Attributes:
-        type: What they feel.
-        placement: Where.
-        resolution: How densely whoever feels in the same simulation does.
-        noise: With what noise.
-        seeds: How many they are.
-        score: Mean of the score.
-        low: Lower bound of its 95 % interval.
-        high: Upper bound.
-        held: Share of the episodes that lasted as long as one may.
-        episodes: How many there were.
-        samples: Control steps of each student.
-        minutes: How long they have learned, with all others of the simulation [min].
+    `held` is the share of the episodes that lasted as long as one may, `samples` are the control steps of each student,
+    `minutes` how long they have learned, with all others of the simulation [min].
     """
 
     type: str
@@ -65,27 +55,27 @@ class Row(NamedTuple):
 def rows_of(
     keys: Sequence[StudentKey], found: Sequence[Evaluation], resolution: str, samples: int, minutes: float
 ) -> list[Row]:
-    """Return the rows of students.
-
-    Args:
-        keys: The students.
-        found: How good each is.
-        resolution: How densely those who feel do.
-        samples: Control steps of each.
-        minutes: How long all have learned together [min].
-    """
+    """Return the rows of students."""
     kinds: dict[tuple[str, str, str], list[Evaluation]] = {}
     for key, evaluation in zip(keys, found, strict=True):
         kinds.setdefault(key.kind, []).append(evaluation)
-    rows = []
-    for (type_, placement, noise), evaluation in kinds.items():
-        low, high = interval(evaluation)
-        score, held = fmean(each.score for each in evaluation), fmean(each.held for each in evaluation)
-        episodes = sum(each.episodes for each in evaluation)
-        rows.append(
-            Row(type_, placement, resolution, noise, len(evaluation), score, low, high, held, episodes, samples, minutes)
+    return [
+        Row(
+            type=type_,
+            placement=placement,
+            resolution=resolution,
+            noise=noise,
+            seeds=len(evaluations),
+            score=fmean(each.score for each in evaluations),
+            low=interval(evaluations)[0],
+            high=interval(evaluations)[1],
+            held=fmean(each.held for each in evaluations),
+            episodes=sum(each.episodes for each in evaluations),
+            samples=samples,
+            minutes=minutes,
         )
-    return rows
+        for (type_, placement, noise), evaluations in kinds.items()
+    ]
 
 
 def interval(found: Sequence[Evaluation]) -> tuple[float, float]:
@@ -100,11 +90,7 @@ def interval(found: Sequence[Evaluation]) -> tuple[float, float]:
 
 
 def write_table(rows: Sequence[Row], file: Path) -> None:
-    """Write rows as CSV.
-
-    Raises:
-        FileError: If that cannot be written.
-    """
+    """Write rows as CSV; raise `FileError` if that cannot be written."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(Row._fields)
@@ -134,16 +120,6 @@ def write_students(
 ) -> None:
     """Write each student as a policy file, with its card, for `tgdsl play --policy` and `tgdsl evaluate`.
 
-    Args:
-        distiller: Who has taught.
-        loaded: The task's document.
-        origin: What the run was made from.
-        seconds: How long it took [s].
-        command: How to make the run again.
-        found: How good each student is; empty: that is not known.
-        folder: Where to.
-        progress: Called with a line of text for each long job.
-
     Raises:
         FileError: If one cannot be written.
     """
@@ -155,11 +131,12 @@ def write_students(
             alone[key.felt] = compile_sensed(own_task(loaded, key.felt), "cpu").touch
         touch, names = alone[key.felt], distiller.groups[key.name]
         sizes = {GROUP if key.felt and name == key.felt.group else name: distiller.env.groups[name] for name in names}
-        task_spec = own_task(loaded, key.felt).spec
-        chosen = {"touch": task_spec.touch, "placement": task_spec.placement, "noise": task_spec.noise}
-        run = dict(origin) | {"spec": task_spec.model_dump(mode="json"), "taxels": touch.taxels_id, "seed": key.seed}
-        run["overrides"] = dict(origin["overrides"]) | chosen
-        card = card_of(distiller, run, seconds, command, sizes)
+        spec = own_task(loaded, key.felt).spec.model_dump(mode="json")
+        run = dict(origin) | {"spec": spec, "taxels": touch.taxels_id, "seed": key.seed}
+        run["overrides"] = dict(origin["overrides"]) | {name: spec[name] for name in ("touch", "placement", "noise")}
+        card = distiller.card(run, seconds, command, sizes)
         card["samples"] = distiller.samples // len(distiller.keys)
         card |= {"teacher": origin["teacher"], "score": found[i].plain() if found else None}
-        write_module(lambda i=i: deployed(distiller.student(i)), touch, card, folder / f"{key.name}.pt")
+        network = acting(distiller.student(i))
+        write_policy(deployed(network), touch, card, folder / f"{key.name}.pt")
+        write_onnx_policy(network, card_texts(touch, card), folder / f"{key.name}.onnx")

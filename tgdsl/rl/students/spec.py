@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictInt, model_validator
+from pydantic import Field, StrictBool, StrictInt, model_validator
 
 from tgdsl.fields.models import NonNegative, Positive, Quantity, SpecModel
 from tgdsl.rl.train.spec import WIDTHS, EncoderSpec, Groups, TouchEncoderSpec, Widths
 
 Whole = Annotated[StrictInt, Field(ge=1)]
-Loss = Literal["mse", "inverse_variance"]
+Loss = Literal["mse", "inverse_variance", "huber"]
 Time = Annotated[float, Quantity("time", gt=0.0)]
 
 
@@ -90,7 +90,12 @@ class DistillSpec(SpecModel):
     max_grad_norm: Positive | None = 2.0
     """Norm to which the gradient of each student is scaled down; null: it is not."""
     loss: Loss = "mse"
-    """Mean of (a_s − a_t)², or of (a_s − a_t)²/σ_t², σ_t the standard deviation of the teacher's actions."""
+    """Mean of e², e = a_s − a_t; of e²/σ_t², σ_t the standard deviation with which the teacher explores; or of Huber's
+    loss, e² up to |e| = 1 and 2|e| − 1 beyond."""
+    normalise: StrictBool = False
+    """Whether e is divided by the standard deviation of the teacher's actions over all states seen so far, joint by joint."""
+    pushes: StrictBool = True
+    """Whether objects are pushed while students are taught, as `randomise.push` says."""
     clip: Positive | None = None
     """Bound of a student's change of an action within an update, as PPO bounds values: of the losses of a_s and of
     a_0 + clamp(a_s − a_0, ±clip) the larger one counts, a_0 being what it asked for in the rollout,
@@ -117,6 +122,9 @@ class DistillSpec(SpecModel):
                 f"final_learning_rate is {self.final_learning_rate:g}, expected at most learning_rate, {self.learning_rate:g}"
             )
             raise ValueError(problem)
+        if self.normalise and self.loss == "inverse_variance":
+            problem = "inverse_variance and normalise each divide errors by a deviation, expected one of them"
+            raise ValueError(f"{problem}; take loss mse or huber, or normalise: false")
         if len(set(self.groups or ())) < len(self.groups or ()):
             raise ValueError("groups names a group twice")
         return self

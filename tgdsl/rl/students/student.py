@@ -1,61 +1,51 @@
 """A student: groups of observations are normalised, each is embedded, and the embeddings are mapped to actions together.
 
-While it is taught, heads tell privileged numbers from the embeddings.
+While it is taught, heads tell privileged numbers from the embeddings. Students of one architecture are stacked: their weights
+are one tensor each, and they step together. A stack of N is N separate trainings: each student has its own weights,
+normalisation, gradient norm and moments of Adam, which are elementwise; nothing is added up over students. `torch.func.vmap`
+makes batched products of a student's own layers.
 
 Shapes: `env` environments, `feature` numbers of all groups, side by side, `memory` numbers that are remembered of an episode,
-`joint` joints that the policy moves, `target` privileged numbers.
+`joint` joints that the policy moves, `target` privileged numbers, `student` students of a stack, `row` rows of each.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
 
 from tgdsl.rl.students.encoders import Encoder, mlp, network
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """All that students of one stack have in common.
+    """All that students of one stack have in common."""
 
-    Attributes:
-        groups: Size of each group of observations, and the network that embeds it.
-        hidden: Widths of the hidden layers that follow the embeddings.
-        actions: Number of joints.
-        heads: Widths of the hidden layers of each decoder.
-        eps: What is added to the standard deviation by which an observation is divided.
-        clip: Bound of normalised observations.
-    """
-
-    groups: tuple[tuple[int, Encoder], ...]
-    hidden: tuple[int, ...]
-    actions: int
-    heads: tuple[tuple[int, ...], ...] = ()
-    eps: float = 1e-5
-    clip: float = 10.0
+    groups: tuple[tuple[int, Encoder], ...]  # size of each group of observations, and the network that embeds it
+    hidden: tuple[int, ...]  # widths of the hidden layers that follow the embeddings
+    actions: int  # number of joints
+    heads: tuple[tuple[int, ...], ...] = ()  # widths of the hidden layers of each decoder
+    eps: float = 1e-5  # what is added to the standard deviation by which an observation is divided
+    clip: float = 10.0  # bound of normalised observations
 
     @property
     def num_features(self) -> int:
-        """How many numbers a student takes."""
         return sum(size for size, _ in self.groups)
 
 
-class Made(NamedTuple):
-    """What a student makes of observations.
+class StudentOutput(NamedTuple):
+    """What a student makes of observations."""
 
-    Attributes:
-        action: Actions.
-        told: What the decoders tell.
-        memory: What it remembers.
-    """
-
-    action: Tensor
-    told: Tensor
-    memory: Tensor
+    action: Tensor  # actions
+    decoded: Tensor  # what the decoders tell
+    memory: Tensor  # what it remembers
 
 
 class Student(nn.Module):
@@ -77,11 +67,10 @@ class Student(nn.Module):
         self.trunk = mlp(latent, architecture.hidden, architecture.actions)
         self.decoders = nn.ModuleList([mlp(latent, hidden, 1) for hidden in architecture.heads])
 
-    def forward(self, x: Tensor, memory: Tensor) -> Made:
-        """Return actions and what else is made of observations."""
+    def forward(self, x: Tensor, memory: Tensor) -> StudentOutput:
         latent, memory = self.embed(x, memory)
         decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
-        return Made(self.trunk(latent), decoded, memory)
+        return StudentOutput(self.trunk(latent), decoded, memory)
 
     def act(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions and what is remembered, and nothing that is dropped at deployment."""
@@ -91,43 +80,41 @@ class Student(nn.Module):
     def embed(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the embeddings of all groups, side by side, and what is remembered."""
         architecture = self.architecture
-        mean, var = self.mean, self.var
-        normal = ((x - mean) / (var.sqrt() + architecture.eps)).clamp(-architecture.clip, architecture.clip)  # pyright: ignore
+        mean: Any = self.mean
+        scale: Any = self.var.sqrt() + architecture.eps  # pyright: ignore[reportCallIssue]
+        normal = ((x - mean) / scale).clamp(-architecture.clip, architecture.clip)
         parts = normal.split([size for size, _ in architecture.groups], dim=1)
         held = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
         embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, held, strict=True)]
         return torch.cat([each for each, _ in embeddings], dim=1), torch.cat([each for _, each in embeddings], dim=1)
 
 
-class Deployed(nn.Module):
-    """A student that acts: takes (env, feature) and returns (env, joint), as TorchScript."""
-
-    def __init__(self, student: Student):
-        super().__init__()
-        self.student = student
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return actions."""
-        return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
-
-
 class Acting(nn.Module):
-    """The networks of a student with memory, as a function."""
+    """The networks of a student as a function: of observations alone, (env, feature), if it remembers nothing."""
 
     def __init__(self, student: Student):
         super().__init__()
         self.student = student
+        self.input_names = ("obs", "memory") if student.memory else ("obs",)
+        self.output_names = ("actions", "next_memory") if student.memory else ("actions",)
 
-    def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions and what is remembered."""
+    def forward(self, x: Tensor, memory: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
+        """Return actions, and what is remembered."""
+        if memory is None:
+            return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
         return self.student.act(x, memory)
+
+    def get_dummy_inputs(self) -> tuple[Tensor, ...]:
+        """Return an example of what it takes."""
+        sizes = (self.student.architecture.num_features, self.student.memory)
+        return tuple(torch.zeros((2, size)) for size in sizes[: len(self.input_names)])
 
 
 RECURRENT = """
 def forward(self, x: Tensor) -> Tensor:
     if self.memory.shape[0] != x.shape[0]:
         self.memory = x.new_zeros((x.shape[0], self.size))
-    action, memory = self.acting(x, self.memory)
+    action, memory = self.student(x, self.memory)
     self.memory = memory
     return action
 
@@ -135,29 +122,31 @@ def begin(self, ended: Tensor) -> None:
     if self.memory.shape[0] == ended.shape[0]:
         self.memory = self.memory.masked_fill(ended.to(self.memory.device).unsqueeze(1), 0.0)
 """
-"""TorchScript of what remembers its episodes; `begin` has it forget those that have ended, (env,)."""
+"""TorchScript of a student that remembers its episodes; `begin` has it forget those that have ended, (env,)."""
 
 
-class Remembering(nn.Module):
-    """The networks of a student with memory as TorchScript, and what it remembers."""
+class Deployed(nn.Module):
+    """A traced student, and what it remembers of each environment's episode."""
 
-    def __init__(self, acting: torch.jit.ScriptModule, size: int):
+    def __init__(self, student: torch.jit.ScriptModule, size: int):
         super().__init__()
-        self.acting, self.size, self.memory = acting, size, torch.zeros((0, size))
+        self.student, self.size, self.memory = student, size, torch.zeros((0, size))
 
 
-def deployed(student: Student) -> torch.jit.ScriptModule:
-    """Return a student as TorchScript, on the CPU."""
-    student_copy = (
-        copy.deepcopy(student).cpu().eval().requires_grad_(False)
-    )  # what remembers would keep a graph of all its steps
+def acting(student: Student) -> Acting:
+    """Return a copy of a student on the CPU, without decoders; nor gradients, as memory would keep the graph of all steps."""
+    student_copy = copy.deepcopy(student).cpu().eval().requires_grad_(False)
     student_copy.decoders = nn.ModuleList()
-    x, memory = torch.zeros((2, student_copy.architecture.num_features)), torch.zeros((2, student_copy.memory))
+    return Acting(student_copy)
+
+
+def deployed(network: Acting) -> torch.jit.ScriptModule:
+    """Return a student as TorchScript, on the CPU."""
     with torch.no_grad():
-        if student_copy.memory == 0:
-            return torch.jit.trace(Deployed(student_copy), (x,))  # pyright: ignore[reportReturnType]
-        acting: torch.jit.ScriptModule = torch.jit.trace(Acting(student_copy), (x, memory))  # pyright: ignore[reportAssignmentType]
-        script: Any = torch.jit.script(Remembering(acting, student_copy.memory))
+        traced: torch.jit.ScriptModule = torch.jit.trace(network, network.get_dummy_inputs())  # pyright: ignore[reportAssignmentType]
+        if network.student.memory == 0:
+            return traced
+        script: Any = torch.jit.script(Deployed(traced, network.student.memory))
         script.define(RECURRENT)
         return script
 
@@ -165,3 +154,137 @@ def deployed(student: Student) -> torch.jit.ScriptModule:
 def forgotten(memory: Tensor, ended: Tensor) -> Tensor:
     """Return what is remembered, zeros where an episode has ended."""
     return torch.where(ended[..., None], 0.0, memory)
+
+
+NORM_EPS = 1e-6
+"""What `torch.nn.utils.clip_grad_norm_` adds to a norm."""
+
+
+class Stack:
+    """Students of one architecture.
+
+    Attributes:
+        memory: How many numbers each remembers of an episode.
+        parameters: Their weights by name, (student, …).
+        buffers: Means and variances by which they normalise what they see, in the same way: copies of `moments`.
+        moments: Means and variances of what they have seen, (student, feature), in float64: after many rows a change is lost in
+            float32.
+        seen: How many rows each has seen.
+    """
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        seeds: Sequence[int],
+        learning_rate: float,
+        max_grad_norm: float | None,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ):
+        self.architecture, self.size = architecture, len(seeds)
+        self._max_norm, self._rate = max_grad_norm, learning_rate
+        if torch.device(device).type == "cuda":
+            self._rate = torch.tensor(learning_rate, dtype=torch.float32, device=device)  # which a CUDA graph reads
+        students = [seeded_student(architecture, seed).to(device, dtype) for seed in seeds]
+        self.memory = students[0].memory
+        self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
+        self.moments = {name: self.buffers[name].to(torch.float64, copy=True) for name in ("mean", "var")}
+        self.seen = torch.zeros((), dtype=torch.float64, device=device)
+        self._shape = copy.deepcopy(students[0]).to("meta")
+        self.optimiser = torch.optim.Adam(list(self.parameters.values()), **self._options())
+        self._called: Any = vmap(self._call)
+
+    def __call__(self, x: Float[Tensor, "student row feature"], memory: Float[Tensor, "student row memory"]) -> StudentOutput:
+        """Return what each student makes of its own rows: (student, row, …)."""
+        return StudentOutput(*self._called(self.parameters, self.buffers, x, memory))
+
+    def descend(self, losses: Float[Tensor, " student"]) -> None:
+        """Take one step of Adam, each student by its own loss."""
+        weights = list(self.parameters.values())
+        gradients = torch.autograd.grad(losses.sum(), weights)
+        with torch.no_grad():
+            if self._max_norm is not None:
+                squares = torch.stack([gradient.flatten(1).square().sum(dim=1) for gradient in gradients])
+                factor = (self._max_norm / (squares.sum(dim=0).sqrt() + NORM_EPS)).clamp(max=1.0)
+                gradients = [gradient * factor.view(-1, *(1,) * (gradient.ndim - 1)) for gradient in gradients]
+            for weight, gradient in zip(weights, gradients, strict=True):
+                weight.grad = torch.empty_like(weight).copy_(gradient)  # Adam's fused kernel takes no others' strides
+        self.optimiser.step()
+
+    def set_rate(self, learning_rate: float) -> None:
+        """Set Adam's learning rate, from the next step on, also of those that a CUDA graph holds."""
+        if isinstance(self._rate, Tensor):
+            self._rate.fill_(learning_rate)
+        else:
+            self._rate = learning_rate
+            self._rated()
+
+    @torch.no_grad()
+    def observe(self, x: Float[Tensor, "student row feature"]) -> None:
+        """Take rows into account in each student's mean and variance, in place."""
+        num = x.shape[1]
+        rate = num / (self.seen + num)
+        var, mean = torch.var_mean(x.double(), dim=1, correction=0)
+        own_mean, own_var = self.moments["mean"], self.moments["var"]
+        delta = mean - own_mean
+        own_mean += rate * delta
+        own_var += rate * (var - own_var + delta * (mean - own_mean))
+        self.seen += num
+        self._normalise()
+
+    def student(self, index: int) -> Student:
+        """Return a copy of one student, on the CPU."""
+        student = Student(self.architecture)
+        state = {name: value[index].detach().cpu() for name, value in (self.parameters | self.buffers).items()}
+        student.load_state_dict({name: state[name] for name in student.state_dict()})
+        return student
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that teaching goes on from: live tensors."""
+        networks = {name: value.detach() for name, value in self.parameters.items()}
+        return {"networks": networks, "seen": self.moments | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what was saved, with the learning rate that the stack has.
+
+        Raises:
+            RuntimeError: If it is of other networks.
+        """
+        own = self.state_dict()
+        for part in ("networks", "seen"):
+            if own[part].keys() != state[part].keys():
+                raise RuntimeError(f"its {part} are {', '.join(state[part])}")
+            for name, value in own[part].items():
+                found = state[part][name]
+                if found.shape != value.shape:
+                    raise RuntimeError(f"{name} is {tuple(found.shape)}, not {tuple(value.shape)}")
+        with torch.no_grad():
+            for part in ("networks", "seen"):
+                for name, value in own[part].items():
+                    value.copy_(state[part][name])
+            self._normalise()
+        optimiser = state["optimiser"]  # saved on another device perhaps, and at another rate; the options place its `step`
+        groups = [group | self._options() for group in optimiser["param_groups"]]
+        self.optimiser.load_state_dict({"state": optimiser["state"], "param_groups": groups})
+        self._rated()  # it has copied it
+
+    def _rated(self) -> None:
+        for group in self.optimiser.param_groups:
+            group["lr"] = self._rate
+
+    def _normalise(self) -> None:
+        for name, value in self.moments.items():
+            self.buffers[name].copy_(value)
+
+    def _options(self) -> dict[str, Any]:
+        return {"lr": self._rate, "capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
+
+    def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
+        return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))
+
+
+def seeded_student(architecture: Architecture, seed: int) -> Student:
+    """Return a student whose first weights follow from a seed alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Student(architecture)

@@ -11,20 +11,14 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.policy import OF_TOUCH, Policy, PolicyError, changes_since, check_card, check_learned, read_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
+from tgdsl.rl.spec import PushSpec
 
 WARM_CALLS = 3
 """Calls in which TorchScript optimises a policy, before one is captured on a GPU."""
 
 
 class Teacher:
-    """A learned policy, seen to be of this task.
-
-    Attributes:
-        saved: Its file.
-        card: Its card.
-        felt: What it feels; None: nothing.
-        changes: What else of the task was otherwise when it was learned, a line each.
-    """
+    """A learned policy, seen to be of this task: its file, its card, and what it feels; None: nothing."""
 
     def __init__(self, file: Path, loaded: LoadedTask):
         """Read it, and see that it is for this task and these actions.
@@ -51,51 +45,43 @@ class Teacher:
         self.changes = changes_since(card, loaded.spec, OF_TOUCH)
 
     def check_taxels(self) -> None:
-        """See that a teacher that feels does so with the taxels that there are now.
-
-        Raises:
-            PolicyError: If they are others.
-        """
+        """See that a teacher that feels does so with the taxels that there are now; raise `PolicyError` if they are others."""
         if self.felt is not None:
             touch = compile_sensed(own_task(self._loaded, self.felt), "cpu").touch
             check_card(self.saved, self.card["joints"], touch)
 
-    def bound(self, env: TouchEnv) -> BoundTeacher:
-        """Return it for some environments; raise `PolicyError` if joints or groups of observations are others."""
-        return BoundTeacher(self, env)
-
-
-class BoundTeacher(Policy):
-    """A teacher in some environments.
-
-    Attributes:
-        std: Standard deviation of its actions; None if it does not tell.
-    """
-
-    def __init__(self, teacher: Teacher, env: TouchEnv):
-        """See that it fits.
+    def bound(self, env: TouchEnv) -> Policy:
+        """Return the policy for some environments.
 
         Raises:
             PolicyError: If joints or groups of observations are others.
         """
-        card, file = teacher.card, teacher.saved.file
+        card, file = self.card, self.saved.file
         if list(env.joint_names) != list(card["joints"]):
             moved = (", ".join(names) for names in (card["joints"], env.joint_names))
             raise PolicyError("{}: this teacher moves {}, not {}".format(file, *moved))
         groups = {}
         for name, size in card["groups"].items():
-            group = teacher.felt.group if name == GROUP and teacher.felt else name
+            group = self.felt.group if name == GROUP and self.felt else name
             if env.groups.get(group) != size:
                 there = f"has {env.groups[group]} numbers, not {size}: probes or objects are others"
                 problem = there if group in env.groups else "is not there"
                 raise PolicyError(f'{file}: this teacher sees the group "{name}", which {problem}')
             groups[group] = size
-        super().__init__(teacher.saved, groups, env.num_envs, env.num_actions, env.device)
-        self.std = torch.tensor(card["std"], dtype=torch.float32, device=env.device) if card.get("std") else None
+        policy = Policy(self.saved, groups, env.num_envs, env.num_actions, env.device)
         zeros = {name: torch.zeros((env.num_envs, size), device=env.device) for name, size in groups.items()}
         for _ in range(WARM_CALLS):
-            self(zeros)
-        self.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+            policy(zeros)
+        policy.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+        return policy
+
+
+def students_task(loaded: LoadedTask) -> LoadedTask:
+    """Return the task in which students are taught: without pushes if its document says so."""
+    if loaded.spec.distill.pushes:
+        return loaded
+    randomise = loaded.spec.randomise.model_copy(update={"push": PushSpec()})
+    return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update={"randomise": randomise}))
 
 
 def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:

@@ -39,6 +39,7 @@ ends the episode, since what is crushed stays so.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -49,11 +50,11 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, RangeOf
-from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.draws import whole
+from tgdsl.rl.features import Features
 from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.task import HandNow, Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.placing import object_qpos
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -145,7 +146,6 @@ class GripForce(Task[GripForceSpec]):
 
     @classmethod
     def observe_hand(cls, spec: GripForceSpec, now: HandNow) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the command."""
         return {"goal": now.goal}
 
     def __init__(self, spec: GripForceSpec, setup: Setup):
@@ -156,7 +156,7 @@ class GripForce(Task[GripForceSpec]):
         """
         super().__init__(spec, setup)
         self.qpos, self.ctrl = (_keyframes(spec, setup, name)[setup.variant] for name in ("qpos", "ctrl"))
-        self.item, actuators = object_qpos(setup), setup.actuators
+        self.item, actuators = setup.free_qpos(), setup.actuators
         self.moved = torch.from_numpy(actuators.actuator).to(setup.device, torch.int64)
         held = self.qpos[:, torch.from_numpy(actuators.qpos).to(setup.device, torch.int64)]
         self.held, self.lag = held, self.ctrl[:, self.moved] - held
@@ -212,8 +212,22 @@ class GripForce(Task[GripForceSpec]):
             "priv_obj_props": groups.object_props(now),
         }
 
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "goal": [Features("force to press with", 1, "N")],
+            "priv_force": [
+                Features("sum of normal forces", 1, "N"),
+                *(Features("normal force", 1, "N", "", link) for link in self.setup.links),
+            ],
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
+        }
+
     def score(self) -> Float[Tensor, " env"]:
-        """Return the root of the mean squared relative error of settled forces; 1 where none has been seen."""
         mean = self.squares / self.samples.clamp(min=1.0)
         return torch.where(self.samples > 0, mean.sqrt(), 1.0)
 
@@ -228,11 +242,7 @@ class GripForce(Task[GripForceSpec]):
 
 
 def _keyframes(spec: GripForceSpec, setup: Setup, field: str) -> Float[Tensor, "variant number"]:
-    """Return `qpos` or `ctrl` of the starts.
-
-    Raises:
-        LowerError: If there is no such keyframe, or not one for each variant.
-    """
+    """Return `qpos` or `ctrl` of the starts."""
     if len(spec.starts) != setup.num_variants:
         problem = f"{len(spec.starts)} starts, and the object has {setup.num_variants} variants"
         raise LowerError(problem, "starts", "expected a keyframe for each")

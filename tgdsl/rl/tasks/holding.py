@@ -9,8 +9,11 @@ Shapes: `env` environments.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
+import mujoco
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from pydantic import Field, StrictInt
@@ -18,8 +21,8 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Quantity, SpecModel
-from tgdsl.rl.links import are_fingers
 from tgdsl.rl.task import Now, Setup
+from tgdsl.runtime.simulators.model_ids import element_id
 
 
 class HoldSpec(SpecModel):
@@ -45,7 +48,6 @@ class Holding:
         self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(setup.device)
 
     def is_held(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where the object is held."""
         is_loaded = vector_norm(now.link_force, dim=2) >= self.spec.load
         return (is_loaded.sum(dim=1) >= self.spec.links) & (is_loaded & self._fingers).any(dim=1)
 
@@ -53,3 +55,22 @@ class Holding:
         """Return what progress pays: 1 where the object is held, else c."""
         held = self.is_held(now).to(now.joint_pos.dtype)
         return held + (1.0 - held) * self.spec.coasting_pay
+
+
+def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray, " link"]:
+    """Return which links are fingers: a hinge moves them, or a slide that does not move all links, as that of a whole hand."""
+    joints = [_joints_above(model, element_id(model, "body", link)) for link in links]
+    of_all = set.intersection(*joints) if joints else set()
+    slides = {joint for joint in of_all if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    return np.array([bool(joint_ids - slides) for joint_ids in joints], dtype=bool)
+
+
+def _joints_above(model: mujoco.MjModel, body: int) -> set[int]:
+    """Return the hinges and slides that move a body."""
+    result: set[int] = set()
+    while body:
+        first = int(model.body_jntadr[body])
+        result |= set(range(first, first + int(model.body_jntnum[body])))
+        body = int(model.body_parentid[body])
+    kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    return {joint for joint in result if int(model.jnt_type[joint]) in kinds}

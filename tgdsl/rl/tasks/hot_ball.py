@@ -26,6 +26,7 @@ refused.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -36,10 +37,10 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf, Temperature
-from tgdsl.rl import groups, terms
+from tgdsl.rl import features, groups, terms
+from tgdsl.rl.features import Features
 from tgdsl.rl.spec import RandomSpec, TaskSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.placing import free_qpos, object_qpos
 
 
 class HotBallRandomSpec(RandomSpec):
@@ -119,11 +120,7 @@ class HotBall(Task[HotBallSpec]):
     work = terms.Work.of_task(-5e-3)
 
     def __init__(self, spec: HotBallSpec, setup: Setup):
-        """Look up the balls, and the cells of each link.
-
-        Raises:
-            LowerError: If another ball is no body that moves freely.
-        """
+        """Look up the balls, and the cells of each link; raise `LowerError` if another ball is no body that moves freely."""
         super().__init__(spec, setup)
         self.places = _places(spec, setup).to(setup.device)
         self.heat, table = setup.rows["temperature_grid"]
@@ -168,21 +165,35 @@ class HotBall(Task[HotBallSpec]):
             "priv_obj_props": groups.object_props(now),
         }
 
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "priv_heat": [
+                *(
+                    Features("progress", 1, "1", "", link)
+                    for link in dict.fromkeys(self.setup.rows["temperature_grid"][1]["link"])
+                ),
+                Features("whether the latch is on", 1),
+                Features("whether the hot ball is touched", 1),
+            ],
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
+        }
+
     def score(self) -> Float[Tensor, " env"]:
         """Return for how long a fingertip was on the hot ball with the latch on [s]."""
         return self.held
 
 
 def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:
-    """Return where each ball's position and quaternion stand in `qpos`, the hot one's first.
-
-    Raises:
-        LowerError: If another ball is no body that moves freely, or is named twice.
-    """
-    rows = [object_qpos(setup)]
+    """Return where each ball's position and quaternion stand in `qpos`, the hot one's first."""
+    rows = [setup.free_qpos()]
     for name in spec.others:
         try:
-            rows.append(free_qpos(setup.model, name))
+            rows.append(setup.free_qpos(name))
         except SimulationError as error:
             raise LowerError(str(error), "others") from error
     if len({row.start for row in rows}) < len(rows):
@@ -191,7 +202,6 @@ def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:
 
 
 def _cells(links: np.ndarray) -> Int[Tensor, "link cell"]:
-    """Return the rows of each link's cells; a link with fewer than others has its first one again."""
     rows = [np.flatnonzero(links == name) for name in dict.fromkeys(links.tolist())]
     most = max(len(links) for links in rows)
     return torch.from_numpy(np.array([np.concatenate([links, np.repeat(links[:1], most - len(links))]) for links in rows]))

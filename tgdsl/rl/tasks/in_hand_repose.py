@@ -9,19 +9,21 @@ position now and at the start,
     φ   = angle(g_k q⁻¹)                                                   angle to the goal, from 0 to π [rad]
     k ← k + 1  where φ < ε for `goal_hold` control steps in a row          goal reached
 
-a_k is uniform on the sphere (`goal_axis: any`), or the vertical, up or down (`vertical`). Boxes and cylinders look alike from
-several sides; a goal is one orientation all the same. The default is the vertical, as the hand reaches little else: a planner
-that knows the physics (`benchmarks/reachable_goals.py`, the XHand1, few episodes) reaches 0, 6 and 17 goals in a row about it,
-and 0 to 5 about any axis.
+a_k is uniform on the sphere (`goal_axis: any`), or the vertical, up or down (`vertical`). With `goal_axis: xy` a goal is turned
+from the one before about the world's x and then about its y, each by an angle that is uniform within ± α. Boxes and cylinders
+look alike from several sides; a goal is one orientation all the same. The default is the vertical, as the hand reaches little
+else: a planner that knows the physics (`benchmarks/reachable_goals.py`, the XHand1, few episodes) reaches 0, 6 and 17 goals in
+a row about it, and 0 to 5 about any axis.
 
-Groups: `goal` holds six numbers of the goal's orientation in the world and φ [rad]; `priv_obj_state` and `priv_obj_props` as in
-`groups`.
+Groups: `goal` holds six numbers of the goal's orientation in the world and φ [rad], or what else the document's `goal` lists;
+`priv_obj_state` and `priv_obj_props` as in `groups`.
 
 Weights of the reward's terms are the paper's. φ and φ' are angles at the end and at the begin of the control step, both to the
 goal that it was made for.
 
-An episode ends for good where the object is further than `drop_distance` from p_0, or where a goal is not reached within
-`goal_timeout`: what has failed is not worth what would have come. Score: goals in a row, k.
+An episode ends for good where the object is further than `drop_distance` from p_0, or below it, or where a goal is not reached
+within `goal_timeout`, of which a range is drawn for each goal: what has failed is not worth what would have come. Score: goals
+in a row, k.
 
 Nothing pays for turning the wrong way: a turn away makes both tracking terms smaller, and costs in `progress` what the way back
 pays at most, as a loss is not clipped. Nor does waiting beside a goal: at φ = ε tracking pays 13.8 until the timeout, which
@@ -35,20 +37,23 @@ speaks of penalties of grip and slip, which its table does not have, and which a
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import model_validator
 from torch import Tensor
-from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Angle, PositiveLength, Quantity, with_defaults
-from tgdsl.rl import groups, rotations, terms
-from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Time, Whole
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, Range, RangeOf, with_defaults
+from tgdsl.rl import features, groups, rotations, terms
+from tgdsl.rl.draws import within
+from tgdsl.rl.features import Features
+from tgdsl.rl.spec import Whole
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.placing import placed
+from tgdsl.rl.tasks.paying import PaidRateSpec
+from tgdsl.rl.tasks.placing import PlacedTaskSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -61,36 +66,31 @@ class Distill(with_defaults(DistillSpec, max_grad_norm=None)):
     """How students are taught; the paper's numbers for this task."""
 
 
-class InHandReposeSpec(TaskSpec):
+class InHandReposeSpec(PlacedTaskSpec, PaidRateSpec):
     """Turn an object in the hand to one orientation after another."""
 
     train: Train = Train()
     """How a policy is learned: `tgdsl train`."""
     distill: Distill = Distill()
     """How students are taught by a policy that is there: `tgdsl distill`."""
-
-    randomise: PlacedRandomSpec = PlacedRandomSpec()
-    """What is random."""
     goal_step: Angle = 0.4
     """α: how far a goal is from the one before [rad]."""
-    goal_axis: Literal["any", "vertical"] = "vertical"
-    """About what a goal is turned: any axis, or the vertical, either way."""
+    goal_axis: Literal["any", "vertical", "xy"] = "vertical"
+    """About what a goal is turned: any axis; the vertical, either way; or the world's x and then its y, each by up to ± α."""
     goal_tolerance: Angle = 0.1
     """ε: a goal is reached this close to it [rad]."""
     goal_hold: Whole = 4
     """How many control steps in a row the object is that close before the goal counts."""
-    goal_timeout: Time = 5.0
-    """An episode ends where a goal is not reached within this [s]."""
+    goal_timeout: Annotated[Range, RangeOf("time", gt=0.0)] = (5.0, 5.0)
+    """An episode ends where a goal is not reached within this, drawn for each goal [s]."""
     track_width: Angle = 0.2
     """σ, width of `track_gaussian` [rad]."""
     track_half: Angle = 0.1
     """φ_0, angle at which `track_inverse` is half of its most [rad]."""
-    max_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
-    """ω_max: what is faster pays no more [rad/s]."""
     near_width: PositiveLength = 0.02
     """λ, decay length of `near` [m]."""
     drop_distance: PositiveLength = 0.08
-    """Further from where it started, the object is lost [m]."""
+    """Further from where it started, or below, the object is lost [m]."""
     max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
     """f_max: less force on a link costs nothing [N]."""
 
@@ -100,9 +100,9 @@ class InHandReposeSpec(TaskSpec):
         if not self.goal_tolerance < self.goal_step <= math.pi:
             expected = f"more than goal_tolerance, {self.goal_tolerance:g} rad, and at most a half turn"
             raise ValueError(f"goal_step is {self.goal_step:g} rad, expected {expected}")
-        if self.goal_hold * control_step > self.goal_timeout:
+        if self.goal_hold * control_step > self.goal_timeout[0]:
             problem = f"goal_hold, {self.goal_hold} control steps of {control_step:g} s, takes longer than goal_timeout"
-            raise ValueError(f"{problem}, {self.goal_timeout:g} s: no goal could be reached in time")
+            raise ValueError(f"{problem}, {self.goal_timeout[0]:g} s: no goal could be reached in time")
         return self
 
 
@@ -111,7 +111,7 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     Spec = InHandReposeSpec
     senses = ("link_contact", "surface_distance")
-    constants = ("goal_step", "goal_timeout")
+    constants = ("goal_step",)
     score_unit = "goals in a row"
 
     @reward_term(500.0, "1/s")
@@ -132,7 +132,7 @@ class InHandRepose(Task[InHandReposeSpec]):
     @reward_term(0.2, "1/rad")
     def progress(self, now: Now) -> Float[Tensor, " env"]:
         """Rate at which the angle to the goal gets smaller, min((φ' − φ)/Δt, ω_max)."""
-        return self.rate
+        return self.spec.paid(self.rate)
 
     near = terms.Near.of_task(0.5, width="near_width")
     contact_force = terms.ContactForce.of_task(-5.0, max_force="max_force")
@@ -140,7 +140,7 @@ class InHandRepose(Task[InHandReposeSpec]):
     @reward_term(-100.0, "1/s")
     def drop(self, now: Now) -> Bool[Tensor, " env"]:
         """Object dropped in this step."""
-        return vector_norm(now.object.pos - self.start_pos, dim=1) > self.spec.drop_distance
+        return self.spec.dropped_by(now.object.pos - self.start_pos) > self.spec.drop_distance
 
     @reward_term(-200.0, "1/s")
     def goal_timeout(self, now: Now) -> Bool[Tensor, " env"]:
@@ -153,9 +153,9 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def __init__(self, spec: InHandReposeSpec, setup: Setup):
         super().__init__(spec, setup)
+        self.item = setup.free_qpos()
         self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.step = torch.full((setup.num_envs,), spec.goal_step, dtype=setup.dtype, device=setup.device)
-        self.most_steps = round(spec.goal_timeout / setup.control_step)
         self.start_pos, self.goal = self.keep("start_pos", 3), self.keep("goal", 4)
         self.error, self.rate = self.keep("error"), self.keep("rate")  # φ of the last step's goal, and how fast it got smaller
         self.left = self.keep("left")  # φ of the present goal
@@ -165,14 +165,14 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random, and give each a first goal."""
-        qpos, pos, quat = placed(self.setup, self.spec.randomise, chosen, episode)
+        pos, quat = self.setup.start[:, self.item].split([3, 4], dim=1)
         for buffer in (self.reached, self.held, self.waited, self.is_reached, self.is_late):
             buffer.masked_fill_(chosen, 0)
         self.begin(chosen, start_pos=pos, episode=episode)
         goal = self._goal_after(quat)
         left = rotations.between(goal, quat)
         self.begin(chosen, goal=goal, left=left, error=left, rate=0.0)
-        return Start({"qpos": qpos})
+        return Start({"qpos": self.setup.start})
 
     def advance(self, now: Now) -> None:
         """Measure how far the goal is, and give another one where it was reached."""
@@ -183,7 +183,7 @@ class InHandRepose(Task[InHandReposeSpec]):
         self.held.copy_(torch.where(error < spec.goal_tolerance, self.held + 1, 0))
         self.waited += 1
         self.is_reached.copy_(self.held >= spec.goal_hold)
-        self.is_late.copy_((self.waited >= self.most_steps) & ~self.is_reached)
+        self.is_late.copy_((self.waited >= self._most_steps()) & ~self.is_reached)
         self.reached += self.is_reached
         for count in (self.held, self.waited):
             count.masked_fill_(self.is_reached, 0)
@@ -198,11 +198,21 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
-        error = rotations.between(self.goal, now.object.quat)
         return {
-            "goal": torch.cat([rotations.six_numbers(self.goal), error[:, None]], dim=1),
+            "goal": groups.goal(self.spec.goal, self.goal, now.object.quat),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),
+        }
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "goal": features.goal(self.spec.goal, self.setup.object),
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
         }
 
     def step_progress(self) -> Float[Tensor, " env"]:
@@ -215,12 +225,28 @@ class InHandRepose(Task[InHandReposeSpec]):
 
     def _goal_after(self, quat: Float[Tensor, "env 4"]) -> Float[Tensor, "env 4"]:
         """Return orientations turned by a goal's step: those of goal `reached`."""
-        count = (self.episode << 32) | self.reached
-        if self.spec.goal_axis == "vertical":
-            side = self.setup.draws.integers("goal side", count, 1, 0, 1).to(quat.dtype)
-            axis = (2.0 * side - 1.0) * self.up
+        draws, count = self.setup.draws, self._goal_count()
+        if self.spec.goal_axis == "xy":
+            angles = draws.uniform("goal angles", count, 2, -self.spec.goal_step, self.spec.goal_step).to(quat.dtype)
+            x, y, _ = torch.eye(3, dtype=quat.dtype, device=quat.device)
+            turns = [rotations.about(axis.expand(len(quat), 3), angle) for axis, angle in zip((x, y), angles.T, strict=True)]
+        elif self.spec.goal_axis == "vertical":
+            side = draws.integers("goal side", count, 1, 0, 1).to(quat.dtype)
+            turns = [rotations.about((2.0 * side - 1.0) * self.up, self.step)]
         else:
-            axis = self.setup.draws.normal("goal axis", count, 3).to(quat.dtype)
-            axis = axis / axis.norm(dim=1, keepdim=True)
-        turned = rotations.product(rotations.about(axis, self.step), quat)
-        return turned / turned.norm(dim=1, keepdim=True)
+            axis = draws.normal("goal axis", count, 3).to(quat.dtype)
+            turns = [rotations.about(axis / axis.norm(dim=1, keepdim=True), self.step)]
+        for turn in turns:
+            quat = rotations.product(turn, quat)
+        return quat / quat.norm(dim=1, keepdim=True)
+
+    def _goal_count(self) -> Int[Tensor, " env"]:
+        return (self.episode << 32) | self.reached
+
+    def _most_steps(self) -> Int[Tensor, " env"] | int:
+        """Return how many control steps there are for each goal."""
+        low, high = self.spec.goal_timeout
+        if low == high:
+            return round(low / self.setup.control_step)
+        share = self.setup.draws.shares({"goal timeout": 1}, self._goal_count())["goal timeout"][:, 0]
+        return (within(share, low, high) / self.setup.control_step).round().to(torch.int64)

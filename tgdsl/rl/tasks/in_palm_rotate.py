@@ -9,13 +9,16 @@ and n up for `direction: counterclockwise`, down for `clockwise`, as seen from a
     g   = (k + 1) π/2                                           goal; k goals were reached, k ← k + 1 where g − ψ < ε, θ < θ_max
 
 Groups: `goal` holds six numbers of the goal's orientation, rot_n(g) q_0, and the angle from there to q [rad], by which whoever
-sees it knows the object's exact angle; `priv_obj_state` and `priv_obj_props` as in `groups`.
+sees it knows the object's exact angle, or what else the document's `goal` lists; `priv_obj_state` and `priv_obj_props` as in
+`groups`.
 
 Weights of the reward's terms are the paper's. Progress pays c, 1 where the object is held, else `hold.coasting_pay`: see
 `holding`. s is the share of Σ max(0, Δψ) since the goal
 before that was paid, Σ c max(0, Δψ) over it. By default c = s = 1: whether an object is held or coasts makes no difference.
 
-An episode ends for good where the object is further than `drop_distance` from p_0. Score: quarter turns, k.
+`spin` pays a bounded rate, see `paying`, and up to a tilt of `spin_tilt` alone.
+
+An episode ends for good where the object is further than `drop_distance` from p_0, or below it. Score: quarter turns, k.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
 formulas, Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours, and so are `effort`, `object_speed`, c
@@ -26,6 +29,7 @@ that coasts; goals that were reached stay reached.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -34,12 +38,13 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Angle, PositiveLength, Quantity
-from tgdsl.rl import groups, rotations, terms
-from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
+from tgdsl.rl import features, groups, rotations, terms
+from tgdsl.rl.features import Features
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.tasks.placing import placed
+from tgdsl.rl.tasks.paying import PaidRateSpec
+from tgdsl.rl.tasks.placing import PlacedTaskSpec
 
 QUARTER = 0.5 * math.pi
 
@@ -51,28 +56,26 @@ class Distill(DistillSpec):
     """Heads by the privileged number that they tell: the object's height [m], and its angle to the goal [rad]."""
 
 
-class InPalmRotateSpec(TaskSpec):
+class InPalmRotateSpec(PlacedTaskSpec, PaidRateSpec):
     """Turn an object on the palm about the vertical."""
 
     distill: Distill = Distill()
     """How students are taught by a policy that is there: `tgdsl distill`."""
 
-    randomise: PlacedRandomSpec = PlacedRandomSpec()
-    """What is random."""
     direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
     """Which way the object is to turn, seen from above."""
     goal_tolerance: Angle = 0.1
     """ε: a goal is reached this close to it [rad]."""
     max_tilt: Angle = 0.4
     """θ_max: no goal is reached with a larger tilt [rad]."""
-    max_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
-    """ω_max: what is faster pays no more [rad/s]."""
+    spin_tilt: Angle | None = None
+    """With a larger tilt `spin` is 0 [rad]; null: it never is."""
     near_width: PositiveLength = 0.02
     """λ, decay length of `near` [m]."""
     free_distance: PositiveLength = 0.02
     """r: closer to where it started, the object costs nothing [m]."""
     drop_distance: PositiveLength = 0.07
-    """Further from where it started, the object is lost [m]."""
+    """Further from where it started, or below, the object is lost [m]."""
     max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
     """f_max: less force on a link costs nothing [N]."""
     hold: HoldSpec = HoldSpec()
@@ -102,7 +105,8 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     @reward_term(2.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:
         """Angular velocity about n, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
-        return self.rate.clamp(max=self.spec.max_spin) * torch.where(self.rate > 0, self.pay, 1.0)
+        paid = self.spec.paid(self.rate) * torch.where(self.rate > 0, self.pay, 1.0)
+        return paid if self.spec.spin_tilt is None else paid * (self.tilt <= self.spec.spin_tilt)
 
     near = terms.Near.of_task(0.1, width="near_width")
 
@@ -131,6 +135,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
         super().__init__(spec, setup)
+        self.item = setup.free_qpos()
         self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.holding = Holding(spec.hold, setup)
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
@@ -141,11 +146,10 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.forth, self.paid = self.keep("forth"), self.keep("paid")  # Σ max(0, Δψ) and Σ c max(0, Δψ) since the goal before
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
-        """Put objects upright on the palm, moved and turned at random."""
-        qpos, pos, quat = placed(self.setup, self.spec.randomise, chosen, episode)
+        pos, quat = self.setup.start[:, self.item].split([3, 4], dim=1)
         self.begin(chosen, start_pos=pos, start_quat=quat, quat=quat, angle=0.0, rate=0.0, tilt=0.0, reached=0.0)
         self.begin(chosen, is_reached=0.0, pay=1.0, share=1.0, forth=0.0, paid=0.0)
-        return Start({"qpos": qpos})
+        return Start({"qpos": self.setup.start})
 
     def advance(self, now: Now) -> None:
         """Add up what the object has turned, and give it another goal where it has reached one."""
@@ -173,7 +177,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped."""
-        return self._distance(now) > self.spec.drop_distance
+        return self.spec.dropped_by(now.object.pos - self.start_pos) > self.spec.drop_distance
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the object has turned in this control step [rad]."""
@@ -181,17 +185,27 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
-        goal = rotations.product(rotations.about(self.axis, self._goal()), self.start_quat)
-        error = rotations.between(goal, now.object.quat)
         return {
-            "goal": torch.cat([rotations.six_numbers(goal), error[:, None]], dim=1),
+            "goal": groups.goal(self.spec.goal, self._goal_quat(), now.object.quat),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),
         }
 
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "goal": features.goal(self.spec.goal, self.setup.object),
+            "priv_obj_state": features.object_state(self.setup.object),
+            "priv_obj_props": [
+                *features.object_props(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
+        }
+
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return the object's height when it stands upright [m], and the angle from the goal to its orientation [rad]."""
-        return {"object_size": 2.0 * self.setup.half_height, "goal_distance": self.observe(now)["goal"][:, -1]}
+        distance = rotations.between(self._goal_quat(), now.object.quat)
+        return {"object_size": 2.0 * self.setup.half_height, "goal_distance": distance}
 
     def score(self) -> Float[Tensor, " env"]:
         """Return how many quarter turns were reached."""
@@ -199,6 +213,9 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def _distance(self, now: Now) -> Float[Tensor, " env"]:
         return vector_norm(now.object.pos - self.start_pos, dim=1)
+
+    def _goal_quat(self) -> rotations.Quat:
+        return rotations.product(rotations.about(self.axis, self._goal()), self.start_quat)
 
     def _goal(self) -> Float[Tensor, " env"]:
         return (self.reached + 1.0) * QUARTER

@@ -15,16 +15,18 @@ Weights of the reward's terms are the paper's. Progress pays c, 1 where the obje
 default: see `holding`. At 2 rad/s `spin` is worth 20 1/s; `near` is worth 1 if all probes touch, `drop` −2.5 in all,
 `joint_limit` −1.9 for a finger stretched out, `action_rate` −0.05 for random actions of eight joints, `work` −0.002 at 2 W.
 
-So a spin of 2 rad/s pays up to a tilt of 15°. An episode ends for good where θ > `drop_tilt` or the tip is out of the screw,
-|s − s_0| > `engagement`. Score: what was turned at a tilt of less than 20°, over the duration of a whole episode [rad/s]: after
-a drop nothing is added.
+So a spin of 2 rad/s pays up to a tilt of 15°; `spin` pays a bounded rate, see `paying`. An episode ends for good where
+θ > `drop_tilt`, where the tip is out of the screw, |s − s_0| > `engagement`, or with `stall` where Σ Δψ does not exceed by
+`stall.turn` within `stall.within` what it was. Score: what was turned at a tilt of less than 20°, over the duration of a whole
+episode [rad/s]: after a drop nothing is added.
 
 The scene's handles are cylinders, a box and capsules. An ellipsoid would be as telling to the hand, but its distance takes 18
 Newton steps (`geometry.shapes`), which take minutes to compile on a GPU, and against it MuJoCo Warp's search for the deepest
 point of two convex shapes runs out of room.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
-formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r, c, the last two terms and the ends of episodes are ours.
+formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r, c, the last two terms, the ends of episodes and the 20° of
+the score are ours.
 Turning back costs what turning forth has paid, however fast, and no less while the object coasts: `spin` is bounded above
 alone.
 """
@@ -32,6 +34,7 @@ alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import mujoco
@@ -40,18 +43,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.fields.models import Angle, PositiveLength, Quantity, with_defaults
-from tgdsl.rl import groups, rotations, terms
-from tgdsl.rl.grasps.spec import GraspSpec
-from tgdsl.rl.spec import TaskSpec
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel, with_defaults
+from tgdsl.rl import features, groups, rotations, terms
+from tgdsl.rl.features import Features
+from tgdsl.rl.grasps.grasps import GraspSpec
+from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
+from tgdsl.rl.tasks.paying import PaidRateSpec, Spin
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
 
 UPRIGHT = math.radians(20.0)
-"""Tilt below which a turn counts for the score [rad]; the paper's."""
+"""Tilt below which a turn counts for the score [rad]; ours."""
 
 
 class Train(with_defaults(TrainSpec, iterations=5000, steps=12, discount=0.99, entropy=0.0)):
@@ -78,7 +83,16 @@ class Distill(
     """Heads by the privileged number that they tell: tilt [rad] and rate of turning [rad/s]."""
 
 
-class ScrewdriverSpec(TaskSpec):
+class StallSpec(SpecModel):
+    """When a screwdriver counts as stalled."""
+
+    within: Time = 2.0
+    """Time for a further turn [s]."""
+    turn: Angle = 0.1
+    """By how much it has to turn in that time, the right way [rad]."""
+
+
+class ScrewdriverSpec(TaskSpec, PaidRateSpec):
     """Spin a screwdriver about its long axis."""
 
     train: Train = Train()
@@ -92,7 +106,7 @@ class ScrewdriverSpec(TaskSpec):
     """How the grasps are sampled that episodes begin from."""
     tip: str = "tip"
     """The scene's site at the tip."""
-    max_spin: Annotated[float, Quantity("number", gt=0.0)] = 6.0
+    max_spin: Spin = 6.0
     """ω_max: what is faster pays no more [rad/s]."""
     max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
     """f_max: less force on a link costs nothing [N]."""
@@ -106,6 +120,8 @@ class ScrewdriverSpec(TaskSpec):
     """With a larger tilt the screwdriver has fallen over [rad]."""
     engagement: PositiveLength = 0.005
     """Further from where it was, the tip is out of the screw [m]."""
+    stall: StallSpec | None = None
+    """When an episode ends for good as the screwdriver does not turn any more; null: never."""
 
 
 class Screwdriver(Task[ScrewdriverSpec]):
@@ -113,13 +129,13 @@ class Screwdriver(Task[ScrewdriverSpec]):
 
     Spec = ScrewdriverSpec
     senses = ("link_contact", "surface_distance")
-    constants = ("grasps",)
+    constants = ("grasps", "stall")
     score_unit = "rad/s"
 
     @reward_term(10.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:
         """Angular velocity about the long axis, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
-        return self.rate.clamp(max=self.spec.max_spin) * self._pay(now)
+        return self.spec.paid(self.rate) * self._pay(now)
 
     near = terms.Near.of_task(1.0, width="near_width")
 
@@ -150,11 +166,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
     effort = terms.Effort.of_task(0.0)
 
     def __init__(self, spec: ScrewdriverSpec, setup: Setup):
-        """Begin with all screwdrivers upright, as the keyframe has them.
-
-        Raises:
-            SimulationError: If there are no grasps.
-        """
+        """Begin with all screwdrivers upright, as the keyframe has them; raise `SimulationError` if there are no grasps."""
         super().__init__(spec, setup)
         if setup.grasps is None:
             raise SimulationError("this task begins with grasps, and there are none")
@@ -165,10 +177,12 @@ class Screwdriver(Task[ScrewdriverSpec]):
         self.upright_pos, self.upright_tip = (place.to(setup.device, setup.dtype) for place in _upright(setup, spec.tip))
         self.quat, self.start_joints = self.keep("quat", 4), self.keep("start_joints", len(setup.actuators.names))
         self.rate, self.tilt, self.turned = self.keep("rate"), self.keep("tilt"), self.keep("turned")
+        if spec.stall:
+            self.angle, self.mark = self.keep("angle"), self.keep("mark")  # Σ Δψ, and that after the last turn that counted
+            self.since = self.keep("since", dtype=torch.int64)  # control steps since then
 
     @classmethod
     def watch(cls, spec: ScrewdriverSpec) -> Watch:
-        """Return that it looks at the tip."""
         return Watch(sites=(spec.tip,))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
@@ -178,6 +192,8 @@ class Screwdriver(Task[ScrewdriverSpec]):
         assert isinstance(qpos, Tensor)
         self.begin(chosen, quat=drawn.quat, start_joints=qpos[:, self.joints], rate=0.0, turned=0.0)
         self.begin(chosen, tilt=rotations.swing(drawn.quat, self.axis))
+        if self.spec.stall:
+            self.begin(chosen, angle=0.0, mark=0.0, since=0)
         return Start(drawn.values, drawn.contacts)
 
     def advance(self, now: Now) -> None:
@@ -188,10 +204,17 @@ class Screwdriver(Task[ScrewdriverSpec]):
         self.tilt.copy_(rotations.swing(quat, self.axis))
         self.turned += torch.where(self.tilt < UPRIGHT, step, 0.0)
         self.quat.copy_(quat)
+        if self.spec.stall:
+            self.angle += step
+            is_further = self.angle >= self.mark + self.spec.stall.turn
+            self.mark.copy_(torch.where(is_further, self.angle, self.mark))
+            self.since.copy_(torch.where(is_further, 0, self.since + 1))
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where the screwdriver has fallen over, or its tip is out of the screw."""
-        return (self.tilt > self.spec.drop_tilt) | (self._tip_distance(now) > self.spec.engagement)
+        """Return where the screwdriver has fallen over, its tip is out of the screw, or it has stalled."""
+        is_lost = (self.tilt > self.spec.drop_tilt) | (self._tip_distance(now) > self.spec.engagement)
+        stall = self.spec.stall
+        return is_lost | (self.since >= round(stall.within / self.setup.control_step)) if stall else is_lost
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the screwdriver has turned in this control step [rad]."""
@@ -202,6 +225,16 @@ class Screwdriver(Task[ScrewdriverSpec]):
         return {
             "priv_obj_state": torch.cat([groups.object_state(now), now.distance], dim=1),
             "priv_obj_props": torch.stack([now.friction, now.mass], dim=1),
+        }
+
+    def describe(self) -> Mapping[str, Sequence[Features]]:
+        """Return what these groups hold."""
+        return {
+            "priv_obj_state": [
+                *features.object_state(self.setup.object),
+                *features.distances(*self.setup.rows["surface_distance"]),
+            ],
+            "priv_obj_props": features.object_props(self.setup.object),
         }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:

@@ -34,17 +34,12 @@ class CheckpointError(TgdslError):
 
 
 def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
-    """Return all that a run goes on from; all processes are asked.
-
-    Args:
-        learner: The learner.
-        seconds: How long it has learned [s].
-    """
+    """Return all that a run goes on from, after so many seconds of learning; all processes call it."""
     env = learner.env
     state = {
         "resets": env.resets.cpu().clone(),
         "steps": env.steps.cpu().clone(),
-        "touch": {name: getattr(env.touch.memory.clock, name).cpu().clone() for name in _counted(env)},
+        "touch": {name: count.cpu().clone() for name, count in _clock(env).items()},
         "cpu": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state(env.device) if env.device.type == "cuda" else None,
     }
@@ -60,18 +55,13 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
 
 
 def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False) -> None:
-    """Write a checkpoint, to the disk.
-
-    Args:
-        state: What `state_of` returned.
-        file: The file; one that is there is replaced.
-        is_slim: Whether the optimisers' moments, two thirds of it, are rounded to bfloat16.
+    """Write a checkpoint to the disk; if slim, the optimisers' moments, two thirds of it, are rounded to bfloat16.
 
     Raises:
         FileError: If it cannot be written; then the file that was there is as it was.
     """
     content = io.BytesIO()
-    torch.save(_slim(state) if is_slim else dict(state), content)
+    torch.save(_rounded(state) if is_slim else dict(state), content)
     with atomic_open(file) as opened:
         opened.write(content.getbuffer())
         opened.flush()
@@ -79,25 +69,21 @@ def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:
-    """Return what a checkpoint holds, on the CPU.
-
-    Raises:
-        CheckpointError: If it cannot be read, or is none.
-    """
+    """Return what a checkpoint holds, on the CPU; raise `CheckpointError` if it cannot be read, or is none."""
     if not file.is_file():
         raise CheckpointError(f"{file}: there is no checkpoint")
+    found = "a file of something else"
     try:
-        opened = file.open("rb")
+        content = io.BytesIO(file.read_bytes())
     except OSError as error:
         raise CheckpointError(f"{file}: cannot read this file: {error.strerror or error}") from error
-    with opened:
-        try:
-            state = torch.load(opened, map_location="cpu", weights_only=True)
-        except Exception as error:  # whatever torch and pickle raise, OSError too
-            cut = f"{file.stat().st_size:,} bytes that are cut off, or of something else"
-            raise _no_checkpoint(file, "a file of something else" if zipfile.is_zipfile(file) else cut) from error
+    try:
+        state = torch.load(content, map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever torch and pickle raise
+        cut = f"{file.stat().st_size:,} bytes that are cut off, or of something else"
+        raise _no_checkpoint(file, found if zipfile.is_zipfile(content) else cut) from error
     if not isinstance(state, dict) or "format" not in state:
-        raise _no_checkpoint(file, "a file of something else")
+        raise _no_checkpoint(file, found)
     if state["format"] != FORMAT:
         raise _no_checkpoint(file, f"a checkpoint of format {state['format']}, not {FORMAT}, of another version of tgdsl")
     if missing := sorted(KEYS - state.keys()):
@@ -111,17 +97,12 @@ def _no_checkpoint(file: Path, found: str) -> CheckpointError:
 
 
 def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
-    """Have a learner go on from a checkpoint; what its physics was has gone.
-
-    Args:
-        learner: The learner, of the same groups and networks.
-        state: What the checkpoint holds.
-        file: Its file, for errors.
+    """Have a learner of the same groups and networks go on from a checkpoint; `file` is named in errors.
 
     Raises:
         CheckpointError: If it is of other groups or networks.
     """
-    rank = learner.ranks.rank
+    env, rank = learner.env, learner.ranks.rank
     names = state["groups"].keys() | learner.groups.keys()
     if state["groups"].keys() ^ learner.groups.keys() == {"rnd_state"}:  # RND was turned on or off
         names -= {"rnd_state"}
@@ -132,35 +113,27 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
     except (RuntimeError, ValueError, KeyError) as error:
         raise CheckpointError(f"{file}: its networks are of other sizes: {str(error).splitlines()[-1].strip()}") from error
     learner.iteration, learner.samples = state["iteration"], state["samples"]
-    process_state = state["processes"][rank] if rank < len(state["processes"]) else None
-    if process_state is not None and process_state["resets"].shape == learner.env.resets.shape:
-        _count_on(learner.env, [process_state])
-        learner.go_on(process_state["steps"].to(learner.env.device))
+    ours = state["processes"][rank] if rank < len(state["processes"]) else None
+    if ours is not None and ours["resets"].shape == env.resets.shape:
+        _count_on(env, [ours])
+        learner.go_on(ours["steps"].to(env.device))
     else:
-        _count_on(learner.env, state["processes"])
-    if process_state is None:
+        _count_on(env, state["processes"])
+    if ours is None:
         return
-    torch.set_rng_state(process_state["cpu"])
-    if process_state["cuda"] is not None and learner.env.device.type == "cuda":
-        torch.cuda.set_rng_state(process_state["cuda"], learner.env.device)
+    torch.set_rng_state(ours["cpu"])
+    if ours["cuda"] is not None and env.device.type == "cuda":
+        torch.cuda.set_rng_state(ours["cuda"], env.device)
 
 
 def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping[str, int], path: str = "") -> str:
-    """Return the name of the first tensor of a state that holds something else than finite numbers; none: nothing.
+    """Return the name of the first tensor of a state that is not all finite numbers, or nothing.
 
-    Of moments of observations with the groups that these are of.
-
-    Args:
-        state: The state, or a part of it.
-        networks: Groups of observations of each network.
-        sizes: Size of each group.
-        path: Where the part is.
+    Moments of observations are named with their groups: `networks` has the groups of each network, `sizes` the size of each.
     """
-    if isinstance(state, Mapping):
-        parts = (not_finite(part, networks, sizes, f"{path}.{name}".lstrip(".")) for name, part in state.items())
-        return next(filter(None, parts), "")
-    if isinstance(state, list | tuple):
-        return next(filter(None, (not_finite(part, networks, sizes, f"{path}.{i}") for i, part in enumerate(state))), "")
+    if isinstance(state, Mapping | list | tuple):
+        parts = state.items() if isinstance(state, Mapping) else enumerate(state)
+        return next(filter(None, (not_finite(part, networks, sizes, f"{path}.{name}".lstrip(".")) for name, part in parts)), "")
     if not isinstance(state, Tensor) or not state.is_floating_point() or bool(state.isfinite().all()):
         return ""
     if "normalizer" not in path and ".seen." not in path:
@@ -174,38 +147,23 @@ def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping
 
 def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
     """Have environments go on to draw what was not drawn: each from its own counts, or all from the largest of any."""
-    counts = {"resets": env.resets} | {name: getattr(env.touch.memory.clock, name) for name in _counted(env)}
-    for name, count in counts.items():
-        counters = [each["resets"] if name == "resets" else each.get("touch", {}).get(name) for each in processes]
-        present = [value for value in counters if value is not None]  # an earlier checkpoint has none of touch
-        if len(present) == 1 and present[0].shape == count.shape:
-            count.copy_(present[0])
-        elif present:
-            count.fill_(max(int(value.max()) for value in present))
+    for name, count in ({"resets": env.resets} | _clock(env)).items():
+        saved = [each["resets"] if name == "resets" else each.get("touch", {}).get(name) for each in processes]
+        saved = [value for value in saved if value is not None]  # an earlier checkpoint has none of touch
+        if len(saved) == 1 and saved[0].shape == count.shape:
+            count.copy_(saved[0])
+        elif saved:
+            count.fill_(max(int(value.max()) for value in saved))
 
 
-def _counted(env: TouchEnv) -> tuple[str, ...]:
-    """Return by which counts of the module's clock its random numbers differ; none if no sensor draws any."""
-    return ("step", "episode") if env.touch.memory.clock.num_envs else ()
+def _clock(env: TouchEnv) -> dict[str, Tensor]:
+    """Return the counts by which the module's random numbers differ; none if no sensor draws any."""
+    clock: Any = env.touch.memory.clock
+    return {"step": clock.step, "episode": clock.episode} if clock.num_envs else {}
 
 
-def _slim(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state whose optimisers' moments are rounded; optimisers widen them again."""
-    if "stacks" in state:
-        stacks = [dict(own) | {"optimiser": _rounded(own["optimiser"])} for own in state["stacks"]]
-        return dict(state) | {"stacks": stacks}
-    if "algorithm" not in state:
-        return dict(state)
-    algorithm = dict(state["algorithm"])
-    for name in [name for name in algorithm if name.endswith("optimizer_state_dict")]:
-        algorithm[name] = _rounded(algorithm[name])
-    return dict(state) | {"algorithm": algorithm}
-
-
-def _rounded(optimiser: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an optimiser's state with its moments in bfloat16."""
-    moments = {
-        i: {key: value.bfloat16() if key.startswith("exp_avg") else value for key, value in moments.items()}
-        for i, moments in optimiser["state"].items()
-    }
-    return dict(optimiser) | {"state": moments}
+def _rounded(part: Any) -> Any:
+    """Return a state with Adam's moments in bfloat16; optimisers widen them again."""
+    if isinstance(part, Mapping):
+        return {name: each.bfloat16() if str(name).startswith("exp_avg") else _rounded(each) for name, each in part.items()}
+    return [_rounded(each) for each in part] if isinstance(part, list) else part

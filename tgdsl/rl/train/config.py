@@ -34,10 +34,6 @@ PPO_OPTIONS = {
 def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[str]]:
     """Return the groups of observations of actor, critic and, if there is one, random network distillation.
 
-    Args:
-        loaded: The task's document.
-        groups: Size of each group that there is.
-
     Raises:
         SpecError: If a group that is named is not there, or is empty.
     """
@@ -52,11 +48,6 @@ def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[st
 
 def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str, int] | None = None) -> dict[str, Any]:
     """Return rsl_rl's configuration, for `PPO.construct_algorithm` or an `OnPolicyRunner`.
-
-    Args:
-        loaded: The task's document.
-        groups: Size of each group of observations that there is.
-        multi_gpu: As rsl_rl has it; None: one process.
 
     Raises:
         SpecError: If a group that is named is not there.
@@ -100,11 +91,7 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
 
 
 def _given(loaded: LoadedTask, groups: Mapping[str, int], place: tuple[str, ...]) -> list[str]:
-    """Return the groups that a document names; none if it names none.
-
-    Raises:
-        SpecError: If there is no such group.
-    """
+    """Return the groups that a document names; none if it names none."""
     result: Any = loaded.spec.train
     for key in place:
         result = getattr(result, key)

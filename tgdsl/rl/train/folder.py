@@ -1,11 +1,12 @@
-"""A run's folder: what it was made from, where it stands, and what it has learned.
+"""A run's folder: its origin, its progress, and what it has learned.
 
-- `run.json`: the task with all that its document leaves out, overrides, seed, versions, hashes; an entry per start
-- `task.yaml`, the sensors' document, the module of a task of one's own: as they were found
+- `run.json`: the task with all defaults, overrides, seed, versions, hashes; an entry per start
+- `task.yaml`, the sensors' document, the module of a user's task: copies
 - `taxels.csv`: the taxels of all sensors
 - `curve.csv`: a row per iteration
-- `checkpoint.pt`: what it goes on from
-- `policy.pt`: the policy without exploration, with its card, for `tgdsl play --policy`
+- `checkpoint.pt`: its state, to resume
+- `policy.pt`: the policy without exploration and its card, for `tgdsl play --policy`
+- `policy.onnx`: the same for ONNX Runtime
 - `evaluation.json`: the evaluation at the end
 - `events.out.*`: TensorBoard's, if that is installed
 """
@@ -27,35 +28,25 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, new_folder, with_folder
-from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.policy import taxel_csv
 from tgdsl.rl.playing.provenance import differences, provenance, spec_differences
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
 COLUMNS = ("iteration", "samples", "seconds")
 """First columns of a curve."""
-ASKED = frozenset({"spec", "seed", "envs", "module", "taxels"})
-"""What of a start is asked when the run goes on."""
+ORIGIN = frozenset({"spec", "seed", "envs", "module", "taxels"})
+"""What a resumed run needs of an entry of `run.json`."""
 
 
 class RunFolder:
-    """The files of a run.
-
-    Attributes:
-        path: The folder.
-        run: What the run was made from.
-        curve: What each iteration was.
-        checkpoint: What the run goes on from.
-        policy: What it has learned.
-        evaluation: How good that is.
-    """
+    """The files of a run, at its `path`."""
 
     def __init__(self, path: Path):
         self.path, self.run, self.curve = path, path / "run.json", path / "curve.csv"
@@ -65,11 +56,11 @@ class RunFolder:
 
     @property
     def has_run(self) -> bool:
-        """Whether there is a run: one that was killed before its first checkpoint is none."""
+        """Whether there is a run with a checkpoint or an iteration."""
         return self.checkpoint.exists() or bool(self.rows())
 
     def check(self, is_resumed: bool) -> None:
-        """See that a run can begin or go on here; nothing is made.
+        """Check that a run can begin or resume here, without writing.
 
         Raises:
             FileError: If the folder cannot be written.
@@ -83,25 +74,29 @@ class RunFolder:
         check_writable(self.checkpoint)
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold the folder against other processes; it is free again if this one is killed.
-
-        It is made if it is not there, and not left behind empty if anything is raised.
+    def lock(self) -> Iterator[None]:
+        """Lock the folder; the lock ends with the process. The folder is created, and removed if it stays empty.
 
         Raises:
-            FileError: If it cannot be made, or written into.
-            TgdslError: If another process holds it.
+            FileError: If it cannot be created, or written into.
+            TgdslError: If another process has locked it.
         """
         with new_folder(check_writable(self.run)):
             folder = os.open(self.path, os.O_RDONLY)
             try:
-                self._lock(folder)
+                try:
+                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    problem = "another process runs in this folder; wait until it has ended, or give another --out"
+                    raise TgdslError(f"{self.path}: {problem}") from error
+                except OSError:  # of a file system that has no locks
+                    pass
                 yield
             finally:
                 os.close(folder)
 
-    def begin(self, made_from: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
-        """Write what a run is made from, or that it is made to go on; starts that made no run are discarded.
+    def begin(self, origin: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
+        """Write the origin of a run, or of its resumption; entries without a run are dropped.
 
         Raises:
             FileError: If it cannot be written.
@@ -110,25 +105,21 @@ class RunFolder:
         for file in self.path.iterdir():  # temporary files that a run which was killed has left
             if re.fullmatch(TEMPORARY.pattern + r"\.\w+", file.name):
                 file.unlink(missing_ok=True)
-        starts = [*(self._read()["starts"] if self.has_run else []), dict(made_from)]
+        starts = [*(self._starts() if self.has_run else []), dict(origin)]
         atomic_write(self.run, (json.dumps({"starts": starts}, indent=2, ensure_ascii=False) + "\n").encode())
         for name, file in documents(loaded).items():
             atomic_write(self.path / name, file.read_bytes())
         atomic_write(self.path / "taxels.csv", taxel_csv(env.touch).encode())
 
     def last_start(self) -> dict[str, Any]:
-        """Return what the run was made from when it was started last.
-
-        Raises:
-            TgdslError: If that cannot be read.
-        """
-        starts = self._read()["starts"]
+        """Return the origin of the run's last start; raise `TgdslError` if it cannot be read."""
+        starts = self._starts()
         if not starts:
             raise TgdslError(f"{self.path}: there is no run to go on with: run.json is missing or empty")
         return starts[-1]
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows of the curve but for a line, header or row, that was half written when the run was killed.
+        """Return the complete rows of the curve; a killed run may leave half a line.
 
         Raises:
             TgdslError: If it is no curve.
@@ -148,7 +139,7 @@ class RunFolder:
         return rows
 
     def keep_rows(self, iterations: int) -> None:
-        """Drop the curve's rows beyond some iterations, which are made again, and what was half written.
+        """Keep the curve's complete rows up to an iteration; later iterations run again.
 
         Raises:
             TgdslError: If it is no curve.
@@ -165,7 +156,7 @@ class RunFolder:
             atomic_write(self.curve, content)
 
     def add_row(self, row: Mapping[str, float | int]) -> None:
-        """Add a row to the curve, under the names that its first row had; nan is what is not known.
+        """Append a row to the curve, with the columns of its header; an unknown value is nan.
 
         Raises:
             FileError: If it cannot be written.
@@ -183,32 +174,22 @@ class RunFolder:
         first, hint = ",".join(found[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
         return TgdslError(f"{self.curve}:{line}: found {len(found)} values, {first!r}, expected {expected}; {hint}")
 
-    def _lock(self, folder: int) -> None:
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            problem = "another process runs in this folder; wait until it has ended, or give another --out"
-            raise TgdslError(f"{self.path}: {problem}") from error
-        except OSError:  # of a file system that has no locks
-            return
-
-    def _read(self) -> dict[str, Any]:
+    def _starts(self) -> list[dict[str, Any]]:
         try:
             result = json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {"starts": []}
         except (OSError, ValueError) as error:
             raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
         starts = result.get("starts") if isinstance(result, dict) else None
-        if not isinstance(starts, list) or not all(isinstance(start, dict) and start.keys() >= ASKED for start in starts):
-            raise TgdslError(
-                f"{self.run}: expected what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ASKED))}"
-            )
-        return result
+        if not isinstance(starts, list) or not all(isinstance(start, dict) and start.keys() >= ORIGIN for start in starts):
+            expected = f"what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ORIGIN))}"
+            raise TgdslError(f"{self.run}: expected {expected}")
+        return starts
 
 
 def documents(loaded: LoadedTask) -> dict[str, Path]:
-    """Return the files of the task's and the sensors' documents, and of a task of one's own, by the names of their copies.
+    """Return the files of the task's and the sensors' documents and of a user's task, by the names of their copies.
 
-    Of documents that are files. Two files of one name have that of their folder before it, as in `sub_palm.yaml`.
+    Files with the same name get their folder's name as a prefix, as in `sub_palm.yaml`.
     """
     documents = [file for file in (Path(loaded.source.file), loaded.folder / loaded.spec.document) if file.is_file()]
     module = sys.modules.get(loaded.task.__module__)
@@ -219,8 +200,8 @@ def documents(loaded: LoadedTask) -> dict[str, Path]:
     return {f"{file.resolve().parent.name}_{file.name}": file for file in documents}
 
 
-def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[str, Any], processes: int) -> dict[str, Any]:
-    """Return what a run is made from, as plain values."""
+def run_origin(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[str, Any], processes: int) -> dict[str, Any]:
+    """Return the origin of a run, as plain values."""
     device = env.device
     return {
         "task": loaded.source.file,
@@ -240,13 +221,7 @@ def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[s
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec]) -> list[str]:
-    """Return what of two starts of a run differs, a line each: the task's numbers, its seed, its sensors.
-
-    Args:
-        before: What the last start was made from; what its version of tgdsl did not know has its default.
-        now: What this one is made from.
-        model: Model of the task's document.
-    """
+    """Return the differences between the origins of two starts, a line each: the task's numbers, its seed, its sensors."""
     lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
     descriptions = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
@@ -254,7 +229,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskS
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what a run depends on, of those packages that there are."""
+    """Return the versions of Python and of the installed packages that a run depends on."""
     result = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -262,26 +237,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return result
-
-
-def taxel_csv(touch: TactileModule) -> str:
-    """Return the taxels of all sensors as a table: sensor, and the columns of `touch.taxels`, vectors by their components."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    is_begun = False
-    for sensor, table in touch.taxels.items():
-        names = table.dtype.names or ()
-        if not is_begun:
-            writer.writerow(["sensor", *(part for name in names for part in _columns(name, table[name]))])
-            is_begun = True
-        for row in table.tolist():
-            writer.writerow([sensor, *(part for value in row for part in _cells(value))])
-    return text.getvalue()
-
-
-def _columns(name: str, values: Any) -> list[str]:
-    return [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
-
-
-def _cells(value: Any) -> list[str]:
-    return [repr(part) for part in value.tolist()] if isinstance(value, np.ndarray) else [str(value)]

@@ -22,14 +22,6 @@ class Captured(Generic[T]):
     """
 
     def __init__(self, body: Callable[[], T], device: torch.device | str, has_tf32: bool = False, is_captured: bool = True):
-        """Take the function.
-
-        Args:
-            body: The function; on a GPU it must not wait for a tensor's value.
-            device: Where its tensors are.
-            has_tf32: Whether a GPU multiplies float32 matrices in TF32.
-            is_captured: Whether it may be captured; if not, each call does the work as it stands.
-        """
         self._body, self._has_tf32, self._is_captured = body, has_tf32, is_captured
         self._stream = torch.cuda.Stream(device) if torch.device(device).type == "cuda" else None
         self.forget()

@@ -1,4 +1,4 @@
-"""What an iteration is, whoever learns: its episodes, added up on the device and read once, and how long it took.
+"""One iteration of learning: its episodes, summed on the device and read once, and its durations.
 
 Shapes: `env` environments.
 """
@@ -20,41 +20,32 @@ from tgdsl.rl.env import Step, TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
 from tgdsl.rl.train.ranks import Ranks, summed
 
-OWN = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
-"""Of an episode that has ended, besides each term: return, steps, score, whether it ended for good, and by a fault."""
+EPISODE_NAMES = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
+"""Numbers of a finished episode, before its terms: return, steps, score, whether it ended for good, and by a fault."""
+ORIGIN_KEYS = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "sensors", "scene", "versions", "spec")
+"""Entries of a run's origin that a policy's card has."""
 
 
 class EpisodeTally:
-    """Sums over the episodes that have ended.
-
-    Attributes:
-        names: What is told of them, known from the first control step on.
-    """
+    """Sums over finished episodes; `names` are set at the first control step."""
 
     def __init__(self):
         self.names: list[str] = []
         self._sums: Tensor | None = None
 
     def add(self, step: Step) -> None:
-        """Add a control step; the host does not wait."""
+        """Add a control step, without waiting for the device."""
         info = step.info
-        numbers = [
-            info.episode_return,
-            info.episode_steps,
-            info.score,
-            step.terminated,
-            info.faults,
-            *info.episode_terms.values(),
-        ]
-        values = torch.stack([info.ended.double(), *(each.double() for each in numbers)])
+        numbers = [info.episode_return, info.episode_steps, info.score, step.terminated, info.faults]
+        values = torch.stack([info.ended.double(), *(each.double() for each in (*numbers, *info.episode_terms.values()))])
         sums = torch.where(info.ended, values, 0.0).sum(dim=1)
         if self._sums is None:
-            self.names = [*OWN, *(f"Reward/{name}" for name in info.episode_terms)]
+            self.names = [*EPISODE_NAMES, *(f"Reward/{name}" for name in info.episode_terms)]
             self._sums = torch.zeros_like(sums)
         self._sums += sums
 
-    def taken(self) -> Tensor:
-        """Return the sums over all processes, the number of episodes first, and begin again; the host does not wait."""
+    def pop(self) -> Tensor:
+        """Return the sums over all processes, the number of episodes first, and restart; the host does not wait."""
         assert self._sums is not None
         sums = self._sums.clone()
         summed(sums)
@@ -62,56 +53,20 @@ class EpisodeTally:
         return sums
 
     def means(self, sums: list[float]) -> dict[str, float]:
-        """Return means over episodes by name, of sums that were taken; none if no episode has ended."""
+        """Return means over episodes by name, from the sums of `pop`; none if no episode has ended."""
         count = sums[0]
         return {name: total / count for name, total in zip(self.names, sums[1:], strict=True)} if count else {}
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """What an iteration was, over all processes.
+    """An iteration, over all processes."""
 
-    Attributes:
-        episodes: How many episodes ended.
-        told: Means over these episodes, and what else there is to tell, by the names that TensorBoard groups: `Episode/score`.
-        rollout: Duration of the rollout [s].
-        update: Duration of the update [s].
-    """
-
-    episodes: int
-    told: dict[str, float]
-    rollout: float
-    update: float
-
-
-class Clock:
-    """Measures rollout and update; on a GPU by events, which nobody waits for."""
-
-    def __init__(self, device: torch.device):
-        self._is_gpu, self._marks = device.type == "cuda", []
-
-    def start(self) -> None:
-        """Begin the rollout."""
-        self._marks = [self._mark()]
-
-    def split(self) -> None:
-        """End the rollout, begin the update."""
-        self._marks.append(self._mark())
-
-    def stop(self) -> tuple[float, float]:
-        """Return the durations of rollout and update [s]; the device must be done."""
-        begun, middle, end = *self._marks, self._mark()
-        if not self._is_gpu:
-            return middle - begun, end - middle
-        end.synchronize()
-        return 1e-3 * begun.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
-
-    def _mark(self) -> Any:
-        if not self._is_gpu:
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
+    episodes: int  # how many episodes ended
+    metrics: dict[str, float]
+    """Means over these episodes, and the learner's numbers, by the names that TensorBoard groups: `Episode/score`."""
+    rollout: float  # duration of the rollout [s]
+    update: float  # duration of the update [s]
 
 
 class Learning(Actor):
@@ -120,8 +75,6 @@ class Learning(Actor):
     On a GPU the host waits once per iteration, but for captures at the first ones.
 
     Attributes:
-        env: The environments.
-        ranks: The processes.
         groups: Groups of observations of each network.
         iteration: Number of iterations so far.
         samples: How many control steps these took, over all processes and environments.
@@ -130,19 +83,14 @@ class Learning(Actor):
 
     rates: ClassVar[str]
     groups: dict[str, list[str]]
+    std: list[float] | None = None
+    """Standard deviation of its actions."""
 
     def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
-        """Begin.
-
-        Args:
-            env: The environments of this process.
-            ranks: The processes.
-            steps: Control steps of a rollout.
-            desynchronise: Whether first episodes end at random times.
-        """
+        """Take the environments of this process; `steps` control steps are a rollout."""
         self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
         self._num_steps, self._desynchronise, self._is_begun = steps, desynchronise, False
-        self._clock, self._tally = Clock(env.device), EpisodeTally()
+        self._tally = EpisodeTally()
 
     @property
     def episode_names(self) -> list[str]:
@@ -150,52 +98,75 @@ class Learning(Actor):
         return self._tally.names
 
     def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it.
-
-        Args:
-            share: How much of the run is over, 0 to 1: some learn in smaller and smaller steps.
-        """
+        """Make a rollout, and learn from it; `share` is how much of the run is over, 0 to 1."""
         self.set_rate(share)
         self.roll()
+        begun, middle = self._roll_start, self._mark()
         self.learn()
-        sums, numbers = self._tally.taken(), self._numbers()
+        sums, numbers = self._tally.pop(), self._numbers()
         values = torch.cat([sums, torch.stack(list(numbers.values())).double().to(sums.device)]).tolist()  # here the host waits
-        durations, own = self._clock.stop(), dict(zip(numbers, values[len(sums) :], strict=True))
-        own = {name: value for name, value in own.items() if not (name.startswith("Score/") and math.isnan(value))}
-        return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | own, *durations)
+        end = self._mark()
+        if self.env.device.type == "cuda":
+            end.synchronize()
+            durations = 1e-3 * begun.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
+        else:
+            durations = middle - begun, end - middle
+        pairs = zip(numbers, values[len(sums) :], strict=True)
+        metrics = {name: value for name, value in pairs if not (name.startswith("Score/") and math.isnan(value))}
+        return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | metrics, *durations)
 
     def set_rate(self, share: float) -> None:
-        """Learn at the rate that stands when a share of the run is over; by default it stays."""
+        """Set the learning rate for a share of the run that is over; by default it stays."""
 
     def roll(self) -> None:
         """Make a rollout."""
         if not self._is_begun:
-            at_random = torch.randint_like(self.env.steps, self.env.max_steps) if self._desynchronise else None
-            self.go_on(at_random)
+            self.go_on(torch.randint_like(self.env.steps, self.env.max_steps) if self._desynchronise else None)
         self._start_rollout()
-        self._clock.start()
+        self._roll_start = self._mark()
         for moment in rollout(self, self.env, self._num_steps):
             self._keep(moment)
             self._tally.add(moment.step)
-        self._clock.split()
 
     def learn(self) -> None:
-        """Learn from the rollout."""
         self._update()
         self.iteration += 1
         self.samples += self._num_steps * self.env.num_envs * self.ranks.size
 
     def go_on(self, steps: Int[Tensor, " env"] | None = None) -> None:
-        """Begin episodes that count as having lasted so many control steps; default: as new ones."""
+        """Begin episodes, at given numbers of control steps; default: 0."""
         self.env.reset()
         if steps is not None:
             self.env.steps.copy_(steps)
         self.go_on_here()
 
     def go_on_here(self) -> None:
-        """Go on from where the environments are; what was remembered of their episodes is forgotten."""
+        """Go on from where the environments are, with an empty memory of their episodes."""
         self._is_begun = True
         self.begin(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
+
+    def card(
+        self, origin: Mapping[str, Any], seconds: float, command: str, groups: Mapping[str, int] | None = None
+    ) -> dict[str, Any]:
+        """Return the card of a policy, as plain values.
+
+        Args:
+            origin: The origin of its run: see `run_origin`.
+            seconds: How long it has learned [s].
+            command: How to learn it again.
+            groups: Size of each group of observations that it takes, in its order; default: those of the actor.
+        """
+        return {
+            "groups": dict(groups or {name: self.env.groups[name] for name in self.groups["actor"]}),
+            "joints": list(self.env.joint_names),
+            "iterations": self.iteration,
+            "samples": self.samples,
+            "minutes": round(seconds / 60.0, 2),
+            "command": command,
+            "score": None,
+            **{name: origin[name] for name in ORIGIN_KEYS},
+            "std": self.std,
+        }
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
@@ -208,6 +179,14 @@ class Learning(Actor):
         Raises:
             RuntimeError: If networks are of other sizes; also ValueError and KeyError.
         """
+
+    def _mark(self) -> Any:
+        """Return the time; on a GPU as an event, which nobody waits for."""
+        if self.env.device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
 
     def _start_rollout(self) -> None:
         """Prepare for a rollout."""
@@ -222,4 +201,4 @@ class Learning(Actor):
 
     @abstractmethod
     def _numbers(self) -> dict[str, Tensor]:
-        """Return what else there is to tell of the iteration, on the device; a score of no episode is not a number."""
+        """Return the learner's numbers of the iteration, on the device; a score of no episode is not a number."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,6 +20,8 @@ from torch import Tensor
 from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.onnx_policy import write_onnx_policy
+from tgdsl.rl.playing.policy import card_texts, write_policy
 from tgdsl.rl.playing.rollout import Moment
 from tgdsl.rl.train.config import config
 from tgdsl.rl.train.iteration import Iteration, Learning
@@ -28,22 +31,12 @@ from tgdsl.tensors.env_ids import may_be_nonempty
 
 
 class Learner(Learning):
-    """Learns a policy by PPO.
-
-    Attributes:
-        algorithm: PPO.
-    """
+    """Learns a policy by PPO, `algorithm`."""
 
     rates = "train.learning_rate or train.desired_kl"
 
     def __init__(self, env: TouchEnv, loaded: LoadedTask, seed: int, ranks: Ranks | None = None):
         """Make the networks; torch's own random generators are seeded.
-
-        Args:
-            env: The environments of this process.
-            loaded: Their task's document.
-            seed: What the networks' first weights and the actions follow from.
-            ranks: The processes.
 
         Raises:
             SpecError: If a group of observations that is named is not there.
@@ -55,24 +48,27 @@ class Learner(Learning):
         self.groups = settings["obs_groups"]
         self._names = list(dict.fromkeys(name for names in self.groups.values() for name in names))
         torch.manual_seed(seed)
-        self.algorithm = self._algorithm(settings)
+        vec_env = TouchVecEnv(env)
+        kind: Any = resolve_callable(settings["algorithm"]["class_name"])
+        with contextlib.redirect_stdout(io.StringIO()):  # the networks, printed
+            self.algorithm: CapturedPPO = kind.construct_algorithm(
+                self._seen(dict(vec_env.get_observations())), vec_env, settings, str(env.device)
+            )
         if self.ranks.size > 1:
             self.algorithm.broadcast_parameters()
         torch.manual_seed(seed * self.ranks.size + self.ranks.rank)
 
     def __call__(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return actions, with exploration."""
         return self.algorithm.act(self._seen(obs))
 
     def iterate(self, share: float = 0.0) -> Iteration:
         """Make a rollout, and learn from it; `share` changes nothing: the rate adapts to the policy, or stays."""
         self.env.curricula.advance(self.iteration, self._score)
         result = super().iterate(share)
-        self._score = result.told.get("Episode/score", self._score)
+        self._score = result.metrics.get("Episode/score", self._score)
         return result
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what is learned, and what learning goes on from."""
         algorithm = self.algorithm
         steps = algorithm.rnd.update_counter if algorithm.rnd else 0
         return {"algorithm": algorithm.save(), "rnd_steps": steps, "score": self._score}
@@ -85,18 +81,32 @@ class Learner(Learning):
         if self.algorithm.rnd and has_rnd:
             self.algorithm.rnd.update_counter = state["rnd_steps"]
 
+    @property
+    def std(self) -> list[float] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        std = dict(self.algorithm.actor.named_parameters()).get("distribution.std_param")
+        return None if std is None else std.tolist()
+
+    def write_policy(self, card: Mapping[str, Any], file: Path) -> None:
+        """Write the policy without exploration, as TorchScript and ONNX, and its card beside it as JSON, for people.
+
+        Raises:
+            FileError: If it cannot be written.
+        """
+        policy: Any = self.algorithm.get_policy()
+        write_policy(policy.as_jit(), self.env.touch, card, file)
+        write_onnx_policy(policy.as_onnx(verbose=False), card_texts(self.env.touch, card), file.with_suffix(".onnx"))
+
     def change_rates(self, before: Mapping[str, Any]) -> None:
         """Take over the document's learning rates, once a state was loaded; one that adapts only if the document had another.
 
-        Args:
-            before: The document's `train` with which the state was saved, as plain values.
+        `before` is the document's `train` with which the state was saved, as plain values.
         """
-        train_spec = self._train
-        if not train_spec.adaptive or before.get("learning_rate", train_spec.learning_rate) != train_spec.learning_rate:
-            self.algorithm.learning_rate = train_spec.learning_rate
-        if self.algorithm.rnd and train_spec.rnd != "off":
+        train = self._train
+        if not train.adaptive or before.get("learning_rate", train.learning_rate) != train.learning_rate:
+            self.algorithm.learning_rate = train.learning_rate
+        if self.algorithm.rnd and train.rnd != "off":
             for group in self.algorithm.rnd.optimizer.param_groups:
-                group["lr"] = train_spec.rnd.learning_rate
+                group["lr"] = train.rnd.learning_rate
 
     def _start_rollout(self) -> None:
         self.algorithm.train_mode()
@@ -119,10 +129,3 @@ class Learner(Learning):
 
     def _seen(self, obs: Mapping[str, Tensor]) -> TensorDict:
         return TensorDict({name: obs[name] for name in self._names}, [self.env.num_envs])
-
-    def _algorithm(self, wanted: dict[str, Any]) -> CapturedPPO:
-        env = TouchVecEnv(self.env)
-        kind: Any = resolve_callable(wanted["algorithm"]["class_name"])
-        with contextlib.redirect_stdout(io.StringIO()):  # the networks, printed
-            algorithm = kind.construct_algorithm(self._seen(dict(env.get_observations())), env, wanted, str(self.env.device))
-        return algorithm

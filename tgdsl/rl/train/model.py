@@ -1,8 +1,10 @@
-"""Networks of actor and critic: each group of observations is normalised and embedded, and the embeddings are mapped together.
+"""Networks of actor and critic, their normalisers, and random network distillation: rsl_rl's, kept on the device.
 
 `class_name: tgdsl.rl.train.model:EncodedModel` gives rsl_rl this model, and `tgdsl.rl.train.model:Gaussian` its distribution.
+No branch waits for a tensor's value, and memory stays where it is. Moments are float64: after many rows a change is lost in
+float32. Over several processes they are those of the joint batch.
 
-Shapes: `env` environments, `feature` numbers of all groups of a model, side by side.
+Shapes: `env` environments, `feature` numbers of all groups of a model, side by side, `row` rows of a batch, of any shape.
 """
 
 from __future__ import annotations
@@ -12,19 +14,86 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from rsl_rl.extensions import RandomNetworkDistillation
 from rsl_rl.models import MLPModel
-from rsl_rl.modules import MLP, GaussianDistribution
+from rsl_rl.modules import MLP, EmpiricalDiscountedVariationNormalization, EmpiricalNormalization, GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from tgdsl.rl.train.normalising import Normalisation
+from tgdsl.rl.train.ranks import num_processes, summed
+
+UNTIL = 10**8
+"""As rsl_rl has it: after so many states, and rewards, their normalisation does not change any more."""
+
+
+class Normalisation(EmpiricalNormalization):
+    """rsl_rl's empirical normalisation, bounded: clamp((x − mean)/(std + eps), ±clip)."""
+
+    _mean: Tensor
+    _var: Tensor
+    _std: Tensor
+    count: Tensor
+
+    def __init__(self, shape: int | list[int], eps: float = 1e-2, until: int | None = None, clip: float = float("inf")):
+        super().__init__(shape, eps, until)
+        self.clip = float(clip)
+        for name in ("_mean", "_var", "_std"):
+            self.register_buffer(name, getattr(self, name).double())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return rows normalised, (row, feature)."""
+        return ((x - self._mean.to(x.dtype)) / (self._std + self.eps).to(x.dtype)).clamp(-self.clip, self.clip)
+
+    @torch.jit.unused
+    def update(self, x: Float[Tensor, "row ..."]) -> None:
+        """Take a batch into account."""
+        if not self.training:
+            return
+        with torch.no_grad():
+            num = x.shape[0] * num_processes()
+            mean = x.sum(dim=0, keepdim=True, dtype=torch.float64)
+            summed(mean)
+            mean /= num
+            var = (x - mean.to(x.dtype)).square().sum(dim=0, keepdim=True, dtype=torch.float64)
+            summed(var)
+            var /= num
+            self._take(num, mean.view_as(self._mean), var.view_as(self._var))
+
+    def _take(self, num: int, mean: Tensor, var: Tensor) -> None:
+        """Take a batch's mean and variance into account, in place."""
+        is_open = torch.ones_like(self.count, dtype=torch.bool) if self.until is None else self.count < self.until
+        rate = is_open * (num / (self.count + num).to(mean.dtype))
+        delta = mean - self._mean
+        self._mean += rate * delta
+        self._var += rate * (var - self._var + delta * (mean - self._mean))
+        self._std.copy_(self._var.sqrt())
+        self.count += num * is_open
+
+
+class RewardNormalisation(EmpiricalDiscountedVariationNormalization):
+    """rsl_rl's normalisation of intrinsic rewards: divided by the standard deviation of their discounted sums."""
+
+    def __init__(self, num_envs: int, eps: float = 1e-2, gamma: float = 0.99, until: int | None = None):
+        super().__init__([], eps, gamma, until)
+        self.emp_norm = Normalisation([], eps, until)
+        self.gamma = gamma
+        self.register_buffer("total", torch.zeros(num_envs), persistent=False)
+
+    def forward(self, rew: Float[Tensor, " row"]) -> Float[Tensor, " row"]:
+        """Return rewards normalised; those of learning are taken into account first."""
+        total: Tensor = self.total  # pyright: ignore[reportAssignmentType]
+        if self.training:
+            total.mul_(self.gamma).add_(rew)
+            self.emp_norm.update(total)
+        std = self.emp_norm._std.to(rew.dtype)
+        return torch.where(std > 0, rew / std, rew).view_as(rew)
 
 
 class Gaussian(GaussianDistribution):
     """rsl_rl's Gaussian distribution; to draw from it waits for nothing, where torch's own looks at the deviations' signs."""
 
     def sample(self) -> Tensor:
-        """Draw: the numbers that torch's own would give."""
         return torch.randn_like(self.mean) * self.std + self.mean
 
     def bound(self) -> None:
@@ -52,22 +121,6 @@ class EncodedModel(MLPModel):
         eps: float = 1e-2,
         clip: float = float("inf"),
     ):
-        """Make the networks.
-
-        Args:
-            obs: Observations by group, as an example.
-            obs_groups: Groups of each set.
-            obs_set: The set that this model sees.
-            output_dim: How many numbers it returns.
-            hidden_dims: Widths of the hidden layers that follow the embeddings.
-            activation: As rsl_rl names it.
-            obs_normalization: Whether observations are normalised.
-            distribution_cfg: Distribution of what it returns, with its `class_name`; None: it returns numbers.
-            encoders: For groups by name, or for all others as "*", `hidden` widths and `size` of the embedding; a group without
-                any is taken as it is.
-            eps: As `Normalisation` has it.
-            clip: As `Normalisation` has it.
-        """
         self._sizes = [obs[name].shape[-1] for name in obs_groups[obs_set]]
         encoder_specs = [(encoders or {}).get(name, (encoders or {}).get("*")) for name in obs_groups[obs_set]]
         self._latent = sum(
@@ -83,7 +136,6 @@ class EncodedModel(MLPModel):
         self.encoders = nn.ModuleList(encoders_of_groups)
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """Return the embeddings of all groups, side by side."""
         return self.embed(torch.cat([obs[name] for name in self.obs_groups], dim=-1))
 
     def embed(self, x: Tensor) -> Tensor:
@@ -127,6 +179,34 @@ class Exported(nn.Module):
         return self.output(self.model.mlp(self.model.embed(x)))
 
     def get_dummy_inputs(self) -> tuple[Tensor]:
-        """Return an example of what it takes."""
         first = next(self.parameters())
         return (torch.zeros((2, self.model.obs_dim), dtype=first.dtype, device=first.device),)
+
+
+class Distillation(RandomNetworkDistillation):
+    """rsl_rl's `RandomNetworkDistillation`, whose rewards wait for no tensor's value."""
+
+    def __init__(self, num_envs: int, eps: float = 1e-2, clip: float = float("inf"), **options: Any):
+        super().__init__(**options)
+        if self.state_normalization:
+            self.state_normalizer = Normalisation([self.num_states], eps, UNTIL, clip).to(self.device)
+        if self.reward_normalization:
+            self.reward_normalizer = RewardNormalisation(num_envs, until=UNTIL).to(self.device)
+        for parameter in self.target.parameters():
+            parameter.requires_grad_(False)
+
+    def prediction_error(self, obs: TensorDict) -> Tensor:
+        """Return the error of the prediction, normalised, (env,)."""
+        with torch.no_grad():
+            state = self.state_normalizer(self.get_rnd_state(obs))
+            error = torch.linalg.norm(self.target(state) - self.predictor(state), dim=1)
+            return self.reward_normalizer(error)
+
+    def next_weight(self) -> float:
+        """Count a control step, and return the weight of its rewards."""
+        self.update_counter += 1
+        scheduler = self.weight_scheduler
+        self.weight = (
+            self.initial_weight if scheduler is None else scheduler(self.update_counter, **self.weight_scheduler_params)
+        )
+        return self.weight

@@ -23,9 +23,8 @@ from torch import Tensor, nn
 
 from tgdsl.errors import TgdslError
 from tgdsl.rl.train.graphs import Captured
-from tgdsl.rl.train.model import Gaussian
+from tgdsl.rl.train.model import Distillation, Gaussian
 from tgdsl.rl.train.ranks import num_processes, summed
-from tgdsl.rl.train.rnd import Distillation
 from tgdsl.tensors.torch_internals import copy_each
 
 LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
@@ -53,21 +52,7 @@ class CapturedPPO(PPO):
         precision: str = "tf32",
         **options: Any,
     ):
-        """Make the algorithm.
-
-        Args:
-            actor: The policy.
-            critic: Its value.
-            storage: Holds a rollout.
-            learning_rate: Learning rate, at the start where it is adaptive.
-            device: Where all tensors are.
-            rnd_cfg: Options of random network distillation; None: there is none.
-            precision: As `TrainSpec` has it; without effect on a CPU.
-            options: Those of rsl_rl's PPO.
-
-        Raises:
-            TgdslError: If something is asked for that cannot be captured.
-        """
+        """Make the algorithm; raise `TgdslError` if something is asked for that cannot be captured."""
         _refuse(actor, critic, options)
         rows, parts = storage.num_envs * storage.num_transitions_per_env, options.get("num_mini_batches", 1)
         if rows < max(2, parts):
@@ -82,15 +67,14 @@ class CapturedPPO(PPO):
         self.losses = torch.zeros(len(LOSSES), dtype=kind, device=device)
         self._kl = self._flat[-1:]
         self._rows = rows // self.num_mini_batches
-        self._order = torch.zeros(rows // self.num_mini_batches * self.num_mini_batches, dtype=torch.int64, device=device)
+        self._order = torch.zeros(self._rows * self.num_mini_batches, dtype=torch.int64, device=device)
         self._obs = storage.observations[0].clone()
         is_cuda, tf32 = self._flat.is_cuda, precision != "float32"
         self._autocast = {"device_type": "cuda", "dtype": torch.bfloat16, "enabled": is_cuda and precision == "bfloat16"}
         self._chosen = Captured(self._choose, device, tf32)
         self._valued = Captured(self._final_value, device, tf32)
-        self._rnd_graph = Captured(
-            self._intrinsic_reward, device, tf32, is_captured=not self.is_multi_gpu
-        )  # all processes join in it
+        is_alone = not self.is_multi_gpu  # else all processes join in it
+        self._rnd_graph = Captured(lambda: self.rnd.prediction_error(self._obs), device, tf32, is_captured=is_alone)
         self._returned = Captured(self._returns, device, tf32)
         self._learned = Captured(self._epoch, device, tf32)
         self._parts = [Captured(lambda i=i: self._differentiate(i), device, tf32) for i in range(self.num_mini_batches)]
@@ -115,16 +99,9 @@ class CapturedPPO(PPO):
         return transition.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
-        """Keep what a control step has brought: see rsl_rl.
-
-        Args:
-            obs: Observations after the step, of the next episode where one has ended.
-            rewards: Rewards of the step.
-            dones: Where an episode has ended.
-            extras: `time_outs`, where an episode was cut off; `final_obs`, observations at the ends of episodes.
-        """
+        """Keep what a control step has brought: see rsl_rl."""
         transition = self.transition
-        paid = rewards.clone()
+        reward = rewards.clone()
         transition.dones = dones
         if self.rnd is not None or "final_obs" in extras:
             transition.observations = self._obs.clone()
@@ -132,12 +109,12 @@ class CapturedPPO(PPO):
             self._see(extras["final_obs"])
             self._value = self._valued()
         if "time_outs" in extras:
-            paid += self.gamma * self._value[:, 0] * extras["time_outs"]
+            reward += self.gamma * self._value[:, 0] * extras["time_outs"]
         if self.rnd is not None:
             self._see(obs)
             self.intrinsic_rewards = self._rnd_graph() * self.rnd.next_weight()
-            paid += self.intrinsic_rewards
-        transition.rewards = paid
+            reward += self.intrinsic_rewards
+        transition.rewards = reward
         self.storage.add_transition(transition)
         transition.clear()
 
@@ -185,20 +162,12 @@ class CapturedPPO(PPO):
         for group in self.optimizer.param_groups:
             self.rate.fill_(float(group["lr"]))
             group["lr"] = self.rate
-        for captured in (
-            self._chosen,
-            self._valued,
-            self._rnd_graph,
-            self._returned,
-            self._learned,
-            *self._parts,
-            self._applied,
-        ):
-            captured.forget()
+        graphs = (self._chosen, self._valued, self._rnd_graph, self._returned, self._learned, *self._parts, self._applied)
+        for graph in graphs:
+            graph.forget()
         return is_loaded
 
     def broadcast_parameters(self) -> None:
-        """Give all processes the first one's networks."""
         models = [self._raw_actor, self._raw_critic, *([self.rnd.predictor, self.rnd.target] if self.rnd else [])]
         for model in models:
             for tensor in model.state_dict().values():
@@ -251,10 +220,6 @@ class CapturedPPO(PPO):
     def _final_value(self) -> Tensor:
         with torch.no_grad():
             return self._judge(self._obs)
-
-    def _intrinsic_reward(self) -> Tensor:
-        assert isinstance(self.rnd, Distillation)
-        return self.rnd.surprise(self._obs)
 
     def _returns(self) -> None:
         with torch.no_grad():
@@ -326,11 +291,7 @@ class CapturedPPO(PPO):
 
 
 def _refuse(actor: MLPModel, critic: MLPModel, options: dict[str, Any]) -> None:
-    """Refuse what cannot be captured.
-
-    Raises:
-        TgdslError: If it is asked for.
-    """
+    """Refuse what cannot be captured."""
     unsupported = {
         name: options.get(name) for name in ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")
     }

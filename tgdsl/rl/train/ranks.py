@@ -22,13 +22,7 @@ class RankError(TgdslError):
 
 @dataclass(frozen=True)
 class Ranks:
-    """Which process of how many this is.
-
-    Attributes:
-        rank: Number of this process, from 0.
-        size: How many there are.
-        local: Its number among those of this host: its GPU.
-    """
+    """Which process of how many this is, from 0; `local`: its number among those of this host, its GPU."""
 
     rank: int = 0
     size: int = 1
@@ -36,15 +30,9 @@ class Ranks:
 
     @staticmethod
     def of(environ: Mapping[str, str] = os.environ) -> Ranks:
-        """Return what torchrun says.
-
-        Raises:
-            RankError: If its variables make no sense.
-        """
+        """Return what torchrun says; raise `RankError` if its variables make no sense."""
         try:
-            result = Ranks(
-                *(int(environ.get(name, least)) for name, least in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
-            )
+            result = Ranks(int(environ.get("RANK", 0)), int(environ.get("WORLD_SIZE", 1)), int(environ.get("LOCAL_RANK", 0)))
         except ValueError as error:
             raise RankError(f"RANK, WORLD_SIZE and LOCAL_RANK are set by torchrun, and are whole numbers: {error}") from error
         if not 0 <= result.rank < result.size or result.local < 0:
@@ -83,12 +71,10 @@ class Ranks:
         distributed.init_process_group("nccl" if is_gpu else "gloo", rank=self.rank, world_size=self.size)
 
     def leave(self) -> None:
-        """Part from the others."""
         if self.size > 1 and distributed.is_initialized():
             distributed.destroy_process_group()
 
     def agreed(self, choices: tuple[bool, ...], device: torch.device | str) -> tuple[bool, ...]:
-        """Return the first process's choices."""
         if self.size == 1:
             return choices
         numbers = torch.tensor(choices, dtype=torch.int32, device=device)

@@ -2,20 +2,88 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping
+from datetime import timedelta
+from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
+from tqdm import tqdm
+
 from tgdsl.errors import FileError, TgdslError
+from tgdsl.files.write import as_file_error
 from tgdsl.rl.train.checkpoint import not_finite, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder
 from tgdsl.rl.train.iteration import Iteration, Learning
-from tgdsl.rl.train.logging import Board
+
+SAID_EVERY = 10.0
+"""Time between lines where there is no terminal for a progress bar [s]."""
+
+
+class ProgressBar:
+    """A progress bar of a run; where there is no terminal, a line now and then."""
+
+    def __init__(self, iterations: int | None, done: int, unit: str):
+        self._unit, self._total, self._said = unit, iterations, -SAID_EVERY
+        form = "{desc} {n_fmt}/{total_fmt} |{bar}| {postfix}" if iterations else "{desc} {n_fmt} {postfix}"
+        self._bar = tqdm(total=iterations, initial=done, desc="learning", disable=None, leave=False, bar_format=form)
+        self._seen: dict[str, float] = {}
+
+    def show(self, row: Mapping[str, float | int], left: float) -> None:
+        """Show an iteration."""
+        self._seen |= {name: row[name] for name in ("Episode/return", "Episode/score") if name in row}
+        parts = [f"{timedelta(seconds=round(left))} left"]
+        if self._seen:
+            score = f"{self._seen['Episode/score']:.2f} {self._unit}"
+            parts = [f"return {self._seen['Episode/return']:.2f}", f"score {score}", *parts]
+        parts.insert(-1, f"{row['steps_per_second']:,.0f} steps/s")
+        text = ", ".join(parts)
+        if not self._bar.disable:
+            self._bar.set_postfix_str(text, refresh=False)
+            self._bar.update()
+        elif row["seconds"] - self._said >= SAID_EVERY:
+            self._said = row["seconds"]
+            print(f"{row['iteration']:.0f}{f'/{self._total}' if self._total else ''}: {text}", flush=True)
+
+    def close(self) -> None:
+        self._bar.close()
+        sys.stdout.flush()
+
+
+class Board:
+    """TensorBoard's file of a run, if TensorBoard is installed."""
+
+    def __init__(self, folder: Path, done: int):
+        self._writer: Any = None
+        self._file = folder / "events.out.tfevents"
+        with contextlib.suppress(ImportError), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of its own packages
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writer = SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
+
+    @property
+    def is_there(self) -> bool:
+        return self._writer is not None
+
+    def add(self, metrics: Mapping[str, float], iteration: int) -> None:
+        """Add an iteration's numbers; raise `FileError` if those before could not be written."""
+        with as_file_error(self._file):
+            for name, value in metrics.items() if self._writer else ():
+                self._writer.add_scalar(name, value, iteration)
+
+    def close(self) -> None:
+        """Write what has not been written; raise `FileError` if it cannot be."""
+        with as_file_error(self._file):
+            if self._writer:
+                self._writer.close()
 
 
 class DivergedError(TgdslError):
@@ -23,18 +91,15 @@ class DivergedError(TgdslError):
 
 
 Shown = Callable[[Mapping[str, float | int], float], None]
-"""Is told what an iteration was, as `curve.csv` has it, and how much time is left [s]."""
+"""Called with an iteration, as `curve.csv` has it, and the time that is left [s]."""
 
 
 class StopRequest:
-    """Notes the first SIGINT (Ctrl-C) or SIGTERM, so that work can end at a good place; the second acts as it did before.
+    """Notes the first SIGINT (Ctrl-C) or SIGTERM, so that work can end at a good place; the second acts as it did before."""
 
-    Attributes:
-        signal: The signal that came; None: none has.
-    """
+    signal: signal.Signals | None = None
 
     def __init__(self) -> None:
-        self.signal: signal.Signals | None = None
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -62,18 +127,11 @@ class Run:
     def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
         """Write the first checkpoint: a folder or disk that cannot take it is found now.
 
-        Args:
-            learner: The learner.
-            folder: Its folder, which `RunFolder.begin` has begun.
-            every: Time between checkpoints [s].
-            seconds: How long it has learned before [s].
-
         Raises:
             FileError: If no checkpoint can be written.
         """
         self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
-        self._rate, self._samples = 0.0, learner.samples
-        self._saved = learner.iteration
+        self._rate, self._samples, self._saved = 0.0, learner.samples, learner.iteration
         self.stopped_by: signal.Signals | None = None
         self._writes = learner.ranks.is_first
         if self._writes:
@@ -83,12 +141,10 @@ class Run:
 
     @property
     def iteration(self) -> int:
-        """How many iterations were made."""
         return self._learner.iteration
 
     @property
     def has_board(self) -> bool:
-        """Whether this process writes for TensorBoard."""
         return self._board is not None and self._board.is_there
 
     def save(self) -> None:
@@ -112,13 +168,8 @@ class Run:
     def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
         """Learn. Ctrl-C and SIGTERM end it after the iteration under way, with a checkpoint.
 
-        Iterations are told how much of the run is over: of iterations, or if that is more, of time, what was learned before
+        Iterations get the share of the run that is over: of iterations, or if that is more, of time, what was learned before
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
-
-        Args:
-            iterations: Iterations of the whole run, those made before included.
-            seconds: Time from now on [s]; may be infinite. Of 0 no iteration is made.
-            shown: Is shown each iteration.
 
         Raises:
             DivergedError: If losses or state are no numbers any more; the last checkpoint is from before.
@@ -144,9 +195,8 @@ class Run:
         is_over = learner.iteration >= iterations or seconds <= 0.0
         while not is_over:
             start = time.monotonic()
-            iteration = learner.iterate(
-                max(learner.iteration / iterations, (seconds_before + start - begun) / (seconds_before + seconds))
-            )
+            time_share = (seconds_before + start - begun) / (seconds_before + seconds)
+            iteration = learner.iterate(max(learner.iteration / iterations, time_share))
             now = time.monotonic()
             self.seconds = seconds_before + now - begun
             self._refuse_diverged(iteration)
@@ -175,17 +225,16 @@ class Run:
             "update": made.update,
             "episodes": made.episodes,
         }
-        self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **made.told})
+        self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **made.metrics})
         if self._board is not None:
-            self._board.add(made.told | perf, learner.iteration)
+            self._board.add(made.metrics | perf, learner.iteration)
         if shown is not None:
-            shown(row | made.told, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
+            shown(row | made.metrics, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
 
     def _refuse_diverged(self, made: Iteration) -> None:
-        wrong: dict[str, Any] = {name: value for name, value in made.told.items() if name.startswith("Loss/")}
-        wrong = {name: value for name, value in wrong.items() if not math.isfinite(value)}
-        if wrong:
-            problem = ", ".join(f"{name} is {value}" for name, value in wrong.items())
+        losses = {name: value for name, value in made.metrics.items() if name.startswith("Loss/")}
+        problem = ", ".join(f"{name} is {value}" for name, value in losses.items() if not math.isfinite(value))
+        if problem:
             raise DivergedError(
                 f"iteration {self._learner.iteration}: {problem}; {self._folder.checkpoint} is from before: try a smaller "
                 f"{self._learner.rates}"

@@ -1,0 +1,37 @@
+"""The published documents: each can be learned on a CPU, and students can be taught what was learned."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tgdsl.commands.learning.distill import Distill
+from tgdsl.commands.learning.train import Train
+
+FOLDER = Path(__file__).parents[2] / "examples" / "tasks" / "published"
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+FEW = {"in_palm_rotate": (), "in_hand_repose": (), "screwdriver": ("grasps.num=8",)}
+
+
+def test_each_document_is_tried():
+    assert {file.stem for file in FOLDER.glob("*.yaml")} == FEW.keys()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FEW)
+def test_a_teacher_and_its_students_learn_a_few_iterations(name, tmp_path):
+    document, out = FOLDER / f"{name}.yaml", tmp_path / "teacher"
+    Train(document, device="cpu", envs=16, iterations=2, episodes=0, out=out, set=FEW[name]).run()
+    card = json.loads((out / "policy.json").read_text())
+    goal = {"in_palm_rotate": 1, "in_hand_repose": 13}
+    assert card["groups"].get("goal") == goal.get(name) and card["groups"]["priv_touch"] == 15
+    students = tmp_path / "students"
+    options = {"device": "cpu", "types": "none,agg_bool,force", "seeds": 1, "envs": 48, "iterations": 2, "episodes": 0}
+    Distill(document, teacher=out / "policy.pt", out=students, set=FEW[name], **options).run()
+    with (students / "med" / "curve.csv").open(newline="") as opened:
+        rows = list(csv.DictReader(opened))
+    losses = [float(value) for name, value in rows[-1].items() if name.startswith("Loss/") and name.endswith("s0")]
+    assert len(rows) == 2 and len(losses) == 3 and min(losses) > 0
+    spec = json.loads((students / "med" / "run.json").read_text())["starts"][-1]["spec"]
+    assert spec["distill"]["normalise"] and (spec["randomise"]["push"]["x"] == [0, 0]) == (name == "screwdriver")

@@ -1,0 +1,179 @@
+"""Descriptions of observations: who follows one alone, from MuJoCo's raw state, gets the observation."""
+
+import math
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tiny_tasks import tiny_env
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.sensed import Felt
+
+FOLDER = Path(__file__).parents[2] / "examples" / "tasks"
+PLAIN = {
+    "physics.substeps": 1,
+    "variants": [0],
+    "touch": "depth",
+    "randomise.friction": 1,
+    "randomise.mass": 0,
+    "physics.cone": "elliptic",
+    "proprio.vel_scale": 0.2,
+}
+"""With one physics step, readings are of where the control step began."""
+TASKS = {"in_palm_rotate": {}, "screwdriver": {"grasps.num": 4}}
+GIVEN = ("qpos", "qvel", "ctrl", "qfrc_applied", "xfrc_applied", "qacc_warmstart")
+
+
+class Raw:
+    """MuJoCo's state of one environment, and what follows from it by MuJoCo's own functions."""
+
+    def __init__(self, env, arrays, action, start):
+        self.env, self.action, self.start = env, action, start
+        self.model = env.sim.env_model(0)
+        self.data = mujoco.MjData(self.model)
+        for name in GIVEN:
+            getattr(self.data, name)[...] = arrays[name].reshape(getattr(self.data, name).shape)
+        mujoco.mj_forward(self.model, self.data)
+
+    def rotation(self, body):
+        return self.data.body(body).xmat.reshape(3, 3)
+
+    def force_on(self, link, body):
+        """The body's force on a link, in world axes."""
+        total, force = np.zeros(3), np.zeros(6)
+        for i, side in self.contacts(link, body):
+            mujoco.mj_contactForce(self.model, self.data, i, force)  # of the first geom on the second
+            total += side * self.data.contact[i].frame.reshape(3, 3).T @ force[:3]
+        return total
+
+    def contacts(self, link, body):
+        """Contacts of a body with a link, and 1 where the link is the second of both, else −1."""
+        found = []
+        for i, contact in enumerate(self.data.contact[: self.data.ncon]):
+            bodies = [self.model.body(self.model.geom_bodyid[geom]).name for geom in contact.geom]
+            if sorted(bodies) == sorted((link, body)):
+                found.append((i, 1 if bodies[1] == link else -1))
+        return found
+
+    def signed_distance(self, point, body):
+        """To the surface of a body of boxes and cylinders."""
+        found = []
+        for geom in np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id):
+            if not self.model.geom_contype[geom] and not self.model.geom_conaffinity[geom]:
+                continue
+            x, y, z = self.data.geom_xmat[geom].reshape(3, 3).T @ (point - self.data.geom_xpos[geom])
+            size = self.model.geom_size[geom]
+            if self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+                off = np.abs([x, y, z]) - size
+            else:
+                assert self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER
+                off = np.array([math.hypot(x, y) - size[0], abs(z) - size[1]])
+            found.append(np.linalg.norm(np.maximum(off, 0)) + min(0, off.max()))
+        return min(found)
+
+    def probes(self, features):
+        """Places in the world and radii of the probes that features are of."""
+        for row in self.env.touch.rows[features.sensor][features.rows.start : features.rows.stop]:
+            assert row["link"] == features.link
+            body = row["body"]
+            yield self.data.body(body).xpos + self.rotation(body) @ row["pos"], row["radius"]
+
+    def goal(self):
+        """The first quarter turn about the vertical."""
+        quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        return quarter @ self.start
+
+
+def rebuilt(raw, features, body):
+    """Follow the description of some features."""
+    name, frame = features.name, features.frame
+    if joint := re.fullmatch(r"(position|velocity) of (\w+)", name):
+        value = raw.data.joint(joint[2]).qpos if joint[1] == "position" else raw.data.joint(joint[2]).qvel
+    elif joint := re.fullmatch(r"last action of (\w+)", name):
+        value = [raw.action[raw.env.joint_names.index(joint[1])]]
+    elif name == "force_x, force_y, force_z":
+        assert frame == "link"
+        value = raw.rotation(features.link).T @ raw.force_on(features.link, body)
+    elif name.startswith("position_x"):
+        value = raw.data.body(features.link).xpos
+    elif name.startswith("orientation_xx"):
+        value = raw.rotation(features.link).T[:2].ravel()
+    elif name.startswith(("velocity_x", "angular_velocity_x")):
+        motion = np.zeros(6)
+        kind, ident = mujoco.mjtObj.mjOBJ_XBODY, raw.model.body(features.link).id
+        mujoco.mj_objectVelocity(raw.model, raw.data, kind, ident, motion, 0)
+        value = motion[:3] if name.startswith("angular") else motion[3:]
+    elif name == "friction":
+        value = [raw.model.geom_friction[raw.model.body(body).geomadr[0], 0]]
+    elif name == "mass":
+        value = raw.model.body(body).mass
+    elif name == "goal_xx, goal_xy, goal_xz, goal_yx, goal_yy, goal_yz":
+        value = raw.goal().T[:2].ravel()
+    elif name == "angle_to_goal":
+        value = [math.acos((np.trace(raw.goal().T @ raw.rotation(features.link)) - 1) / 2)]
+    elif name == "distance":
+        assert features.note == "at most 0.1 m"
+        value = [min(0.1, raw.signed_distance(place, body)) for place, _ in raw.probes(features)]
+    else:
+        assert name == "depth" and features.note == "0 while the solver has no contact of link and object"
+        is_touched = bool(raw.contacts(features.link, body))
+        value = [is_touched * max(0.0, radius - raw.signed_distance(place, body)) for place, radius in raw.probes(features)]
+    return features.scale * np.asarray(value)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_an_observation_can_be_rebuilt_from_its_description(name):
+    env = TouchEnv(FOLDER / f"{name}.yaml", 1, threads=1, overrides=PLAIN | TASKS[name])
+    generator, description, body = torch.Generator().manual_seed(0), env.describe(), env.task.setup.object
+    data = mujoco.MjData(env.sim.env_model(0))
+    data.qpos[:] = env.sim.qpos[0].numpy()
+    mujoco.mj_kinematics(env.sim.env_model(0), data)
+    start, seen = data.body(body).xmat.reshape(3, 3).copy(), set()
+    for step in range(40):
+        action = 0.6 * torch.rand((1, env.num_actions), generator=generator) - 0.3
+        before = {name: env.sim.arrays[name][0].clone().numpy() for name in GIVEN}
+        made = env.step(action)
+        assert not made.info.ended
+        if step < 10 or step % 6:
+            continue
+        after = {name: env.sim.arrays[name][0].numpy() for name in ("ctrl", "qfrc_applied", "xfrc_applied")}
+        raw = Raw(env, before | after, action[0].numpy(), start)
+        for group, parts in description.items():
+            assert parts[-1][0].stop == env.groups[group]
+            for place, features in parts:
+                value = made.obs[group][0, place].numpy()
+                expected = rebuilt(raw, features, body)
+                scale = max(1.0, float(np.abs(expected).max()))
+                np.testing.assert_allclose(value, expected, rtol=0, atol=1e-6 * scale, err_msg=f"{group}: {features}")
+                seen |= {features.name} if np.abs(value).max() > 0 else set()
+    assert {"depth", "distance", "force_x, force_y, force_z"} <= seen
+    env.close()
+
+
+def test_students_that_feel_parts_of_a_sensor_are_described(tmp_path):
+    felts = [Felt("agg_force", "left", "clean"), Felt("force", "right", "clean"), Felt("agg_bool", "hand", "clean")]
+    env = tiny_env(tmp_path, 1, feels=[*felts, Felt("force", "left", "clean")])
+    force, touched, bits = (env.describe()[felt.group] for felt in felts)
+    assert [(each.name, each.link, each.scale) for _, each in force] == [(f"depth_{axis}", "left", 1e4) for axis in "zyx"]
+    names = [(f"force_{axis}", "right", range(2, 4)) for axis in "xyz"]
+    assert [(each.name, each.link, each.rows) for _, each in touched] == names
+    assert [each.link for _, each in bits] == ["left", "right"]
+    env.close()
+
+
+def test_it_prints_units_and_names_what_is_not_described(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "from tgdsl.rl.terms import ObservationTerm\nclass Own(ObservationTerm):\n"
+        "    def observe(self, now, setup):\n        return now.joint_pos\n"
+    )
+    env = tiny_env(tmp_path, 1, more='terms: {mine: {term: "own.py:Own"}}\ntemporal: stack\ntouch: depth\n')
+    text = repr(env.describe())
+    assert re.search(r"mine +0:2 +not described", text)
+    assert re.search(r"proprio +2:3 +velocity of left +rad/s", text)
+    assert re.search(r"tactile_sensors +0:2 +depth of physics step 0, rows 0:2 of depth +m +– +left +1 ", text)
+    assert re.search(r"tactile_sensors +18:20 +depth of physics step 4, rows 2:4 of depth +m +– +right +1 ", text)
+    env.close()

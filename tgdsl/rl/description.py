@@ -1,0 +1,123 @@
+"""What each feature of each group of observations is: name, unit, frame, link and scale, in order.
+
+A task describes its own groups by `Task.describe`, a document's term its group by `ObservationTerm.describe`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from tgdsl.console.tables import text_table
+from tgdsl.observations.observations import WANTED, AggForceObservation
+from tgdsl.rl.features import Features, link_forces, runs_of
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.sensed import Sensed, Source, sensors_document
+from tgdsl.rl.task import Task
+from tgdsl.rl.terms import ObservationTerm, Term
+
+HEADER = ("group", "features", "what", "unit", "frame", "link", "scale", "note")
+
+
+class Description(dict[str, tuple[tuple[slice, Features], ...]]):
+    """The features of each group with their places in it; it prints as a table."""
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return a row of text for all features of a kind: the cells under `HEADER`."""
+        return [
+            (
+                group,
+                f"{place.start}:{place.stop}",
+                each.name + (f", rows {each.rows.start}:{each.rows.stop} of {each.sensor}" if each.sensor else ""),
+                each.unit,
+                each.frame or "–",
+                each.link or "–",
+                f"{each.scale:g}",
+                each.note,
+            )
+            for group, features in self.items()
+            for place, each in features
+        ]
+
+    def __repr__(self) -> str:
+        return text_table(HEADER, self.rows())
+
+
+def describe(
+    loaded: LoadedTask, sensed: Sensed, task: Task[Any], terms: Mapping[str, Term], sizes: Mapping[str, int]
+) -> Description:
+    """Return what each feature of each group of observations is.
+
+    Args:
+        loaded: The task's document.
+        sensed: What is felt.
+        task: The task.
+        terms: Terms that the document adds.
+        sizes: Size of each group.
+    """
+    setup, substeps = task.setup, loaded.spec.physics.substeps if loaded.spec.temporal == "stack" else 0
+    names, is_slide = setup.actuators.names, setup.actuators.is_slide.tolist()
+    known: dict[str, Sequence[Features]] = {
+        "proprio": _joints(names, is_slide, loaded.spec.proprio.vel_scale),
+        "priv_proprio": [*_joints(names, is_slide, 1.0), *link_forces(setup.links)],
+    }
+    known |= {name: _touch(sensed, source, substeps) for name, source in sensed.groups.items()} | dict(task.describe())
+    known |= {name: term.describe(setup) for name, term in terms.items() if isinstance(term, ObservationTerm)}
+    result, notes = {}, _notes(loaded)
+    for group, size in sizes.items():
+        features = [
+            replace(each, note=notes.get(each.sensor, "")) for each in known.get(group) or [Features("not described", size)]
+        ]
+        stops = np.cumsum([each.size for each in features]).tolist()
+        result[group] = tuple((slice(stop - each.size, stop), each) for stop, each in zip(stops, features, strict=True))
+    return Description(result)
+
+
+def _notes(loaded: LoadedTask) -> dict[str, str]:
+    """Return where sensors are cut off, by name."""
+    notes = {}
+    for name, sensor in sensors_document(loaded).spec.sensors.items():
+        if (most := getattr(sensor, "max_range", None)) is not None:
+            notes[name] = f"at most {most:g} m"
+        elif getattr(sensor, "gate", None) == "contact_pair":
+            notes[name] = "0 while the solver has no contact of link and object"
+    return notes
+
+
+def _joints(names: Sequence[str], is_slide: Sequence[bool], vel_scale: float) -> list[Features]:
+    units = ["m" if each else "rad" for each in is_slide]
+    pos = [Features(f"position of {name}", 1, unit) for name, unit in zip(names, units, strict=True)]
+    vel = [Features(f"velocity of {name}", 1, f"{unit}/s", scale=vel_scale) for name, unit in zip(names, units, strict=True)]
+    return pos + vel + [Features(f"last action of {name}", 1) for name in names]
+
+
+def _touch(sensed: Sensed, source: Source, substeps: int) -> list[Features]:
+    """Return what a group of touch has: of each channel each link's rows, and all that of each physics step if stacked."""
+    touch = sensed.touch
+    (term,) = (term for term in touch.plan.observations if term.group == source.observation)
+    assert term.reading is not None
+    (output,) = (output for output in touch.outputs if output.name == term.reading)
+    table = touch.rows[term.reading]
+    links = list(np.asarray(table["link" if "link" in (table.dtype.names or ()) else "body"]).tolist())
+    scale = 1.0
+    if term.type in ("agg_bool", "agg_force"):
+        links = list(dict.fromkeys(links))
+        axes = term.axes if term.type == "agg_force" else ""
+        channels = [(f"depth_{axis}", "m", "link") for axis in axes] or [("contact", "1", "")]
+        scale = AggForceObservation.model_fields["scale"].default if axes else 1.0
+    else:
+        has_axes = term.type in WANTED and len(WANTED[term.type][0]) > 1
+        channels = [(output.channels[i], output.units[i], "link" if has_axes else "") for i in term.channels]
+    num = len(links)
+    columns = range(len(channels) * num) if source.columns is None else source.columns.tolist()
+    features = []
+    for channel, group in groupby(columns, key=lambda column: column // num):
+        name, unit, frame = channels[channel]
+        for link, rows in runs_of(links, [column % num for column in group]):
+            features.append(Features(name, len(rows), unit, frame, link, scale, rows, term.reading))
+    steps = [replace(each, name=f"{each.name} of physics step {step}") for step in range(substeps) for each in features]
+    return steps or features

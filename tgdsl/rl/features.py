@@ -1,0 +1,101 @@
+"""What features of observations are, of the groups that tasks share: beside `groups`, which makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from tgdsl.console.tables import TaxelTable
+
+GoalPart = Literal["orientation", "difference", "angle"]
+"""What can be observed of a goal that is an orientation."""
+AXES = ("x", "y", "z")
+COLUMNS = ("xx", "xy", "xz", "yx", "yy", "yz")
+"""Components of the first two columns of a rotation's matrix, that is of the turned x axis and y axis."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features that stand side by side and are of one kind.
+
+    Attributes:
+        name: What they are, those of a vector by their components in order: `force_x, force_y, force_z`.
+        size: How many there are.
+        unit: Unit of the quantity, before it is scaled; "1" if it has none.
+        frame: Axes of a vector's components: `world`, or `link`, the frame of the link; empty of what has no direction.
+        link: Body that they are of; empty if they are of none.
+        scale: Factor from the quantity to the features.
+        rows: Which taxels or probes they are of, one after another, by their places in `env.touch.rows[sensor]`; else empty.
+        sensor: The reading that they are of; empty if they are of none.
+        note: What else is to be known of the sensor: where it is cut off.
+    """
+
+    name: str
+    size: int
+    unit: str = "1"
+    frame: str = ""
+    link: str = ""
+    scale: float = 1.0
+    rows: range = range(0)
+    sensor: str = ""
+    note: str = ""
+
+
+def vector(name: str, unit: str, link: str = "", frame: str = "world") -> Features:
+    """Return the components of a vector."""
+    return Features(", ".join(f"{name}_{axis}" for axis in AXES), 3, unit, frame, link)
+
+
+def orientation(name: str, link: str = "") -> Features:
+    """Return the six numbers of an orientation: the turned x axis, then the turned y axis, in world axes."""
+    return Features(", ".join(f"{name}_{part}" for part in COLUMNS), 6, "1", "world", link)
+
+
+def object_state(body: str) -> list[Features]:
+    """Return what `groups.object_state` has."""
+    return [
+        vector("position", "m", body),
+        orientation("orientation", body),
+        vector("velocity", "m/s", body),
+        vector("angular_velocity", "rad/s", body),
+    ]
+
+
+def distances(sensor: str, table: TaxelTable) -> list[Features]:
+    """Return what `Now.distance` has, of each probe: less than 0 inside the object. See `Setup.rows`."""
+    links = table["link"].tolist()
+    return [
+        Features("distance", len(rows), "m", "", link, 1.0, rows, sensor) for link, rows in runs_of(links, range(len(links)))
+    ]
+
+
+def object_props(body: str) -> list[Features]:
+    """Return what `groups.object_props` has before the distances."""
+    return [Features("friction", 1, "1", "", body), Features("mass", 1, "kg", "", body)]
+
+
+def link_forces(links: Sequence[str]) -> list[Features]:
+    """Return what `Now.link_force` has: the object's force on each link."""
+    return [vector("force", "N", link, "link") for link in links]
+
+
+def goal(parts: Sequence[GoalPart], body: str) -> list[Features]:
+    """Return what `groups.goal` has."""
+    known = {
+        "orientation": orientation("goal", body),
+        "difference": orientation("goal_from_object", body),
+        "angle": Features("angle_to_goal", 1, "rad", "", body),
+    }
+    return [known[part] for part in parts]
+
+
+def runs_of(links: Sequence[str], rows: Sequence[int]) -> list[tuple[str, range]]:
+    """Return rows that follow one another and are of one link."""
+    runs: list[tuple[str, range]] = []
+    for row in rows:
+        if runs and runs[-1][0] == links[row] and runs[-1][1].stop == row:
+            runs[-1] = (links[row], range(runs[-1][1].start, row + 1))
+        else:
+            runs.append((links[row], range(row, row + 1)))
+    return runs
