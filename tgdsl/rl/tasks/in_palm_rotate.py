@@ -192,7 +192,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         }
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what these groups hold."""
+        """Describe these groups."""
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
             "priv_obj_state": features.object_state(self.setup.object),

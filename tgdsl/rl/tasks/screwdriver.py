@@ -233,7 +233,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
         }
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what these groups hold."""
+        """Describe these groups."""
         return {
             "priv_obj_state": [
                 *features.object_state(self.setup.object),
