@@ -82,10 +82,12 @@ def test_recurrent_networks_train_and_forget_episodes_that_have_ended(touch_env)
     after = dict(runner.alg.actor.named_parameters())
     assert any(name.startswith("rnn.") for name in after)
     assert all(not torch.equal(before[name], weight) and weight.isfinite().all() for name, weight in after.items())
-    hidden, cell = runner.alg.actor.get_hidden_state()
-    assert hidden.abs().amax(dim=(0, 2)).min() > 0
-    ended = torch.tensor([True, False, True, False], device=touch_env.device)
-    runner.alg.actor.reset(ended)
+    with torch.inference_mode():
+        runner.alg.actor(env.get_observations())
+        hidden, cell = runner.alg.actor.get_hidden_state()
+        assert hidden.abs().amax(dim=(0, 2)).min() > 0
+        ended = torch.tensor([True, False, True, False], device=touch_env.device)
+        runner.alg.actor.reset(ended)
     hidden, cell = runner.alg.actor.get_hidden_state()
     for memory in (hidden, cell):
         assert ((memory.abs().amax(dim=(0, 2)) == 0) == ended).all()

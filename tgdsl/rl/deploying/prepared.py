@@ -26,6 +26,7 @@ from tgdsl.rl.playing.policy import (
 )
 from tgdsl.rl.playing.provenance import changes_around
 from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
+from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.start import moved_joints
 from tgdsl.scene.scene import SceneModels
 
@@ -35,7 +36,7 @@ EMULATED = "agg_force"
 """What an emulated hand's fingertips feel, whatever a policy makes of it."""
 
 
-_OF_CARDS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel", "proprio")
+_OF_CARDS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel")
 """What of a task's document is as it was where the policy was learned."""
 
 
@@ -126,6 +127,7 @@ def prepare(
     if card is not None:
         check_learned(card, policy, loaded.spec)
         from_card = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
+        from_card["proprio"] = ProprioSpec.model_validate(card["spec"].get("proprio", {}))
         loaded = dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=from_card))
         changes += changes_since(card, loaded.spec)
     known = ("proprio", *([GROUP] if loaded.spec.touch != "none" else []), *loaded.task.hand_groups)
