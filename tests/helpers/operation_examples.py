@@ -1,6 +1,7 @@
 """One example of the arguments of each operation that has a kernel, and what of its result is compared."""
 
 from collections.abc import Callable
+from dataclasses import is_dataclass, replace
 from typing import Any, NamedTuple
 
 import contact_patches
@@ -111,11 +112,13 @@ def in_dtype(tree: Any, dtype: torch.dtype) -> Any:
 
 
 def mapped(function: Callable[[Tensor], Tensor], tree: Any) -> Any:
-    """Return nested tuples, lists and dictionaries with a function of each tensor in its place."""
+    """Return nested tuples, lists, dictionaries and dataclasses with a function of each tensor in its place."""
     if isinstance(tree, Tensor):
         return function(tree)
     if isinstance(tree, dict):
         return {name: mapped(function, part) for name, part in tree.items()}
+    if is_dataclass(tree):
+        return replace(tree, **{name: mapped(function, part) for name, part in vars(tree).items()})  # type: ignore[type-var]
     if isinstance(tree, list):
         return [mapped(function, part) for part in tree]
     if isinstance(tree, tuple):

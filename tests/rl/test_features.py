@@ -158,10 +158,21 @@ def test_students_that_feel_parts_of_a_sensor_are_described(tmp_path):
     felts = [Felt("agg_force", "left", "clean"), Felt("force", "right", "clean"), Felt("agg_bool", "hand", "clean")]
     env = tiny_env(tmp_path, 1, feels=[*felts, Felt("force", "left", "clean")])
     force, touched, bits = (env.describe()[felt.group] for felt in felts)
-    assert [(each.name, each.link, each.scale) for _, each in force] == [(f"depth_{axis}", "left", 1e4) for axis in "zyx"]
+    sums = [(f"sum of depth times normal, {axis}", "left", 1e4, 1) for axis in "zyx"]
+    assert [(each.name, each.link, each.scale, each.size) for _, each in force] == sums
     names = [(f"force_{axis}", "right", range(2, 4)) for axis in "xyz"]
     assert [(each.name, each.link, each.rows) for _, each in touched] == names
-    assert [each.link for _, each in bits] == ["left", "right"]
+    assert [(each.link, each.name) for _, each in bits] == [
+        (link, "contact of more than 2 taxels") for link in ("left", "right")
+    ]
+    env.close()
+
+
+def test_calls_that_a_sensor_stacks_are_told_apart(tmp_path):
+    env = tiny_env(tmp_path, 1, more="touch: depth\nsensors: {depth: {history: 2}}\n")
+    parts = env.describe()["tactile_sensors"]
+    names = [(f"depth of call {call}", link) for call in (0, 1) for link in ("left", "right")]
+    assert [(each.name, each.link) for _, each in parts] == names and parts[-1][0].stop == env.groups["tactile_sensors"]
     env.close()
 
 

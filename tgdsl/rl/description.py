@@ -1,4 +1,4 @@
-"""What each feature of each group of observations is: name, unit, frame, link and scale, in order.
+"""The features of each group of observations in order: name, unit, frame, link and scale.
 
 A task describes its own groups by `Task.describe`, a document's term its group by `ObservationTerm.describe`.
 """
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from tgdsl.console.tables import text_table
-from tgdsl.observations.observations import WANTED, AggForceObservation
+from tgdsl.observations.observations import WANTED, AggBoolObservation, AggForceObservation
 from tgdsl.rl.features import Features, link_forces, runs_of
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.sensed import Sensed, Source, sensors_document
+from tgdsl.rl.sensed import PER_LINK, Sensed, Source, sensors_document
 from tgdsl.rl.task import Task
 from tgdsl.rl.terms import ObservationTerm, Term
 
@@ -24,15 +24,15 @@ HEADER = ("group", "features", "what", "unit", "frame", "link", "scale", "note")
 
 
 class Description(dict[str, tuple[tuple[slice, Features], ...]]):
-    """The features of each group with their places in it; it prints as a table."""
+    """The features of each group with their slices; it prints as a table."""
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return a row of text for all features of a kind: the cells under `HEADER`."""
+        """Return the cells under `HEADER`, a row for adjacent features of one kind."""
         return [
             (
                 group,
                 f"{place.start}:{place.stop}",
-                each.name + (f", rows {each.rows.start}:{each.rows.stop} of {each.sensor}" if each.sensor else ""),
+                each.name + (f", rows {each.rows.start}:{each.rows.stop} of {each.sensor}" if each.rows else ""),
                 each.unit,
                 each.frame or "–",
                 each.link or "–",
@@ -50,11 +50,11 @@ class Description(dict[str, tuple[tuple[slice, Features], ...]]):
 def describe(
     loaded: LoadedTask, sensed: Sensed, task: Task[Any], terms: Mapping[str, Term], sizes: Mapping[str, int]
 ) -> Description:
-    """Return what each feature of each group of observations is.
+    """Return the features of each group of observations.
 
     Args:
         loaded: The task's document.
-        sensed: What is felt.
+        sensed: The sensors.
         task: The task.
         terms: Terms that the document adds.
         sizes: Size of each group.
@@ -78,7 +78,7 @@ def describe(
 
 
 def _notes(loaded: LoadedTask) -> dict[str, str]:
-    """Return where sensors are cut off, by name."""
+    """Return by sensor where its readings are cut off."""
     notes = {}
     for name, sensor in sensors_document(loaded).spec.sensors.items():
         if (most := getattr(sensor, "max_range", None)) is not None:
@@ -96,28 +96,30 @@ def _joints(names: Sequence[str], is_slide: Sequence[bool], vel_scale: float) ->
 
 
 def _touch(sensed: Sensed, source: Source, substeps: int) -> list[Features]:
-    """Return what a group of touch has: of each channel each link's rows, and all that of each physics step if stacked."""
+    """Return the features of a group of touch: by physics step if these are stacked, then channel, then link."""
     touch = sensed.touch
     (term,) = (term for term in touch.plan.observations if term.group == source.observation)
     assert term.reading is not None
     (output,) = (output for output in touch.outputs if output.name == term.reading)
-    table = touch.rows[term.reading]
-    links = list(np.asarray(table["link" if "link" in (table.dtype.names or ()) else "body"]).tolist())
-    scale = 1.0
-    if term.type in ("agg_bool", "agg_force"):
+    table, scale, is_aggregate = touch.rows[term.reading], 1.0, term.type in PER_LINK
+    links = table["link" if "link" in (table.dtype.names or ()) else "body"].tolist()
+    if is_aggregate:
         links = list(dict.fromkeys(links))
-        axes = term.axes if term.type == "agg_force" else ""
-        channels = [(f"depth_{axis}", "m", "link") for axis in axes] or [("contact", "1", "")]
-        scale = AggForceObservation.model_fields["scale"].default if axes else 1.0
+        channels = [(f"sum of depth times normal, {axis}", "m", "link") for axis in term.axes]
+        scale = AggForceObservation.model_fields["scale"].default if channels else 1.0
+        least = AggBoolObservation.model_fields["more_than"].default
+        channels = channels or [(f"contact of more than {least} taxels", "1", "")]
     else:
         has_axes = term.type in WANTED and len(WANTED[term.type][0]) > 1
         channels = [(output.channels[i], output.units[i], "link" if has_axes else "") for i in term.channels]
-    num = len(links)
-    columns = range(len(channels) * num) if source.columns is None else source.columns.tolist()
-    features = []
-    for channel, group in groupby(columns, key=lambda column: column // num):
+    columns = range(term.num_features) if source.columns is None else source.columns.tolist()
+    has_calls, features = term.num_features > len(channels) * len(links), []
+    for index, group in groupby(columns, key=lambda column: column // len(links)):
+        call, channel = divmod(index, len(channels))
         name, unit, frame = channels[channel]
-        for link, rows in runs_of(links, [column % num for column in group]):
-            features.append(Features(name, len(rows), unit, frame, link, scale, rows, term.reading))
+        for link, rows in runs_of(links, [column % len(links) for column in group]):
+            text = f"{name} of call {call}" if has_calls else name
+            places = range(0) if is_aggregate else rows
+            features.append(Features(text, len(rows), unit, frame, link, scale, places, term.reading))
     steps = [replace(each, name=f"{each.name} of physics step {step}") for step in range(substeps) for each in features]
     return steps or features

@@ -254,7 +254,7 @@ class TouchEnv:
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
-            now = self._instant = self._begun(everyone, self.sim.read())
+            now = self._instant = self._begin_instant(everyone, self.sim.read())
             self._obs, self._is_loaded = self._observe(now), False
             return dict(self._obs)
 
@@ -306,7 +306,7 @@ class TouchEnv:
         with torch.inference_mode(False), torch.no_grad(), self._dispatch():
             self.actuation.follow(control)
             self._events.advance()
-            now = self._instant = self._advanced(self._stepped(self.sim.ctrl))
+            now = self._instant = self._advance_task(self._step_physics(self.sim.ctrl))
             step = self._judged(now, self.sim.faults)
         self._obs, self._is_loaded = step.obs, False
         return step
@@ -397,11 +397,11 @@ class TouchEnv:
             self._before.copy_(self._used)
             control = self._commanded(self._action, sim.ctrl)
             self._events.advance()
-        readings = self._stepped(control)
+        readings = self._step_physics(control)
         with self._logic_by():
             return self._conclude(readings)
 
-    def _stepped(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
+    def _step_physics(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
         """Make the physics steps of a control step, and return the readings at its end."""
         if self._substeps is not None:
             return self._substeps.step(control)
@@ -410,15 +410,15 @@ class TouchEnv:
 
     def _conclude(self, readings: dict[str, Tensor]) -> tuple[Step, Now]:
         """Return what a control step has brought, by its readings, and its instant; begin episodes where some have ended."""
-        sim, now = self.sim, self._advanced(readings)
+        sim, now = self.sim, self._advance_task(readings)
         step = self._judged(now, sim.faults)
         if may_be_nonempty(step.info.ended):
             self._begin(step.info.ended)
-            now = self._begun(step.info.ended, sim.read(step.info.ended))
+            now = self._begin_instant(step.info.ended, sim.read(step.info.ended))
             step = step._replace(obs=self._observed(now))
         return step, now
 
-    def _advanced(self, readings: dict[str, Tensor]) -> Now:
+    def _advance_task(self, readings: dict[str, Tensor]) -> Now:
         """Return the instant at the end of a control step, of which the task has taken note."""
         now = self._now(readings)
         if self._speeds:
@@ -426,7 +426,7 @@ class TouchEnv:
         self.task.advance_healthy(now, self.sim.faults)
         return replace(now, score=self.task.score())
 
-    def _begun(self, chosen: Bool[Tensor, " env"], readings: dict[str, Tensor]) -> Now:
+    def _begin_instant(self, chosen: Bool[Tensor, " env"], readings: dict[str, Tensor]) -> Now:
         """Return the instant at which some environments begin an episode."""
         now = self._now(readings)
         if self._speeds:

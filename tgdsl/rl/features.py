@@ -1,4 +1,4 @@
-"""What features of observations are, of the groups that tasks share: beside `groups`, which makes them."""
+"""Descriptions of the groups of observations that tasks share, which `groups` computes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 from tgdsl.console.tables import TaxelTable
 
 GoalPart = Literal["orientation", "difference", "angle"]
-"""What can be observed of a goal that is an orientation."""
+"""Parts of an observed goal, an orientation."""
 AXES = ("x", "y", "z")
 COLUMNS = ("xx", "xy", "xz", "yx", "yy", "yz")
 """Components of the first two columns of a rotation's matrix, that is of the turned x axis and y axis."""
@@ -17,18 +17,18 @@ COLUMNS = ("xx", "xy", "xz", "yx", "yy", "yz")
 
 @dataclass(frozen=True)
 class Features:
-    """Features that stand side by side and are of one kind.
+    """Adjacent features of one kind.
 
     Attributes:
-        name: What they are, those of a vector by their components in order: `force_x, force_y, force_z`.
+        name: Name of the quantity; of a vector, its components in order: `force_x, force_y, force_z`.
         size: How many there are.
         unit: Unit of the quantity, before it is scaled; "1" if it has none.
-        frame: Axes of a vector's components: `world`, or `link`, the frame of the link; empty of what has no direction.
-        link: Body that they are of; empty if they are of none.
+        frame: Axes of a vector's components: `world`, or `link`, the frame of the link; empty without a direction.
+        link: The body; empty if there is none.
         scale: Factor from the quantity to the features.
-        rows: Which taxels or probes they are of, one after another, by their places in `env.touch.rows[sensor]`; else empty.
-        sensor: The reading that they are of; empty if they are of none.
-        note: What else is to be known of the sensor: where it is cut off.
+        rows: Rows of `env.touch.rows[sensor]`, one feature each: taxels or probes; else empty.
+        sensor: The reading; empty if there is none.
+        note: Where the reading is cut off.
     """
 
     name: str
@@ -53,7 +53,7 @@ def orientation(name: str, link: str = "") -> Features:
 
 
 def object_state(body: str) -> list[Features]:
-    """Return what `groups.object_state` has."""
+    """Describe `groups.object_state`."""
     return [
         vector("position", "m", body),
         orientation("orientation", body),
@@ -63,7 +63,7 @@ def object_state(body: str) -> list[Features]:
 
 
 def distances(sensor: str, table: TaxelTable) -> list[Features]:
-    """Return what `Now.distance` has, of each probe: less than 0 inside the object. See `Setup.rows`."""
+    """Describe `Now.distance`, less than 0 inside the object; sensor and table are those of `Setup.rows`."""
     links = table["link"].tolist()
     return [
         Features("distance", len(rows), "m", "", link, 1.0, rows, sensor) for link, rows in runs_of(links, range(len(links)))
@@ -71,17 +71,17 @@ def distances(sensor: str, table: TaxelTable) -> list[Features]:
 
 
 def object_props(body: str) -> list[Features]:
-    """Return what `groups.object_props` has before the distances."""
+    """Describe `groups.object_props`, the distances left out."""
     return [Features("friction", 1, "1", "", body), Features("mass", 1, "kg", "", body)]
 
 
 def link_forces(links: Sequence[str]) -> list[Features]:
-    """Return what `Now.link_force` has: the object's force on each link."""
+    """Describe `Now.link_force`, the object's force on each link."""
     return [vector("force", "N", link, "link") for link in links]
 
 
 def goal(parts: Sequence[GoalPart], body: str) -> list[Features]:
-    """Return what `groups.goal` has."""
+    """Describe `groups.goal`."""
     known = {
         "orientation": orientation("goal", body),
         "difference": orientation("goal_from_object", body),

@@ -18,12 +18,12 @@ class SubstepTouch:
     """The groups of touch after each physics step of the last control step; all steps of a start are alike.
 
     Attributes:
-        stacked: By group of observations: live tensors.
+        stacks: By group of observations: live tensors.
     """
 
     def __init__(self, sensed: Sensed, sim: Simulation):
         self._sensed, self._sim = sensed, sim
-        self.stacked: dict[str, Float[Tensor, "env step feature"]] = {}
+        self.stacks: dict[str, Float[Tensor, "env step feature"]] = {}
 
     def step(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
         """Make a control step, feeling at each physics step; return the readings of the last one."""
@@ -32,17 +32,17 @@ class SubstepTouch:
         for i, state in enumerate(self._sim.substates(control)):
             readings = touch(state)
             for name, value in self._sensed.observe(readings).items():
-                self.stacked[name][:, i].copy_(value)
+                self.stacks[name][:, i].copy_(value)
         return readings
 
     def begin(self, chosen: Bool[Tensor, " env"], readings: dict[str, Tensor]) -> None:
         """Fill the stacks of environments that begin an episode with the readings of their start."""
         for name, value in self._sensed.observe(readings).items():
             start = value[:, None].expand(-1, self._sim.substeps, -1)
-            if name not in self.stacked:
-                self.stacked[name] = start.clone()
-            self.stacked[name].copy_(torch.where(chosen[:, None, None], start, self.stacked[name]))
+            if name not in self.stacks:
+                self.stacks[name] = start.clone()
+            self.stacks[name].copy_(torch.where(chosen[:, None, None], start, self.stacks[name]))
 
     def observe(self) -> dict[str, Float[Tensor, "env feature"]]:
         """Return copies of the groups: all features of the first physics step, then of the second."""
-        return {name: value.flatten(1).clone() for name, value in self.stacked.items()}
+        return {name: value.flatten(1).clone() for name, value in self.stacks.items()}

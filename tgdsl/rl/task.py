@@ -316,7 +316,7 @@ class Task(ABC, Generic[S]):
         """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what the features of `observe` are, by group and in order; what is left out counts as not described."""
+        """Describe the features of `observe`, by group and in order; a group that is left out is "not described"."""
         return {}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:

@@ -117,7 +117,7 @@ class ObservationTerm(Term):
         """Return the group."""
 
     def describe(self, setup: Setup) -> Sequence[Features]:
-        """Return what its features are, in order; none: they are not described."""
+        """Describe its features, in order; none: they are "not described"."""
         return ()
 
 

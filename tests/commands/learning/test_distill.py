@@ -315,6 +315,9 @@ def test_a_teacher_of_other_taxels_or_without_a_card_is_refused(base, fails):
     extra["taxels.csv"] = "".join([lines[0], *lines[2:], lines[1]])  # the first taxel comes last
     torch.jit.save(module, base / "teacher.pt", _extra_files=extra)
     assert "teacher.pt: this policy feels with other taxels" in fails(*TEACHER, *FIVE, "--envs", "10")
+    stacked = task.spec.model_dump(mode="json") | {"temporal": "stack"}
+    teacher(base / "teacher.pt", task, ["proprio", "tactile_sensors"], spec=stacked)
+    assert "this teacher feels other readings of a control step: temporal stack, here last" in fails(*TEACHER, *FIVE)
     torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), base / "teacher.pt")
     assert "this policy has no card that says how it was learned" in fails(*TEACHER, *FIVE, "--envs", "10")
     teacher(base / "teacher.pt", task, ["proprio"])

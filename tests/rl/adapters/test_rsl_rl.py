@@ -26,9 +26,13 @@ def touch_env(request, tmp_path_factory):
     env.close()
 
 
-def runner_of(env, log_dir=None, groups=("proprio", "tactile_sensors", "goal")):
+MLP = {"class_name": "MLPModel"}
+LSTM = {"class_name": "RNNModel", "rnn_type": "lstm", "rnn_hidden_dim": 8, "rnn_num_layers": 1}
+
+
+def runner_of(env, log_dir=None, groups=("proprio", "tactile_sensors", "goal"), model=MLP):
     """PPO with small networks, an actor on what a hand has and a critic on what only a simulation knows."""
-    network = {"class_name": "MLPModel", "hidden_dims": [16], "activation": "elu", "obs_normalization": True}
+    network = model | {"hidden_dims": [16], "activation": "elu", "obs_normalization": True}
     actor = network | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
     config = {
         "num_steps_per_env": 12,
@@ -66,6 +70,27 @@ def test_the_runner_trains(touch_env, tmp_path):
     terms = [sum(found[f"Reward/{name}"][i] for name in touch_env.step(torch.zeros(4, 2)).info.terms) for i in range(2)]
     assert found["Episode/return"] == pytest.approx(terms, abs=1e-6)
     assert found["Train/mean_reward"][0] == pytest.approx(found["Episode/return"][0], abs=1e-6)
+
+
+def test_recurrent_networks_train_and_forget_episodes_that_have_ended(touch_env):
+    """By rsl_rl's own PPO and its RNNModel: all weights change, those of the memory among them."""
+    env = TouchVecEnv(touch_env)
+    env.reset(seed=1)
+    runner = runner_of(env, model=LSTM)
+    before = {name: weight.clone() for name, weight in runner.alg.actor.named_parameters()}
+    runner.learn(2)
+    after = dict(runner.alg.actor.named_parameters())
+    assert any(name.startswith("rnn.") for name in after)
+    assert all(not torch.equal(before[name], weight) and weight.isfinite().all() for name, weight in after.items())
+    with torch.inference_mode():
+        runner.alg.actor(env.get_observations())
+        hidden, cell = runner.alg.actor.get_hidden_state()
+        assert hidden.abs().amax(dim=(0, 2)).min() > 0
+        ended = torch.tensor([True, False, True, False], device=touch_env.device)
+        runner.alg.actor.reset(ended)
+    hidden, cell = runner.alg.actor.get_hidden_state()
+    for memory in (hidden, cell):
+        assert ((memory.abs().amax(dim=(0, 2)) == 0) == ended).all()
 
 
 def test_the_environment_goes_on_after_training(touch_env):

@@ -52,11 +52,12 @@ def in_environments(task, file, **overrides):
     return steps, made.info.score
 
 
-@pytest.mark.parametrize("joint_vel", ["exact", "measured"])
-def test_on_a_simulation_it_does_what_it_does_in_environments(task, joint_vel):
+@pytest.mark.parametrize(("joint_vel", "scale"), [("exact", 1.0), ("measured", 1.0), ("exact", 0.2)])
+def test_on_a_simulation_it_does_what_it_does_in_environments(task, joint_vel, scale):
     """Episode i is that of environment i: observations, targets and scores; drives with play, bias and delay are the scene's."""
-    file = press_policy(task.parent, task, name=f"{joint_vel}.pt", joint_vel=joint_vel)
-    expected, scores = in_environments(task, file, joint_vel=joint_vel)
+    overrides = {"joint_vel": joint_vel, "proprio.vel_scale": scale}
+    file = press_policy(task.parent, task, name=f"{joint_vel}_{scale}.pt", **overrides)
+    expected, scores = in_environments(task, file, **overrides)
     found = list(Deployment(task, file).steps(EPISODES))
     assert len(found) == EPISODES * len(expected)
     for moment in found:

@@ -39,6 +39,7 @@ from tgdsl.rl.playing.policy import (
 )
 from tgdsl.rl.playing.provenance import changes_around
 from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
+from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.start import moved_joints
 from tgdsl.rl.task import HandNow
 from tgdsl.runtime.connection import Connection
@@ -49,7 +50,7 @@ JOINT_POS, JOINT_VEL = "joint_pos", "joint_vel"
 """Groups of the module that proprioception is made of: all actuated joints, in the order of the actuators."""
 EMULATED = "agg_force"
 """What an emulated hand's fingertips feel, whatever a policy makes of it."""
-CARD_KEYS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel", "proprio")
+CARD_KEYS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel")
 """What of a task's document is as it was where the policy was learned."""
 EVERYONE = torch.ones(1, dtype=torch.bool)
 APPROACH_S = 2.0
@@ -112,6 +113,7 @@ def prepare(
     if card is not None:
         check_learned(card, policy, loaded.spec)
         from_card = {name: card["spec"][name] for name in CARD_KEYS if name in card["spec"]}
+        from_card["proprio"] = ProprioSpec.model_validate(card["spec"].get("proprio", {}))
         loaded = replace(loaded, spec=loaded.spec.model_copy(update=from_card))
         changes += changes_since(card, loaded.spec)
     of_hand = loaded.task.hand_groups

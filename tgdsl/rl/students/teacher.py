@@ -39,6 +39,9 @@ class Teacher:
         if self.felt and theirs["resolution"] != ours["resolution"]:
             resolutions = f"resolution {theirs['resolution']}, here {ours['resolution']}"
             raise PolicyError(f"{file}: this teacher feels with other taxels: {resolutions}")
+        if self.felt and theirs.get("temporal", "last") != ours["temporal"]:
+            readings = f"temporal {theirs.get('temporal', 'last')}, here {ours['temporal']}"
+            raise PolicyError(f"{file}: this teacher feels other readings of a control step: {readings}")
         if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
             problem = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
             raise PolicyError(f"{file}: {problem}; learn it again, or take distill.loss=mse")

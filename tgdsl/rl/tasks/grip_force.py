@@ -213,7 +213,7 @@ class GripForce(Task[GripForceSpec]):
         }
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what these groups hold."""
+        """Describe these groups."""
         return {
             "goal": [Features("force to press with", 1, "N")],
             "priv_force": [

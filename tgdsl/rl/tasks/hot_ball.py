@@ -166,7 +166,7 @@ class HotBall(Task[HotBallSpec]):
         }
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what these groups hold."""
+        """Describe these groups."""
         return {
             "priv_heat": [
                 *(

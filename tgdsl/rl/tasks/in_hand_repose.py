@@ -52,8 +52,8 @@ from tgdsl.rl.features import Features
 from tgdsl.rl.spec import Whole
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.paying import PaidRateSpec
 from tgdsl.rl.tasks.placing import PlacedTaskSpec
+from tgdsl.rl.tasks.progress import ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -66,7 +66,7 @@ class Distill(with_defaults(DistillSpec, max_grad_norm=None)):
     """How students are taught; the paper's numbers for this task."""
 
 
-class InHandReposeSpec(PlacedTaskSpec, PaidRateSpec):
+class InHandReposeSpec(PlacedTaskSpec, ProgressSpec):
     """Turn an object in the hand to one orientation after another."""
 
     train: Train = Train()
@@ -132,7 +132,7 @@ class InHandRepose(Task[InHandReposeSpec]):
     @reward_term(0.2, "1/rad")
     def progress(self, now: Now) -> Float[Tensor, " env"]:
         """Rate at which the angle to the goal gets smaller, min((φ' − φ)/Δt, ω_max)."""
-        return self.spec.paid(self.rate)
+        return self.spec.pay(self.rate)
 
     near = terms.Near.of_task(0.5, width="near_width")
     contact_force = terms.ContactForce.of_task(-5.0, max_force="max_force")
@@ -140,7 +140,7 @@ class InHandRepose(Task[InHandReposeSpec]):
     @reward_term(-100.0, "1/s")
     def drop(self, now: Now) -> Bool[Tensor, " env"]:
         """Object dropped in this step."""
-        return self.spec.dropped_by(now.object.pos - self.start_pos) > self.spec.drop_distance
+        return self.spec.drop_extent(now.object.pos - self.start_pos) > self.spec.drop_distance
 
     @reward_term(-200.0, "1/s")
     def goal_timeout(self, now: Now) -> Bool[Tensor, " env"]:
@@ -205,7 +205,7 @@ class InHandRepose(Task[InHandReposeSpec]):
         }
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what these groups hold."""
+        """Describe these groups."""
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
             "priv_obj_state": features.object_state(self.setup.object),

@@ -16,7 +16,7 @@ Weights of the reward's terms are the paper's. Progress pays c, 1 where the obje
 `holding`. s is the share of Σ max(0, Δψ) since the goal
 before that was paid, Σ c max(0, Δψ) over it. By default c = s = 1: whether an object is held or coasts makes no difference.
 
-`spin` pays a bounded rate, see `paying`, and up to a tilt of `spin_tilt` alone.
+`spin` pays a bounded rate, see `progress`, and up to a tilt of `spin_tilt` alone.
 
 An episode ends for good where the object is further than `drop_distance` from p_0, or below it. Score: quarter turns, k.
 
@@ -43,8 +43,8 @@ from tgdsl.rl.features import Features
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.tasks.paying import PaidRateSpec
 from tgdsl.rl.tasks.placing import PlacedTaskSpec
+from tgdsl.rl.tasks.progress import ProgressSpec
 
 QUARTER = 0.5 * math.pi
 
@@ -56,7 +56,7 @@ class Distill(DistillSpec):
     """Heads by the privileged number that they tell: the object's height [m], and its angle to the goal [rad]."""
 
 
-class InPalmRotateSpec(PlacedTaskSpec, PaidRateSpec):
+class InPalmRotateSpec(PlacedTaskSpec, ProgressSpec):
     """Turn an object on the palm about the vertical."""
 
     distill: Distill = Distill()
@@ -105,7 +105,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     @reward_term(2.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:
         """Angular velocity about n, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
-        paid = self.spec.paid(self.rate) * torch.where(self.rate > 0, self.pay, 1.0)
+        paid = self.spec.pay(self.rate) * torch.where(self.rate > 0, self.pay, 1.0)
         return paid if self.spec.spin_tilt is None else paid * (self.tilt <= self.spec.spin_tilt)
 
     near = terms.Near.of_task(0.1, width="near_width")
@@ -177,7 +177,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped."""
-        return self.spec.dropped_by(now.object.pos - self.start_pos) > self.spec.drop_distance
+        return self.spec.drop_extent(now.object.pos - self.start_pos) > self.spec.drop_distance
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the object has turned in this control step [rad]."""
@@ -192,7 +192,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         }
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what these groups hold."""
+        """Describe these groups."""
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
             "priv_obj_state": features.object_state(self.setup.object),

@@ -27,6 +27,6 @@ class PlacedTaskSpec(TaskSpec):
     drop_measure: Literal["distance", "below"] = "distance"
     """What `drop_distance` bounds: how far the object is from where it started, or how far below."""
 
-    def dropped_by(self, offset: Float[Tensor, "env 3"]) -> Float[Tensor, " env"]:
+    def drop_extent(self, offset: Float[Tensor, "env 3"]) -> Float[Tensor, " env"]:
         """Return what `drop_distance` bounds, of an object's position less that at its start [m]."""
         return vector_norm(offset, dim=1) if self.drop_measure == "distance" else -offset[:, 2]

@@ -15,7 +15,7 @@ Weights of the reward's terms are the paper's. Progress pays c, 1 where the obje
 default: see `holding`. At 2 rad/s `spin` is worth 20 1/s; `near` is worth 1 if all probes touch, `drop` −2.5 in all,
 `joint_limit` −1.9 for a finger stretched out, `action_rate` −0.05 for random actions of eight joints, `work` −0.002 at 2 W.
 
-So a spin of 2 rad/s pays up to a tilt of 15°; `spin` pays a bounded rate, see `paying`. An episode ends for good where
+So a spin of 2 rad/s pays up to a tilt of 15°; `spin` pays a bounded rate, see `progress`. An episode ends for good where
 θ > `drop_tilt`, where the tip is out of the screw, |s − s_0| > `engagement`, or with `stall` where Σ Δψ does not exceed by
 `stall.turn` within `stall.within` what it was. Score: what was turned at a tilt of less than 20°, over the duration of a whole
 episode [rad/s]: after a drop nothing is added.
@@ -51,7 +51,7 @@ from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.tasks.paying import PaidRateSpec, Spin
+from tgdsl.rl.tasks.progress import ProgressSpec, Spin
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
 
@@ -92,7 +92,7 @@ class StallSpec(SpecModel):
     """By how much it has to turn in that time, the right way [rad]."""
 
 
-class ScrewdriverSpec(TaskSpec, PaidRateSpec):
+class ScrewdriverSpec(TaskSpec, ProgressSpec):
     """Spin a screwdriver about its long axis."""
 
     train: Train = Train()
@@ -135,7 +135,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
     @reward_term(10.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:
         """Angular velocity about the long axis, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
-        return self.spec.paid(self.rate) * self._pay(now)
+        return self.spec.pay(self.rate) * self._pay(now)
 
     near = terms.Near.of_task(1.0, width="near_width")
 
@@ -228,7 +228,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
         }
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Return what these groups hold."""
+        """Describe these groups."""
         return {
             "priv_obj_state": [
                 *features.object_state(self.setup.object),

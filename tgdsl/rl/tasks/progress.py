@@ -16,7 +16,7 @@ from tgdsl.fields.models import Quantity, SpecModel
 Spin = Annotated[float, Quantity("number", gt=0.0)]
 
 
-class PaidRateSpec(SpecModel):
+class ProgressSpec(SpecModel):
     """Bounds of the rate that pays: part of a task's document."""
 
     max_spin: Spin = 4.0
@@ -26,7 +26,7 @@ class PaidRateSpec(SpecModel):
     backward: Spin = 1.0
     """κ, factor on what goes back."""
 
-    def paid(self, rate: Float[Tensor, " env"]) -> Float[Tensor, " env"]:
+    def pay(self, rate: Float[Tensor, " env"]) -> Float[Tensor, " env"]:
         """Return what pays of a rate [rad/s]."""
         bounded = rate.clamp(max=self.max_spin)
         if self.min_spin is not None:
