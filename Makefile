@@ -37,8 +37,8 @@ test-full: $(READY)
 	@$(PYTEST) -m "not slow" --check-types tests/geometry tests/observations tests/oracles tests/quantities tests/surfaces tests/tensors tests/sensors --ignore=tests/sensors/test_compiled.py
 
 # Adapters against the simulators as they are installed, each in an environment of its own beside torch and the rest of $(VENV). mjlab
-# pins MuJoCo 3.11, with which readers and errors are tested too; one that cannot be installed is named.
-test-adapters: adapter-mjlab adapter-newton adapter-gymnasium_robotics
+# pins MuJoCo 3.11, with which readers and errors are tested too; lerobot reads datasets back; one that cannot be installed is named.
+test-adapters: adapter-mjlab adapter-newton adapter-gymnasium_robotics adapter-lerobot
 adapter-mjlab: MORE = tests/runtime/test_by_name.py tests/runtime/batch/test_older_mujoco.py
 adapter-%: $(READY)
 	@$(PYTHON) -m venv $(ADAPTERS)/$*
