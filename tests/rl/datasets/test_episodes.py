@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import torch
 from hand_logs import random_readings, write_log
+from pressing_hands import CALIBRATION, Blind, press_policy, press_task
 from small_tasks import small_task
 
 from tgdsl.errors import TgdslError
 from tgdsl.rl.datasets.episode import Episode, LinkTaxels, Source, features, frames
-from tgdsl.rl.datasets.sources import of_environments, of_log
+from tgdsl.rl.datasets.sources import of_deployment, of_environments, of_log
+from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actions import RandomActor
 from tgdsl.rl.playing.rollout import rollout
@@ -110,3 +112,23 @@ def test_a_hands_log_is_cut_where_no_reading_came(tmp_path):
     np.testing.assert_array_equal(first.action[:24], positions[5:29])  # where the joints are a frame later
     with pytest.raises(TgdslError, match="--fps 500: expected more than 0, and at most the source's rate, 100"):
         of_log(tmp_path / "press.npz", fps=500.0)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+def test_an_emulated_hand_gives_the_force_on_each_fingertip(tmp_path):
+    task = press_task(tmp_path)
+    options = {"lockstep": True, "calibration": CALIBRATION}
+    policy = press_policy(tmp_path, task, Blind(6), joint_vel="measured")
+    source, episodes = of_deployment(Deployment(task, policy, "emulator", **options), 2)
+    first, second = episodes
+    moments = [moment for moment in Deployment(task, policy, "emulator", **options).steps(2) if moment.episode == 1]
+    assert len(moments) == len(second.time) and source.unit == "N" and first.is_success
+    names, num = list(source.links), len(source.joints)
+    for k, moment in enumerate(moments):
+        of_axes = moment.obs["tactile_sensors"][0].split(len(names))  # x of all fingertips, then y, then z
+        for i, name in enumerate(names):
+            np.testing.assert_array_equal(second.touch[name][k, 0], [float(axis[i]) for axis in of_axes])
+        np.testing.assert_array_equal(second.state[k], moment.obs["proprio"][0, :num])
+        np.testing.assert_array_equal(second.action[k], moment.target[0])
+    assert max(abs(touch).max() for touch in second.touch.values()) > 0.1
+    assert second.score == pytest.approx(float(moments[-1].step.info.score))

@@ -3,6 +3,8 @@
 LeRobot's own writer pins torch below 2.11; the format is as lerobot 0.4.4 reads it.
 """
 
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import json

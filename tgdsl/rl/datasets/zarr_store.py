@@ -1,5 +1,7 @@
 """A dataset as a Zarr store: `data/<feature>` (frame, …), `meta/episode_ends`, and `meta/tactile/<link>` with the taxels."""
 
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 from collections.abc import Iterable
