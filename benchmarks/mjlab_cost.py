@@ -4,8 +4,8 @@
     python benchmarks/mjlab_cost.py --device cpu --envs 16
 
 Needs tgdsl and mjlab, and no network: `pip install --no-index --find-links WHEELS tgdsl mjlab`. The scene is that of the task
-Tgdsl-In-Palm-Rotate, an XHand1 with 199 taxels of `kinematic_taxel` and a cube. The share is (with − without) / with, medians of
-blocks of steps that take turns.
+Tgdsl-In-Palm-Rotate, an XHand1 with 199 taxels of `kinematic_taxel` and a cube. The share is (with − without) / with, by the
+medians of blocks of steps that take turns.
 
 - `eager`: the module as the adapter reads it
 - `compiled`: the same after `torch.compile`
