@@ -23,13 +23,13 @@ import torch
 
 
 def environment(num_envs: int, device: str, has_touch: bool):
-    """Return environments of the task, with the sensor or without; nothing ends or resets them."""
+    """Return environments of the task, with the sensor or without, that begin alike; nothing ends or resets them."""
     from mjlab.envs import ManagerBasedRlEnv  # pyright: ignore[reportMissingImports]
 
     from tgdsl.adapters.mjlab_tasks import env_cfg
 
     cfg = env_cfg()
-    cfg.scene.num_envs, cfg.terminations = num_envs, {}
+    cfg.scene.num_envs, cfg.terminations, cfg.seed = num_envs, {}, 0
     if not has_touch:
         cfg.scene.sensors = ()
         for group in cfg.observations.values():

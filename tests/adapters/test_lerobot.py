@@ -1,4 +1,4 @@
-"""Datasets, as lerobot and zarr read them: every number is that of the episodes."""
+"""Datasets, as lerobot, mcap and zarr read them: every number is that of the episodes."""
 
 import json
 
@@ -14,9 +14,11 @@ except RuntimeError:  # its operations are built for torch with CUDA; lerobot ca
         torch.library.define(f"torchvision::{name}", "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 import zarr
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from mcap.reader import make_reader
 
 from tgdsl.rl.datasets.episode import Episode, LinkTaxels, Source, frames
 from tgdsl.rl.datasets.lerobot import write_lerobot
+from tgdsl.rl.datasets.mcap_file import write_mcap
 from tgdsl.rl.datasets.zarr_store import write_zarr
 
 
@@ -70,6 +72,25 @@ def test_zarr_reads_every_frame(tmp_path):
     assert root["meta/episode_ends"][:].tolist() == [16, 22, 34] and root["meta/success"][:].tolist() == [1.0, 0.0, 1.0]
     np.testing.assert_array_equal(root["meta/tactile/tip/pos"][:], source.links["tip"].pos)
     assert root.attrs["fps"] == 50.0
+
+
+def test_mcap_reads_every_frame(tmp_path):
+    source, episodes = made_up()
+    assert write_mcap(source, episodes, tmp_path) == (3, 34)
+    each = [frames(source, episode) for episode in episodes]
+    starts = (0.0, 16 / 50 + 1.0, 22 / 50 + 2.0)
+    with (tmp_path / "episodes.mcap").open("rb") as file:
+        reader = make_reader(file)
+        for name in each[0]:
+            messages = [m for *_, m in reader.iter_messages(topics=[f"/{name.replace('.', '/')}"])]
+            assert len(messages) == 34
+            for message in messages:
+                told = json.loads(message.data)
+                value = each[told["episode"]][name][message.sequence]
+                np.testing.assert_array_equal(np.asarray(told["value"], value.dtype), value)
+                assert message.log_time == pytest.approx(1e9 * (starts[told["episode"]] + message.sequence / 50), abs=2)
+        (tactile,) = reader.iter_metadata()
+    assert json.loads(tactile.metadata["links"])["tip"]["pos"] == source.links["tip"].pos.tolist()
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

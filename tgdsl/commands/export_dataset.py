@@ -27,10 +27,10 @@ class ExportDataset:
     """Write episodes with touch as a dataset: joints, set-points, the force on each taxel, rewards, success."""
 
     input: Input
-    to: Literal["lerobot", "zarr"] = "lerobot"
-    """lerobot: LeRobot v3.0; zarr: a Zarr store."""
+    to: Literal["lerobot", "mcap", "zarr"] = "lerobot"
+    """lerobot: LeRobot v3.0; mcap: an MCAP file of JSON messages; zarr: a Zarr store."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
-    """Folder to make; default: out/NAME_lerobot or out/NAME_zarr."""
+    """Folder to make; default: out/NAME_lerobot and the like."""
     policy: OptionalFile = None
     """Of a task: the policy that acts."""
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
@@ -68,6 +68,7 @@ class ExportDataset:
         """Read or play the episodes, and write them."""
         from tgdsl.files.write import with_folder
         from tgdsl.rl.datasets.lerobot import write_lerobot
+        from tgdsl.rl.datasets.mcap_file import write_mcap
         from tgdsl.rl.datasets.zarr_store import write_zarr
 
         out = self.out or Path("out") / f"{self.input.stem}_{self.to}"
@@ -80,7 +81,8 @@ class ExportDataset:
         partial.mkdir()
         with StatusLine() as progress:
             progress("writing episodes")
-            num, frames = (write_lerobot if self.to == "lerobot" else write_zarr)(source, episodes, partial)
+            write = {"lerobot": write_lerobot, "mcap": write_mcap, "zarr": write_zarr}[self.to]
+            num, frames = write(source, episodes, partial)
         partial.rename(out)
         print(
             f"{out}: {num} episodes, {frames} frames at {source.fps:g} Hz; touch in {source.unit} on {len(source.links)} links"
