@@ -85,10 +85,10 @@ def test_mcap_reads_every_frame(tmp_path):
             messages = [m for *_, m in reader.iter_messages(topics=[f"/{name.replace('.', '/')}"])]
             assert len(messages) == 34
             for message in messages:
-                told = json.loads(message.data)
-                value = each[told["episode"]][name][message.sequence]
-                np.testing.assert_array_equal(np.asarray(told["value"], value.dtype), value)
-                assert message.log_time == pytest.approx(1e9 * (starts[told["episode"]] + message.sequence / 50), abs=2)
+                content = json.loads(message.data)
+                value = each[content["episode"]][name][message.sequence]
+                np.testing.assert_array_equal(np.asarray(content["value"], value.dtype), value)
+                assert message.log_time == pytest.approx(1e9 * (starts[content["episode"]] + message.sequence / 50), abs=2)
         (tactile,) = reader.iter_metadata()
     assert json.loads(tactile.metadata["links"])["tip"]["pos"] == source.links["tip"].pos.tolist()
 

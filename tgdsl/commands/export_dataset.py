@@ -105,7 +105,9 @@ class ExportDataset:
             return of_log(self.input, self.fps, load_calibration(self.calibration) if self.calibration else None, self.side)
         if not document:
             known = "expected a recording of tgdsl run, or a log of tgdsl hand record"
-            raise TgdslError(f"{self.input}: found {', '.join(names[:6])}, …; {known}; of tgdsl play export the task itself")
+            raise TgdslError(
+                f"{self.input}: found {', '.join(names[:6])}, …; {known}; to export what a policy does, name its task"
+            )
         with StatusLine() as progress:
             touch = module_of(Path(document), self.set, progress)
         return of_run(self.input, touch, self.fps, self.reading)
@@ -125,10 +127,20 @@ class ExportDataset:
                 options = {"goal": self.goal, "overrides": overrides, "seed": self.seed, "lockstep": self.lockstep}
                 options |= {"calibration": self.calibration, "progress": progress}
                 deployment = Deployment(self.input, self.policy, self.source, **options)
-            return of_deployment(deployment, self.episodes, self.seconds, self.fps, least)
+            return of_deployment(deployment, self.episodes, self._unit(), self.seconds, self.fps, least)
         saved = None if self.policy is None else read_policy(self.policy)
         envs = min(self.envs, self.episodes)
         with StatusLine() as progress:
             env = TouchEnv(self.input, envs, device=self.device, seed=self.seed, overrides=overrides, progress=progress)
         actor = actor_of(env, self.actions, self.seed) if saved is None else policy_for(env, saved)
         return of_environments(env, actor, self.episodes, self.fps, self.reading, least)
+
+    def _unit(self) -> str:
+        """Return the unit of a hand's forces: what the calibration says, or the log."""
+        from tgdsl.runtime.xhand1.calibration import load_calibration
+        from tgdsl.runtime.xhand1.log.log import open_log
+
+        if self.calibration is not None:
+            return load_calibration(self.calibration).units
+        log = open_log(self.source) if self.source.endswith(".npz") else None
+        return log.calibration.units if log is not None and log.calibration is not None else "counts"

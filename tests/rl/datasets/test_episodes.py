@@ -119,7 +119,9 @@ def test_an_emulated_hand_gives_the_force_on_each_fingertip(tmp_path):
     task = press_task(tmp_path)
     options = {"lockstep": True, "calibration": CALIBRATION}
     policy = press_policy(tmp_path, task, Blind(6), joint_vel="measured")
-    source, episodes = of_deployment(Deployment(task, policy, "emulator", **options), 2)
+    source, episodes = of_deployment(Deployment(task, policy, "emulator", **options), 2, "N")
+    with pytest.raises(TgdslError, match="a simulation's forces on taxels come from --source environments"):
+        of_deployment(Deployment(task, policy), 1, "N")
     first, second = episodes
     moments = [moment for moment in Deployment(task, policy, "emulator", **options).steps(2) if moment.episode == 1]
     assert len(moments) == len(second.time) and source.unit == "N" and first.is_success

@@ -66,7 +66,7 @@ def write_lerobot(source: Source, episodes: Iterable[Episode], folder: Path) -> 
         row |= {"dataset_from_index": total, "dataset_to_index": total + num}
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         row |= {} if episode.score is None else {"score": episode.score, "success": episode.is_success}
-        rows.append(row | {f"stats/{name}/{key}": s.tolist() for name, own in stats[-1].items() for key, s in own.items()})
+        rows.append(row | {f"stats/{name}/{key}": s.tolist() for name, parts in stats[-1].items() for key, s in parts.items()})
         total += num
     if writer is None:
         raise TgdslError(f"{source.name}: there is no episode to write")
@@ -86,7 +86,10 @@ def write_lerobot(source: Source, episodes: Iterable[Episode], folder: Path) -> 
     info |= {"chunks_size": 1000, "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": 200}
     info |= {"fps": int(source.fps) if source.fps.is_integer() else source.fps, "splits": {"train": f"0:{len(rows)}"}}
     info |= {"data_path": PATHS["data"], "video_path": None, "features": described}
-    joined = {name: {key: s.tolist() for key, s in _joined([own[name] for own in stats]).items()} for name in columns}
+    joined = {
+        name: {key: s.tolist() for key, s in _joined([episode_stats[name] for episode_stats in stats]).items()}
+        for name in columns
+    }
     for name, value in {"info": info, "stats": joined, "tactile": description(source)}.items():
         (folder / "meta" / f"{name}.json").write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return len(rows), total
@@ -102,8 +105,8 @@ def description(source: Source) -> dict[str, Any]:
         }
         for name, link in source.links.items()
     }
-    told = {"source": source.name, "unit": source.unit, "channels": list(source.channels), "frame": "body"}
-    return told | {"window": source.window, "sample_step": source.control_step, "links": links}
+    touch = {"source": source.name, "unit": source.unit, "channels": list(source.channels), "frame": "body"}
+    return touch | {"window": source.window, "sample_step": source.control_step, "links": links}
 
 
 def _type(pa: Any, feature: Feature) -> Any:

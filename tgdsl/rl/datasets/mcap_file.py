@@ -40,8 +40,8 @@ def write_mcap(source: Source, episodes: Iterable[Episode], folder: Path) -> tup
             values = frames(source, episode)
             if not channels:
                 for name, feature in features(source, {link: t.shape[1] for link, t in episode.touch.items()}).items():
-                    told = {"names": json.dumps(feature.names), "shape": json.dumps(feature.shape)}
-                    channels[name] = writer.register_channel(f"/{name.replace('.', '/')}", "json", kind, told)
+                    metadata = {"names": json.dumps(feature.names), "shape": json.dumps(feature.shape)}
+                    channels[name] = writer.register_channel(f"/{name.replace('.', '/')}", "json", kind, metadata)
             for frame in range(len(values["action"])):
                 time = start + round(frame * SECOND / source.fps)
                 for name, channel in channels.items():

@@ -24,6 +24,7 @@ from tgdsl.rl.deploying.prepared import EMULATED
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, rollout
 from tgdsl.rl.sensed import GROUP
+from tgdsl.runtime.connect import kind_of
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S
 from tgdsl.runtime.xhand1.log.log import open_log
@@ -37,7 +38,7 @@ LOG_FPS = 30.0
 
 
 class _Watching(Actor):
-    """An actor of which joints, touch and set-points are kept before each step."""
+    """An actor; notes joints, touch and set-points before each step."""
 
     def __init__(self, actor: Actor, env: TouchEnv, output: Output):
         self._actor, self._env, self._output = actor, env, output
@@ -93,23 +94,23 @@ def of_environments(
 
     def play() -> Iterator[Episode]:
         quota = [episodes // env.num_envs + (i < episodes % env.num_envs) for i in range(env.num_envs)]
-        kept: list[list[dict[str, Any]]] = [[] for _ in quota]
+        pending: list[list[dict[str, Any]]] = [[] for _ in quota]
         watching = _Watching(actor, env, output)
         actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
         for moment in rollout(watching, env):
             info, reward = moment.step.info, moment.step.reward.cpu().numpy()
             ended, whole, score = (value.cpu().numpy() for value in (info.ended, info.is_whole(env.max_steps), info.score))
             for i in np.flatnonzero(quota):
-                kept[i].append({name: value[i] for name, value in watching.row.items()} | {"reward": reward[i]})
+                pending[i].append({name: value[i] for name, value in watching.row.items()} | {"reward": reward[i]})
                 if not ended[i]:
                     continue
                 quota[i] -= 1
-                samples = {name: np.stack([row[name] for row in kept[i]]) for name in kept[i][0]}
-                kept[i] = []
+                samples = {name: np.stack([row[name] for row in pending[i]]) for name in pending[i][0]}
+                pending[i] = []
                 touch = samples.pop("touch")[:, :, columns]
                 time = np.arange(len(touch)) * env.control_step
                 is_good = whole[i] if least is None else (score[i] <= least if env.task.is_less_better else score[i] >= least)
-                by_link = {link: touch[:, own] for link, own in rows.items()}
+                by_link = {link: touch[:, taxels] for link, taxels in rows.items()}
                 yield Episode(time, touch=by_link, score=float(score[i]), is_success=bool(is_good), **samples)
             if not any(quota):
                 return
@@ -118,24 +119,32 @@ def of_environments(
 
 
 def of_deployment(
-    deployment: Deployment, episodes: int, seconds: float | None = None, fps: float | None = None, least: float | None = None
+    deployment: Deployment,
+    episodes: int,
+    unit: str,
+    seconds: float | None = None,
+    fps: float | None = None,
+    least: float | None = None,
 ) -> tuple[Source, Iterator[Episode]]:
     """Return episodes of a policy on an emulated hand, a real one or a log: the force on each fingertip, as the hand says it.
 
     Args:
         deployment: The policy on its source.
         episodes: How many.
+        unit: Unit of the forces, as the hand's calibration has it.
         seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
         fps: Frames per second; default: one per control step.
         least: As for `of_environments`; without a scene there is no score, and no success.
 
     Raises:
-        TgdslError: If the policy does not feel forces on fingertips.
+        TgdslError: If the policy does not feel forces on fingertips, or acts in a simulation.
     """
     prepared, felt = deployment.prepared, deployment.prepared.felt
     if felt is None or felt.type != EMULATED or "proprio" not in prepared.groups:
         problem = f"this policy feels {'nothing' if felt is None else felt.type}"
         raise TgdslError(f"{prepared.saved.file}: {problem}; of a hand, expected one that feels {EMULATED}, and proprio")
+    if deployment.has_scene and "motion" not in kind_of(deployment.source).options:
+        raise TgdslError(f"--source {deployment.source}: a simulation's forces on taxels come from --source environments")
     num, task = len(prepared.moved.names), prepared.loaded.task
     bodies = {link.name: LinkTaxels(link.body) for link in prepared.sensed.groups[felt.group].layout.links}
     source = Source(
@@ -144,7 +153,7 @@ def of_deployment(
         prepared.moved.names,
         bodies,
         FORCE,
-        "N",
+        unit,
         prepared.control_step,
         _checked_fps(fps or 1.0 / prepared.control_step, prepared.control_step),
         has_outcome=deployment.has_scene,
@@ -224,8 +233,8 @@ def of_run(
         force = force if force.ndim == 4 else force[:, :, -1]  # of stacked samples the newest
         for env in range(qpos.shape[1]):
             action = ctrl if ctrl.ndim == 2 else ctrl[:, env]
-            felt = {link: force[:-1, env, own] for link, own in rows.items()}
-            yield Episode(arrays["time"][:-1], qpos[:-1, env][:, addresses], action[1:], felt)
+            by_link = {link: force[:-1, env, taxels] for link, taxels in rows.items()}
+            yield Episode(arrays["time"][:-1], qpos[:-1, env][:, addresses], action[1:], by_link)
 
     return source, read()
 
@@ -263,10 +272,10 @@ def of_log(
     source = Source(str(file), file.stem.replace("_", " "), joints, links, FORCE, meaning.units, step, rate)
 
     def read() -> Iterator[Episode]:
-        for own in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > MAX_AGE_S) + 1):
-            later = np.searchsorted(time[own], time[own] + (1.0 + EPS) / rate, side="right") - 1
-            felt = {body: force[own][:, None, i] for i, body in enumerate(bodies)}
-            yield Episode(time[own], position[own], position[own][later], felt)
+        for part in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > MAX_AGE_S) + 1):
+            later = np.searchsorted(time[part], time[part] + (1.0 + EPS) / rate, side="right") - 1
+            by_link = {body: force[part][:, None, i] for i, body in enumerate(bodies)}
+            yield Episode(time[part], position[part], position[part][later], by_link)
 
     return source, read()
 
@@ -293,8 +302,8 @@ def _links(table: Columns | np.ndarray) -> tuple[dict[str, np.ndarray], dict[str
     names = [str(name) for name in table["link"]]
     rows = {link: np.flatnonzero([name == link for name in names]) for link in dict.fromkeys(names)}
     taxels = {
-        link: LinkTaxels(str(table["body"][own[0]]), np.asarray(table["pos"])[own], np.asarray(table["normal"])[own])
-        for link, own in rows.items()
+        link: LinkTaxels(str(table["body"][of_link[0]]), *(np.asarray(table[name])[of_link] for name in ("pos", "normal")))
+        for link, of_link in rows.items()
     }
     return rows, taxels
 
