@@ -1,10 +1,12 @@
 """Datasets, as lerobot, mcap and zarr read them: every number is that of the episodes."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 import torch
+from hand_logs import random_readings, write_log
 from small_tasks import small_task
 
 try:
@@ -115,3 +117,14 @@ def test_a_task_and_a_recording_become_datasets(tmp_path, here):
     assert len(ends) == run["qpos"].shape[1] == 2
     code, _, error = here(tmp_path, "export-dataset", "out/readings.npz", "--to", "zarr", "--out", "run.zarr")
     assert code == 2 and "run.zarr: is there already; remove it, or name another folder with --out" in error
+
+
+def test_what_fails_leaves_nothing_behind(tmp_path, here, monkeypatch):
+    write_log(tmp_path / "press.npz", random_readings(np.arange(50) * 0.01))
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "zarr", None)
+        code, _, error = here(tmp_path, "export-dataset", "press.npz", "--to", "zarr", "--out", "press.zarr")
+    assert code == 2 and 'a Zarr store needs zarr: pip install "tgdsl[data]"' in error
+    assert [path.name for path in tmp_path.iterdir()] == ["press.npz"]
+    code, out, error = here(tmp_path, "export-dataset", "press.npz", "--to", "zarr", "--out", "press.zarr")
+    assert code == 0 and "touch in counts on 5 links" in out, error

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -77,13 +78,13 @@ class ExportDataset:
         if self.episodes < 1:
             raise TgdslError(f"--episodes {self.episodes}: expected at least 1")
         source, episodes = self._recorded() if self.input.suffix == ".npz" else self._played()
-        partial = with_folder(out).with_name(f"{out.name}.partial")
-        partial.mkdir()
-        with StatusLine() as progress:
+        with StatusLine() as progress, TemporaryDirectory(prefix=f".{out.name}", dir=with_folder(out).parent) as temporary:
             progress("writing episodes")
+            partial = Path(temporary) / out.name
+            partial.mkdir()
             write = {"lerobot": write_lerobot, "mcap": write_mcap, "zarr": write_zarr}[self.to]
             num, frames = write(source, episodes, partial)
-        partial.rename(out)
+            partial.rename(out)
         print(
             f"{out}: {num} episodes, {frames} frames at {source.fps:g} Hz; touch in {source.unit} on {len(source.links)} links"
         )
