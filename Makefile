@@ -11,7 +11,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 ADAPTERS := .venv-adapters
 
-.PHONY: demo learn test test-full test-adapters mutate lint bench docs soak clean
+.PHONY: demo learn test test-full test-adapters test-resolve mutate lint bench docs soak clean
 
 demo: $(READY)
 	@echo "compiling examples/xhand1_palm.yaml"
@@ -37,16 +37,28 @@ test-full: $(READY)
 	@$(PYTEST) -m "not slow" --check-types tests/geometry tests/observations tests/oracles tests/quantities tests/surfaces tests/tensors tests/sensors --ignore=tests/sensors/test_compiled.py
 
 # Adapters against the simulators as they are installed, each in an environment of its own beside torch and the rest of $(VENV). mjlab
-# pins MuJoCo 3.11, with which readers and errors are tested too; one that cannot be installed is named.
-test-adapters: adapter-mjlab adapter-newton adapter-gymnasium_robotics
+# pins MuJoCo 3.11, with which readers and errors are tested too; lerobot reads datasets back; one that cannot be installed is named.
+# mjlab_newest is mjlab with the newest MuJoCo that tgdsl takes, that of $(VENV).
+test-adapters: test-resolve adapter-mjlab adapter-mjlab_newest adapter-newton adapter-gymnasium_robotics adapter-lerobot
+PINS = cat tests/adapters/constraints-$*.txt
+adapter-mjlab_newest: PINS = grep -v ^mujoco tests/adapters/constraints-mjlab.txt
 adapter-mjlab: MORE = tests/runtime/test_by_name.py tests/runtime/batch/test_older_mujoco.py
 adapter-%: $(READY)
 	@$(PYTHON) -m venv $(ADAPTERS)/$*
-	@if $(ADAPTERS)/$*/bin/pip install --quiet --no-deps -r tests/adapters/constraints-$*.txt; then \
+	@$(PINS) > $(ADAPTERS)/$*/pins.txt
+	@if $(ADAPTERS)/$*/bin/pip install --quiet --no-deps -r $(ADAPTERS)/$*/pins.txt; then \
 		$(BIN)/python -c "import sysconfig; print(sysconfig.get_path('purelib'))" \
 			> $$($(ADAPTERS)/$*/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))")/tgdsl.pth && \
 		OMP_NUM_THREADS=1 $(ADAPTERS)/$*/bin/python -m pytest -W default tests/adapters $(MORE); \
 	else echo "$* cannot be installed here: its adapter is not tested"; fi
+
+# Versions that suit both tgdsl and mjlab, in an empty environment; nothing is installed.
+test-resolve:
+	@$(PYTHON) -m venv $(ADAPTERS)/empty
+	@if $(ADAPTERS)/empty/bin/pip install --quiet --dry-run . mjlab 2> $(ADAPTERS)/empty/errors.txt; then \
+		echo "tgdsl and mjlab can be installed together"; \
+	elif grep -q ResolutionImpossible $(ADAPTERS)/empty/errors.txt; then cat $(ADAPTERS)/empty/errors.txt; exit 1; \
+	else echo "no packages can be had here: tgdsl and mjlab together are not tried"; fi
 
 # Change one thing at a time in a room and list what no test notices: make mutate ROOM=sensors MUTATE="--count 60".
 ROOM ?= fields

@@ -14,14 +14,14 @@ from tgdsl.tuning.compile import compile
 Document = str | PathLike[str] | Mapping[str, Any]
 
 
-def module_of(document: Document, host: str) -> TactileModule:
-    """Compile a document, or load an artefact (`.safetensors`), for a host that is read once a control step.
+def module_of(document: Document, host: str, scene: Any = None) -> TactileModule:
+    """Compile a document, of a scene that is built already if one is given, or load an artefact (`.safetensors`).
 
     Raises:
         SimulationError: If the module is advanced at each physics step.
     """
     is_artifact = not isinstance(document, Mapping) and str(document).endswith(".safetensors")
-    touch = load(document) if is_artifact else compile(document)  # pyright: ignore[reportArgumentType]
+    touch = load(document) if is_artifact else compile(document, scene=scene)  # pyright: ignore[reportArgumentType]
     if touch.inputs.substeps > 1:
         what = f"this module is advanced at {touch.inputs.substeps} physics steps a call"
         raise SimulationError(f"{what}, and {host} reads it once a control step")

@@ -7,7 +7,7 @@ Shapes: `env` environments, `row` and `channel` as the module's `outputs` list t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,11 +34,13 @@ class TouchSensorCfg(SensorCfg):
         document: The document, or an artefact (`.safetensors`).
         prefix: Stands before all names in mjlab's scene, such as "robot/"; needed only where several names end alike.
         names: Names in mjlab's scene by those in the document, where they differ otherwise.
+        scene_fn: Returns the scene that the document is of, robot and objects under its names; default: what it names itself.
     """
 
     document: Document = field(kw_only=True)
     prefix: str = ""
     names: Mapping[str, str] = field(default_factory=dict)
+    scene_fn: Callable[[], mujoco.MjSpec] | None = None
 
     def build(self) -> TouchSensor:
         """Compile the document, or load the artefact.
@@ -46,7 +48,7 @@ class TouchSensorCfg(SensorCfg):
         Raises:
             SimulationError: If the module is advanced at each physics step.
         """
-        return TouchSensor(self, module_of(self.document, "mjlab"))
+        return TouchSensor(self, module_of(self.document, "mjlab", self.scene_fn and self.scene_fn()))
 
 
 class TouchSensor(Sensor):

@@ -15,6 +15,7 @@ from tgdsl.commands.calibrate.calibrate import Calibrate
 from tgdsl.commands.compile import Compile
 from tgdsl.commands.explain import Explain
 from tgdsl.commands.export import Export
+from tgdsl.commands.export_dataset import ExportDataset
 from tgdsl.commands.export_usd import ExportUsd
 from tgdsl.commands.grasps import Grasps
 from tgdsl.commands.hand.hand import Hand
@@ -56,6 +57,7 @@ Command = (
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[ExportDataset, tyro.conf.subcommand("export-dataset")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
     | Annotated[Cache, tyro.conf.subcommand("cache")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]

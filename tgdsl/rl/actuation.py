@@ -286,6 +286,10 @@ class Actuation:
 
         What is beyond −1 and 1 is clipped; where an action is no number, its target stays.
         """
+        self._take(self.commanded(action))
+
+    def commanded(self, action: Float[Tensor, "env joint"]) -> Float[Tensor, "env joint"]:
+        """Return the targets that an action would lead to [rad]; nothing changes."""
         low, high, action = self._values["low"], self._values["high"], action.to(self.target.dtype).clamp(-1.0, 1.0)
         if self.action.mode == "absolute":
             command = low + 0.5 * (action + 1.0) * (high - low)
@@ -293,7 +297,7 @@ class Actuation:
             origin = self.start if self.action.mode == "offset" else self.target
             command = torch.minimum(torch.maximum(origin + self._scale * action, low), high)
         command = torch.lerp(command, self.target, self.action.smoothing)
-        self._take(torch.where(action.isfinite(), command, self.target))
+        return torch.where(action.isfinite(), command, self.target)
 
     def follow(self, control: Float[Tensor, "env actuator"]) -> None:
         """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too."""

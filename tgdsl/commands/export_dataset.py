@@ -1,0 +1,147 @@
+"""`tgdsl export-dataset`: episodes with touch as a dataset that others' tools read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from tgdsl.commands.arguments import OptionalFile, Overrides, module_of, parsed_overrides
+from tgdsl.console.progress import StatusLine
+from tgdsl.errors import TgdslError
+
+if TYPE_CHECKING:
+    from tgdsl.rl.datasets.episode import Episode, Source
+
+Input = Annotated[
+    tyro.conf.Positional[Path],
+    tyro.conf.arg(help="A task (.yaml), a recording of tgdsl run, or a log of tgdsl hand record (.npz).", metavar="INPUT"),
+]
+
+
+@dataclass(frozen=True)
+class ExportDataset:
+    """Write episodes with touch as a dataset: joints, set-points, the force on each taxel, rewards, success."""
+
+    input: Input
+    to: Literal["lerobot", "mcap", "zarr"] = "lerobot"
+    """lerobot: LeRobot v3.0; mcap: an MCAP file of JSON messages; zarr: a Zarr store."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    """Folder to make; default: out/NAME_lerobot and the like."""
+    policy: OptionalFile = None
+    """Of a task: the policy that acts."""
+    actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
+    """Of a task without a policy: who acts, as for tgdsl play."""
+    source: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "environments"
+    """Of a policy: where it acts. environments: those of the task, many at a time; emulator, xhand1:PORT or a log as for tgdsl
+    deploy, for a policy that feels agg_force."""
+    episodes: int = 16
+    """Of a task: number of episodes."""
+    envs: int = 16
+    """Environments that are stepped together."""
+    seconds: float | None = None
+    """On a hand: longest duration of an episode [s]; default: the task's."""
+    fps: float | None = None
+    """Frames per second; default: one per control step, of a log 30."""
+    reading: str | None = None
+    """The force on taxels to export; default: the first."""
+    success_score: float | None = None
+    """Score with which an episode succeeds; default: it succeeds if it lasts as long as one may."""
+    goal: tuple[float, ...] = ()
+    """On a hand: what the policy is asked for."""
+    calibration: OptionalFile = None
+    """On a hand or of a log: what counts mean."""
+    side: Literal["right", "left"] | None = None
+    """Of a log: which hand it is, for the names of links and joints."""
+    lockstep: bool = False
+    """On an emulated hand: its scene waits for each step; a log is read as fast as possible."""
+    device: str = "cpu"
+    """Where environments are computed: cpu, or cuda."""
+    seed: int = 0
+    """What all that is random follows from."""
+    set: Overrides = ()
+
+    def run(self) -> None:
+        """Read or play the episodes, and write them."""
+        from tgdsl.files.write import with_folder
+        from tgdsl.rl.datasets.lerobot import write_lerobot
+        from tgdsl.rl.datasets.mcap_file import write_mcap
+        from tgdsl.rl.datasets.zarr_store import write_zarr
+
+        out = self.out or Path("out") / f"{self.input.stem}_{self.to}"
+        if out.exists():
+            raise TgdslError(f"{out}: is there already; remove it, or name another folder with --out")
+        if self.episodes < 1:
+            raise TgdslError(f"--episodes {self.episodes}: expected at least 1")
+        source, episodes = self._recorded() if self.input.suffix == ".npz" else self._played()
+        with StatusLine() as progress, TemporaryDirectory(prefix=f".{out.name}", dir=with_folder(out).parent) as temporary:
+            progress("writing episodes")
+            partial = Path(temporary) / out.name
+            partial.mkdir()
+            write = {"lerobot": write_lerobot, "mcap": write_mcap, "zarr": write_zarr}[self.to]
+            num, frames = write(source, episodes, partial)
+            partial.rename(out)
+        print(
+            f"{out}: {num} episodes, {frames} frames at {source.fps:g} Hz; touch in {source.unit} on {len(source.links)} links"
+        )
+
+    def _recorded(self) -> tuple[Source, Iterator[Episode]]:
+        import numpy as np
+
+        from tgdsl.rl.datasets.sources import of_log, of_run
+        from tgdsl.runtime.xhand1.calibration import load_calibration
+
+        if self.policy is not None:
+            raise TgdslError(f"--policy {self.policy}: a recording has its actions; a policy acts on a task: see --source")
+        try:
+            with np.load(self.input, allow_pickle=False) as archive:
+                names, document = archive.files, str(archive["document"]) if "document" in archive.files else ""
+        except (OSError, ValueError) as error:
+            raise TgdslError(f"{self.input}: cannot read this file: {error}") from error
+        if "about" in names:
+            return of_log(self.input, self.fps, load_calibration(self.calibration) if self.calibration else None, self.side)
+        if not document:
+            known = "expected a recording of tgdsl run, or a log of tgdsl hand record"
+            raise TgdslError(
+                f"{self.input}: found {', '.join(names[:6])}, …; {known}; to export what a policy does, name its task"
+            )
+        with StatusLine() as progress:
+            touch = module_of(Path(document), self.set, progress)
+        return of_run(self.input, touch, self.fps, self.reading)
+
+    def _played(self) -> tuple[Source, Iterator[Episode]]:
+        from tgdsl.rl.datasets.sources import of_deployment, of_environments
+        from tgdsl.rl.deploying.deploy import Deployment
+        from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.playing.actions import actor_of
+        from tgdsl.rl.playing.policy import policy_for, read_policy
+
+        overrides, least = parsed_overrides(self.set), self.success_score
+        if self.source != "environments":
+            if self.policy is None:
+                raise TgdslError(f"--source {self.source}: name the policy that acts there with --policy")
+            with StatusLine() as progress:
+                options = {"goal": self.goal, "overrides": overrides, "seed": self.seed, "lockstep": self.lockstep}
+                options |= {"calibration": self.calibration, "progress": progress}
+                deployment = Deployment(self.input, self.policy, self.source, **options)
+            return of_deployment(deployment, self.episodes, self._unit(), self.seconds, self.fps, least)
+        saved = None if self.policy is None else read_policy(self.policy)
+        envs = min(self.envs, self.episodes)
+        with StatusLine() as progress:
+            env = TouchEnv(self.input, envs, device=self.device, seed=self.seed, overrides=overrides, progress=progress)
+        actor = actor_of(env, self.actions, self.seed) if saved is None else policy_for(env, saved)
+        return of_environments(env, actor, self.episodes, self.fps, self.reading, least)
+
+    def _unit(self) -> str:
+        """Return the unit of a hand's forces: what the calibration says, or the log."""
+        from tgdsl.runtime.xhand1.calibration import load_calibration
+        from tgdsl.runtime.xhand1.log.log import open_log
+
+        if self.calibration is not None:
+            return load_calibration(self.calibration).units
+        log = open_log(self.source) if self.source.endswith(".npz") else None
+        return log.calibration.units if log is not None and log.calibration is not None else "counts"

@@ -1,0 +1,154 @@
+"""Episodes with touch, and the frames that a dataset has of them.
+
+A source samples joints and touch at its own rate; a dataset has frames at a fixed one. A frame holds the newest sample at its
+time. Where there are several samples in a frame's time, it also holds a window of the newest ones.
+
+Shapes: `step` samples, `frame` frames, `window` samples of a window, `joint` joints, `taxel` taxels of a link, `channel`
+components.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+TOUCH = "observation.tactile"
+EPS = 1e-6
+"""Share of a frame by which a sample may be late."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkTaxels:
+    """Where the taxels of a link are; of a hand that reports the sum of a fingertip's forces alone, that is not known.
+
+    Attributes:
+        body: The link's body.
+        pos: Positions in the body's frame [m].
+        normal: Outward normals in the body's frame.
+    """
+
+    body: str
+    pos: Float[np.ndarray, "taxel 3"] | None = None
+    normal: Float[np.ndarray, "taxel 3"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What all episodes of a dataset have in common.
+
+    Attributes:
+        name: The document, task or log.
+        task: The task in words.
+        joints: Names of the joints.
+        links: Taxels by link.
+        channels: Names of the components of touch.
+        unit: Their unit.
+        control_step: Time between samples, of a log its median [s].
+        fps: Frames per second.
+        has_outcome: Whether there are rewards and success.
+        has_policy: Whether a policy acts.
+    """
+
+    name: str
+    task: str
+    joints: tuple[str, ...]
+    links: Mapping[str, LinkTaxels]
+    channels: tuple[str, ...]
+    unit: str
+    control_step: float
+    fps: float
+    has_outcome: bool = False
+    has_policy: bool = False
+
+    @property
+    def window(self) -> int:
+        """Samples of touch per frame."""
+        return max(1, round(1.0 / (self.fps * self.control_step)))
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """The samples of one episode.
+
+    Attributes:
+        time: Time of each sample [s].
+        state: Joint positions [rad].
+        action: Set-points of the joints [rad].
+        touch: Touch by link.
+        policy_action: The policy's actions, from −1 to 1.
+        reward: Reward of the step that follows each sample.
+        score: Score of the episode.
+        is_success: Whether it succeeded.
+    """
+
+    time: Float[np.ndarray, " step"]
+    state: Float[np.ndarray, "step joint"]
+    action: Float[np.ndarray, "step joint"]
+    touch: Mapping[str, Float[np.ndarray, "step taxel channel"]]
+    policy_action: Float[np.ndarray, "step joint"] | None = None
+    reward: Float[np.ndarray, " step"] | None = None
+    score: float | None = None
+    is_success: bool | None = None
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A column of a dataset.
+
+    Attributes:
+        dtype: Its dtype.
+        shape: Shape of a frame's value.
+        names: Names of its numbers, or of its axes if it has several.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] | None = None
+
+
+def features(source: Source, num_taxels: Mapping[str, int]) -> dict[str, Feature]:
+    """Return the columns of a source's frames, given the taxels of each link."""
+    joints, channels, window = source.joints, source.channels, source.window
+    vector = Feature("float32", (len(joints),), joints)
+    result = {"observation.state": vector, "action": vector}
+    flat = tuple(f"{link}/{i}/{name}" for link, num in num_taxels.items() for i in range(num) for name in channels)
+    result[TOUCH] = Feature("float32", (len(flat),), flat)
+    for link, num in num_taxels.items():
+        result[f"{TOUCH}.{link}"] = Feature("float32", (num, len(channels)), ("taxel", "channel"))
+        if window > 1:
+            shape = (window, num, len(channels))
+            result[f"{TOUCH}_window.{link}"] = Feature("float32", shape, ("sample", "taxel", "channel"))
+    if window > 1:
+        result[f"{TOUCH}_window_time"] = Feature("float32", (window,))
+    result |= {"policy_action": vector} if source.has_policy else {}
+    if source.has_outcome:
+        result |= {"next.reward": Feature("float32", (1,)), "next.success": Feature("bool", (1,))}
+    return result | {"next.done": Feature("bool", (1,))}
+
+
+def frames(source: Source, episode: Episode) -> dict[str, np.ndarray]:
+    """Return an episode's frames by the names of `features`; a frame's reward is the sum over its time."""
+    time = episode.time - episode.time[0]
+    ticks = np.arange(int(np.floor(time[-1] * source.fps + EPS)) + 1)
+    newest: Int[np.ndarray, " frame"] = np.searchsorted(time, (ticks + EPS) / source.fps, side="right") - 1
+    back = np.arange(source.window)[::-1]
+    past = np.maximum(newest[:, None] - back, 0)
+    result = {"observation.state": episode.state[newest], "action": episode.action[newest]}
+    result[TOUCH] = np.concatenate([touch[newest].reshape(len(newest), -1) for touch in episode.touch.values()], axis=1)
+    for link, touch in episode.touch.items():
+        result[f"{TOUCH}.{link}"] = touch[newest]
+        if source.window > 1:
+            result[f"{TOUCH}_window.{link}"] = touch[past]
+    if source.window > 1:
+        result[f"{TOUCH}_window_time"] = time[past] - (ticks / source.fps)[:, None]
+    is_last = ticks == ticks[-1]
+    if episode.policy_action is not None:
+        result["policy_action"] = episode.policy_action[newest]
+    if episode.reward is not None:
+        result["next.reward"] = np.add.reduceat(episode.reward, newest)
+        result["next.success"] = is_last & bool(episode.is_success)
+    result["next.done"] = is_last
+    return {name: value if value.dtype == bool else value.astype(np.float32) for name, value in result.items()}
