@@ -223,6 +223,17 @@ def test_servos_say_how_far_joints_go_that_have_no_limits(tmp_path):
     assert closing_motion(loaded(tmp_path, single_links('ref="40"'))) == {}
 
 
+@pytest.mark.parametrize("limits", ["", 'range="0 0"'], ids=["none", "nothing"])
+def test_fingers_without_limits_close_where_their_tips_meet(tmp_path, limits):
+    """Upright links around a palm face each other, which is a weak guess; nothing says how far a simulator may close them."""
+    robot = loaded(tmp_path, single_links(limits))
+    proposal = propose(robot, DENSITY)
+    assert {link.name: link.facing for link in proposal.links} == {"palm": (0, 0, 1), "a": INNER, "b": INNER, "c": INNER}
+    doubt = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
+    assert {link.doubt for link in proposal.links if link.name != "palm"} == {doubt}
+    assert closing_motion(robot) == {}
+
+
 def test_radians_that_were_read_as_degrees(tmp_path, here):
     """The guess is that of the same hand in radians; the motion keeps to the limits that MuJoCo has; the command says so."""
     (tmp_path / "meant.xml").write_text(single_links('range="0 1.05" ref="0.7"', '<compiler angle="radian"/>'))

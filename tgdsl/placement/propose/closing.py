@@ -85,7 +85,8 @@ class Closing:
         others = {joint: float(np.mean(self._range(joint))) for joint in self.bending}
         half = {joint: self._gain(joint, others) for joint in self.bending}
         others = {joint: self._end(joint, self.sense.get(joint) or half[joint]) for joint in self.bending}
-        whole = {joint: self._gain(joint, others) for joint in self.bending}
+        # Within assumed limits fingers may pass each other: their closed ends say nothing.
+        whole = half if tree.doubt else {joint: self._gain(joint, others) for joint in self.bending}
         found = {joint: self._motion(joint, half[joint], whole[joint]) for joint in self.bending}
         self.motions = {joint: motion for joint, motion in found.items() if motion is not None}
 
@@ -222,7 +223,7 @@ class Closing:
         gain = self.hand.closes or (half + whole if _is_clear(half, whole) else 0.0)
         sense, lean = self.sense.get(joint, 0.0), self.lean[joint] if abs(self.lean[joint]) == 1.0 else 0.0
         siblings = [j for j in self.sense if self.chain[self.segment(j)] == self.chain[self.segment(joint)]]
-        doubt = ""
+        doubt = self.tree.doubt
         if sense:
             if gain * sense < 0:
                 doubt = f"as it curls, its tip goes {abs(gain) / 2:.0%} away from the palm and the other tips"

@@ -93,7 +93,8 @@ class Flexion:
     def _moving_side(self, body: int) -> InnerSide:
         if (facing := self._meeting(body)) is not None:
             return InnerSide(facing, self._doubt(self.tree.segment[body]))
-        if (side := self._flexor(self.tree.segment[body])) is None:
+        segment = self.tree.segment[body]
+        if (side := self._flexor(segment) or self._flexor(self.bars.get(segment, segment))) is None:
             return InnerSide(None, UNCLEAR)
         joint, along = side
         turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
@@ -112,16 +113,16 @@ class Flexion:
         is_across = has_lever and bool((np.abs(carried @ facing) < ALONG * lever).all())
         return is_across and not any(self._is_along_hinge(segment, along) for along in carried / lever[:, None])
 
-    def _bars(self) -> set[int]:
-        """Return the segments that are alone in their chain and are driven together with the longer chain beside them.
+    def _bars(self) -> dict[int, int]:
+        """Return the segments that are alone in their chain and are driven with a longer chain beside them, and its first.
 
         They are the second bars of parallel linkages, whose loop a tree of links leaves open. Where nothing would be left for
         a hand to close on, none is.
         """
         chains = self.hand.chains
         single, longer = ([chain[0] for chain in chains if (len(chain) == 1) == is_single] for is_single in (True, False))
-        bars = {s for s in single if any(self._is_bar(s, other) for other in longer)}
-        return bars if len(chains) - len(bars) > 1 else set()
+        bars = {s: other for s in single for other in longer if self._is_bar(s, other)}
+        return bars if len(chains) - len(bars) > 1 else {}
 
     def _is_bar(self, segment: int, other: int) -> bool:
         """Return whether a segment is driven together with another, about axes that are parallel to and near that one's."""

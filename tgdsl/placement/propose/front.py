@@ -25,9 +25,9 @@ GAP = 2e-4
 """What is closer in front of a surface than this is not in front of it [m]."""
 MIN_SHARE = 0.1
 """Least share of what faces an inner side, and of a link's surface, to be believed."""
-MARGIN, LEVEL, TOWER = 0.15, 0.2, 0.25
-"""Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, and how high
-above the joints of the fingers a tower is."""
+MARGIN, LEVEL, TOWER, AHEAD = 0.15, 0.2, 0.25, 0.1
+"""Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, how high
+above the joints of the fingers a tower is, and how far beside the middle of a palm the fingers must begin to be ahead of it."""
 HALF = 0.5
 """A part of a palm is in front by this share, and has this share of the largest part's area."""
 
@@ -106,7 +106,10 @@ class PalmFront:
             self.outline = ConvexHull(np.concatenate(swept) @ self.axes[:2].T).equations
             self.margin = MARGIN * hand.length
             first = [chain[0] for chain in hand.chains]
-            self.joints = max(float(anchor(tree, s) @ self.axes[2]) for s in first)
+            anchors = np.array([anchor(tree, s) for s in first]) @ self.axes.T
+            self.joints = float(anchors[:, 2].max())
+            ahead = anchors.mean(axis=0) - self.axes @ tree.centre(hand.palm, tree.start)
+            self.ahead = np.where(np.linalg.norm(ahead[:2]) > AHEAD * hand.length, ahead * (1, 1, 0), 0.0)
 
     def mounts(self) -> list[int]:
         """Return the bodies fixed to a palm that are in front, those before the one that carries the fingers included."""
@@ -114,25 +117,35 @@ class PalmFront:
         if self.axes is None:
             return hand.mounts
         assert hand.palm is not None
-        free, height, _ = self._points(hand.palm)
-        level = float(np.median(height[free])) if free.any() else None
-        return [body for body in tree.bodies[hand.base] if body == hand.palm or self._is_in_front(body, level)]
+        free, place, _ = self._points(hand.palm)
+        level = float(np.median(place[free, 2])) if free.any() else None
+        heel = float((place @ self.ahead).min(initial=np.inf))
+        return [body for body in tree.bodies[hand.base] if body == hand.palm or self._is_in_front(body, level, heel)]
 
-    def _is_in_front(self, body: int, level: float | None) -> bool:
-        free, height, is_beside = self._points(body)
+    def _is_in_front(self, body: int, level: float | None, heel: float) -> bool:
+        """Return whether a body is in front.
+
+        Args:
+            body: The body.
+            level: Height of the palm; None if all of it is behind other bodies.
+            heel: Where the palm begins, in the direction from its middle to the joints of the fingers.
+        """
+        free, place, is_beside = self._points(body)
         tree, hand = self.flexion.tree, self.flexion.hand
         assert hand.palm is not None
         if body in hand.mounts:
             return not len(free) or bool((~is_beside).mean() >= MIN_SHARE)
         if level is None or not len(free) or HALF * tree.area[body] > tree.area[hand.palm]:  # a larger one is a flange
             return False
-        return bool((free & ~is_beside & (np.abs(height - level) <= LEVEL * hand.length)).mean() >= HALF)
+        is_level = (np.abs(place[:, 2] - level) <= LEVEL * hand.length) & (place @ self.ahead >= heel)
+        return bool((free & ~is_beside & is_level).mean() >= HALF)
 
     def limit(self, body: int) -> float | None:
         """Return how far along its inner side a body is no tower beside the hand, in its frame; None if it has none."""
         if self.axes is None:
             return None
-        _, height, is_beside = self._points(body)
+        _, place, is_beside = self._points(body)
+        height = place[:, 2]
         limit = self.joints + TOWER * self.flexion.hand.length
         is_high = height > limit
         least = MIN_SHARE * len(height)
@@ -140,13 +153,13 @@ class PalmFront:
             return None
         return limit - float(self.flexion.tree.start.xpos[body] @ self.axes[2])
 
-    def _points(self, body: int) -> tuple[Bool[np.ndarray, " p"], Float[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
-        """Return of points of a body whether they are free, their heights, and whether they are beside the hand."""
+    def _points(self, body: int) -> tuple[Bool[np.ndarray, " p"], Float[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
+        """Return whether points of a body are free, their places along `axes` [m], and whether they are beside the hand."""
         facing, data = self.flexion.palm_side(body).facing, self.flexion.tree.start
         if facing is None:
-            return np.zeros(0, bool), np.zeros(0), np.zeros(0, bool)
+            return np.zeros(0, bool), np.zeros((0, 3)), np.zeros(0, bool)
         front = front_of(self.flexion.tree, body, facing)
         assert self.axes is not None
         place = (data.xpos[body] + front.pos @ data.xmat[body].reshape(3, 3).T) @ self.axes.T
         beyond = (place[:, :2] @ self.outline[:, :2].T + self.outline[:, 2]).max(axis=1, initial=-np.inf)
-        return front.is_free, place[:, 2], beyond > self.margin
+        return front.is_free, place, beyond > self.margin

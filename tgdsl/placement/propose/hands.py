@@ -30,6 +30,8 @@ MAX_FINGER = 0.35
 """A longer chain is an arm or a leg, of which nothing closes [m]."""
 MAX_STEM = 1.5
 """Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
+MIN_TIP = 0.2
+"""Least surface of a fingertip, as a share of the largest body fixed to it."""
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
@@ -40,10 +42,12 @@ class KinematicTree:
     Attributes:
         model: MuJoCo's model, with the limits of its joints as they are meant.
         surface: Surface of each body that has one, in the body's frame.
+        doubt: What speaks against the limits of its joints; empty if nothing does.
     """
 
     model: mujoco.MjModel
     surface: Mapping[int, Surface]
+    doubt: str = ""
 
     @cached_property
     def area(self) -> dict[int, float]:
@@ -203,6 +207,19 @@ def free_standing(tree: KinematicTree) -> list[int]:
     return [] if single >= tree.carries else [body for segment in sorted(single) for body in tree.bodies[segment]]
 
 
+def loose_parts(tree: KinematicTree) -> list[int]:
+    """Return the bodies that are farther from all that is fixed to them than twice their size: they mark a place in the air."""
+    result = []
+    for bodies in tree.bodies.values():
+        boxes = [(points.min(axis=0), points.max(axis=0)) for points in (tree.points(body, tree.start) for body in bodies)]
+        largest = max((tree.area[body] for body in bodies), default=0.0)
+        for body, (low, high) in zip(bodies, boxes, strict=True):
+            gaps = [np.linalg.norm(np.maximum(np.maximum(a - high, low - b), 0.0)) for a, b in boxes if a is not low]
+            if tree.area[body] < largest and min(gaps) > 2.0 * np.linalg.norm(high - low):
+                result.append(body)
+    return result
+
+
 def _is_driven(tree: KinematicTree, segment: int) -> bool:
     """Return whether a segment has one or two hinges and slides: none stands still, more let it go anywhere."""
     kinds = [int(tree.model.jnt_type[joint]) for joint in tree.joints(segment)]
@@ -292,8 +309,9 @@ def _mounts(tree: KinematicTree, base: int) -> list[int]:
 
 
 def _last(tree: KinematicTree, segment: int) -> list[int]:
-    """Return the bodies with surface of a segment that have no other such below them."""
-    own = tree.bodies[segment]
+    """Return the bodies of a segment that have no other below them; small parts of it, such as markers, do not count."""
+    largest = max(tree.area[body] for body in tree.bodies[segment])
+    own = [body for body in tree.bodies[segment] if tree.area[body] >= MIN_TIP * largest]
     above = {over for body in own for over in tree.within(segment, body)[1:]}
     return [body for body in own if body not in above]
 

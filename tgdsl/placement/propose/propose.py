@@ -149,8 +149,10 @@ def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
     """
     scale = RADIANS_AS_DEGREES if angles_are_misread(robot.compiled) else 1.0
     motion: dict[str, tuple[float, float]] = {}
-    for flexion in chosen_hands(kinematic_tree(robot, link_meshes(robot)[0])):
-        motion |= {robot.compiled.joint(i).name: (one / scale, two / scale) for i, (one, two) in flexion.motion().items()}
+    tree = kinematic_tree(robot, link_meshes(robot)[0])
+    for flexion in chosen_hands(tree):
+        if flexion.tree is tree:  # not within assumed limits
+            motion |= {robot.compiled.joint(i).name: (one / scale, two / scale) for i, (one, two) in flexion.motion().items()}
     return {name: ends for name, ends in motion.items() if name}
 
 

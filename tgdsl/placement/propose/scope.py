@@ -10,21 +10,33 @@ from tgdsl.placement.propose.flexion import Flexion
 from tgdsl.placement.propose.front import PalmFront
 from tgdsl.placement.propose.hands import KinematicTree, free_standing, hands
 from tgdsl.placement.propose.jaws import with_jaws
+from tgdsl.placement.propose.limits import with_assumed_limits
 from tgdsl.schema.select import matching
 
 BEFORE = "before the link from which the fingers part; --include adds it"
 BESIDE = "no part of a hand; --include adds it"
+NO_LIMITS = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
 SCENERY = "stands or floats by itself: taken for scenery or an object; --include adds it"
 
 
 def chosen_hands(tree: KinematicTree) -> list[Flexion]:
-    """Return the hands of a robot: those of which two chains or a jaw are known to close, or else all that may be one."""
+    """Return the hands of a robot: those of which two chains or a jaw are known to close, or else all that may be one.
+
+    Where none is known to close, hinges without limits are tried within assumed ones.
+    """
     results = [Flexion(tree, own) for hand in hands(tree) for own in with_jaws(tree, hand)]
-    closing = [flexion for flexion in results if flexion.num_closing > (flexion.hand.jaw is None)]
+    closing = _that_close(results)
+    if not closing:
+        free = replace(tree, model=with_assumed_limits(tree.model), doubt=NO_LIMITS)
+        closing = _that_close([Flexion(free, hand) for hand in hands(free)])
     for flexion in closing:
         if flexion.hand.palm is not None:
             flexion.hand = replace(flexion.hand, mounts=PalmFront(flexion).mounts())
     return closing or results
+
+
+def _that_close(flexions: Sequence[Flexion]) -> list[Flexion]:
+    return [flexion for flexion in flexions if flexion.num_closing > (flexion.hand.jaw is None)]
 
 
 def outside(tree: KinematicTree, found: Sequence[Flexion]) -> dict[int, str]:

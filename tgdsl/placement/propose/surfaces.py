@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from tgdsl.errors import RobotError, SampleError
 from tgdsl.formats.model import Model
 from tgdsl.placement.propose.exposure import MIN_AREA, Options, exposed_pool, surface_pool
-from tgdsl.placement.propose.hands import free_standing, kinematic_tree
+from tgdsl.placement.propose.hands import free_standing, kinematic_tree, loose_parts
 from tgdsl.placement.reach import Colliders
 from tgdsl.placement.sample.poisson import Pool
 from tgdsl.surfaces.surface import Surface
@@ -61,6 +61,9 @@ def link_meshes(robot: Model) -> tuple[dict[str, Surface], list[tuple[str, str]]
         else:
             left_out.append((body, f"a marker: its surface is {1e4 * area:.2g} cm²" if area > MIN_AREA else _NO_AREA))
     model = robot.compiled
+    for name in [model.body(body).name for body in loose_parts(kinematic_tree(robot, meshes))]:
+        del meshes[name]
+        left_out.append((name, "a marker: it touches nothing that it is fixed to"))
     unnamed = [i for i in range(model.nbody) if not model.body(i).name and model.body_geomnum[i]]
     left_out += [(robot.body_path(i), "no name, so no document can mean it") for i in unnamed]
     return meshes, left_out
