@@ -107,8 +107,8 @@ def test_a_wrist_before_a_palm_is_no_part_of_it(tmp_path, z):
 
 
 def test_a_ball_that_nothing_holds_is_a_marker(tmp_path):
-    """Balls of 5 mm: one 60 mm before the palm, and one in the fingertip, which sticks out by 4 mm and is no tip of its own."""
-    ball = '<body name="{}" pos="{}"><geom size=".005"/></body>'
+    """Balls of 3 mm: one 60 mm before the palm, and one in the fingertip, which sticks out by 2 mm and is no tip of its own."""
+    ball = '<body name="{}" pos="{}"><geom size=".003"/></body>'
     text = palm_and_fingers(thumb(1) + ball.format("tool", ".08 0 .04"))
     geom = '<geom type="box" size=".006 .008 .014" pos="0 0 .016"/>'
     place = text.index(geom, text.index('name="f1_3"')) + len(geom)

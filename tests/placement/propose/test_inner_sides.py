@@ -150,6 +150,16 @@ def test_mimicked_joints_close_along(tmp_path):
     assert len(found) == 6
 
 
+def test_mimic_joints_that_their_limits_contradict_close_by_themselves(tmp_path):
+    """Slides of opposite axes that a mimic of −1 would move the same way, out of the second one's limits."""
+    mimic = '<equality><joint joint1="slide1" joint2="slide0" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    robot = loaded(tmp_path, world(slides()).replace("</mujoco>", mimic))
+    assert closing_motion(robot) == {"slide0": (0.04, 0.0), "slide1": (0.04, 0.0)}
+    assert {link.name: link.facing for link in propose(robot, DENSITY).links if link.name != "gripper"} == dict.fromkeys(
+        ("jaw0", "jaw1"), INNER
+    )
+
+
 def test_loops_hold_while_closing(tmp_path):
     """Both poses satisfy MuJoCo's own residuals of the loops; the pads, twice as far in, face each other."""
     text = FOUR_BAR

@@ -30,7 +30,7 @@ MAX_FINGER = 0.35
 """A longer chain is an arm or a leg, of which nothing closes [m]."""
 MAX_STEM = 1.5
 """Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
-MIN_TIP = 0.2
+MIN_TIP = 0.1
 """Least surface of a fingertip, as a share of the largest body fixed to it."""
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
@@ -210,8 +210,9 @@ def free_standing(tree: KinematicTree) -> list[int]:
 def loose_parts(tree: KinematicTree) -> list[int]:
     """Return the bodies that are farther from all that is fixed to them than twice their size: they mark a place in the air."""
     result = []
-    for bodies in tree.bodies.values():
-        boxes = [(points.min(axis=0), points.max(axis=0)) for points in (tree.points(body, tree.start) for body in bodies)]
+    for segment, bodies in tree.bodies.items():
+        placed = [tree.points(body, tree.start) @ tree.start.xmat[segment].reshape(3, 3) for body in bodies]
+        boxes = [(points.min(axis=0), points.max(axis=0)) for points in placed]
         largest = max((tree.area[body] for body in bodies), default=0.0)
         for body, (low, high) in zip(bodies, boxes, strict=True):
             gaps = [np.linalg.norm(np.maximum(np.maximum(a - high, low - b), 0.0)) for a, b in boxes if a is not low]
