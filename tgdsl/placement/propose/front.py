@@ -6,8 +6,6 @@ of all that the fingers sweep as they close, seen from in front of the palm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
@@ -32,21 +30,19 @@ HALF = 0.5
 """A part of a palm is in front by this share, and has this share of the largest part's area."""
 
 
-@dataclass(frozen=True, eq=False)
-class Front:
-    """Points of a body that face a direction, and what is in front of them.
+def front_of(
+    tree: KinematicTree, body: int, facing: tuple[float, ...]
+) -> tuple[Float[np.ndarray, "point 3"], Bool[np.ndarray, " point"]]:
+    """Return evenly spaced points of a body, and whether no other body of its segment is in front of them.
 
-    Attributes:
-        pos: The points, in the body's frame.
-        is_free: Whether no other body of the segment is in front.
+    Args:
+        tree: The robot.
+        body: The body.
+        facing: Direction in its frame against which it is seen.
+
+    Returns:
+        The points in the body's frame [m], and whether they are free.
     """
-
-    pos: Float[np.ndarray, "point 3"]
-    is_free: Bool[np.ndarray, " point"]
-
-
-def front_of(tree: KinematicTree, body: int, facing: tuple[float, ...]) -> Front:
-    """Return evenly spaced points of a body, as seen against the direction in its frame in which it faces."""
     direction = np.array(facing) / np.linalg.norm(facing)
     axes, view = frame(-direction), OrthographicView.of(tree.surface[body], frame(-direction))
     corners = view.corners[..., :2].reshape(-1, 2)
@@ -57,27 +53,25 @@ def front_of(tree: KinematicTree, body: int, facing: tuple[float, ...]) -> Front
     hits = first_hits(view, uv)
     is_facing = (hits.face >= 0) & (-view.normals[hits.face] @ axes[2] >= np.cos(np.radians(WITHIN_DEG)))
     pos = np.column_stack([uv, hits.depth])[is_facing] @ axes
-    others = [_seen_from(tree, body, other) for other in tree.bodies[tree.segment[body]] if other != body]
+    data, turn = tree.start, tree.start.xmat[body].reshape(3, 3).T
+    others = [
+        tree.surface[other].placed(turn @ (data.xpos[other] - data.xpos[body]), turn @ data.xmat[other].reshape(3, 3))
+        for other in tree.bodies[tree.segment[body]]
+        if other != body
+    ]
     ahead = first_hits(OrthographicView.of(Surface.joined(others), axes), uv[is_facing]).depth if others else np.inf
-    return Front(pos, np.broadcast_to(ahead >= hits.depth[is_facing] - GAP, len(pos)))
+    return pos, np.broadcast_to(ahead >= hits.depth[is_facing] - GAP, len(pos))
 
 
-def _seen_from(tree: KinematicTree, body: int, other: int) -> Surface:
-    """Return the surface of another body in a body's frame."""
-    data = tree.start
-    turn = data.xmat[body].reshape(3, 3).T
-    return tree.surface[other].placed(turn @ (data.xpos[other] - data.xpos[body]), turn @ data.xmat[other].reshape(3, 3))
-
-
-def hidden(flexion: Flexion) -> set[int]:
+def hidden(flexion: Flexion) -> list[int]:
     """Return the bodies of a hand whose inner side is behind other bodies that are fixed to them."""
-    tree, result = flexion.tree, set[int]()
+    tree, result = flexion.tree, list[int]()
     for body in (*flexion.hand.mounts, *flexion.hand.fingers):
         facing = flexion.inner_side(body).facing
         if facing is not None and len(tree.bodies[tree.segment[body]]) > 1:
-            front = front_of(tree, body, facing)
-            if len(front.pos) and front.is_free.mean() < MIN_SHARE:
-                result.add(body)
+            _, is_free = front_of(tree, body, facing)
+            if len(is_free) and is_free.mean() < MIN_SHARE:
+                result.append(body)
     return result
 
 
@@ -158,8 +152,8 @@ class PalmFront:
         facing, data = self.flexion.palm_side(body).facing, self.flexion.tree.start
         if facing is None:
             return np.zeros(0, bool), np.zeros((0, 3)), np.zeros(0, bool)
-        front = front_of(self.flexion.tree, body, facing)
+        pos, is_free = front_of(self.flexion.tree, body, facing)
         assert self.axes is not None
-        place = (data.xpos[body] + front.pos @ data.xmat[body].reshape(3, 3).T) @ self.axes.T
+        place = (data.xpos[body] + pos @ data.xmat[body].reshape(3, 3).T) @ self.axes.T
         beyond = (place[:, :2] @ self.outline[:, :2].T + self.outline[:, 2]).max(axis=1, initial=-np.inf)
-        return front.is_free, place, beyond > self.margin
+        return is_free, place, beyond > self.margin

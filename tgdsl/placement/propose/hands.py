@@ -32,6 +32,11 @@ MAX_STEM = 1.5
 """Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
 MIN_TIP = 0.1
 """Least surface of a fingertip, as a share of the largest body fixed to it."""
+JAW_REACH = 0.5
+"""A fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed."""
+MIN_BEND, MAX_BEND = np.radians(19.9), np.radians(200.1)
+"""A jaw that turns by less does not grip, and what turns by more is a wrist; no angles that people draw."""
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
@@ -230,7 +235,7 @@ def _is_driven(tree: KinematicTree, segment: int) -> bool:
 def hands(tree: KinematicTree) -> list[Hand]:
     """Return what may be a hand; trees that a hinge or slide joins to the world make up one.
 
-    A tree without two chains that part is one as a whole, without a palm.
+    A tree without two chains that part is one as a whole, without a palm; where a jaw turns against a fixed one, these are.
     """
     left_out = set(free_standing(tree))
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
@@ -239,7 +244,61 @@ def hands(tree: KinematicTree) -> list[Hand]:
     results = [_hand(tree, base) for root in roots if root not in straight for base in bases[root] or [root]]
     if straight:
         results.append(_hand(tree, 0, [s for root in straight for s in (root, *tree.below(root))]))
-    return results
+    return [gripper for hand in results for gripper in _with_jaws(tree, hand)]
+
+
+def _with_jaws(tree: KinematicTree, hand: Hand) -> list[Hand]:
+    """Return the grippers of one jaw in a hand of one chain, or whose chains are arms; if there are none, the hand."""
+    if len(hand.chains) > 1 and hand.length <= MAX_FINGER:
+        return [hand]
+    results = [gripper for chain in hand.chains for s in chain if (gripper := _gripper_of(tree, s)) is not None]
+    return [gripper for gripper in results if gripper.length <= MAX_FINGER] or [hand]
+
+
+def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
+    """Return the gripper of which a segment is the moving jaw; None if it is none.
+
+    A jaw is the only child of its parent, carries nothing, and turns on one hinge. It is closed at the end of the hinge's range
+    at which its parent's surface goes on farther in the direction in which it points, which is away from where the parent
+    is carried: a forearm that folds onto its upper arm points to there.
+    """
+    parent, joints, model = tree.parent[segment], tree.joints(segment), tree.model
+    if not parent or len(joints) != 1 or tree.children(segment) or len(tree.children(parent)) != 1 or not tree.bodies[parent]:
+        return None
+    joint = joints[0]
+    is_hinge = int(model.jnt_type[joint]) == _HINGE and bool(model.jnt_limited[joint])
+    if not is_hinge or not MIN_BEND <= np.ptp(model.jnt_range[joint]) <= MAX_BEND:
+        return None
+    ends = [_ahead(tree, joint, parent, float(value)) for value in model.jnt_range[joint]]
+    own = tree.bodies[segment]
+    reach = [max(end[body] for body in own) if end else 0.0 for end in ends]
+    share = [max(end[b] for b in tree.bodies[parent]) / r if r > 0 else 0.0 for end, r in zip(ends, reach, strict=True)]
+    closed = int(share[1] > share[0])
+    if share[closed] < JAW_REACH:
+        return None
+    fixed = [body for body in tree.bodies[parent] if ends[closed][body] >= JAW_REACH * reach[closed]]
+    jaw = max(fixed, key=lambda body: (ends[closed][body], -body))
+    return Hand(parent, fixed, None, [[segment]], own, own, reach[closed], jaw, 1.0 if closed else -1.0)
+
+
+def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[int, float]:
+    """Return how far bodies of a jaw and of its parent reach beyond the hinge in the jaw's direction [m].
+
+    Nothing, if this direction is toward where the parent is carried.
+    """
+    data, segment = mujoco.MjData(tree.model), tree.segment[int(tree.model.jnt_bodyid[joint])]
+    data.qpos[:] = tree.model.qpos0
+    data.qpos[tree.model.jnt_qposadr[joint]] = value
+    mujoco.mj_kinematics(tree.model, data)
+    own, anchor, axis = tree.bodies[segment], data.xanchor[joint], data.xaxis[joint]
+    along = tree.middle(segment, data) - anchor
+    along = along - (along @ axis) * axis
+    above = tree.joints(parent)
+    carried_at = data.xanchor[above[0]] if above else data.xpos[parent]
+    if np.linalg.norm(along) < 1e-6 or along @ (anchor - carried_at) <= 0:
+        return {}
+    along /= np.linalg.norm(along)
+    return {b: float(((tree.points(b, data) - anchor) @ along).max()) for b in (*own, *tree.bodies[parent])}
 
 
 def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
