@@ -87,8 +87,8 @@ class Closing:
         others = {joint: self._end(joint, self.sense.get(joint) or half[joint]) for joint in self.bending}
         # Within assumed limits fingers may pass each other: their closed ends say nothing.
         whole = half if tree.doubt else {joint: self._gain(joint, others) for joint in self.bending}
-        found = {joint: self._motion(joint, half[joint], whole[joint]) for joint in self.bending}
-        self.motions = {joint: motion for joint, motion in found.items() if motion is not None}
+        motions = {joint: self._motion(joint, half[joint], whole[joint]) for joint in self.bending}
+        self.motions = {joint: motion for joint, motion in motions.items() if motion is not None}
 
     def posed(self, share: float) -> Float[np.ndarray, " qpos"]:
         """Return the pose in which all joints that close are closed by a share; the others are as at the start."""
@@ -187,8 +187,8 @@ class Closing:
         results = []
         for joint in candidates:
             segment = self.segment(joint)
-            own = [other for other in candidates if self.segment(other) == segment]
-            rivals = [other for other in own if other in self.sense] or [other for other in own if other in one_way] or own
+            siblings = [other for other in candidates if self.segment(other) == segment]
+            rivals = [j for j in siblings if j in self.sense] or [j for j in siblings if j in one_way] or siblings
             spreads = joint in spreading or (joint in free and self.chain[segment] in curled)
             if rivals == [joint] and not spreads:
                 results.append(joint)
@@ -216,7 +216,7 @@ class Closing:
         return {
             one
             for one, chain, axis in axes
-            if any(chain != own_chain and abs(axis @ own) > PARALLEL for _, own_chain, own in axes)
+            if any(chain != other_chain and abs(axis @ other) > PARALLEL for _, other_chain, other in axes)
         }
 
     def _motion(self, joint: int, half: float, whole: float) -> Motion | None:

@@ -91,9 +91,9 @@ class Flexion:
         return replace(side, doubt=ACROSS) if not side.doubt and self._is_across(body, side) else side
 
     def _moving_side(self, body: int) -> InnerSide:
-        if (facing := self._meeting(body)) is not None:
-            return InnerSide(facing, self._doubt(self.tree.segment[body]))
         segment = self.tree.segment[body]
+        if (facing := self._meeting(body)) is not None:
+            return InnerSide(facing, next((self.closing.motions[joint].doubt for joint in self._nearest(segment)), ""))
         if (side := self._flexor(segment) or self._flexor(self.bars.get(segment, segment))) is None:
             return InnerSide(None, UNCLEAR)
         joint, along = side
@@ -132,14 +132,14 @@ class Flexion:
         first = [self.tree.joints(s)[:1] for s in (segment, other)]
         if not moved or not parallel or not all(first):
             return False
-        one, two = (self._frames(self.open).xanchor[own[0]].copy() for own in first)
+        one, two = (self._frames(self.open).xanchor[joints[0]].copy() for joints in first)
         return float(np.linalg.norm(one - two)) < BESIDE * length_of(self.tree, other)
 
     def _turn(self, pose: Float[np.ndarray, " qpos"], segment: int) -> Float[np.ndarray, " 3"]:
         """Return how far a segment turns against its parent from the open pose to one near to it, about its axes [rad]."""
-        own = [joint for joint in self.tree.joints(segment) if joint in self.closing.poses.joints]
-        at = [self.closing.poses.at(joint) for joint in own]
-        return (pose[at] - self.open[at]) @ self._frames(self.open).xaxis[own] if own else np.zeros(3)
+        joints = [joint for joint in self.tree.joints(segment) if joint in self.closing.poses.joints]
+        at = [self.closing.poses.at(joint) for joint in joints]
+        return (pose[at] - self.open[at]) @ self._frames(self.open).xaxis[joints] if joints else np.zeros(3)
 
     def _stepped(self, joint: int) -> Float[np.ndarray, " qpos"]:
         """Return the open pose with one joint a small step closed."""
@@ -205,9 +205,6 @@ class Flexion:
         hinges = [j for j in self.motion() if self.closing.segment(j) in beyond and int(self.tree.model.jnt_type[j]) == _HINGE]
         return bool((np.abs(data.xaxis[hinges] @ along) > ALONG_HINGE).any())
 
-    def _doubt(self, segment: int) -> str:
-        return next((self.closing.motions[joint].doubt for joint in self._nearest(segment)), "")
-
     def _meeting(self, body: int) -> tuple[float, ...] | None:
         """Return where a body faces the tip of the other chain, of two that close on each other without curling."""
         segment, chain = self.tree.segment[body], self.closing.chain
@@ -215,12 +212,12 @@ class Flexion:
         is_jaw = segment in jaws and len({chain[jaw] for jaw in jaws}) == 2
         if not is_jaw or not self.closing.motions or any(motion.is_curling for motion in self.closing.motions.values()):
             return None
-        own = [tip for tip in tips if self.tree.segment[tip] == segment]
-        others = [tip for tip in tips if chain[self.tree.segment[tip]] != chain[segment]]
+        near = [tip for tip in tips if self.tree.segment[tip] == segment]
+        far = [tip for tip in tips if chain[self.tree.segment[tip]] != chain[segment]]
         apart = []
         for pose in (self.open, self.closing.posed(1.0 - STEP), self.shut):
             data = self._frames(pose)
-            mean = [np.mean([self.tree.centre(tip, data) for tip in some], axis=0) for some in (others, own)]
+            mean = [np.mean([self.tree.centre(tip, data) for tip in some], axis=0) for some in (far, near)]
             apart.append(mean[0] - mean[1])
         along = apart[1] - apart[2]
         if float(np.linalg.norm(along)) < 1e-9 or along @ apart[0] < 0.5 * np.linalg.norm(along) * np.linalg.norm(apart[0]):
@@ -260,7 +257,7 @@ class Flexion:
 
     def _curled(self) -> Float[np.ndarray, " 3"] | None:
         """Return where most fingers, as they curl, carry their first bones in the open pose; None if no majority does."""
-        found, data, motion, place = [], self._frames(self.open), self.motion(), self.closing.segment
+        curls, data, motion, place = [], self._frames(self.open), self.motion(), self.closing.segment
         curling = {j for joint, m in self.closing.motions.items() if m.is_curling for j in self.closing.turned[joint]}
         for chain in self.hand.chains:
             hinges = sorted(
@@ -270,9 +267,9 @@ class Flexion:
             if beyond:
                 opened, closed = motion[hinges[0]]
                 bone = data.xanchor[beyond[0]] - data.xanchor[hinges[0]]
-                found.append(np.cross(np.sign(closed - opened) * data.xaxis[hinges[0]], bone))
-        found = [along / max(float(np.linalg.norm(along)), 1e-9) for along in found]
-        alike = [[other for other in found if one @ other > MIN_COSINE] for one in found]
+                curls.append(np.cross(np.sign(closed - opened) * data.xaxis[hinges[0]], bone))
+        curls = [along / max(float(np.linalg.norm(along)), 1e-9) for along in curls]
+        alike = [[other for other in curls if one @ other > MIN_COSINE] for one in curls]
         most = max(alike, key=len, default=[])
         return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 

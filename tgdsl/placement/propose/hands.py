@@ -57,12 +57,15 @@ class KinematicTree:
     @cached_property
     def area(self) -> dict[int, float]:
         """Surface of each body that has one [m²]; at most its convex hull's, as geoms may overlap."""
-        return {body: min(float(own.face_areas.sum()), _hull_area(own)) for body, own in self.surface.items()}
+        return {body: min(float(surface.face_areas.sum()), _hull_area(surface)) for body, surface in self.surface.items()}
 
     @cached_property
     def centroid(self) -> dict[int, Float[np.ndarray, " 3"]]:
         """Centre of that surface, in the body's frame [m]."""
-        return {b: own.face_areas @ own.corners.mean(axis=1) / own.face_areas.sum() for b, own in self.surface.items()}
+        return {
+            b: surface.face_areas @ surface.corners.mean(axis=1) / surface.face_areas.sum()
+            for b, surface in self.surface.items()
+        }
 
     @cached_property
     def segment(self) -> list[int]:
@@ -88,7 +91,7 @@ class KinematicTree:
     @cached_property
     def carries(self) -> set[int]:
         """The segments that have surface, or whose descendants have."""
-        return {above for segment, own in self.bodies.items() if own for above in self.path(segment)}
+        return {above for segment, bodies in self.bodies.items() if bodies for above in self.path(segment)}
 
     def path(self, segment: int) -> list[int]:
         """Return a segment and all above it, upward."""
@@ -150,13 +153,13 @@ class KinematicTree:
 
     def middle(self, segment: int, data: mujoco.MjData) -> Float[np.ndarray, " 3"]:
         """Return the centre of the surfaces of a segment's bodies in the world [m]."""
-        own = self.bodies[segment]
-        return np.average([self.centre(body, data) for body in own], axis=0, weights=[self.area[body] for body in own])
+        bodies = self.bodies[segment]
+        return np.average([self.centre(body, data) for body in bodies], axis=0, weights=[self.area[body] for body in bodies])
 
     def points(self, body: int, data: mujoco.MjData) -> Float[np.ndarray, "corner 3"]:
         """Return the corners of a body's surface in the world [m]."""
-        own = self.surface[body]
-        return data.xpos[body] + own.vertices[np.unique(own.faces)] @ data.xmat[body].reshape(3, 3).T
+        surface = self.surface[body]
+        return data.xpos[body] + surface.vertices[np.unique(surface.faces)] @ data.xmat[body].reshape(3, 3).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +197,7 @@ def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTre
         surface: Surface of each body that has one, in the body's frame, by name.
     """
     model = as_meant(robot.compiled)
-    return KinematicTree(model, {int(model.body(name).id): own for name, own in surface.items()})
+    return KinematicTree(model, {int(model.body(name).id): mesh for name, mesh in surface.items()})
 
 
 def _hull_area(surface: Surface) -> float:
@@ -270,15 +273,15 @@ def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
     if not is_hinge or not MIN_BEND <= np.ptp(model.jnt_range[joint]) <= MAX_BEND:
         return None
     ends = [_ahead(tree, joint, parent, float(value)) for value in model.jnt_range[joint]]
-    own = tree.bodies[segment]
-    reach = [max(end[body] for body in own) if end else 0.0 for end in ends]
+    bodies = tree.bodies[segment]
+    reach = [max(end[body] for body in bodies) if end else 0.0 for end in ends]
     share = [max(end[b] for b in tree.bodies[parent]) / r if r > 0 else 0.0 for end, r in zip(ends, reach, strict=True)]
     closed = int(share[1] > share[0])
     if share[closed] < JAW_REACH:
         return None
     fixed = [body for body in tree.bodies[parent] if ends[closed][body] >= JAW_REACH * reach[closed]]
     jaw = max(fixed, key=lambda body: (ends[closed][body], -body))
-    return Hand(parent, fixed, None, [[segment]], own, own, reach[closed], jaw, 1.0 if closed else -1.0)
+    return Hand(parent, fixed, None, [[segment]], bodies, bodies, reach[closed], jaw, 1.0 if closed else -1.0)
 
 
 def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[int, float]:
@@ -290,7 +293,7 @@ def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[i
     data.qpos[:] = tree.model.qpos0
     data.qpos[tree.model.jnt_qposadr[joint]] = value
     mujoco.mj_kinematics(tree.model, data)
-    own, anchor, axis = tree.bodies[segment], data.xanchor[joint], data.xaxis[joint]
+    bodies, anchor, axis = tree.bodies[segment], data.xanchor[joint], data.xaxis[joint]
     along = tree.middle(segment, data) - anchor
     along = along - (along @ axis) * axis
     above = tree.joints(parent)
@@ -298,7 +301,7 @@ def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[i
     if np.linalg.norm(along) < 1e-6 or along @ (anchor - carried_at) <= 0:
         return {}
     along /= np.linalg.norm(along)
-    return {b: float(((tree.points(b, data) - anchor) @ along).max()) for b in (*own, *tree.bodies[parent])}
+    return {b: float(((tree.points(b, data) - anchor) @ along).max()) for b in (*bodies, *tree.bodies[parent])}
 
 
 def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
@@ -324,8 +327,8 @@ def _parts_within(tree: KinematicTree, base: int, other: int) -> bool:
 
 def length_of(tree: KinematicTree, segment: int) -> float:
     """Return the length from where a segment moves against its parent to the end of what it carries [m]."""
-    own = [float(np.linalg.norm(tree.centre(b, tree.start) - anchor(tree, segment))) for b in tree.bodies[segment]]
-    reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(own, tree.bodies[segment], strict=True)]
+    distances = [float(np.linalg.norm(tree.centre(b, tree.start) - anchor(tree, segment))) for b in tree.bodies[segment]]
+    reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(distances, tree.bodies[segment], strict=True)]
     for child in tree.children(segment):
         stem = float(np.linalg.norm(anchor(tree, child) - anchor(tree, segment)))
         reach.append(stem + length_of(tree, child))
@@ -363,17 +366,17 @@ def _mounts(tree: KinematicTree, base: int) -> list[int]:
         return tree.bodies[base]
     common = [body for body in above[0] if all(body in path for path in above)]
     for body in common:  # upward, to the first with surface
-        if own := [b for b in tree.bodies[base] if body in tree.within(base, b)]:
-            return own
+        if bodies := [b for b in tree.bodies[base] if body in tree.within(base, b)]:
+            return bodies
     return []
 
 
 def _last(tree: KinematicTree, segment: int) -> list[int]:
     """Return the bodies of a segment that have no other below them; small parts of it, such as markers, do not count."""
     largest = max(tree.area[body] for body in tree.bodies[segment])
-    own = [body for body in tree.bodies[segment] if tree.area[body] >= MIN_TIP * largest]
-    above = {over for body in own for over in tree.within(segment, body)[1:]}
-    return [body for body in own if body not in above]
+    bodies = [body for body in tree.bodies[segment] if tree.area[body] >= MIN_TIP * largest]
+    above = {over for body in bodies for over in tree.within(segment, body)[1:]}
+    return [body for body in bodies if body not in above]
 
 
 def _chains(tree: KinematicTree, base: int, beyond: Sequence[int]) -> list[list[int]]:
