@@ -95,7 +95,7 @@ class PalmFront:
         facing = flexion.palm_side(hand.palm).facing
         self.axes = None if facing is None else frame(tree.start.xmat[hand.palm].reshape(3, 3) @ facing)
         if self.axes is not None:
-            poses = (flexion.open, flexion.closing.posed(0.5), flexion.shut)
+            poses = (flexion.open, flexion.closing.pose(0.5), flexion.shut)
             swept = [tree.points(b, flexion.closing.poses.kinematics(pose)) for pose in poses for b in hand.fingers]
             self.outline = ConvexHull(np.concatenate(swept) @ self.axes[:2].T).equations
             self.margin = MARGIN * hand.length

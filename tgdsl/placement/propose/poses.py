@@ -64,7 +64,7 @@ class Poses:
         """Return a joint's index in `qpos`."""
         return int(self.model.jnt_qposadr[joint])
 
-    def posed(self, values: Mapping[int, float]) -> Float[np.ndarray, " qpos"]:
+    def pose(self, values: Mapping[int, float]) -> Float[np.ndarray, " qpos"]:
         """Return the pose in which independent joints have some values and the other independent ones are as at the start.
 
         Where the equalities cannot hold, the pose is the last on the way at which they do.

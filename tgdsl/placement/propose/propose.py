@@ -35,7 +35,7 @@ BEFORE = "before the link from which the fingers part; --include adds it"
 BESIDE = "no part of a hand; --include adds it"
 NO_LIMITS = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
 SCENERY = "stands or floats by itself: taken for scenery or an object; --include adds it"
-Box = tuple[()] | tuple[tuple[float, ...], tuple[float, ...]]
+Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class LinkProposal:
         doubt: What speaks against that side, or why there is none; empty if nothing does.
         counts: Number of taxels at each resolution.
         options: Options by which taxels are where they can feel.
-        box: Lower and upper corner of what is no tower beside the hand, in the link's frame [m]; empty if it is all of it.
+        box: Lower and upper corner of what is no tower beside the hand, in the link's frame [m]; None if it is all of it.
     """
 
     name: str
@@ -58,7 +58,7 @@ class LinkProposal:
     doubt: str
     counts: dict[str, int]
     options: Options
-    box: Box = ()
+    box: Box | None = None
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,10 @@ class Proposal:
         result |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
         if link.facing is not None:
             facing = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
-            box = dict(zip(("min", "max"), map(list, link.box), strict=False))
-            result["region"] = [facing, {"box": box}] if link.box else facing
+            result["region"] = facing
+            if link.box is not None:
+                low, high = link.box
+                result["region"] = [facing, {"box": {"min": list(low), "max": list(high)}}]
         return result
 
     def mapping(self) -> dict[str, Any]:
@@ -135,7 +137,7 @@ def propose(
     asked_for = InnerSide(None, "asked for with --include")
     boxes = {names[b]: box for flexion in flexions for b, box in _boxes(flexion).items()}
     links = tuple(
-        _link(name, surfaces[name], sides.get(name, asked_for), boxes.get(name, ()), density)
+        _link(name, surfaces[name], sides.get(name, asked_for), boxes.get(name), density)
         for name in robot.bodies
         if name in surfaces
     )
@@ -263,16 +265,16 @@ def _boxes(flexion: Flexion) -> dict[int, Box]:
     return result
 
 
-def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box, density: float) -> LinkProposal:
+def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box | None, density: float) -> LinkProposal:
     share, facing, doubt = 1.0, side.facing, side.doubt
     if facing is not None:
         pool = surface.pool
         is_in = _faces(pool.normal, facing)
-        if box:
+        if box is not None:
             is_in &= ((pool.pos >= box[0]) & (pool.pos <= box[1])).all(axis=1)
         share = float(pool.point_area[is_in].sum()) / pool.area
         if share < MIN_SHARE:
-            share, facing, doubt, box = 1.0, None, UNCLEAR, ()
+            share, facing, doubt, box = 1.0, None, UNCLEAR, None
     area = share * surface.pool.area
     # Areas that people draw often hold half a taxel more, and the last bits of an area shall not decide.
     counts = {name: max(1, int(np.floor(area * density * factor + 0.501))) for name, factor in FACTORS.items()}
