@@ -34,7 +34,7 @@ MIN_TIP = 0.1
 """Least surface of a fingertip, as a share of the largest body fixed to it."""
 JAW_REACH = 0.5
 """A fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed."""
-MIN_BEND, MAX_BEND = np.radians(19.9), np.radians(200.1)
+MIN_JAW_TURN, MAX_JAW_TURN = np.radians(19.9), np.radians(200.1)
 """A jaw that turns by less does not grip, and what turns by more is a wrist; no angles that people draw."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -219,9 +219,11 @@ def loose_parts(tree: KinematicTree) -> list[int]:
     """Return the bodies that are farther from all that is fixed to them than twice their size: they mark a place in the air."""
     result = []
     for segment, bodies in tree.bodies.items():
+        if len(bodies) < 2:
+            continue
         placed = [tree.points(body, tree.start) @ tree.start.xmat[segment].reshape(3, 3) for body in bodies]
         boxes = [(points.min(axis=0), points.max(axis=0)) for points in placed]
-        largest = max((tree.area[body] for body in bodies), default=0.0)
+        largest = max(tree.area[body] for body in bodies)
         for body, (low, high) in zip(bodies, boxes, strict=True):
             gaps = [np.linalg.norm(np.maximum(np.maximum(a - high, low - b), 0.0)) for a, b in boxes if a is not low]
             if tree.area[body] < largest and min(gaps) > 2.0 * np.linalg.norm(high - low):
@@ -270,7 +272,7 @@ def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
         return None
     joint = joints[0]
     is_hinge = int(model.jnt_type[joint]) == _HINGE and bool(model.jnt_limited[joint])
-    if not is_hinge or not MIN_BEND <= np.ptp(model.jnt_range[joint]) <= MAX_BEND:
+    if not is_hinge or not MIN_JAW_TURN <= np.ptp(model.jnt_range[joint]) <= MAX_JAW_TURN:
         return None
     ends = [_ahead(tree, joint, parent, float(value)) for value in model.jnt_range[joint]]
     bodies = tree.bodies[segment]
@@ -293,15 +295,15 @@ def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[i
     data.qpos[:] = tree.model.qpos0
     data.qpos[tree.model.jnt_qposadr[joint]] = value
     mujoco.mj_kinematics(tree.model, data)
-    bodies, anchor, axis = tree.bodies[segment], data.xanchor[joint], data.xaxis[joint]
-    along = tree.middle(segment, data) - anchor
+    bodies, hinge, axis = tree.bodies[segment], data.xanchor[joint], data.xaxis[joint]
+    along = tree.middle(segment, data) - hinge
     along = along - (along @ axis) * axis
     above = tree.joints(parent)
     carried_at = data.xanchor[above[0]] if above else data.xpos[parent]
-    if np.linalg.norm(along) < 1e-6 or along @ (anchor - carried_at) <= 0:
+    if np.linalg.norm(along) < 1e-6 or along @ (hinge - carried_at) <= 0:
         return {}
     along /= np.linalg.norm(along)
-    return {b: float(((tree.points(b, data) - anchor) @ along).max()) for b in (*bodies, *tree.bodies[parent])}
+    return {b: float(((tree.points(b, data) - hinge) @ along).max()) for b in (*bodies, *tree.bodies[parent])}
 
 
 def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
