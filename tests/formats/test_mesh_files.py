@@ -108,12 +108,13 @@ def test_files_of_one_stem_are_told_apart_and_named_once(tmp_path):
         assert trimesh_of(model, link).volume == pytest.approx(0.02 * 0.04 * 0.06, rel=1e-5)
 
 
-def test_a_flat_visual_is_read(tmp_path):
+@pytest.mark.parametrize("ending", ["glb", "stl", "obj"])
+def test_a_flat_visual_is_read(tmp_path, ending):
     plate = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [1, 3, 2]])
-    trimesh.Scene(plate).export(tmp_path / "logo.glb")
+    trimesh.Scene(plate).export(tmp_path / f"logo.{ending}")
     path = tmp_path / "hand.urdf"
     path.write_text(
-        f"<robot name='hand'><link name='a'>{INERTIAL}<visual><geometry><mesh filename='logo.glb'/></geometry></visual></link></robot>"
+        f"<robot name='hand'><link name='a'>{INERTIAL}<visual><geometry><mesh filename='logo.{ending}'/></geometry></visual></link></robot>"
     )
     model, _ = loaded(path)
     assert trimesh_of(model, "a").area == pytest.approx(0.01)

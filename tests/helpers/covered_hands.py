@@ -32,8 +32,8 @@ def shell(name: str = "shell", side: int = 1) -> str:
 def hand(side: int = 1) -> str:
     """Return a hand: a palm that is an L, a plate welded to it, a finger that begins inside it, and links not collided.
 
-    The finger's first 8 mm are inside the palm at rest, and its second link is not collided; the thumb collides with the cube
-    alone, by an explicit pair; `cube` floats, partly inside the palm.
+    Its joints are balls, so that nothing says how it closes. The finger's first 8 mm are inside the palm at rest, and its second
+    link is not collided; the thumb collides with the cube alone, by an explicit pair; `cube` floats, partly inside the palm.
     """
     return f"""
 <mujoco model="hand">
@@ -44,14 +44,14 @@ def hand(side: int = 1) -> str:
       <geom name="palm" type="mesh" mesh="shell"/>
       <body name="plate" pos="-.002 {side * 0.015} .02"><geom name="plate" type="box" size=".006 .005 .01"/></body>
       <body name="finger" pos=".022 {side * 0.005} .02">
-        <joint name="bend" axis="0 1 0"/>
+        <joint name="bend" type="ball"/>
         <geom name="finger" type="box" size=".02 .003 .003" pos=".02 0 0"/>
         <body name="the tip" pos=".04 0 0">
-          <joint axis="0 1 0"/><geom name="nail" type="sphere" size=".004" contype="0" conaffinity="0"/>
+          <joint type="ball"/><geom name="nail" type="sphere" size=".004" contype="0" conaffinity="0"/>
         </body>
       </body>
       <body name="thumb" pos="-.05 0 .02">
-        <joint axis="0 1 0"/><geom name="thumb" type="mesh" mesh="shell" contype="0" conaffinity="0"/>
+        <joint type="ball"/><geom name="thumb" type="mesh" mesh="shell" contype="0" conaffinity="0"/>
       </body>
     </body>
     <body name="cube" pos="0 {side * 0.03} 0"><freejoint/><geom name="cube" type="box" size=".01 .01 .01"/></body>

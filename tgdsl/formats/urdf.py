@@ -40,7 +40,7 @@ def read_urdf(path: Path) -> Model:
     spec = mujoco.MjSpec.from_string(text)
     _fill_meshes(path, spec, files)
     rewritten = rewrite_meshes(spec)
-    compiled = spec.compile()
+    compiled = _compile(spec)
     if overlaps := _overlaps_with_base(compiled):
         for pair in overlaps:
             spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
@@ -48,6 +48,19 @@ def read_urdf(path: Path) -> Model:
         pairs = listed([f"{base} and {link}" for base, link in overlaps])
         warnings.warn(f"{path}: links that overlap where a joint connects them do not collide: {pairs}", stacklevel=4)
     return Model(path, spec, compiled, is_rounded=True, mjcf=mjcf_of(spec), rewritten=rewritten)
+
+
+def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model; meshes without volume, such as a sticker's, weigh as shells: MuJoCo's error names these."""
+    while True:
+        try:
+            return spec.compile()
+        except ValueError as error:
+            flat = re.search(r"mesh volume is too small: (.*?) ?\. Try", str(error))
+            mesh = spec.mesh(flat[1]) if flat else None
+            if mesh is None or mesh.inertia == mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL:
+                raise
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 
 
 def _overlaps_with_base(model: mujoco.MjModel) -> list[tuple[str, str]]:

@@ -45,7 +45,7 @@ def _table_names(layouts: Mapping[str, Layout], out: Path) -> dict[str, str]:
         stem = f"{out.stem}.{re.sub(r'[^A-Za-z0-9_-]', '_', name)}"
         taken = {other.lower() for other in result.values()}
         tries = (f"{stem}{suffix}.csv" for suffix in ("", *(f"_{i}" for i in range(2, len(layouts) + 2))))
-        result[name] = next(own for own in tries if own.lower() not in taken)
+        result[name] = next(file for file in tries if file.lower() not in taken)
     return result
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 
 import mujoco
@@ -99,15 +100,12 @@ def _self_contacts(robot: Model) -> list[str]:
 
 def _aligned(blocks: Sequence[Sequence[tuple[str, ...]]]) -> list[str]:
     """Return blocks of cells, of one or several lines each, as lines with aligned columns."""
-    widths = [max(len(line) for block in blocks for line in block[i]) for i in range(len(_HEADER))]
+    rows = [row for block in blocks for row in zip_longest(*block, fillvalue="")]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
-    for block in blocks:
-        for k in range(max(len(cell) for cell in block)):
-            texts = [cell[k] if k < len(cell) else "" for cell in block]
-            pads = [
-                text.rjust(w) if i in _NUMBERS else text.ljust(w) for i, (text, w) in enumerate(zip(texts, widths, strict=True))
-            ]
-            lines.append("  ".join(pads).rstrip())
+    for row in rows:
+        columns = enumerate(zip(row, widths, strict=True))
+        lines.append("  ".join(text.rjust(w) if i in _NUMBERS else text.ljust(w) for i, (text, w) in columns).rstrip())
     return lines
 
 

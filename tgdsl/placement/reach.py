@@ -20,6 +20,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import BURIED, COVERED, NOT_COLLIDED, Unfelt
 from tgdsl.surfaces.convex import ConvexSolid, hull_planes
 from tgdsl.surfaces.geom import Geom
+from tgdsl.surfaces.rays import sphere_directions
 from tgdsl.surfaces.region import Covered
 
 INSIDE = 1e-6
@@ -74,7 +75,7 @@ class Colliders:
         """Return points of a body's frame in the world."""
         return self.state.xpos[body] + pos @ self.state.xmat[body].reshape(3, 3).T
 
-    def own(self, body: int) -> Int[np.ndarray, " own"]:
+    def solids_of(self, body: int) -> Int[np.ndarray, " solid"]:
         """Return the solids of a body's rigid link: what is welded to it moves with it; what is fixed to the world does not."""
         return np.flatnonzero(self.segment[self.body] == self.segment[body])
 
@@ -90,7 +91,7 @@ class Colliders:
         is_link[[0, *ignored]] = False
         return np.flatnonzero(is_link[self.body])
 
-    def depths(self, solids: Int[np.ndarray, " own"], pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "own n"]:
+    def depths(self, solids: Int[np.ndarray, " solid"], pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "solid n"]:
         """Return how deep points of the world are inside each of some solids [m], see `ConvexSolid.depth`."""
         results = [self.solids[i].depth(pos) for i in solids]
         return np.stack(results) if results else np.zeros((0, len(pos)))
@@ -103,17 +104,17 @@ class Colliders:
         A ball that is inside none of the solids may be inside all of them together: every one of its points that is looked
         at is then inside one.
         """
-        own, at = self.own(body), self.in_world(body, pos)
-        depths = self.depths(own, at)
+        solids, at = self.solids_of(body), self.in_world(body, pos)
+        depths = self.depths(solids, at)
         depth = depths.max(axis=0, initial=-np.inf)
         is_buried = depth > radius + INSIDE
         several = (depth > INSIDE) & ~is_buried & ((depths > -radius).sum(axis=0) > 1)
-        for direction in _sphere(DIRECTIONS):
+        for direction in sphere_directions(DIRECTIONS):
             doubtful = np.flatnonzero(several)
             if not len(doubtful):
                 break
             rim = at[doubtful] + radius[doubtful, None] * direction
-            several[doubtful] = self.depths(own, rim).max(axis=0) > INSIDE
+            several[doubtful] = self.depths(solids, rim).max(axis=0) > INSIDE
         return is_buried | several, depth
 
     def cover_of(self, body: str, geoms: Sequence[Geom], ignored: Collection[int] = ()) -> Covered:
@@ -124,12 +125,12 @@ class Colliders:
             geoms: Geoms that do not count: those that the points are on.
             ignored: Bodies that are no links, such as objects, by their indices.
         """
-        own = int(self.robot.compiled.body(body).id)
-        solids = np.concatenate([self.own(own), self.others(own, ignored)])
+        body_id = int(self.robot.compiled.body(body).id)
+        solids = np.concatenate([self.solids_of(body_id), self.others(body_id, ignored)])
         solids = solids[~np.isin(self.geom[solids], [geom.id for geom in geoms])]
 
         def is_covered(pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-            return self.depths(solids, self.in_world(own, pos)).max(axis=0, initial=-np.inf) > INSIDE
+            return self.depths(solids, self.in_world(body_id, pos)).max(axis=0, initial=-np.inf) > INSIDE
 
         return is_covered
 
@@ -172,42 +173,30 @@ def reach(colliders: Colliders, layout: Layout, ignored: Collection[int] = ()) -
     return result
 
 
-def unfelt(colliders: Colliders, layout: Layout, found: Reach) -> tuple[Unfelt, ...]:
+def unfelt(colliders: Colliders, layout: Layout, reached: Reach) -> tuple[Unfelt, ...]:
     """Return the taxels that cannot feel by link and reason; each taxel is in one record.
 
     Args:
         colliders: The robot's.
         layout: The taxels.
-        found: Their reach; whoever knows better which are collided may have replaced that.
+        reached: Their reach; callers that know which bodies meet an object replace `is_collided`.
     """
     records: list[Unfelt] = []
-    is_buried = found.is_collided & found.is_buried
-    is_covered = found.is_collided & ~found.is_buried & (found.cover >= 0)
+    is_buried = reached.is_collided & reached.is_buried
+    is_covered = reached.is_collided & ~reached.is_buried & (reached.cover >= 0)
     for i, link in enumerate(layout.links):
-        own = layout.link_id == i
-        if len(taxels := np.flatnonzero(own & ~found.is_collided)):
+        is_on_link = layout.link_id == i
+        if len(taxels := np.flatnonzero(is_on_link & ~reached.is_collided)):
             collides = colliders.collides(int(colliders.robot.compiled.body(link.body).id))
             why = NEVER_MET if collides else "on a body that the simulator does not collide"
-            records.append(Unfelt(link.name, NOT_COLLIDED, why, taxels, int(own.sum())))
-        if len(taxels := np.flatnonzero(own & is_buried)):
-            why = f"buried in the link's own colliding geoms, up to {_mm(found.depth[taxels])} deep, beyond their radius"
-            records.append(Unfelt(link.name, BURIED, why, taxels, int(own.sum())))
-        for body in np.unique(found.cover[own & is_covered]).tolist():
-            taxels = np.flatnonzero(own & is_covered & (found.cover == body))
+            records.append(Unfelt(link.name, NOT_COLLIDED, why, taxels, int(is_on_link.sum())))
+        if len(taxels := np.flatnonzero(is_on_link & is_buried)):
+            depth = f"{1e3 * reached.depth[taxels].max():.2g} mm"
+            why = f"buried in the link's own colliding geoms, up to {depth} deep, beyond their radius"
+            records.append(Unfelt(link.name, BURIED, why, taxels, int(is_on_link.sum())))
+        for body in np.unique(reached.cover[is_on_link & is_covered]).tolist():
+            taxels = np.flatnonzero(is_on_link & is_covered & (reached.cover == body))
             name = colliders.robot.compiled.body(body).name
             other = f'"{name}"' if name else f"unnamed body {body}"
-            records.append(Unfelt(link.name, COVERED, f"inside {other} in the initial state", taxels, int(own.sum())))
+            records.append(Unfelt(link.name, COVERED, f"inside {other} in the initial state", taxels, int(is_on_link.sum())))
     return tuple(records)
-
-
-def _mm(depth: Float[np.ndarray, " n"]) -> str:
-    return f"{1e3 * depth.max():.2g} mm"
-
-
-def _sphere(count: int) -> Float[np.ndarray, "n 3"]:
-    """Return a Fibonacci lattice of unit vectors, in an order that meets every side early."""
-    place = 37 * np.arange(count) % count
-    height = 1.0 - (2.0 * place + 1.0) / count
-    turn = np.pi * (3.0 - np.sqrt(5.0)) * place
-    ring = np.sqrt(1.0 - height**2)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)

@@ -75,6 +75,15 @@ class OrthographicView:
         return OrthographicView(axes, face_id, corners, normals, surface.face_geom[face_id], ROUNDING * extent)
 
 
+def sphere_directions(count: int) -> Float[np.ndarray, "direction 3"]:
+    """Return a Fibonacci lattice of unit vectors, in an order that meets every side early."""
+    place = 37 * np.arange(count) % count
+    height = 1.0 - (2.0 * place + 1.0) / count
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * place
+    ring = np.sqrt(1.0 - height**2)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)
+
+
 def reference_axes(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return the first of the z, y and x axes that is not near parallel to each unit vector."""
     is_across = np.abs(directions[:, ::-1]) < NEAR_PARALLEL

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from closing_hands import INNER, finger, palm_and_fingers, slides, thumb, world
+from closing_hands import INNER, finger, palm_and_fingers, parallel_jaws, slides, thumb, world
 
 from tgdsl.compiler.pipeline import placed
 from tgdsl.formats.robot import load_model
@@ -91,6 +91,40 @@ def test_both_halves_of_a_palm_are_the_palm(tmp_path, order):
     assert set(facing_of(proposal).values()) == {INNER}
 
 
+@pytest.mark.parametrize("z", [-0.03, 0.04], ids=["before", "beside"])
+def test_a_wrist_before_a_palm_is_no_part_of_it(tmp_path, z):
+    """A thumb that points back passes over a box fixed to the palm: below it is before the palm; as high as it is, its half."""
+    wrist = f'<body name="wrist" pos="0 0 .2"><geom type="box" size=".012 .025 {abs(z)}" pos="0 -.02 {z}"/>'
+    back = finger("thumb", ".02 -.02 0", "180 0 0")
+    text = palm_and_fingers(back if z < 0 else thumb(1)).replace(
+        '<body name="palm" pos="0 0 .2">', f'{wrist}<body name="palm">'
+    )
+    if z > 0:
+        text = text.replace('size=".012 .04 .04" pos="0 0 .04"', 'size=".012 .02 .04" pos="0 .02 .04"')
+    proposal = proposal_of(tmp_path, world(text + "</body>"))
+    assert proposal.groups["palm"] == (("palm",) if z < 0 else ("wrist", "palm"))
+    assert ("wrist" in {name for name, _ in proposal.left_out}) == (z < 0)
+
+
+def test_a_ball_that_nothing_holds_is_a_marker(tmp_path):
+    """Balls of 3 mm: one 60 mm before the palm, and one in the fingertip, which sticks out by 2 mm and is no tip of its own."""
+    ball = '<body name="{}" pos="{}"><geom size=".003"/></body>'
+    text = palm_and_fingers(thumb(1) + ball.format("tool", ".08 0 .04"))
+    geom = '<geom type="box" size=".006 .008 .014" pos="0 0 .016"/>'
+    place = text.index(geom, text.index('name="f1_3"')) + len(geom)
+    proposal = proposal_of(tmp_path, world(text[:place] + ball.format("mark", ".005 0 .02") + text[place:]))
+    assert proposal.left_out == (("tool", "a marker: it touches nothing that it is fixed to"),)
+    assert set(proposal.groups["tips"]) == {"f0_3", "f1_3", "f2_3", "f3_3", "thumb3"} and "mark" in proposal.groups["fingers"]
+
+
+def test_the_second_bar_of_a_linkage_faces_as_the_first(tmp_path):
+    """Its middle, at its hinge, is carried nowhere."""
+    bar = '<geom type="box" size=".002 .006 .02" pos="0 0 .03"/>'
+    text = parallel_jaws().replace(bar, bar.replace('pos="0 0 .03"', ""))
+    facing = facing_of(proposal_of(tmp_path, text))
+    assert facing["left_second"] == facing["right_second"] == INNER
+
+
 def test_covers_of_a_link(tmp_path):
     """Behind a link, in front of another, and beside a third: the last faces as the link does, though it lies off its middle."""
     text = palm_and_fingers(thumb(1))
@@ -104,8 +138,7 @@ def test_covers_of_a_link(tmp_path):
         place = text.index(geom, text.index(f'name="{name}"')) + len(geom)
         text = text[:place] + part + text[place:]
     proposal = proposal_of(tmp_path, world(text))
-    left_out = {name for name, why in proposal.left_out if why == HIDDEN}
-    assert left_out == {"back", "f1_3"}
+    assert [name for name, why in proposal.left_out if why == HIDDEN] == ["back", "f1_3"]
     assert set(facing_of(proposal).values()) == {INNER}
     assert "pad" in proposal.groups["tips"] and "side" in proposal.groups["fingers"]
 

@@ -150,6 +150,16 @@ def test_mimicked_joints_close_along(tmp_path):
     assert len(found) == 6
 
 
+def test_mimic_joints_that_their_limits_contradict_close_by_themselves(tmp_path):
+    """Slides of opposite axes that a mimic of −1 would move the same way, out of the second one's limits."""
+    mimic = '<equality><joint joint1="slide1" joint2="slide0" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    robot = loaded(tmp_path, world(slides()).replace("</mujoco>", mimic))
+    assert closing_motion(robot) == {"slide0": (0.04, 0.0), "slide1": (0.04, 0.0)}
+    assert {link.name: link.facing for link in propose(robot, DENSITY).links if link.name != "gripper"} == dict.fromkeys(
+        ("jaw0", "jaw1"), INNER
+    )
+
+
 def test_loops_hold_while_closing(tmp_path):
     """Both poses satisfy MuJoCo's own residuals of the loops; the pads, twice as far in, face each other."""
     text = FOUR_BAR
@@ -221,6 +231,17 @@ def test_servos_say_how_far_joints_go_that_have_no_limits(tmp_path):
         assert found.keys() == expected.keys()
         np.testing.assert_allclose([*found.values()], [*expected.values()], rtol=0, atol=1e-12)
     assert closing_motion(loaded(tmp_path, single_links('ref="40"'))) == {}
+
+
+@pytest.mark.parametrize("limits", ["", 'range="0 0"'], ids=["none", "nothing"])
+def test_fingers_without_limits_close_where_their_tips_meet(tmp_path, limits):
+    """Upright links around a palm face each other, which is a weak guess; nothing says how far a simulator may close them."""
+    robot = loaded(tmp_path, single_links(limits))
+    proposal = propose(robot, DENSITY)
+    assert {link.name: link.facing for link in proposal.links} == {"palm": (0, 0, 1), "a": INNER, "b": INNER, "c": INNER}
+    doubt = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
+    assert {link.doubt for link in proposal.links if link.name != "palm"} == {doubt}
+    assert closing_motion(robot) == {}
 
 
 def test_radians_that_were_read_as_degrees(tmp_path, here):

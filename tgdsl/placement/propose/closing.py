@@ -65,7 +65,7 @@ class Closing:
     Attributes:
         poses: The hand's poses.
         motions: How each joint closes; one that is not clear is not in it.
-        turned: Per joint, the hinges that turn as it moves to the high end, and the axes of these rotations in the world.
+        rotations: Per joint, the hinges that turn as it moves to the high end, and the axes of these rotations in the world.
     """
 
     def __init__(self, tree: KinematicTree, hand: Hand):
@@ -74,25 +74,26 @@ class Closing:
         self.chain = {s: i for i, chain in enumerate(hand.chains) for s in chain}
         independent = self.poses.independent if hand.length <= MAX_FINGER else ()
         candidates = [joint for joint in independent if self._can_close(joint)]
-        self.turned = {joint: self._turned(joint) for joint in candidates}
+        self.rotations = {joint: self._rotations(joint) for joint in candidates}
         self.lean = {joint: self._lean(joint) for joint in candidates}
         self.sense = self._curling()
         for joint in self.sense:
-            if {self.chain[self.segment(hinge)] for hinge in self.turned[joint]} == set(self.chain.values()):
+            if {self.chain[self.segment(hinge)] for hinge in self.rotations[joint]} == set(self.chain.values()):
                 gain = self._gain(joint, {})
                 self.sense[joint] = float(np.sign(gain)) if abs(gain) > MIN_CLOSING else self.sense[joint]
         self.bending = self._bending(candidates)
         others = {joint: float(np.mean(self._range(joint))) for joint in self.bending}
         half = {joint: self._gain(joint, others) for joint in self.bending}
         others = {joint: self._end(joint, self.sense.get(joint) or half[joint]) for joint in self.bending}
-        whole = {joint: self._gain(joint, others) for joint in self.bending}
-        found = {joint: self._motion(joint, half[joint], whole[joint]) for joint in self.bending}
-        self.motions = {joint: motion for joint, motion in found.items() if motion is not None}
+        # Within assumed limits fingers may pass each other: their closed ends say nothing.
+        whole = half if tree.doubt else {joint: self._gain(joint, others) for joint in self.bending}
+        motions = {joint: self._motion(joint, half[joint], whole[joint]) for joint in self.bending}
+        self.motions = {joint: motion for joint, motion in motions.items() if motion is not None}
 
-    def posed(self, share: float) -> Float[np.ndarray, " qpos"]:
+    def pose(self, share: float) -> Float[np.ndarray, " qpos"]:
         """Return the pose in which all joints that close are closed by a share; the others are as at the start."""
         values = {joint: (1.0 - share) * m.opened + share * m.closed for joint, m in self.motions.items()}
-        return self.poses.posed(values)
+        return self.poses.pose(values)
 
     def segment(self, joint: int) -> int:
         """Return the segment that a joint moves against its parent."""
@@ -130,12 +131,12 @@ class Closing:
             return 0.0
         return float(np.sign(up - down)) * (1.0 if max(down, up) >= ONE_SIDED * min(down, up) else 0.5)
 
-    def _turned(self, joint: int) -> dict[int, Float[np.ndarray, " 3"]]:
+    def _rotations(self, joint: int) -> dict[int, Float[np.ndarray, " 3"]]:
         model, start = self.tree.model, self.poses.start
         step = 0.05 * float(np.ptp(model.jnt_range[joint]))
         down, up = self._sides(joint)
         sign = 1.0 if up > down else -1.0
-        moved = (self.poses.posed({joint: float(start[self.poses.at(joint)]) + sign * step}) - start) * sign
+        moved = (self.poses.pose({joint: float(start[self.poses.at(joint)]) + sign * step}) - start) * sign
         axes = self.poses.kinematics(start).xaxis.copy()
         hinges = [j for j in self.poses.joints if int(model.jnt_type[j]) == _HINGE]
         turned = {j: float(moved[self.poses.at(j)]) for j in hinges if abs(moved[self.poses.at(j)]) > 1e-2 * step}
@@ -150,7 +151,7 @@ class Closing:
                 if any(max(abs(lean), abs(self.lean[other])) == 1.0 for other in agreeing):
                     sense[joint] = float(np.sign(lean))
         for joint, lean in self.lean.items():  # a hinge that leans to no side goes with those that it is parallel to
-            if not lean and self.turned[joint]:
+            if not lean and self.rotations[joint]:
                 votes = [s for s in (1.0, -1.0) if any(self._is_agreeing(joint, s, other, sense[other]) for other in sense)]
                 sense |= {joint: votes[0]} if len(votes) == 1 else {}
         return sense
@@ -169,8 +170,8 @@ class Closing:
     def _cosines(self, one: int, two: int) -> list[float]:
         """Return the cosines between the axes of hinges of one finger that two joints turn."""
         results = []
-        for i, axis in self.turned[one].items():
-            for j, other in self.turned[two].items():
+        for i, axis in self.rotations[one].items():
+            for j, other in self.rotations[two].items():
                 paths = (self.tree.path(self.segment(i)), self.tree.path(self.segment(j)))
                 if i != j and (paths[0][0] in paths[1] or paths[1][0] in paths[0]):
                     results.append(float(axis @ other))
@@ -186,8 +187,8 @@ class Closing:
         results = []
         for joint in candidates:
             segment = self.segment(joint)
-            own = [other for other in candidates if self.segment(other) == segment]
-            rivals = [other for other in own if other in self.sense] or [other for other in own if other in one_way] or own
+            siblings = [other for other in candidates if self.segment(other) == segment]
+            rivals = [j for j in siblings if j in self.sense] or [j for j in siblings if j in one_way] or siblings
             spreads = joint in spreading or (joint in free and self.chain[segment] in curled)
             if rivals == [joint] and not spreads:
                 results.append(joint)
@@ -209,20 +210,20 @@ class Closing:
         for joint in sorted(free):
             beyond = [other for other in path if other != joint and self.segment(joint) in path[other][1:]]
             if beyond and not any(abs(cosine) > PARALLEL for other in beyond for cosine in self._cosines(joint, other)):
-                axes += [(joint, self.chain[self.segment(i)], axis) for i, axis in self.turned[joint].items()]
+                axes += [(joint, self.chain[self.segment(i)], axis) for i, axis in self.rotations[joint].items()]
         if axes and {chain for _, chain, _ in axes} == set(self.chain.values()) and _are_around([axis for _, _, axis in axes]):
             return {one for one, _, _ in axes}
         return {
             one
             for one, chain, axis in axes
-            if any(chain != own_chain and abs(axis @ own) > PARALLEL for _, own_chain, own in axes)
+            if any(chain != other_chain and abs(axis @ other) > PARALLEL for _, other_chain, other in axes)
         }
 
     def _motion(self, joint: int, half: float, whole: float) -> Motion | None:
         gain = self.hand.closes or (half + whole if _is_clear(half, whole) else 0.0)
         sense, lean = self.sense.get(joint, 0.0), self.lean[joint] if abs(self.lean[joint]) == 1.0 else 0.0
         siblings = [j for j in self.sense if self.chain[self.segment(j)] == self.chain[self.segment(joint)]]
-        doubt = ""
+        doubt = self.tree.doubt
         if sense:
             if gain * sense < 0:
                 doubt = f"as it curls, its tip goes {abs(gain) / 2:.0%} away from the palm and the other tips"
@@ -250,7 +251,7 @@ class Closing:
 
     def _points(self, values: Mapping[int, float]) -> Float[np.ndarray, "point 3"]:
         """Return the centres of the tips, and of the palm if there is one, in the world [m]."""
-        data = self.poses.kinematics(self.poses.posed(values))
+        data = self.poses.kinematics(self.poses.pose(values))
         bodies = [*self.hand.tips, *([self.hand.palm] if self.hand.palm is not None else [])]
         return np.array([self.tree.centre(body, data) for body in bodies]).reshape(-1, 3)
 

@@ -59,16 +59,16 @@ class Flexion:
         """Find which end of each joint's range is the closed one."""
         self.tree, self.hand = tree, hand
         self.closing = Closing(tree, hand)
-        self.open, self.shut = self.closing.posed(0.0), self.closing.posed(1.0)
+        self.open, self.shut = self.closing.pose(0.0), self.closing.pose(1.0)
         bent = {joint: m.opened for joint, m in self.closing.motions.items() if self.closing.lean[joint]}
-        self.straight = self.closing.poses.posed(bent)
-        self.steps = {joint: self._stepped(joint) for joint in self.closing.motions}
+        self.straight = self.closing.poses.pose(bent)
+        self.steps = {joint: self._step(joint) for joint in self.closing.motions}
         self.bars = self._bars()
 
     @property
     def num_closing(self) -> int:
         """How many chains close."""
-        moved = {self.closing.chain[self.closing.segment(j)] for step in self.steps.values() for j in self._moved(step)}
+        moved = {self.closing.chain[self.closing.segment(j)] for step in self.steps.values() for j in self._moving_joints(step)}
         return len(moved)
 
     @property
@@ -80,7 +80,7 @@ class Flexion:
     def motion(self) -> dict[int, tuple[float, float]]:
         """Return the open and closed end of each hinge and slide that closes, those that others drive included."""
         poses = self.closing.poses
-        moved = {j for step in self.steps.values() for j in self._moved(step)}
+        moved = {j for step in self.steps.values() for j in self._moving_joints(step)}
         return {j: (float(self.open[poses.at(j)]), float(self.shut[poses.at(j)])) for j in sorted(moved)}
 
     def inner_side(self, body: int) -> InnerSide:
@@ -91,13 +91,14 @@ class Flexion:
         return replace(side, doubt=ACROSS) if not side.doubt and self._is_across(body, side) else side
 
     def _moving_side(self, body: int) -> InnerSide:
+        segment = self.tree.segment[body]
         if (facing := self._meeting(body)) is not None:
-            return InnerSide(facing, self._doubt(self.tree.segment[body]))
-        if (side := self._flexor(self.tree.segment[body])) is None:
+            return InnerSide(facing, next((self.closing.motions[joint].doubt for joint in self._nearest(segment)), ""))
+        if (side := self._flexor(segment) or self._flexor(self.bars.get(segment, segment))) is None:
             return InnerSide(None, UNCLEAR)
         joint, along = side
         turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
-        return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
+        return InnerSide(_link_side(turned), self.closing.motions[joint].doubt)
 
     def _is_across(self, body: int, side: InnerSide) -> bool:
         """Return whether hinges of a link's own have a lever on it and none carries it to its inner side or away from it."""
@@ -112,16 +113,16 @@ class Flexion:
         is_across = has_lever and bool((np.abs(carried @ facing) < ALONG * lever).all())
         return is_across and not any(self._is_along_hinge(segment, along) for along in carried / lever[:, None])
 
-    def _bars(self) -> set[int]:
-        """Return the segments that are alone in their chain and are driven together with the longer chain beside them.
+    def _bars(self) -> dict[int, int]:
+        """Return the segments that are alone in their chain and are driven with a longer chain beside them, and its first.
 
         They are the second bars of parallel linkages, whose loop a tree of links leaves open. Where nothing would be left for
         a hand to close on, none is.
         """
         chains = self.hand.chains
         single, longer = ([chain[0] for chain in chains if (len(chain) == 1) == is_single] for is_single in (True, False))
-        bars = {s for s in single if any(self._is_bar(s, other) for other in longer)}
-        return bars if len(chains) - len(bars) > 1 else set()
+        bars = {s: other for s in single for other in longer if self._is_bar(s, other)}
+        return bars if len(chains) - len(bars) > 1 else {}
 
     def _is_bar(self, segment: int, other: int) -> bool:
         """Return whether a segment is driven together with another, about axes that are parallel to and near that one's."""
@@ -131,22 +132,22 @@ class Flexion:
         first = [self.tree.joints(s)[:1] for s in (segment, other)]
         if not moved or not parallel or not all(first):
             return False
-        one, two = (self._frames(self.open).xanchor[own[0]].copy() for own in first)
+        one, two = (self._frames(self.open).xanchor[joints[0]].copy() for joints in first)
         return float(np.linalg.norm(one - two)) < BESIDE * length_of(self.tree, other)
 
     def _turn(self, pose: Float[np.ndarray, " qpos"], segment: int) -> Float[np.ndarray, " 3"]:
         """Return how far a segment turns against its parent from the open pose to one near to it, about its axes [rad]."""
-        own = [joint for joint in self.tree.joints(segment) if joint in self.closing.poses.joints]
-        at = [self.closing.poses.at(joint) for joint in own]
-        return (pose[at] - self.open[at]) @ self._frames(self.open).xaxis[own] if own else np.zeros(3)
+        joints = [joint for joint in self.tree.joints(segment) if joint in self.closing.poses.joints]
+        at = [self.closing.poses.at(joint) for joint in joints]
+        return (pose[at] - self.open[at]) @ self._frames(self.open).xaxis[joints] if joints else np.zeros(3)
 
-    def _stepped(self, joint: int) -> Float[np.ndarray, " qpos"]:
+    def _step(self, joint: int) -> Float[np.ndarray, " qpos"]:
         """Return the open pose with one joint a small step closed."""
         values = {other: motion.opened for other, motion in self.closing.motions.items()}
         values[joint] += STEP * (self.closing.motions[joint].closed - values[joint])
-        return self.closing.poses.posed(values)
+        return self.closing.poses.pose(values)
 
-    def _moved(self, pose: Float[np.ndarray, " qpos"]) -> list[int]:
+    def _moving_joints(self, pose: Float[np.ndarray, " qpos"]) -> list[int]:
         poses = self.closing.poses
         moved = {joint: abs(float(pose[poses.at(joint)] - self.open[poses.at(joint)])) for joint in poses.joints}
         return [joint for joint, by in moved.items() if by > 1e-3 * max(moved.values(), default=0.0)]
@@ -158,12 +159,12 @@ class Flexion:
         """Return the joints that move a segment, the one that moves it nearest to itself first."""
         path, result = self.tree.path(segment), {}
         for joint, pose in self.steps.items():
-            depths = [path.index(s) for s in map(self.closing.segment, self._moved(pose)) if s in path]
+            depths = [path.index(s) for s in map(self.closing.segment, self._moving_joints(pose)) if s in path]
             if depths:
                 result[joint] = min(depths)
         return sorted(result, key=lambda joint: (result[joint], joint))
 
-    def _carried(self, segment: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
+    def _carry_direction(self, segment: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
         """Return the joint that carries a segment, with all that is fixed to it, and where to in the world in the open pose."""
         data = self._frames(self.open)
         middle, rotation = self.tree.middle(segment, data), data.xmat[segment].reshape(3, 3).copy()
@@ -186,7 +187,7 @@ class Flexion:
         It faces where that joint carries it, unless this is along the axis of a hinge beyond, such as of a thumb that is
         brought before the palm: it then takes the side of the nearest segment beyond that has one.
         """
-        carried = self._carried(segment)
+        carried = self._carry_direction(segment)
         if carried is not None and not self._is_along_hinge(segment, carried[1]):
             return carried
         beyond = [s for s in self.tree.below(segment) if self.tree.bodies[s]]
@@ -204,9 +205,6 @@ class Flexion:
         hinges = [j for j in self.motion() if self.closing.segment(j) in beyond and int(self.tree.model.jnt_type[j]) == _HINGE]
         return bool((np.abs(data.xaxis[hinges] @ along) > ALONG_HINGE).any())
 
-    def _doubt(self, segment: int) -> str:
-        return next((self.closing.motions[joint].doubt for joint in self._nearest(segment)), "")
-
     def _meeting(self, body: int) -> tuple[float, ...] | None:
         """Return where a body faces the tip of the other chain, of two that close on each other without curling."""
         segment, chain = self.tree.segment[body], self.closing.chain
@@ -214,35 +212,35 @@ class Flexion:
         is_jaw = segment in jaws and len({chain[jaw] for jaw in jaws}) == 2
         if not is_jaw or not self.closing.motions or any(motion.is_curling for motion in self.closing.motions.values()):
             return None
-        own = [tip for tip in tips if self.tree.segment[tip] == segment]
-        others = [tip for tip in tips if chain[self.tree.segment[tip]] != chain[segment]]
+        near = [tip for tip in tips if self.tree.segment[tip] == segment]
+        far = [tip for tip in tips if chain[self.tree.segment[tip]] != chain[segment]]
         apart = []
-        for pose in (self.open, self.closing.posed(1.0 - STEP), self.shut):
+        for pose in (self.open, self.closing.pose(1.0 - STEP), self.shut):
             data = self._frames(pose)
-            mean = [np.mean([self.tree.centre(tip, data) for tip in some], axis=0) for some in (others, own)]
+            mean = [np.mean([self.tree.centre(tip, data) for tip in some], axis=0) for some in (far, near)]
             apart.append(mean[0] - mean[1])
         along = apart[1] - apart[2]
         if float(np.linalg.norm(along)) < 1e-9 or along @ apart[0] < 0.5 * np.linalg.norm(along) * np.linalg.norm(apart[0]):
             return None
         rotation = self._frames(self.shut).xmat[body].reshape(3, 3)
-        return _snapped(rotation.T @ along, LINK_SNAP, keeps_oblique=True)
+        return _link_side(rotation.T @ along)
 
     def _fixed_side(self, body: int) -> InnerSide:
         """Return where a fixed jaw faces: against the moving one, as that comes to it."""
         tip = self.hand.tips[0]
-        if (carried := self._carried(self.tree.segment[tip])) is None:
+        if (carried := self._carry_direction(self.tree.segment[tip])) is None:
             return InnerSide(None, UNCLEAR)
         joint, along = carried
         in_tip = self._frames(self.open).xmat[tip].reshape(3, 3).T @ along
         data = self._frames(self.shut)
         facing = -data.xmat[body].reshape(3, 3).T @ data.xmat[tip].reshape(3, 3) @ in_tip
-        return InnerSide(_snapped(facing, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
+        return InnerSide(_link_side(facing), self.closing.motions[joint].doubt)
 
     def palm_side(self, body: int) -> InnerSide:
         """Return where a palm's inner side faces, in the frame of it or of a body that is fixed to it."""
         turned = self._frames(self.open).xmat[body].reshape(3, 3).copy()
-        curled = self._curled()
-        if curled is not None and (direction := _snapped(turned.T @ curled, PALM_SNAP, keeps_oblique=False)) is not None:
+        curled = self._curl_direction()
+        if curled is not None and (direction := _axis_near(turned.T @ curled, PALM_SNAP)) is not None:
             return InnerSide(direction)
         tips = [tip for tip in self.hand.tips if self._nearest(self.tree.segment[tip])]
         if self.hand.palm is None or not tips or 2 * len(tips) < len(self.hand.tips):
@@ -251,16 +249,16 @@ class Flexion:
         joints = [anchor(self.tree, chain[0]) for chain in self.hand.chains]
         for start in (self.tree.centre(self.hand.palm, self._frames(self.open)), np.mean(joints, axis=0)):
             half, nearly, whole = (self._toward(start, body, tips, share) for share in (0.5, 0.75, 1.0))
-            direction = _snapped(nearly, PALM_SNAP, keeps_oblique=False)
+            direction = _axis_near(nearly, PALM_SNAP)
             # Fingers that curl around cross the palm's plane where no palm is modelled in their way: no side is clear then.
             if direction is not None and min(half @ direction, whole @ direction) > 0.5:
                 return InnerSide(direction)
         return InnerSide(None, UNCLEAR)
 
-    def _curled(self) -> Float[np.ndarray, " 3"] | None:
+    def _curl_direction(self) -> Float[np.ndarray, " 3"] | None:
         """Return where most fingers, as they curl, carry their first bones in the open pose; None if no majority does."""
-        found, data, motion, place = [], self._frames(self.open), self.motion(), self.closing.segment
-        curling = {j for joint, m in self.closing.motions.items() if m.is_curling for j in self.closing.turned[joint]}
+        curls, data, motion, place = [], self._frames(self.open), self.motion(), self.closing.segment
+        curling = {j for joint, m in self.closing.motions.items() if m.is_curling for j in self.closing.rotations[joint]}
         for chain in self.hand.chains:
             hinges = sorted(
                 (j for j in curling & motion.keys() if place(j) in chain), key=lambda j: len(self.tree.path(place(j)))
@@ -269,25 +267,30 @@ class Flexion:
             if beyond:
                 opened, closed = motion[hinges[0]]
                 bone = data.xanchor[beyond[0]] - data.xanchor[hinges[0]]
-                found.append(np.cross(np.sign(closed - opened) * data.xaxis[hinges[0]], bone))
-        found = [along / max(float(np.linalg.norm(along)), 1e-9) for along in found]
-        alike = [[other for other in found if one @ other > MIN_COSINE] for one in found]
+                curls.append(np.cross(np.sign(closed - opened) * data.xaxis[hinges[0]], bone))
+        curls = [along / max(float(np.linalg.norm(along)), 1e-9) for along in curls]
+        alike = [[other for other in curls if one @ other > MIN_COSINE] for one in curls]
         most = max(alike, key=len, default=[])
         return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 
     def _toward(self, start: Float[np.ndarray, " 3"], body: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
         """Return the direction from a place to the middle of tips in a body's frame, all joints closed by a share."""
-        data = self._frames(self.closing.posed(share))
+        data = self._frames(self.closing.pose(share))
         toward = np.mean([self.tree.centre(tip, data) for tip in tips], axis=0) - start
         return data.xmat[body].reshape(3, 3).T @ toward / max(float(np.linalg.norm(toward)), 1e-9)
 
 
-def _snapped(direction: Float[np.ndarray, " 3"], angle: float, keeps_oblique: bool) -> tuple[float, ...] | None:
-    """Return the axis of the frame that is near a direction; if none is, the direction itself or None."""
+def _axis_near(direction: Float[np.ndarray, " 3"], angle: float) -> tuple[float, ...] | None:
+    """Return the axis of the frame within an angle [rad] of a direction; None if none is."""
     direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
     axis = int(np.abs(direction).argmax())
-    if abs(direction[axis]) >= np.cos(angle):
-        return tuple(float(np.sign(direction[axis])) if i == axis else 0.0 for i in range(3))
+    is_near = abs(direction[axis]) >= np.cos(angle)
+    return tuple(float(np.sign(direction[axis])) if i == axis else 0.0 for i in range(3)) if is_near else None
+
+
+def _link_side(direction: Float[np.ndarray, " 3"]) -> tuple[float, ...]:
+    """Return the axis of the frame that is near a direction; if none is, its unit vector in hundredths."""
+    unit = direction / max(float(np.linalg.norm(direction)), 1e-9)
     # Halves of a hundredth are rounded up, and what is just below them too.
-    rounded = np.sign(direction) * np.floor(100.0 * np.abs(direction) + 0.501) / 100.0
-    return tuple((rounded + 0.0).tolist()) if keeps_oblique else None
+    rounded = np.sign(unit) * np.floor(100.0 * np.abs(unit) + 0.501) / 100.0
+    return _axis_near(direction, LINK_SNAP) or tuple((rounded + 0.0).tolist())

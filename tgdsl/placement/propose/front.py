@@ -6,8 +6,6 @@ of all that the fingers sweep as they close, seen from in front of the palm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
@@ -25,28 +23,26 @@ GAP = 2e-4
 """What is closer in front of a surface than this is not in front of it [m]."""
 MIN_SHARE = 0.1
 """Least share of what faces an inner side, and of a link's surface, to be believed."""
-MARGIN, LEVEL, TOWER = 0.15, 0.2, 0.25
-"""Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, and how high
-above the joints of the fingers a tower is."""
+MARGIN, LEVEL, TOWER, AHEAD = 0.15, 0.2, 0.25, 0.1
+"""Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, how high
+above the joints of the fingers a tower is, and how far beside the middle of a palm the fingers must begin to be ahead of it."""
 HALF = 0.5
 """A part of a palm is in front by this share, and has this share of the largest part's area."""
 
 
-@dataclass(frozen=True, eq=False)
-class Front:
-    """Points of a body that face a direction, and what is in front of them.
+def front_of(
+    tree: KinematicTree, body: int, facing: tuple[float, ...]
+) -> tuple[Float[np.ndarray, "point 3"], Bool[np.ndarray, " point"]]:
+    """Return evenly spaced points of a body, and whether no other body of its segment is in front of them.
 
-    Attributes:
-        pos: The points, in the body's frame.
-        is_free: Whether no other body of the segment is in front.
+    Args:
+        tree: The robot.
+        body: The body.
+        facing: Direction in its frame against which it is seen.
+
+    Returns:
+        The points in the body's frame [m], and whether they are free.
     """
-
-    pos: Float[np.ndarray, "point 3"]
-    is_free: Bool[np.ndarray, " point"]
-
-
-def front_of(tree: KinematicTree, body: int, facing: tuple[float, ...]) -> Front:
-    """Return evenly spaced points of a body, as seen against the direction in its frame in which it faces."""
     direction = np.array(facing) / np.linalg.norm(facing)
     axes, view = frame(-direction), OrthographicView.of(tree.surface[body], frame(-direction))
     corners = view.corners[..., :2].reshape(-1, 2)
@@ -57,27 +53,25 @@ def front_of(tree: KinematicTree, body: int, facing: tuple[float, ...]) -> Front
     hits = first_hits(view, uv)
     is_facing = (hits.face >= 0) & (-view.normals[hits.face] @ axes[2] >= np.cos(np.radians(WITHIN_DEG)))
     pos = np.column_stack([uv, hits.depth])[is_facing] @ axes
-    others = [_seen_from(tree, body, other) for other in tree.bodies[tree.segment[body]] if other != body]
+    data, turn = tree.start, tree.start.xmat[body].reshape(3, 3).T
+    others = [
+        tree.surface[other].placed(turn @ (data.xpos[other] - data.xpos[body]), turn @ data.xmat[other].reshape(3, 3))
+        for other in tree.bodies[tree.segment[body]]
+        if other != body
+    ]
     ahead = first_hits(OrthographicView.of(Surface.joined(others), axes), uv[is_facing]).depth if others else np.inf
-    return Front(pos, np.broadcast_to(ahead >= hits.depth[is_facing] - GAP, len(pos)))
+    return pos, np.broadcast_to(ahead >= hits.depth[is_facing] - GAP, len(pos))
 
 
-def _seen_from(tree: KinematicTree, body: int, other: int) -> Surface:
-    """Return the surface of another body in a body's frame."""
-    data = tree.start
-    turn = data.xmat[body].reshape(3, 3).T
-    return tree.surface[other].placed(turn @ (data.xpos[other] - data.xpos[body]), turn @ data.xmat[other].reshape(3, 3))
-
-
-def hidden(flexion: Flexion) -> set[int]:
+def hidden(flexion: Flexion) -> list[int]:
     """Return the bodies of a hand whose inner side is behind other bodies that are fixed to them."""
-    tree, result = flexion.tree, set[int]()
+    tree, result = flexion.tree, list[int]()
     for body in (*flexion.hand.mounts, *flexion.hand.fingers):
         facing = flexion.inner_side(body).facing
         if facing is not None and len(tree.bodies[tree.segment[body]]) > 1:
-            front = front_of(tree, body, facing)
-            if len(front.pos) and front.is_free.mean() < MIN_SHARE:
-                result.add(body)
+            _, is_free = front_of(tree, body, facing)
+            if len(is_free) and is_free.mean() < MIN_SHARE:
+                result.append(body)
     return result
 
 
@@ -101,12 +95,15 @@ class PalmFront:
         facing = flexion.palm_side(hand.palm).facing
         self.axes = None if facing is None else frame(tree.start.xmat[hand.palm].reshape(3, 3) @ facing)
         if self.axes is not None:
-            poses = (flexion.open, flexion.closing.posed(0.5), flexion.shut)
+            poses = (flexion.open, flexion.closing.pose(0.5), flexion.shut)
             swept = [tree.points(b, flexion.closing.poses.kinematics(pose)) for pose in poses for b in hand.fingers]
             self.outline = ConvexHull(np.concatenate(swept) @ self.axes[:2].T).equations
             self.margin = MARGIN * hand.length
             first = [chain[0] for chain in hand.chains]
-            self.joints = max(float(anchor(tree, s) @ self.axes[2]) for s in first)
+            anchors = np.array([anchor(tree, s) for s in first]) @ self.axes.T
+            self.joints = float(anchors[:, 2].max())
+            ahead = anchors.mean(axis=0) - self.axes @ tree.centre(hand.palm, tree.start)
+            self.ahead = np.where(np.linalg.norm(ahead[:2]) > AHEAD * hand.length, ahead * (1, 1, 0), 0.0)
 
     def mounts(self) -> list[int]:
         """Return the bodies fixed to a palm that are in front, those before the one that carries the fingers included."""
@@ -114,25 +111,35 @@ class PalmFront:
         if self.axes is None:
             return hand.mounts
         assert hand.palm is not None
-        free, height, _ = self._points(hand.palm)
-        level = float(np.median(height[free])) if free.any() else None
-        return [body for body in tree.bodies[hand.base] if body == hand.palm or self._is_in_front(body, level)]
+        free, place, _ = self._points(hand.palm)
+        level = float(np.median(place[free, 2])) if free.any() else None
+        heel = float((place @ self.ahead).min(initial=np.inf))
+        return [body for body in tree.bodies[hand.base] if body == hand.palm or self._is_in_front(body, level, heel)]
 
-    def _is_in_front(self, body: int, level: float | None) -> bool:
-        free, height, is_beside = self._points(body)
+    def _is_in_front(self, body: int, level: float | None, heel: float) -> bool:
+        """Return whether a body is in front.
+
+        Args:
+            body: The body.
+            level: Height of the palm; None if all of it is behind other bodies.
+            heel: Where the palm begins, in the direction from its middle to the joints of the fingers.
+        """
+        free, place, is_beside = self._points(body)
         tree, hand = self.flexion.tree, self.flexion.hand
         assert hand.palm is not None
         if body in hand.mounts:
             return not len(free) or bool((~is_beside).mean() >= MIN_SHARE)
         if level is None or not len(free) or HALF * tree.area[body] > tree.area[hand.palm]:  # a larger one is a flange
             return False
-        return bool((free & ~is_beside & (np.abs(height - level) <= LEVEL * hand.length)).mean() >= HALF)
+        is_level = (np.abs(place[:, 2] - level) <= LEVEL * hand.length) & (place @ self.ahead >= heel)
+        return bool((free & ~is_beside & is_level).mean() >= HALF)
 
     def limit(self, body: int) -> float | None:
         """Return how far along its inner side a body is no tower beside the hand, in its frame; None if it has none."""
         if self.axes is None:
             return None
-        _, height, is_beside = self._points(body)
+        _, place, is_beside = self._points(body)
+        height = place[:, 2]
         limit = self.joints + TOWER * self.flexion.hand.length
         is_high = height > limit
         least = MIN_SHARE * len(height)
@@ -140,13 +147,13 @@ class PalmFront:
             return None
         return limit - float(self.flexion.tree.start.xpos[body] @ self.axes[2])
 
-    def _points(self, body: int) -> tuple[Bool[np.ndarray, " p"], Float[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
-        """Return of points of a body whether they are free, their heights, and whether they are beside the hand."""
+    def _points(self, body: int) -> tuple[Bool[np.ndarray, " p"], Float[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
+        """Return whether points of a body are free, their places along `axes` [m], and whether they are beside the hand."""
         facing, data = self.flexion.palm_side(body).facing, self.flexion.tree.start
         if facing is None:
-            return np.zeros(0, bool), np.zeros(0), np.zeros(0, bool)
-        front = front_of(self.flexion.tree, body, facing)
+            return np.zeros(0, bool), np.zeros((0, 3)), np.zeros(0, bool)
+        pos, is_free = front_of(self.flexion.tree, body, facing)
         assert self.axes is not None
-        place = (data.xpos[body] + front.pos @ data.xmat[body].reshape(3, 3).T) @ self.axes.T
+        place = (data.xpos[body] + pos @ data.xmat[body].reshape(3, 3).T) @ self.axes.T
         beyond = (place[:, :2] @ self.outline[:, :2].T + self.outline[:, 2]).max(axis=1, initial=-np.inf)
-        return front.is_free, place[:, 2], beyond > self.margin
+        return is_free, place, beyond > self.margin

@@ -30,6 +30,13 @@ MAX_FINGER = 0.35
 """A longer chain is an arm or a leg, of which nothing closes [m]."""
 MAX_STEM = 1.5
 """Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
+MIN_TIP = 0.1
+"""Least surface of a fingertip, as a share of the largest body fixed to it."""
+JAW_REACH = 0.5
+"""A fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed."""
+MIN_JAW_TURN, MAX_JAW_TURN = np.radians(19.9), np.radians(200.1)
+"""A jaw that turns by less does not grip, and what turns by more is a wrist; no angles that people draw."""
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
@@ -40,20 +47,25 @@ class KinematicTree:
     Attributes:
         model: MuJoCo's model, with the limits of its joints as they are meant.
         surface: Surface of each body that has one, in the body's frame.
+        doubt: What speaks against the limits of its joints; empty if nothing does.
     """
 
     model: mujoco.MjModel
     surface: Mapping[int, Surface]
+    doubt: str = ""
 
     @cached_property
     def area(self) -> dict[int, float]:
         """Surface of each body that has one [m²]; at most its convex hull's, as geoms may overlap."""
-        return {body: min(float(own.face_areas.sum()), _hull_area(own)) for body, own in self.surface.items()}
+        return {body: min(float(surface.face_areas.sum()), _hull_area(surface)) for body, surface in self.surface.items()}
 
     @cached_property
     def centroid(self) -> dict[int, Float[np.ndarray, " 3"]]:
         """Centre of that surface, in the body's frame [m]."""
-        return {b: own.face_areas @ own.corners.mean(axis=1) / own.face_areas.sum() for b, own in self.surface.items()}
+        return {
+            b: surface.face_areas @ surface.corners.mean(axis=1) / surface.face_areas.sum()
+            for b, surface in self.surface.items()
+        }
 
     @cached_property
     def segment(self) -> list[int]:
@@ -79,7 +91,7 @@ class KinematicTree:
     @cached_property
     def carries(self) -> set[int]:
         """The segments that have surface, or whose descendants have."""
-        return {above for segment, own in self.bodies.items() if own for above in self.path(segment)}
+        return {above for segment, bodies in self.bodies.items() if bodies for above in self.path(segment)}
 
     def path(self, segment: int) -> list[int]:
         """Return a segment and all above it, upward."""
@@ -141,13 +153,13 @@ class KinematicTree:
 
     def middle(self, segment: int, data: mujoco.MjData) -> Float[np.ndarray, " 3"]:
         """Return the centre of the surfaces of a segment's bodies in the world [m]."""
-        own = self.bodies[segment]
-        return np.average([self.centre(body, data) for body in own], axis=0, weights=[self.area[body] for body in own])
+        bodies = self.bodies[segment]
+        return np.average([self.centre(body, data) for body in bodies], axis=0, weights=[self.area[body] for body in bodies])
 
     def points(self, body: int, data: mujoco.MjData) -> Float[np.ndarray, "corner 3"]:
         """Return the corners of a body's surface in the world [m]."""
-        own = self.surface[body]
-        return data.xpos[body] + own.vertices[np.unique(own.faces)] @ data.xmat[body].reshape(3, 3).T
+        surface = self.surface[body]
+        return data.xpos[body] + surface.vertices[np.unique(surface.faces)] @ data.xmat[body].reshape(3, 3).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +197,7 @@ def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTre
         surface: Surface of each body that has one, in the body's frame, by name.
     """
     model = as_meant(robot.compiled)
-    return KinematicTree(model, {int(model.body(name).id): own for name, own in surface.items()})
+    return KinematicTree(model, {int(model.body(name).id): mesh for name, mesh in surface.items()})
 
 
 def _hull_area(surface: Surface) -> float:
@@ -203,6 +215,22 @@ def free_standing(tree: KinematicTree) -> list[int]:
     return [] if single >= tree.carries else [body for segment in sorted(single) for body in tree.bodies[segment]]
 
 
+def loose_parts(tree: KinematicTree) -> list[int]:
+    """Return the bodies that are farther from all that is fixed to them than twice their size: they mark a place in the air."""
+    result = []
+    for segment, bodies in tree.bodies.items():
+        if len(bodies) < 2:
+            continue
+        placed = [tree.points(body, tree.start) @ tree.start.xmat[segment].reshape(3, 3) for body in bodies]
+        boxes = [(points.min(axis=0), points.max(axis=0)) for points in placed]
+        largest = max(tree.area[body] for body in bodies)
+        for body, (low, high) in zip(bodies, boxes, strict=True):
+            gaps = [np.linalg.norm(np.maximum(np.maximum(a - high, low - b), 0.0)) for a, b in boxes if a is not low]
+            if tree.area[body] < largest and min(gaps) > 2.0 * np.linalg.norm(high - low):
+                result.append(body)
+    return result
+
+
 def _is_driven(tree: KinematicTree, segment: int) -> bool:
     """Return whether a segment has one or two hinges and slides: none stands still, more let it go anywhere."""
     kinds = [int(tree.model.jnt_type[joint]) for joint in tree.joints(segment)]
@@ -212,7 +240,7 @@ def _is_driven(tree: KinematicTree, segment: int) -> bool:
 def hands(tree: KinematicTree) -> list[Hand]:
     """Return what may be a hand; trees that a hinge or slide joins to the world make up one.
 
-    A tree without two chains that part is one as a whole, without a palm.
+    A tree without two chains that part is one as a whole, without a palm; where a jaw turns against a fixed one, these are.
     """
     left_out = set(free_standing(tree))
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
@@ -221,7 +249,61 @@ def hands(tree: KinematicTree) -> list[Hand]:
     results = [_hand(tree, base) for root in roots if root not in straight for base in bases[root] or [root]]
     if straight:
         results.append(_hand(tree, 0, [s for root in straight for s in (root, *tree.below(root))]))
-    return results
+    return [gripper for hand in results for gripper in _with_jaws(tree, hand)]
+
+
+def _with_jaws(tree: KinematicTree, hand: Hand) -> list[Hand]:
+    """Return the grippers of one jaw in a hand of one chain, or whose chains are arms; if there are none, the hand."""
+    if len(hand.chains) > 1 and hand.length <= MAX_FINGER:
+        return [hand]
+    results = [gripper for chain in hand.chains for s in chain if (gripper := _gripper_of(tree, s)) is not None]
+    return [gripper for gripper in results if gripper.length <= MAX_FINGER] or [hand]
+
+
+def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
+    """Return the gripper of which a segment is the moving jaw; None if it is none.
+
+    A jaw is the only child of its parent, carries nothing, and turns on one hinge. It is closed at the end of the hinge's range
+    at which its parent's surface goes on farther in the direction in which it points, which is away from where the parent
+    is carried: a forearm that folds onto its upper arm points to there.
+    """
+    parent, joints, model = tree.parent[segment], tree.joints(segment), tree.model
+    if not parent or len(joints) != 1 or tree.children(segment) or len(tree.children(parent)) != 1 or not tree.bodies[parent]:
+        return None
+    joint = joints[0]
+    is_hinge = int(model.jnt_type[joint]) == _HINGE and bool(model.jnt_limited[joint])
+    if not is_hinge or not MIN_JAW_TURN <= np.ptp(model.jnt_range[joint]) <= MAX_JAW_TURN:
+        return None
+    ends = [_ahead(tree, joint, parent, float(value)) for value in model.jnt_range[joint]]
+    bodies = tree.bodies[segment]
+    reach = [max(end[body] for body in bodies) if end else 0.0 for end in ends]
+    share = [max(end[b] for b in tree.bodies[parent]) / r if r > 0 else 0.0 for end, r in zip(ends, reach, strict=True)]
+    closed = int(share[1] > share[0])
+    if share[closed] < JAW_REACH:
+        return None
+    fixed = [body for body in tree.bodies[parent] if ends[closed][body] >= JAW_REACH * reach[closed]]
+    jaw = max(fixed, key=lambda body: (ends[closed][body], -body))
+    return Hand(parent, fixed, None, [[segment]], bodies, bodies, reach[closed], jaw, 1.0 if closed else -1.0)
+
+
+def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[int, float]:
+    """Return how far bodies of a jaw and of its parent reach beyond the hinge in the jaw's direction [m].
+
+    Nothing, if this direction is toward where the parent is carried.
+    """
+    data, segment = mujoco.MjData(tree.model), tree.segment[int(tree.model.jnt_bodyid[joint])]
+    data.qpos[:] = tree.model.qpos0
+    data.qpos[tree.model.jnt_qposadr[joint]] = value
+    mujoco.mj_kinematics(tree.model, data)
+    bodies, hinge, axis = tree.bodies[segment], data.xanchor[joint], data.xaxis[joint]
+    along = tree.middle(segment, data) - hinge
+    along = along - (along @ axis) * axis
+    above = tree.joints(parent)
+    carried_at = data.xanchor[above[0]] if above else data.xpos[parent]
+    if np.linalg.norm(along) < 1e-6 or along @ (hinge - carried_at) <= 0:
+        return {}
+    along /= np.linalg.norm(along)
+    return {b: float(((tree.points(b, data) - hinge) @ along).max()) for b in (*bodies, *tree.bodies[parent])}
 
 
 def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
@@ -247,8 +329,8 @@ def _parts_within(tree: KinematicTree, base: int, other: int) -> bool:
 
 def length_of(tree: KinematicTree, segment: int) -> float:
     """Return the length from where a segment moves against its parent to the end of what it carries [m]."""
-    own = [float(np.linalg.norm(tree.centre(b, tree.start) - anchor(tree, segment))) for b in tree.bodies[segment]]
-    reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(own, tree.bodies[segment], strict=True)]
+    distances = [float(np.linalg.norm(tree.centre(b, tree.start) - anchor(tree, segment))) for b in tree.bodies[segment]]
+    reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(distances, tree.bodies[segment], strict=True)]
     for child in tree.children(segment):
         stem = float(np.linalg.norm(anchor(tree, child) - anchor(tree, segment)))
         reach.append(stem + length_of(tree, child))
@@ -286,16 +368,17 @@ def _mounts(tree: KinematicTree, base: int) -> list[int]:
         return tree.bodies[base]
     common = [body for body in above[0] if all(body in path for path in above)]
     for body in common:  # upward, to the first with surface
-        if own := [b for b in tree.bodies[base] if body in tree.within(base, b)]:
-            return own
+        if bodies := [b for b in tree.bodies[base] if body in tree.within(base, b)]:
+            return bodies
     return []
 
 
 def _last(tree: KinematicTree, segment: int) -> list[int]:
-    """Return the bodies with surface of a segment that have no other such below them."""
-    own = tree.bodies[segment]
-    above = {over for body in own for over in tree.within(segment, body)[1:]}
-    return [body for body in own if body not in above]
+    """Return the bodies of a segment that have no other below them; small parts of it, such as markers, do not count."""
+    largest = max(tree.area[body] for body in tree.bodies[segment])
+    bodies = [body for body in tree.bodies[segment] if tree.area[body] >= MIN_TIP * largest]
+    above = {over for body in bodies for over in tree.within(segment, body)[1:]}
+    return [body for body in bodies if body not in above]
 
 
 def _chains(tree: KinematicTree, base: int, beyond: Sequence[int]) -> list[list[int]]:

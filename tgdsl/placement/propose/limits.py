@@ -13,6 +13,8 @@ LEAST = 0.5
 """At least one of them turns by so many radians if they were."""
 RADIANS_AS_DEGREES = float(np.degrees(1.0))
 """By how much angles are larger that were read as degrees but meant as radians."""
+ASSUMED = np.radians(30.0)
+"""How far a hinge without limits is taken to turn to either side of its start, where no joint with limits closes a hand."""
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _SERVO_BIAS, _FIXED_GAIN = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtGain.mjGAIN_FIXED)
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -50,6 +52,16 @@ def as_meant(model: mujoco.MjModel) -> mujoco.MjModel:
             low, high = max(low, float(model.jnt_range[joint, 0])), min(high, float(model.jnt_range[joint, 1]))
         if low < high:
             model.jnt_limited[joint], model.jnt_range[joint] = 1, (low, high)
+    return model
+
+
+def with_assumed_limits(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a model whose hinges without limits turn by `ASSUMED` to either side of their start."""
+    model = copy.copy(model)
+    hinges = np.flatnonzero((model.jnt_type == _HINGE) & (model.jnt_limited == 0))
+    start = model.qpos0[model.jnt_qposadr[hinges]]
+    model.jnt_range[hinges] = np.column_stack([start - ASSUMED, start + ASSUMED])
+    model.jnt_limited[hinges] = 1
     return model
 
 

@@ -21,7 +21,9 @@ RESIDUAL = 1e-5
 """Largest residual of an equality in a pose [m or rad]."""
 INDEPENDENT = 1e-3
 """Least share of a joint's motion that the equalities must leave free."""
-
+MOST = 0.5
+"""Least share of its way to which the limits of a driven joint must let it go: else limits and equality contradict each other,
+as those of a mimic joint of the wrong sign do, and each joint by itself says more."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _JOINT, _TENDON = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)
 _BODIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -62,7 +64,7 @@ class Poses:
         """Return a joint's index in `qpos`."""
         return int(self.model.jnt_qposadr[joint])
 
-    def posed(self, values: Mapping[int, float]) -> Float[np.ndarray, " qpos"]:
+    def pose(self, values: Mapping[int, float]) -> Float[np.ndarray, " qpos"]:
         """Return the pose in which independent joints have some values and the other independent ones are as at the start.
 
         Where the equalities cannot hold, the pose is the last on the way at which they do.
@@ -123,7 +125,8 @@ class Poses:
         for i in np.flatnonzero(model.eq_active0).tolist():
             kind, ids = int(model.eq_type[i]), (int(model.eq_obj1id[i]), int(model.eq_obj2id[i]))
             if kind == _JOINT:
-                is_within = ids[1] >= 0 and joints.issuperset(ids)  # to one joint alone, it is a spring
+                # To one joint alone, it is a spring.
+                is_within = ids[1] >= 0 and joints.issuperset(ids) and self._is_within_limits(i, *ids)
             elif kind == _TENDON:
                 is_within = all(joints.issuperset(_of_tendon(model, t)) and _of_tendon(model, t) for t in ids if t >= 0)
             else:
@@ -132,6 +135,17 @@ class Poses:
             if is_within:
                 result.append(i)
         return result
+
+    def _is_within_limits(self, equality: int, driven: int, driver: int) -> bool:
+        """Return whether most of the driver's range takes the driven joint to where its limits let it go."""
+        model = self.model
+        if not (model.jnt_limited[driven] and model.jnt_limited[driver]):
+            return True
+        start = model.qpos0[[self.at(driven), self.at(driver)]]
+        driven_to = start[0] + np.polyval(model.eq_data[equality, 4::-1], model.jnt_range[driver] - start[1])
+        low, high = np.sort(driven_to)
+        common = min(high, model.jnt_range[driven, 1]) - max(low, model.jnt_range[driven, 0])
+        return bool(common >= MOST * (high - low))
 
     def _bound(self, qpos: Float[np.ndarray, " qpos"], dofs: Sequence[int] | np.ndarray) -> np.ndarray | None:
         """Return a pose near another at which the equalities hold, by motion of some degrees of freedom."""

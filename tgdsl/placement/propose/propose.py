@@ -7,22 +7,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import TgdslError
+from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.formats.model import Model
-from tgdsl.placement.propose.exposure import Options
 from tgdsl.placement.propose.flexion import UNCLEAR, Flexion, InnerSide
 from tgdsl.placement.propose.front import MIN_SHARE, WITHIN_DEG, PalmFront, hidden, palm_parts
-from tgdsl.placement.propose.hands import kinematic_tree
-from tgdsl.placement.propose.limits import RADIANS_AS_DEGREES, angles_are_misread
-from tgdsl.placement.propose.scope import chosen_hands, included, outside
-from tgdsl.placement.propose.surfaces import HIDDEN, LinkSurface, Sampler, link_meshes
+from tgdsl.placement.propose.hands import KinematicTree, free_standing, hands, kinematic_tree
+from tgdsl.placement.propose.limits import RADIANS_AS_DEGREES, angles_are_misread, with_assumed_limits
+from tgdsl.placement.propose.surfaces import HIDDEN, LinkSurface, Options, Sampler, link_meshes
+from tgdsl.schema.select import matching
 
 FACTORS = {"low": 0.25, "med": 1.0, "high": 4.0}
 """Each resolution's share of the density."""
@@ -32,7 +31,11 @@ MAX_COUNT = 1_000_000
 """The most taxels that the grammar lets a link have."""
 ROOM = 1e-3
 """A box is larger than a link's surface by this [m]."""
-Box = tuple[()] | tuple[tuple[float, ...], tuple[float, ...]]
+BEFORE = "before the link from which the fingers part; --include adds it"
+BESIDE = "no part of a hand; --include adds it"
+NO_LIMITS = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
+SCENERY = "stands or floats by itself: taken for scenery or an object; --include adds it"
+Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class LinkProposal:
         doubt: What speaks against that side, or why there is none; empty if nothing does.
         counts: Number of taxels at each resolution.
         options: Options by which taxels are where they can feel.
-        box: Lower and upper corner of what is no tower beside the hand, in the link's frame [m]; empty if it is all of it.
+        box: Lower and upper corner of what is no tower beside the hand, in the link's frame [m]; None if it is all of it.
     """
 
     name: str
@@ -55,7 +58,7 @@ class LinkProposal:
     doubt: str
     counts: dict[str, int]
     options: Options
-    box: Box = ()
+    box: Box | None = None
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,10 @@ class Proposal:
         result |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
         if link.facing is not None:
             facing = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
-            box = dict(zip(("min", "max"), map(list, link.box), strict=False))
-            result["region"] = [facing, {"box": box}] if link.box else facing
+            result["region"] = facing
+            if link.box is not None:
+                low, high = link.box
+                result["region"] = [facing, {"box": {"min": list(low), "max": list(high)}}]
         return result
 
     def mapping(self) -> dict[str, Any]:
@@ -122,21 +127,21 @@ def propose(
             matches no link that can have taxels.
     """
     sampler = Sampler(robot, 0.95 * COVERING / np.sqrt(density * max(FACTORS.values())))
-    found, surfaces = _sampled_hands(sampler, include, progress)
+    flexions, surfaces = _sampled_hands(sampler, include, progress)
     left_out = tuple(sampler.left_out)
     if not surfaces:
         problem = "; ".join(f'"{name}": {why}' for name, why in left_out)
         raise TgdslError(f"{robot.file}: no link has a surface for taxels" + (f" ({problem})" if problem else ""))
     names = {int(robot.compiled.body(name).id): name for name in surfaces}
-    sides = {names[b]: flexion.inner_side(b) for flexion in found for b in (*flexion.hand.mounts, *flexion.hand.fingers)}
+    sides = {names[b]: flexion.inner_side(b) for flexion in flexions for b in (*flexion.hand.mounts, *flexion.hand.fingers)}
     asked_for = InnerSide(None, "asked for with --include")
-    boxes = {names[b]: box for flexion in found for b, box in _boxes(flexion).items()}
+    boxes = {names[b]: box for flexion in flexions for b, box in _boxes(flexion).items()}
     links = tuple(
-        _link(name, surfaces[name], sides.get(name, asked_for), boxes.get(name, ()), density)
+        _link(name, surfaces[name], sides.get(name, asked_for), boxes.get(name), density)
         for name in robot.bodies
         if name in surfaces
     )
-    groups = _groups(found, names, tuple(surfaces)) if with_groups else {}
+    groups = _groups(flexions, names, tuple(surfaces)) if with_groups else {}
     shared, is_misread = _shared(robot, tuple(surfaces)), angles_are_misread(robot.compiled)
     return Proposal(density, groups, links, left_out, shared, sampler.is_collided, is_misread)
 
@@ -149,9 +154,67 @@ def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
     """
     scale = RADIANS_AS_DEGREES if angles_are_misread(robot.compiled) else 1.0
     motion: dict[str, tuple[float, float]] = {}
-    for flexion in chosen_hands(kinematic_tree(robot, link_meshes(robot)[0])):
-        motion |= {robot.compiled.joint(i).name: (one / scale, two / scale) for i, (one, two) in flexion.motion().items()}
+    tree = kinematic_tree(robot, link_meshes(robot)[0])
+    for flexion in chosen_hands(tree):
+        if flexion.tree is tree:  # not within assumed limits
+            motion |= {robot.compiled.joint(i).name: (one / scale, two / scale) for i, (one, two) in flexion.motion().items()}
     return {name: ends for name, ends in motion.items() if name}
+
+
+def chosen_hands(tree: KinematicTree) -> list[Flexion]:
+    """Return the hands of a robot: those of which two chains or a jaw are known to close, or else all that may be one.
+
+    Where none is known to close, hinges without limits are tried within assumed ones.
+    """
+    results = [Flexion(tree, hand) for hand in hands(tree)]
+    closing = _that_close(results)
+    if not closing:
+        free = replace(tree, model=with_assumed_limits(tree.model), doubt=NO_LIMITS)
+        closing = _that_close([Flexion(free, hand) for hand in hands(free) if hand.jaw is None])
+    for flexion in closing:
+        if flexion.hand.palm is not None:
+            flexion.hand = replace(flexion.hand, mounts=PalmFront(flexion).mounts())
+    return closing or results
+
+
+def _that_close(flexions: Sequence[Flexion]) -> list[Flexion]:
+    return [flexion for flexion in flexions if flexion.num_closing > (flexion.hand.jaw is None)]
+
+
+def _outside(tree: KinematicTree, flexions: Sequence[Flexion]) -> dict[int, str]:
+    """Return the bodies with surface that are in no hand, and why a layout leaves them out."""
+    within = {body for flexion in flexions for body in (*flexion.hand.mounts, *flexion.hand.fingers)}
+    before = {s for flexion in flexions for s in tree.path(flexion.hand.base)[1:]}
+    carrying = {b for flexion in flexions for m in flexion.hand.mounts for b in tree.within(flexion.hand.base, m)}
+    scenery = set(free_standing(tree))
+    result: dict[int, str] = {}
+    for body in sorted(tree.area.keys() - within):
+        is_before = tree.segment[body] in before or body in carrying
+        result[body] = SCENERY if body in scenery else BEFORE if is_before else BESIDE
+    return result
+
+
+def _included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[str, str]) -> set[str]:
+    """Return the links that some patterns ask for.
+
+    Args:
+        patterns: Names of links, or shell wildcards.
+        names: Links that can have taxels.
+        left_out: Other links, and why they cannot.
+
+    Raises:
+        TgdslError: If a pattern matches no link that can have taxels.
+    """
+    result: set[str] = set()
+    for pattern in patterns:
+        links = {pattern} & {*names} or {*matching(pattern, names)}
+        if not links:
+            barred = [name for name in left_out if name == pattern or name in matching(pattern, [name])]
+            why = [f'"{name}" can have no taxels: {left_out[name]}' for name in barred]
+            problem = "; ".join(why) or f'no link matches "{pattern}"; {did_you_mean(pattern, names, "links")}'
+            raise TgdslError(f"--include: {problem}")
+        result |= links
+    return result
 
 
 def _sampled_hands(
@@ -163,28 +226,26 @@ def _sampled_hands(
     """
     surfaces: dict[str, LinkSurface] = {}
     while True:
-        asked = included(include, tuple(sampler.meshes), dict(sampler.left_out))
+        include_names = _included(include, tuple(sampler.meshes), dict(sampler.left_out))
         tree = kinematic_tree(sampler.robot, sampler.meshes)
-        result = chosen_hands(tree)
-        outer = {sampler.robot.compiled.body(body).name: why for body, why in outside(tree, result).items()}
-        behind = {sampler.robot.compiled.body(body).name for flexion in result for body in hidden(flexion)} - asked
-        for name in behind:
-            sampler.drop(name, HIDDEN)
-        if behind:
-            continue
-        wanted = [name for name in sampler.meshes if name not in outer or name in asked]
-        fresh: dict[str, LinkSurface | str] = {}
-        for i, name in enumerate(wanted):
+        flexions = chosen_hands(tree)
+        names = {body: sampler.robot.compiled.body(body).name for body in tree.area}
+        reasons = {names[body]: why for body, why in _outside(tree, flexions).items()}
+        dropped = {names[body]: HIDDEN for flexion in flexions for body in hidden(flexion) if names[body] not in include_names}
+        links = [name for name in sampler.meshes if name not in reasons or name in include_names]
+        for i, name in enumerate(links if not dropped else []):
             if name not in surfaces:
-                progress(f"sampling {name} ({i + 1} of {len(wanted)} links)")
-                fresh[name] = sampler.sampled(name)
-        surfaces |= {name: own for name, own in fresh.items() if isinstance(own, LinkSurface)}
-        dropped = {name: own for name, own in fresh.items() if isinstance(own, str)}
+                progress(f"sampling {name} ({i + 1} of {len(links)} links)")
+                surface = sampler.sampled(name)
+                if isinstance(surface, str):
+                    dropped[name] = surface
+                else:
+                    surfaces[name] = surface
         for name, why in dropped.items():
             sampler.drop(name, why)
         if not dropped:
-            sampler.left_out += [(name, why) for name, why in outer.items() if name not in asked]
-            return result, {name: surfaces[name] for name in wanted}
+            sampler.left_out += [(name, why) for name, why in reasons.items() if name not in include_names]
+            return flexions, {name: surfaces[name] for name in links}
 
 
 def _boxes(flexion: Flexion) -> dict[int, Box]:
@@ -204,18 +265,19 @@ def _boxes(flexion: Flexion) -> dict[int, Box]:
     return result
 
 
-def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box, density: float) -> LinkProposal:
+def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box | None, density: float) -> LinkProposal:
     share, facing, doubt = 1.0, side.facing, side.doubt
     if facing is not None:
         pool = surface.pool
         is_in = _faces(pool.normal, facing)
-        if box:
+        if box is not None:
             is_in &= ((pool.pos >= box[0]) & (pool.pos <= box[1])).all(axis=1)
         share = float(pool.point_area[is_in].sum()) / pool.area
         if share < MIN_SHARE:
-            share, facing, doubt, box = 1.0, None, UNCLEAR, ()
-    area = share * surface.area
-    counts = {resolution: max(1, _rounded(area * density * factor)) for resolution, factor in FACTORS.items()}
+            share, facing, doubt, box = 1.0, None, UNCLEAR, None
+    area = share * surface.pool.area
+    # Areas that people draw often hold half a taxel more, and the last bits of an area shall not decide.
+    counts = {name: max(1, int(np.floor(area * density * factor + 0.501))) for name, factor in FACTORS.items()}
     if max(counts.values()) > MAX_COUNT:
         raise TgdslError(
             f'link "{name}" would have {max(counts.values())} taxels, expected at most {MAX_COUNT}; lower the density'
@@ -223,31 +285,25 @@ def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box, density: f
     return LinkProposal(name, area, facing, doubt, counts, surface.options, box)
 
 
-def _rounded(number: float) -> int:
-    """Return the nearest integer; of what is within a thousandth of the middle of two, the larger.
-
-    Areas that people draw often hold half a taxel more, and the last bits of an area shall not decide.
-    """
-    return int(np.floor(number + 0.501))
-
-
 def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool[np.ndarray, " n"]:
     direction = np.array(facing) / np.linalg.norm(facing)
     return normals @ direction >= np.cos(np.radians(WITHIN_DEG))
 
 
-def _groups(found: Sequence[Flexion], names: dict[int, str], links: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+def _groups(flexions: Sequence[Flexion], names: dict[int, str], links: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Return the groups that have members; `fingers` and `hand` name those that they contain."""
     order = {name: i for i, name in enumerate(links)}
-    tips = {names[body] for flexion in found for body in flexion.tips}
-    palms = {names[body] for flexion in found for body in palm_parts(flexion)}
-    fingers = {names[body] for flexion in found for body in flexion.hand.fingers}
-    mounts = {names[body] for flexion in found for body in flexion.hand.mounts} - palms
+    tips = {names[body] for flexion in flexions for body in flexion.tips}
+    palms = {names[body] for flexion in flexions for body in palm_parts(flexion)}
+    fingers = {names[body] for flexion in flexions for body in flexion.hand.fingers}
+    mounts = {names[body] for flexion in flexions for body in flexion.hand.mounts} - palms
     known = {name for name, members in (("tips", tips), ("palm", palms), ("fingers", fingers), ("hand", links)) if members}
 
     def members(group: str, *others: str, bodies: set[str]) -> tuple[str, ...]:
-        patterns = (_own(escaped(name), known - {group}) for name in sorted(bodies, key=order.__getitem__))
-        return (*(other for other in others if other in known), *patterns)
+        patterns = [escaped(name) for name in sorted(bodies, key=order.__getitem__)]
+        # A pattern such as [p]alm means the link even if another group has its name.
+        links = [f"[{pattern[0]}]{pattern[1:]}" if pattern in known - {group} else pattern for pattern in patterns]
+        return (*(other for other in others if other in known), *links)
 
     wanted = {
         "tips": members("tips", bodies=tips),
@@ -261,11 +317,6 @@ def _groups(found: Sequence[Flexion], names: dict[int, str], links: tuple[str, .
 def escaped(name: str) -> str:
     """Return the pattern that matches a name and nothing else."""
     return re.sub(r"[*?\[]", r"[\g<0>]", name)
-
-
-def _own(pattern: str, groups: set[str]) -> str:
-    """Return a pattern that means the link even if another group has its name."""
-    return f"[{pattern[0]}]{pattern[1:]}" if pattern in groups else pattern
 
 
 def _shared(robot: Model, links: tuple[str, ...]) -> tuple[str, ...]:

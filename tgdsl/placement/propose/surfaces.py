@@ -1,15 +1,24 @@
-"""The surfaces of a robot's links: triangles, which say where links are; and samples of what can be touched, which are slow."""
+"""The surfaces of a robot's links: triangles, which say where links are; and samples of what can be touched, which are slow.
+
+A link is sampled on its meshes as they are, unless these have hollows that are deeper inside the hulls that the simulator
+collides than a taxel's radius; what is inside other colliding geoms in the initial state is left out.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from tgdsl.errors import RobotError, SampleError
 from tgdsl.formats.model import Model
-from tgdsl.placement.propose.exposure import MIN_AREA, Options, exposed_pool, surface_pool
-from tgdsl.placement.propose.hands import free_standing, kinematic_tree
+from tgdsl.placement.propose.hands import free_standing, kinematic_tree, loose_parts
 from tgdsl.placement.reach import Colliders
+from tgdsl.placement.sample import poisson
 from tgdsl.placement.sample.poisson import Pool
+from tgdsl.surfaces import meshlab
+from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
 
 NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
@@ -17,7 +26,12 @@ HIDDEN = "behind what is fixed in front of it; --include adds it"
 COVERED = "all of it is inside other links in the initial state"
 MAX_MARKER = 2e-5
 """A link with no more surface than this only marks a place, such as a ball of a millimetre at a fingertip [m²]."""
+MIN_AREA = 1e-8
+"""A surface smaller than this is degenerate [m²]."""
 _NO_AREA = "a surface without area"
+_ANYWHERE = Region(is_geom=None, facings=(), boxes=(), spheres=())
+Options = Mapping[str, str | bool]
+"""Options of a placement, `surface` and `exposed`, as the grammar has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +45,6 @@ class LinkSurface:
 
     pool: Pool
     options: Options = field(default_factory=dict)
-
-    @property
-    def area(self) -> float:
-        """Its whole surface [m²]."""
-        return self.pool.area
 
 
 def link_meshes(robot: Model) -> tuple[dict[str, Surface], list[tuple[str, str]]]:
@@ -61,6 +70,9 @@ def link_meshes(robot: Model) -> tuple[dict[str, Surface], list[tuple[str, str]]
         else:
             left_out.append((body, f"a marker: its surface is {1e4 * area:.2g} cm²" if area > MIN_AREA else _NO_AREA))
     model = robot.compiled
+    for name in [model.body(body).name for body in loose_parts(kinematic_tree(robot, meshes))]:
+        del meshes[name]
+        left_out.append((name, "a marker: it touches nothing that it is fixed to"))
     unnamed = [i for i in range(model.nbody) if not model.body(i).name and model.body_geomnum[i]]
     left_out += [(robot.body_path(i), "no name, so no document can mean it") for i in unnamed]
     return meshes, left_out
@@ -101,17 +113,47 @@ class Sampler:
     def sampled(self, name: str) -> LinkSurface | str:
         """Return what can be touched of a link, or why nothing can."""
         try:
-            pool = surface_pool(self.robot.surface(self.robot.touchable(name)))
+            pool = _pool(self.robot.surface(self.robot.touchable(name)))
         except (RobotError, SampleError) as error:
             return _reason(self.robot, error)
         if pool is None:
             return "nothing that can be touched from outside"
         if pool.area < MIN_AREA:
             return _NO_AREA
-        if name not in self._feeling:
+        return self._exposed(name, pool) if name in self._feeling else LinkSurface(pool)
+
+    def _exposed(self, name: str, pool: Pool) -> LinkSurface | str:
+        """Return what can feel of a colliding link, of which points on its meshes are given."""
+        geoms, options = self.robot.touchable(name), dict[str, str | bool]()
+        if not all(geom.is_colliding for geom in geoms):
             return LinkSurface(pool)
-        exposed, options = exposed_pool(self.robot, self.colliders, name, pool, self.radius)
-        return LinkSurface(exposed, options) if exposed is not None else COVERED
+        is_covered = self.colliders.cover_of(name, geoms)
+        covered = is_covered(pool.pos)
+        body = int(self.robot.compiled.body(name).id)
+        buried, _ = self.colliders.is_buried(body, pool.pos, np.full(len(pool.pos), self.radius))
+        if (buried & ~covered).any():
+            options["surface"] = "collision"
+            on_hulls = _pool(self.robot.surface(geoms, as_collided=True))
+            if on_hulls is None:
+                return COVERED
+            pool, covered = on_hulls, is_covered(on_hulls.pos)
+        if covered.any():
+            options["exposed"] = True
+            pool = Pool(pool.pos[~covered], pool.normal[~covered], pool.point_area[~covered])
+        return LinkSurface(pool, options) if pool.area > MIN_AREA else COVERED
+
+
+def _pool(surface: Surface) -> Pool | None:
+    """Return points on the outside of a link's surface; None if none of it can be touched from outside.
+
+    Raises:
+        SampleError: If pymeshlab is not installed.
+    """
+    try:
+        shell = meshlab.outer_shell(surface)
+    except ImportError as error:
+        raise SampleError(f"sampling needs pymeshlab: {error}", "pip install pymeshlab") from error
+    return poisson.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
 
 
 def _reason(robot: Model, error: Exception) -> str:

@@ -91,10 +91,10 @@ def new_layout(
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),
         *(f"group {name}: {_BRACKETED.sub(_CHARACTER, listed(members))}" for name, members in proposal.groups.items()),
-        *(f"left out: {line}" for line in _left_out(proposal)),
+        *(f"left out: {line}" for line in _by_reason(proposal.left_out)),
         *(f"weak guess of the inner side: {line}" for line in _doubts(proposal, has_side=True)),
         *(f"all around: {line}" for line in _doubts(proposal, has_side=False)),
-        *(f"{option}: {listed([link.name for link in links])}: {_OPTIONS[key]}" for key, option, links in _chosen(proposal)),
+        *(f"{option}: {listed([link.name for link in links])}: {_OPTIONS[key]}" for key, option, links in _options(proposal)),
         *([] if proposal.is_collided else [f"not collided: {_NOT_COLLIDED}"]),
         *([f"limits: {_MISREAD}"] if proposal.is_misread else []),
         f"{out}: every guess in it is marked; please look at them",
@@ -109,7 +109,7 @@ def layout_text(proposal: Proposal, robot: str) -> str:
         robot: How the text calls the robot.
     """
     parts = [_HEADER.format(robot=quoted(robot), density=proposal.density * 1e-4)]
-    parts += [f"# Left out: {line}\n" for line in _left_out(proposal)]
+    parts += [f"# Left out: {line}\n" for line in _by_reason(proposal.left_out)]
     parts += [] if proposal.is_collided else [f"# Mind: {_NOT_COLLIDED}.\n"]
     parts += [f"# Mind: {_MISREAD}.\n"] if proposal.is_misread else []
     if proposal.groups and proposal.shared:
@@ -123,15 +123,10 @@ def layout_text(proposal: Proposal, robot: str) -> str:
     return "".join(parts)
 
 
-def _chosen(proposal: Proposal) -> list[tuple[str, str, list[LinkProposal]]]:
+def _options(proposal: Proposal) -> list[tuple[str, str, list[LinkProposal]]]:
     """Return each option that some links need, as the grammar has it, and the links."""
     results = [(key, [link for link in proposal.links if key in link.options]) for key in _OPTIONS]
     return [(key, f"{key}: {_flow(links[0].options[key])}", links) for key, links in results if links]
-
-
-def _left_out(proposal: Proposal) -> list[str]:
-    """Return the bodies without taxels, one line per reason."""
-    return _by_reason(proposal.left_out)
 
 
 def _doubts(proposal: Proposal, has_side: bool) -> list[str]:

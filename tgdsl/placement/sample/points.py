@@ -105,9 +105,9 @@ def _read(folder: Path, name: str, link: str) -> Iterator[tuple[str, dict[str, f
         if None in row:
             raise SampleError(f"{place}: more values than the header has columns")
         if "link" in header:
-            own = (row.pop("link") or "").strip()
-            links[own] = None
-            if own != link:
+            owner = (row.pop("link") or "").strip()
+            links[owner] = None
+            if owner != link:
                 continue
         values = {column: _number(place, column, text) for column, text in row.items() if (text or "").strip()}
         for column in REQUIRED:
@@ -153,9 +153,9 @@ def _check(place: str, values: Mapping[str, float], radius: float | None) -> Non
 def _check_cells(places: Sequence[str], cell: Int[np.ndarray, "point 2"]) -> None:
     """Raise a `SampleError` if two points have one cell."""
     first: dict[tuple[int, ...], str] = {}
-    for place, own in zip(places, map(tuple, cell.tolist()), strict=True):
-        if min(own) >= 0 and (other := first.setdefault(own, place)) != place:
-            raise SampleError(f"{place}: row {own[0]}, column {own[1]} is that of {other} too", "one point for each cell")
+    for place, (row, column) in zip(places, cell.tolist(), strict=True):
+        if min(row, column) >= 0 and (other := first.setdefault((row, column), place)) != place:
+            raise SampleError(f"{place}: row {row}, column {column} is that of {other} too", "one point for each cell")
 
 
 def _number(place: str, column: str, text: str) -> float:

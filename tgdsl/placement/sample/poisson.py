@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 
 from tgdsl.placement.sample import lattice
 from tgdsl.surfaces.meshlab import Shell, stratified_points
-from tgdsl.surfaces.rays import OrthographicView, first_hits, frame
+from tgdsl.surfaces.rays import OrthographicView, first_hits, frame, sphere_directions
 from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
 
@@ -91,11 +91,11 @@ def pool(
     while len(face):
         num = area / point_area
         drawn = _drawn(shell, region, face, corners, point_area, seed, sampler)
-        found, wanted = len(drawn.pos), _wanted(drawn.area, count, spacing)
-        is_hopeless = num >= limit or (count is None and wanted > MAX_POOL) or (not found and num >= 10 * MIN_POOL)
-        if found > 0.7 * wanted or is_hopeless:
+        num_drawn, num_wanted = len(drawn.pos), _wanted(drawn.area, count, spacing)
+        is_hopeless = num >= limit or (count is None and num_wanted > MAX_POOL) or (not num_drawn and num >= 10 * MIN_POOL)
+        if num_drawn > 0.7 * num_wanted or is_hopeless:
             break
-        point_area = max(point_area * (found / wanted if found > 100 else 0.1), area / limit)
+        point_area = max(point_area * (num_drawn / num_wanted if num_drawn > 100 else 0.1), area / limit)
     return drawn if drawn is not None and len(drawn.pos) else None
 
 
@@ -163,9 +163,9 @@ def _exact(drawn: lattice.Hits, area: Float[np.ndarray, " piece"]) -> Float[np.n
     """
     num = np.bincount(drawn.piece, minlength=len(area))
     owner = np.where(num >= MANY, np.arange(len(area)), len(area))
-    found = np.bincount(owner[drawn.piece], drawn.area, minlength=len(area) + 1)
-    wanted = np.bincount(owner, area, minlength=len(area) + 1)
-    exact = drawn.area * (wanted / np.where(found > 0, found, 1.0))[owner[drawn.piece]]
+    drawn_area = np.bincount(owner[drawn.piece], drawn.area, minlength=len(area) + 1)
+    exact_area = np.bincount(owner, area, minlength=len(area) + 1)
+    exact = drawn.area * (exact_area / np.where(drawn_area > 0, drawn_area, 1.0))[owner[drawn.piece]]
     return exact * (area.sum() / exact.sum()) if len(exact) else exact
 
 
@@ -182,7 +182,7 @@ def _on_outer_surface(
     component = shell.component[face]
     is_geom = np.ones(len(shell.surface.geoms), bool) if region.is_geom is None else region.is_geom
     is_out = np.ones(len(pos), dtype=bool)
-    directions = _directions()
+    directions = sphere_directions(DIRECTIONS)
     is_seen = _visible(shell, above, normal, directions[:FIRST_DIRECTIONS])
     for solid in np.flatnonzero(shell.is_solid).tolist():
         doubtful = np.flatnonzero(is_out & ~(is_seen & shell.is_closed[solid]))  # nothing seen is inside a closed surface
@@ -193,15 +193,6 @@ def _on_outer_surface(
     left = np.flatnonzero(is_out & ~is_seen)
     is_out[left] = _visible(shell, above[left], normal[left], directions[FIRST_DIRECTIONS:])
     return is_out
-
-
-def _directions() -> Float[np.ndarray, "direction 3"]:
-    """Return unit vectors that cover the sphere evenly; every side of it is met early."""
-    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(DIRECTIONS)
-    height = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
-    ring = np.sqrt(1.0 - height**2)
-    fibonacci = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)
-    return fibonacci[37 * np.arange(DIRECTIONS) % DIRECTIONS]
 
 
 def _visible(
