@@ -101,7 +101,10 @@ def gelsight_recordings(data: Path, folder: Path) -> np.ndarray:
     )
     moved = np.zeros((2, 2, 3))
     moved[0, 1], moved[1, 1] = wide, [1e-3, 1e-3, 4e-4]
-    both, motion = poses((0, 0, deep), (0, 3e-4, deep)), {"zero:skin": 0.0, "width:body_pos": moved}
+    turned = np.zeros((2, 2, 4))
+    turned[1, 1, 3] = 0.05  # half the angle about the normal by which the drag turned the ball [rad]
+    both = poses((0, 0, deep), (0, 3e-4, deep))
+    motion = {"zero:skin": 0.0, "width:body_pos": moved, "width:body_quat": turned}
     size = np.sqrt((drag[found["drag_kept"]] ** 2).mean())
     np.savez(folder / "drag.npz", **both, **target([1], drag, found["drag_kept"], 0.01 * size), **motion)
     raw = [np.loadtxt(data / "gelsight" / f"{i}.csv", delimiter=",", skiprows=1)[:, 2:4] / PX for i in (0, 1)]
@@ -125,7 +128,7 @@ def show(rows: list[tuple[str, Fit, float]]) -> None:
     print(text_table(("model", "recording", "error", "held out", "floor", "without", "parameters", "s"), lines))
 
 
-def gelsight(data: Path, out: Path | None, only: str) -> None:
+def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the GelSight's press and drag."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -140,9 +143,9 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
             ("gaussian, drag, offset", {**GAUSSIAN, "dilation_strength": 0}, [drag], ["skin.shear_falloff=1e4:1e6"], "offset"),
             ("half_space, drag, offset", {**HALF_SPACE, "friction": 0.3}, [drag], [*OF_HALF_SPACE, FRICTION], "offset"),
             ("layer, drag, offset", {**LAYER, "friction": 0.3}, [drag], [*OF_LAYER, FRICTION], "offset"),
-            ("press's layer, drag, offset", {**PRESSED, "friction": 0.3}, [drag], [FRICTION], "offset"),
+            ("press's layer, drag, offset", {**PRESSED, "friction": 0.6}, [drag], [FRICTION], "offset"),
             ("half_space, raw drag, offset", {**HALF_SPACE, "friction": 0.3}, [raw], [*OF_HALF_SPACE, FRICTION], "offset"),
-            ("layer, both, offset", {**LAYER, "friction": 0.3}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
+            ("layer, both, offset", {**PRESSED, "friction": 0.6}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
         ]  # fmt: skip
         rows = []
         for label, skin, recordings, fit, reading in cases:
@@ -158,7 +161,7 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
                 gain=True,
                 hold_out="taxel",
                 intervals="none",
-                starts=4,
+                starts=starts,
             )
             rows.append((label, result, time.perf_counter() - start))
             show(rows[-1:])
@@ -196,7 +199,7 @@ def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return pos[used], normal[used]
 
 
-def dome(data: Path, out: Path | None, only: str) -> None:
+def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the finite-element dome: its material from the press, which then predicts the drag."""
     with tempfile.TemporaryDirectory() as name:
         folder, rows = Path(name), []
@@ -217,11 +220,11 @@ def dome(data: Path, out: Path | None, only: str) -> None:
             sheet = document(folder, places, normals, {**skin, "enter": 0}, DOME_BALL, 4.5e-4, 9e-5)
             start = time.perf_counter()
             press = tgdsl.calibrate(
-                sheet, folder / "press.npz", material, gain=True, hold_out="blocks", intervals="none", starts=1
+                sheet, folder / "press.npz", material, gain=True, hold_out="blocks", intervals="none", starts=starts
             )
             fitted = press.document(folder / "fitted.yaml")
             between = time.perf_counter()
-            drag = tgdsl.calibrate(fitted, folder / "drag.npz", gain=True, intervals="none", starts=1)
+            drag = tgdsl.calibrate(fitted, folder / "drag.npz", gain=True, intervals="none", starts=starts)
             rows += [(f"{kernel}, press", press, between - start)]
             rows += [(f"{kernel}, drag by the press's material", drag, time.perf_counter() - between)]
             print(press, drag, sep="\n\n", flush=True)
@@ -251,7 +254,7 @@ def eflesh_recording(data: Path, run: str, contact: float, every: int, cycles: s
     }  # fmt: skip
 
 
-def eflesh(data: Path, out: Path | None, only: str) -> None:
+def eflesh(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the eFlesh under a probe: its load by the robot's pose."""
     stiffness, exponent = "load.normal_stiffness=1e1:1e8", "load.depth_exponent=0.05:4"
     lattice = {"densification": 0.03, "depth_exponent": 0.3, "normal_stiffness": 30}
@@ -274,7 +277,14 @@ def eflesh(data: Path, out: Path | None, only: str) -> None:
                 continue
             start = time.perf_counter()
             result = tgdsl.calibrate(
-                probe_document(folder, law), recordings, fit, gain=gain, hold_out="time", folds=10, intervals="none", starts=1
+                probe_document(folder, law),
+                recordings,
+                fit,
+                gain=gain,
+                hold_out="time",
+                folds=10,
+                intervals="none",
+                starts=starts,
             )
             rows.append((label, result, time.perf_counter() - start))
             print(result, flush=True)
@@ -318,9 +328,10 @@ def main(
     data: Path,
     out: Path | None = None,
     only: str = "",
+    starts: int = 1,
 ) -> None:
     """Fit sensors to recordings and print the errors."""
-    {"gelsight": gelsight, "eflesh": eflesh, "dome": dome}[which](data, out, only)
+    {"gelsight": gelsight, "eflesh": eflesh, "dome": dome}[which](data, out, only, starts)
 
 
 if __name__ == "__main__":
