@@ -1,5 +1,6 @@
 """Several models fitted to one recording, in one table."""
 
+import numpy as np
 import pytest
 from recorded_presses import document, recording
 
@@ -32,3 +33,15 @@ def test_mistakes_have_a_place(tmp_path):
     (tmp_path / "models.yaml").write_text(MODELS.replace("set:", "sett:"))
     with pytest.raises(SpecError, match=r"models\.yaml:4:\d+: compare\.linear spring"):
         tgdsl.compare(document(tmp_path), {}, tmp_path / "models.yaml")
+
+
+def test_the_command_prints_the_table(tmp_path, here):
+    path = document(tmp_path)
+    (tmp_path / "models.yaml").write_text(MODELS)
+    np.savez(tmp_path / "press.npz", **recording(path, num=20))  # type: ignore[arg-type]
+    words = ("calibrate", "sensor", "touch.yaml", "press.npz", "--compare", "models.yaml", "--intervals", "none")
+    code, out, errors = here(tmp_path, *words, "--starts", "1")
+    assert code == 0, errors
+    assert "linear spring" in out and "as written" in out
+    code, _, errors = here(tmp_path, *words, "--fit", "touch.normal_stiffness")
+    assert code != 0 and "expected no --fit" in errors
