@@ -2,6 +2,7 @@
 
     python benchmarks/reality.py gelsight DATA_FOLDER [--out docs/images]
     python benchmarks/reality.py eflesh DATA_FOLDER
+    python benchmarks/reality.py dome DATA_FOLDER
 
 The data are not part of tgdsl. `gelsight/subpixel.npz` (FOTS, places of markers found again from its images), `eflesh/normal`
 (eFlesh) and `gel_dome_fem.npz` (Taxim) are expected in DATA_FOLDER. Each row is one call of `tgdsl.calibrate` with the document
@@ -42,16 +43,18 @@ OF_HALF_SPACE = ["skin.poissons_ratio", "skin.marker_depth=0 mm:2 mm"]
 FRICTION = "skin.friction=0.02:3"
 
 
-def document(folder: Path, places: np.ndarray, skin: dict[str, Any], ball: float, half: float, pitch: float) -> Path:
+def document(
+    folder: Path, places: np.ndarray, normals: np.ndarray, skin: dict[str, Any], ball: float, half: float, pitch: float
+) -> Path:
     """Write a pad under a ball, taxels on a square in its middle, and markers at some places [m]; return the document."""
     (folder / "scene.xml").write_text(
         f'<mujoco><worldbody><body name="pad"><geom type="box" size=".03 .03 .01" pos="0 0 -.01"/></body>'
         f'<body name="ball" pos="0 0 .1"><freejoint/><geom type="sphere" size="{ball}"/></body></worldbody></mujoco>'
     )
-    num, normal = round(2 * half / pitch), [0, 0, 1]
+    num = round(2 * half / pitch)
     square = {"box": {"min": [-half, -half, -1e-3], "max": [half, half, 1e-3]}}
     grid = {"method": "grid", "rows": num, "columns": num, "direction": [0, 0, -1], "radius": 1e-3, "region": square}
-    dots = [{"pos": [float(x), float(y), 0.0], "normal": normal, "radius": 1e-3} for x, y in places]
+    dots = [{"pos": p.tolist(), "normal": n.tolist(), "radius": 1e-3} for p, n in zip(places, normals, strict=True)]
     layout = {"resolutions": {"taxels": {"pad": grid}, "dots": {"pad": {"method": "points", "points": dots}}}}
     sensor = {"kind": "elastomer", "links": "pad", "feels": ["ball"], "gate": "geometric", "markers": "dots", **skin}
     content = {
@@ -98,14 +101,17 @@ def gelsight_recordings(data: Path, folder: Path) -> np.ndarray:
     )
     moved = np.zeros((2, 2, 3))
     moved[0, 1], moved[1, 1] = wide, [1e-3, 1e-3, 4e-4]
-    both, motion = poses((0, 0, deep), (0, 3e-4, deep)), {"zero:skin": 0.0, "width:body_pos": moved}
+    turned = np.zeros((2, 2, 4))
+    turned[1, 1, 3] = 0.05  # half the angle about the normal by which the drag turned the ball [rad]
+    both = poses((0, 0, deep), (0, 3e-4, deep))
+    motion = {"zero:skin": 0.0, "width:body_pos": moved, "width:body_quat": turned}
     size = np.sqrt((drag[found["drag_kept"]] ** 2).mean())
     np.savez(folder / "drag.npz", **both, **target([1], drag, found["drag_kept"], 0.01 * size), **motion)
     raw = [np.loadtxt(data / "gelsight" / f"{i}.csv", delimiter=",", skiprows=1)[:, 2:4] / PX for i in (0, 1)]
     raw_drag, every = raw[1] - raw[0], np.ones(len(drag))
     size = np.sqrt((raw_drag**2).mean())
     np.savez(folder / "raw.npz", **both, **target([1], raw_drag, every, 0.113 * size), **motion)
-    return (found["unloaded"] - CENTRE) / PX
+    return np.column_stack([(found["unloaded"] - CENTRE) / PX, np.zeros(len(press))])
 
 
 def show(rows: list[tuple[str, Fit, float]]) -> None:
@@ -122,7 +128,7 @@ def show(rows: list[tuple[str, Fit, float]]) -> None:
     print(text_table(("model", "recording", "error", "held out", "floor", "without", "parameters", "s"), lines))
 
 
-def gelsight(data: Path, out: Path | None, only: str) -> None:
+def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the GelSight's press and drag."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -137,15 +143,15 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
             ("gaussian, drag, offset", {**GAUSSIAN, "dilation_strength": 0}, [drag], ["skin.shear_falloff=1e4:1e6"], "offset"),
             ("half_space, drag, offset", {**HALF_SPACE, "friction": 0.3}, [drag], [*OF_HALF_SPACE, FRICTION], "offset"),
             ("layer, drag, offset", {**LAYER, "friction": 0.3}, [drag], [*OF_LAYER, FRICTION], "offset"),
-            ("press's layer, drag, offset", {**PRESSED, "friction": 0.3}, [drag], [FRICTION], "offset"),
+            ("press's layer, drag, offset", {**PRESSED, "friction": 0.6}, [drag], [FRICTION], "offset"),
             ("half_space, raw drag, offset", {**HALF_SPACE, "friction": 0.3}, [raw], [*OF_HALF_SPACE, FRICTION], "offset"),
-            ("layer, both, offset", {**LAYER, "friction": 0.3}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
+            ("layer, both, offset", {**PRESSED, "friction": 0.6}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
         ]  # fmt: skip
         rows = []
         for label, skin, recordings, fit, reading in cases:
             if only not in label:
                 continue
-            sheet = document(folder, places, skin, BALL, 4e-3, 0.4e-3)
+            sheet = document(folder, places, np.tile([0.0, 0.0, 1.0], (len(places), 1)), skin, BALL, 4e-3, 0.4e-3)
             start = time.perf_counter()
             result = tgdsl.calibrate(
                 sheet,
@@ -155,7 +161,7 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
                 gain=True,
                 hold_out="taxel",
                 intervals="none",
-                starts=4,
+                starts=starts,
             )
             rows.append((label, result, time.perf_counter() - start))
             show(rows[-1:])
@@ -166,33 +172,126 @@ def gelsight(data: Path, out: Path | None, only: str) -> None:
         show(rows)
 
 
-def eflesh(data: Path, out: Path | None, only: str) -> None:
-    """Print the table of the eFlesh under a probe: its load by the robot's pose."""
-    with lzma.open(data / "eflesh" / "normal" / "states.csv.xz") as file:
+def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Write press.npz and drag.npz; return places [m] and normals of the nodes used: all near the load, some beyond."""
+    nodes = np.load(data / "gel_dome_fem.npz")
+    out = np.array([1.0, -1.0, -1.0])  # from the file's axes, z into the gel, to z out of it
+    pos = nodes["dz_pos"].astype(np.float64)
+    top = np.array([*(0.5 * (pos.max(axis=0) + pos.min(axis=0))[:2]), pos[:, 2].min()])
+    pos, press, drag = (pos - top) * out, nodes["dz_disp"] * out, nodes["dxdz_disp"] * out
+    normal = pos + np.array([0.0, 0.0, DOME_RADIUS])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    loaded = pos[np.linalg.norm(press, axis=1).argmax()]
+    is_near = np.linalg.norm(pos - loaded, axis=1) < DOME_NEAR
+    used = is_near | (np.random.default_rng(0).random(len(pos)) < DOME_SHARE)
+    weight = np.where(is_near[used], 1.0, (~is_near).sum() / (used & ~is_near).sum())
+    # First the ball is pressed, so that the gel sticks to it, then it is where it is fitted to be: moved along the gel too.
+    down, apart = [loaded[0], loaded[1], DOME_BALL - 2.5e-4], np.array([1e-4, 1e-4, 3e-5])
+    moved = np.zeros((2, 2, 3))
+    moved[0, 1], moved[1, 1] = apart * [1, 1, 0], apart
+    cases = {"press": (press, (0.0, 0.0)), **{f"drag{i}": (drag, start) for i, start in enumerate(DRAG_STARTS)}}
+    for name, (value, (x, y)) in cases.items():
+        first = (down[0] + x / 2, down[1] + y / 2, down[2])
+        states = poses(first, (down[0] + x, down[1] + y, DOME_BALL - 5e-5))
+        read = {
+            "target:skin": np.stack([np.zeros((used.sum(), 3)), value[used]]), "clock:skin": [0, 1], "unit:skin": "m",
+            "weight:skin": np.stack([0.0 * weight, weight])[:, :, None], "width:body_pos": moved,
+        }  # fmt: skip
+        np.savez(folder / f"{name}.npz", **states, **read)
+    return pos[used], normal[used]
+
+
+def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
+    """Print the table of the finite-element dome: its material from the press, which then predicts the drag."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, rows = Path(name), []
+        places, normals = dome_recordings(data, folder)
+        poisson, depth = "skin.poissons_ratio", "skin.marker_depth=0 mm:0.3 mm"
+        elastic = {"youngs_modulus": 1e6, "normal_stiffness": 1e10, "poissons_ratio": 0.45, "marker_depth": 5e-5}
+        spread = {**GAUSSIAN, "dilation_falloff": 4e6, "shear_falloff": 4e6, "shear_strength": 1e5}
+        of_spread = ["skin.dilation_falloff=1e5:1e8", "skin.shear_falloff=1e5:1e8", "skin.shear_strength=1:1e8"]
+        layer, thickness = {**elastic, "kernel": "bonded_layer", "thickness": 5.5e-3}, "skin.thickness=2 mm:12 mm"
+        cases = {
+            "gaussian": (spread, of_spread),
+            "half_space": ({**elastic, "kernel": "half_space"}, [poisson, depth]),
+            "layer": (layer, [poisson, depth, thickness]),
+        }
+        for kernel, (skin, material) in cases.items():
+            if only not in kernel:
+                continue
+            sheet = document(folder, places, normals, {**skin, "enter": 0}, DOME_BALL, 4.5e-4, 9e-5)
+            start = time.perf_counter()
+            press = tgdsl.calibrate(
+                sheet, folder / "press.npz", material, gain=True, hold_out="blocks", intervals="none", starts=starts
+            )
+            fitted = press.document(folder / "fitted.yaml")
+            between = time.perf_counter()
+            drags = [
+                tgdsl.calibrate(fitted, folder / f"drag{i}.npz", gain=True, intervals="none", starts=starts)
+                for i in range(len(DRAG_STARTS))
+            ]
+            drag = min(drags, key=lambda fit: fit.errors[0].error)
+            rows += [(f"{kernel}, press", press, between - start)]
+            rows += [(f"{kernel}, drag by the press's material", drag, time.perf_counter() - between)]
+            print(press, drag, sep="\n\n", flush=True)
+        show(rows)
+
+
+def eflesh_recording(data: Path, run: str, contact: float, every: int, cycles: slice = slice(None)) -> dict[str, Any]:
+    """Return the recording of a run: its load [N] by the robot's height, every so many valid samples, of some of ten cycles.
+
+    Args:
+        data: The data folder.
+        run: `normal` or `shear`.
+        contact: Height of the first contact below the robot's highest pose, roughly [m].
+        every: One sample of so many is used.
+        cycles: Which of the ten.
+    """
+    with lzma.open(data / "eflesh" / run / "states.csv.xz") as file:
         states = np.genfromtxt(file, delimiter=",")
     time_s, height, load = states[:, 0] - states[0, 0], 1e-3 * states[:, 3], states[:, 4]
-    is_valid = load >= 0
+    cycle = np.arange(len(time_s)) * 10 // len(time_s)
+    valid = np.flatnonzero((load >= 0) & np.isin(cycle, np.arange(10)[cycles]))[::every]
+    ball = 0.034 + height - (height.max() - contact)  # it touches the probe at 0.034 m
+    return {
+        **poses(*[(0.0, 0.0, z) for z in ball]), "time": time_s, "target:load": -9.81e-3 * load[valid, None, None],
+        "clock:load": time_s[valid], "clock_width:load": 0.5, "unit:load": "N", "channels:load": ["force_z"],
+        **width(np.array([[0, 0, 0], [0, 0, 2e-3]])),
+    }  # fmt: skip
+
+
+def eflesh(data: Path, out: Path | None, only: str, starts: int) -> None:
+    """Print the table of the eFlesh under a probe: its load by the robot's pose."""
+    stiffness, exponent = "load.normal_stiffness=1e1:1e8", "load.depth_exponent=0.05:4"
+    lattice = {"densification": 0.03, "depth_exponent": 0.3, "normal_stiffness": 30}
+    loop, of_loop = {"force": 1.5, "width": 2e-3}, ["load.loop.force=0.1:10", "load.loop.width=0.1 mm:10 mm"]
+    closing = "load.densification=21 mm:500 mm"
+    normal, shear = eflesh_recording(data, "normal", 0.75e-3, 2), eflesh_recording(data, "shear", 4e-3, 12)
+    halves = [eflesh_recording(data, "normal", 0.75e-3, 4, part) for part in (slice(0, 5), slice(5, 10))]
+    cases = {
+        "normal, power law": ({}, [normal], [stiffness, exponent], False),
+        "normal, power law, damping": ({}, [normal], [stiffness, exponent, "load.normal_damping=0:1e6"], False),
+        "normal, power law, gain of each half": ({}, halves, [exponent], True),
+        "shear, power law": ({}, [shear], [stiffness, exponent], False),
+        "shear, loop": ({"loop": loop}, [shear], [stiffness, exponent, *of_loop], False),
+        "shear, loop, densification": ({"loop": loop, **lattice}, [shear], [stiffness, exponent, *of_loop, closing], False),
+    }
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        sheet = probe_document(folder)
-        # The ball touches the probe at 0.034 m; the robot at some height below its highest, which is fitted.
-        ball = 0.034 + height - (height.max() - CONTACT)
-        keep = np.arange(0, len(time_s), 2)
-        np.savez(
-            folder / "normal.npz",
-            **{**poses(*[(0.0, 0.0, z) for z in ball]), "time": time_s},
-            **{"target:load": -9.81e-3 * load[keep, None, None], "weight:load": is_valid[keep, None, None].astype(float)},
-            **{"clock:load": time_s[keep], "clock_width:load": 0.5, "unit:load": "N", "channels:load": ["force_z"]},
-            **width(np.array([[0, 0, 0], [0, 0, 2e-3]])),
-        )
-        rows = []
-        law = ["load.normal_stiffness=1e2:1e8", "load.depth_exponent=0.5:4"]
-        cases = {"power law": law, "power law, damping": [*law, "load.normal_damping=0:1e6"]}
-        for label, fit in cases.items():
+        folder, rows = Path(name), []
+        for label, (law, recordings, fit, gain) in cases.items():
             if only not in label:
                 continue
             start = time.perf_counter()
-            result = tgdsl.calibrate(sheet, folder / "normal.npz", fit, hold_out="time", intervals="none", starts=4)
+            result = tgdsl.calibrate(
+                probe_document(folder, law),
+                recordings,
+                fit,
+                gain=gain,
+                hold_out="time",
+                folds=10,
+                intervals="none",
+                starts=starts,
+            )
             rows.append((label, result, time.perf_counter() - start))
             print(result, flush=True)
             if out is not None:
@@ -200,11 +299,19 @@ def eflesh(data: Path, out: Path | None, only: str) -> None:
         show(rows)
 
 
-CONTACT = 0.75e-3
-"""Height of the eFlesh's first contact below the robot's highest pose, roughly [m]."""
+DOME_RADIUS = 28.41e-3
+"""Radius of the sphere that the dome's nodes lie on, within 1 µm [m]."""
+DOME_BALL = 1e-3
+"""Radius of the ball that stands for the load on its node [m]."""
+DRAG_STARTS = ((0.0, 0.0), (1.5e-4, 5e-5), (1.5e-4, 9e-5))
+"""Where the search for the dragged ball starts, from the loaded node [m]: its place has several minima."""
+DOME_NEAR = 1.5e-3
+"""Distance from that node up to which all nodes are used [m]."""
+DOME_SHARE = 0.03
+"""Share of the other nodes, with as much more weight."""
 
 
-def probe_document(folder: Path) -> Path:
+def probe_document(folder: Path, law: dict[str, Any]) -> Path:
     """Write one probe under a ball, whose force is the load; return the document."""
     (folder / "scene.xml").write_text(
         '<mujoco><worldbody><body name="pad"><geom type="box" size=".02 .02 .01" pos="0 0 -.01"/></body>'
@@ -213,7 +320,7 @@ def probe_document(folder: Path) -> Path:
     probe = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 0.014}
     layout = {"resolutions": {"r": {"pad": {"method": "points", "points": [probe]}}}}
     sensor = {"kind": "kinematic_taxel", "links": "pad", "feels": ["ball"], "gate": "geometric", "outputs": ["force"]}
-    sensor |= {"normal_stiffness": 1e4, "depth_exponent": 1.5, "normal_damping": 0, "shear_damping": 0}
+    sensor |= {"normal_stiffness": 1e4, "depth_exponent": 1.5, "normal_damping": 0, "shear_damping": 0, **law}
     content = {
         "tgdsl": 1,
         "robot": {"model": "scene.xml", "layout": layout},
@@ -225,13 +332,14 @@ def probe_document(folder: Path) -> Path:
 
 
 def main(
-    which: Annotated[Literal["gelsight", "eflesh"], tyro.conf.arg(help="The data.")],
+    which: Annotated[Literal["gelsight", "eflesh", "dome"], tyro.conf.arg(help="The data.")],
     data: Path,
     out: Path | None = None,
     only: str = "",
+    starts: int = 1,
 ) -> None:
     """Fit sensors to recordings and print the errors."""
-    {"gelsight": gelsight, "eflesh": eflesh}[which](data, out, only)
+    {"gelsight": gelsight, "eflesh": eflesh, "dome": dome}[which](data, out, only, starts)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tgdsl import testing
+    from tgdsl.calibration.compare import compare as compare
     from tgdsl.calibration.fit import calibrate as calibrate
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import (
@@ -65,6 +66,7 @@ _PLACES = {
     "WarpSimulation": "runtime.warp",
     "bodies_by_name": "runtime.by_name",
     "calibrate": "calibration.fit",
+    "compare": "calibration.compare",
     "check_taxels": "module.taxels.identity",
     "compile": "tuning.compile",
     "connect": "runtime.connect",
@@ -98,6 +100,7 @@ __all__ = [
     "bodies_by_name",
     "calibrate",
     "check_taxels",
+    "compare",
     "compile",
     "connect",
     "contacts_by_pair",

@@ -191,22 +191,3 @@ def test_a_wrong_model_is_worse_on_what_was_held_out(path):
     assert fit.errors[0].error > 2 * fit.errors[0].floor
     better = tgdsl.calibrate(path, arrays, [*FIT, "touch.normal_damping=0:1e5"], starts=2)
     assert better.errors[0].error < 0.2 * fit.errors[0].error
-
-
-def covered(path, seeds, intervals="profile"):
-    """Return how often intervals hold the true value, over both parameters."""
-    hits = []
-    for seed in seeds:
-        fit = tgdsl.calibrate(path, recording(path, seed=seed, num=25), FIT, starts=1, intervals=intervals)
-        hits += [fit.parameters[name].low <= TRUE[f"sensors.{name}"] <= fit.parameters[name].high for name in FIT]
-    return np.mean(hits)
-
-
-def test_intervals_cover_the_truth(path):
-    """Of 12 sets: 24 intervals of 95 %, strongly correlated in pairs."""
-    assert covered(path, range(12)) >= 0.8
-
-
-@pytest.mark.slow
-def test_intervals_cover_the_truth_in_many_sets(path):
-    assert 0.90 <= covered(path, range(200)) <= 0.99

@@ -38,6 +38,35 @@ class TestKinematicTaxelInTheCone(KindConformance):
     test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
 
 
+class TestKinematicTaxelOfALattice(KindConformance):
+    kind = KINEMATIC_TAXEL
+    parameters = {"densification": 0.02, "loop": {"force": 0.3, "width": 0.001}}
+    test_compiled_equals_eager = None  # pointwise
+
+
+def test_a_loop_is_a_play_beside_the_law(tmp_path):
+    """With α = 1: f = (k + Q/r) d − (Q/r) p, p the play of width r by its own definition: p ← max(d − r, min(d + r, p))."""
+    k, force, width = 900.0, 0.4, 6e-4
+    sensor = {**kinematic.STILL, "normal_stiffness": k, "depth_exponent": 1, "loop": {"force": force, "width": width}}
+    touch, play = module(tmp_path, [(0.0, 0.0, 0.0)], BOX, kind="kinematic_taxel", **sensor), 0.0
+    for d in 1e-3 * (3 + 2.5 * np.sin(0.3 * np.arange(40)) + 0.4 * np.sin(1.1 * np.arange(40))):
+        play = max(d - width, min(d + width, play))
+        expected = (k + force / width) * d - force / width * play
+        found = -touch(state(touch, pos=[0, 0, 0.03 - d]))["s"][0, 0, 2].item()
+        assert found == pytest.approx(max(0.0, expected), rel=1e-9, abs=1e-12)
+    touch(state(touch, pos=[0, 0, 0.05]))
+    again = -touch(state(touch, pos=[0, 0, 0.03 - 1e-4]))["s"][0, 0, 2].item()
+    assert again == pytest.approx((k + force / width) * 1e-4, rel=1e-9)  # a contact that was lost begins at the origin
+
+
+def test_a_lattice_stiffens_as_its_cells_close():
+    """At half the depth of densification, the law's force twice; beyond it, finite."""
+    (force,) = read(sensor={**kinematic.STILL, "densification": 0.008})[2:]
+    assert force == pytest.approx(-2 * 500 * S, rel=1e-12)
+    (force,) = read(sensor={**kinematic.STILL, "densification": 0.002})[2:]
+    assert force == pytest.approx(-100 * 500 * S, rel=1e-9)
+
+
 def test_the_papers_model_has_the_papers_sign():
     readings = read(sensor={"model": "paper"}, linvel=[0.1, 0, 0], angvel=[0, 0, 3])
     np.testing.assert_allclose(readings[:3], [-0.2, 0, -500 * S], rtol=1e-12)

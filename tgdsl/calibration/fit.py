@@ -136,7 +136,7 @@ def calibrate(
 
     Args:
         document: A YAML file, or the same as a mapping. Its values are where the search starts.
-        recordings: `.npz` files, or their arrays; `tgdsl.calibration.recordings` describes the format.
+        recordings: `.npz` files, YAML documents of CSV files, or arrays; `tgdsl.calibration.recordings` describes the format.
         fit: Parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`. Without any, only
             nuisances are fitted: the document predicts the recordings.
         reading: Map of its own that each recording's reading may have: an `offset` of each channel (the camera moved); also a

@@ -31,6 +31,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.calibration.tables import read_tables
 from tgdsl.errors import Problem, SpecError, did_you_mean, listed
 from tgdsl.fields.units import UNITS
 from tgdsl.module.outputs import Output
@@ -127,7 +128,7 @@ def load_recording(
     """Read a recording for a module.
 
     Args:
-        source: A `.npz` file, or its arrays.
+        source: A `.npz` file, a YAML document of CSV files, or arrays.
         inputs: What the module reads.
         outputs: The module's readings, by name.
         name: What to call arrays.
@@ -146,6 +147,8 @@ def load_recording(
 def _arrays(source: str | Path | Arrays, name: str) -> dict[str, np.ndarray]:
     if isinstance(source, Mapping):
         return {key: np.asarray(value) for key, value in source.items()}
+    if Path(source).suffix in (".yaml", ".yml"):
+        return {key: np.asarray(value) for key, value in read_tables(source).items()}
     try:
         with np.load(source) as file:
             return dict(file)

@@ -13,6 +13,8 @@ the object's motion.
 
 Options, all off by default, applied in this order:
 
+    densification D     s_j = d_j^α/(1 − min(d_j/D, 0.99)) in place of d_j^α
+    loop Q, r           f_n,j ← max(0, f_n,j + Q e_j/r),  e_j ← clamp(e_j + Δd_j, −r, r), and 0 where d_j = 0
     balance solver      f_n,j ← λ_j W,  λ_j = q_j Q/(Q² + ε²),  q_j = max(0, f_n,j),  Q = Σ_j q_j,  W = Σ_c f_c · m_c
                         f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = λ_j Σ_c |f_c − (f_c · m_c) m_c|,  spin within ± l_j R_j
     friction_cone μ     f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = μ max(0, f_n,j), which replaces the l_j above
@@ -30,7 +32,15 @@ bounded as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. A negative (tens
 below which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. The
 force of contacts beyond `slots` is included, at the centre of the others. The law has no static friction; `force_taxel` has.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults.
+`densification` is for lattices and foams, which stiffen as their cells close: with α < 1 the force rises, levels off and rises
+again. `loop` is the loop of loading and unloading of filled rubbers and magnetic elastomers: r the depth over which the
+branches part, 2 Q their distance. It is an elastoplastic element (Prandtl's stop operator) beside the law, so that with α = 1
+the force is a Prandtl–Ishlinskii operator of the depth with one play of width r. It depends on the path of the depth, not on
+its rate.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults; the
+loop: Visintin, *Differential Models of Hysteresis* (1994), chapter III; densification: Gibson and Ashby, *Cellular Solids*
+(1997), chapter 5, here a hyperbola.
 
 Departures: the paper's tangential and spin terms have the opposite sign, −k_t v_t and −k_ω (ω · m) m, which is the force on
 the object while its normal force is the one on the sensor; `model: paper` keeps them. Velocities are of the material at
@@ -41,14 +51,14 @@ force follows depth, not load, unless balanced: its sum over a pad is not the we
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Generic, Literal
+from typing import Annotated, Generic, Literal, NamedTuple
 
 import numpy as np
 import torch
 from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 
-from tgdsl.fields.models import NonNegative, Positive, Usual
+from tgdsl.fields.models import NonNegative, Positive, PositiveLength, SpecModel, Usual
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
@@ -61,15 +71,27 @@ from tgdsl.sensors.base import (
     Context,
     Kind,
     Lowered,
+    Memory,
     ReferenceContext,
     ReferenceState,
-    State,
     SurfaceOf,
     components,
     scalar,
     vector,
 )
 from tgdsl.sensors.noise import FORCE
+
+CLOSED = 0.99
+"""Largest depth over `densification`, so that the force stays finite."""
+
+
+class LoopSpec(SpecModel):
+    """A loop of loading and unloading: Prandtl's elastoplastic element."""
+
+    force: Annotated[Positive, Usual("number", high=1e4)]
+    """Q, half the distance of the two branches [N]."""
+    width: Annotated[PositiveLength, Usual("length", high=0.1)]
+    """r, depth over which the element yields [m]."""
 
 
 class KinematicTaxelSpec(ContactProbeSpec):
@@ -91,6 +113,10 @@ class KinematicTaxelSpec(ContactProbeSpec):
     """k_ω, torque per angular velocity about the normal [N·m·s/rad]."""
     model: Literal["tgdsl", "paper"] = "tgdsl"
     """`paper` keeps the paper's signs of the tangential and the spin term."""
+    densification: Annotated[PositiveLength | None, Usual("length", high=1.0)] = None
+    """D, depth at which the cells of a lattice are closed [m]; default: never."""
+    loop: LoopSpec | None = None
+    """Loop of loading and unloading; default: none."""
     friction_cone: NonNegative | None = None
     """μ, largest tangential over normal force [1]; default: no limit, as in the paper."""
     torque_about: Literal["link", "taxel"] = "link"
@@ -118,14 +144,20 @@ class KinematicTaxelSpec(ContactProbeSpec):
 def reference(
     spec: KinematicTaxelSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return (f [N], τ [N·m]) of the outputs asked for, (taxel, 3) or (taxel, 6)."""
+    """Return (f [N], τ [N·m]) of the outputs asked for, (taxel, 3) or (taxel, 6), and the loop's state."""
     touch = gathered[ContactDepth]
     forces, torques, num = np.zeros_like(layout.pos), np.zeros_like(layout.pos), layout.num_taxels
     pressed, shear, spin = np.zeros(num), np.zeros_like(layout.pos), np.zeros(num)
+    stretch = np.zeros(num)
     for j, (d, m) in enumerate(zip(touch.depth, touch.normal, strict=True)):
         if d > 0:
             s, v = d**spec.depth_exponent, touch.velocity[j]
+            s /= 1.0 if spec.densification is None else 1.0 - min(d / spec.densification, CLOSED)
             pressed[j] = spec.normal_stiffness * s + spec.normal_damping * s * (v @ m)
+            if spec.loop is not None:
+                width = spec.loop.width
+                stretch[j] = np.clip(state["stretch"][j] + d - state["depth"][j], -width, width)
+                pressed[j] = max(0.0, pressed[j] + spec.loop.force * stretch[j] / width)
             shear[j] = spec.shear_sign * spec.shear_damping * (v - (v @ m) * m)
             spin[j] = spec.shear_sign * spec.spin_damping * (touch.angular[j] @ m)
     limit = np.full(num, np.inf)
@@ -142,7 +174,9 @@ def reference(
         if spec.torque_about == "link":
             torques[j] += np.cross(x, forces[j])
     parts = {"force": forces, "torque": torques}
-    return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
+    return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), (
+        {} if spec.loop is None else {"stretch": stretch, "depth": touch.depth}
+    )
 
 
 def reference_balance(pressed: np.ndarray, body_id: np.ndarray, contacts: ReferenceContacts) -> tuple[np.ndarray, np.ndarray]:
@@ -175,6 +209,17 @@ class KinematicTaxelConstants(Generic[Array]):
     """The same as an index (taxel,)."""
     patch: Array | None = None
     """Radius of each probe [m]."""
+    densification: Array | None = None
+    loop_stiffness: Array | None = None
+    """Q/r [N/m]."""
+    loop_width: Array | None = None
+
+
+class LoopState(NamedTuple):
+    """Stretch e of the loop's element and the last depth [m]; None without a loop."""
+
+    stretch: Tensor | None = None
+    depth: Tensor | None = None
 
 
 def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
@@ -194,28 +239,40 @@ def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
         member=member.astype(np.float64) if is_balanced else None,
         body=layout.body_id if is_balanced else None,
         patch=np.maximum(layout.radius, 0.0) if is_balanced and has_torque else None,
+        densification=None if spec.densification is None else scalar(spec.densification),
+        loop_stiffness=None if spec.loop is None else scalar(spec.loop.force / spec.loop.width),
+        loop_width=None if spec.loop is None else scalar(spec.loop.width),
     )
     motion = bool(spec.normal_damping or spec.shear_damping or (has_torque and spec.spin_damping))
     depth = ContactDepth(spec.objects, spec.is_gated, normal=True, motion=motion)
     requests = (depth, Contacts(spec.objects, slots=spec.slots)) if is_balanced else (depth,)
-    return Lowered(channels, constants, requests=requests)
+    state = {} if spec.loop is None else {name: Memory() for name in LoopState._fields}
+    return Lowered(channels, constants, state, requests)
 
 
 def forward(
-    gathered: Gathered, context: Context, constants: KinematicTaxelConstants[Tensor], state: State
-) -> tuple[dict[str, Tensor], State]:
-    """Return the force planes [N] and, if wanted, the torque planes [N·m].
+    gathered: Gathered, context: Context, constants: KinematicTaxelConstants[Tensor], state: LoopState
+) -> tuple[dict[str, Tensor], LoopState]:
+    """Return the force planes [N] and, if wanted, the torque planes [N·m], and the loop's state.
 
     Where nothing is touched, depth, normal and motion are all zero, and so is every term.
     """
     touch = gathered[ContactDepth]
     assert touch.normal is not None
-    stiffness = planes.power(touch.depth, constants.depth_exponent)
+    stiffness, after = planes.power(touch.depth, constants.depth_exponent), LoopState()
+    if constants.densification is not None:
+        stiffness = stiffness / (1.0 - (touch.depth / constants.densification).clamp(max=CLOSED))
     pressed, shear, limit = constants.normal_stiffness * stiffness, None, None
     if touch.velocity is not None:
         approach = planes.dot(touch.velocity, touch.normal)
         pressed = pressed + constants.normal_damping * stiffness * approach
         shear = planes.scale(constants.shear_damping, planes.sub(touch.velocity, planes.scale(approach, touch.normal)))
+    if constants.loop_stiffness is not None and constants.loop_width is not None:
+        assert state.stretch is not None and state.depth is not None
+        width = constants.loop_width
+        stretch = torch.minimum(torch.maximum(state.stretch + touch.depth - state.depth, -width), width)
+        stretch = torch.where(touch.depth > 0, stretch, touch.depth)
+        pressed, after = (pressed + constants.loop_stiffness * stretch).clamp(min=0), LoopState(stretch, touch.depth)
     if constants.member is not None and constants.body is not None:
         pressed, limit = _balanced(pressed, gathered[Contacts], constants.member, constants.body)
     if constants.friction_cone is not None:
@@ -234,7 +291,7 @@ def forward(
                 spin = torch.minimum(torch.maximum(spin, -largest), largest)
             torque = planes.add(torque, planes.scale(spin, touch.normal))
         readings |= components("torque", torque)
-    return readings, {}
+    return readings, after
 
 
 def unloaded() -> float:
@@ -262,5 +319,12 @@ def _balanced(pressed: Tensor, contacts: ContactPoints, member: Tensor, body: Te
 
 
 KINEMATIC_TAXEL = Kind(
-    KinematicTaxelSpec, lower, forward, reference, knobs=FORCE, is_pointwise=True, constants=KinematicTaxelConstants
+    KinematicTaxelSpec,
+    lower,
+    forward,
+    reference,
+    knobs=FORCE,
+    is_pointwise=True,
+    constants=KinematicTaxelConstants,
+    state=LoopState,
 )

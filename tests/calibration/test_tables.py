@@ -1,0 +1,82 @@
+"""Recordings in CSV files: columns, units, invalid numbers, and mistakes by line and column."""
+
+import numpy as np
+import pytest
+from recorded_presses import LAG, document, recording
+
+import tgdsl
+from tgdsl.calibration.recordings import load_recording
+from tgdsl.calibration.tables import read_tables
+from tgdsl.errors import SpecError
+
+TABLES = """\
+tgdsl: 1
+states:
+  file: states.csv
+  time: t
+  unit: mm
+  position: {ball: [x, y, z], pad: [px, py, pz]}
+targets:
+  touch:
+    file: touch.csv
+    time: 0
+    unit: N
+    channels: {force_z: [1, 2, 3]}
+    scale: -0.001
+    invalid: [-1]
+    clock_width: 200 ms
+    floor: 0.002
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The recording of `recorded_presses` in two files: positions in mm, forces in -mN, and two numbers that are none."""
+    arrays = recording(document(tmp_path))
+    ball, pad = (1e3 * arrays["body_pos"][:, i] for i in (0, 1))
+    rows = [",".join(f"{value:.9g}" for value in line) for line in np.column_stack([arrays["time"], ball, pad])]
+    (tmp_path / "states.csv").write_text("t,x,y,z,px,py,pz\n" + "\n".join(rows) + "\n")
+    force = -1e3 * arrays["target:touch"][:, :, 2]
+    force[3, 1], force[5, 0] = -1, np.nan
+    lines = np.column_stack([arrays["clock:touch"], force])
+    text = "\n".join(",".join("" if np.isnan(v) else f"{v:.9g}" for v in line) for line in lines)
+    (tmp_path / "touch.csv").write_text(text)
+    (tmp_path / "press.yaml").write_text(TABLES)
+    return tmp_path
+
+
+def test_a_recording_in_tables_is_the_recording(folder):
+    path = folder / "touch.yaml"
+    touch = tgdsl.compile(path, dtype="float64")
+    outputs = {output.name: output for output in touch.outputs}
+    found, arrays = load_recording(folder / "press.yaml", touch.inputs, outputs), recording(path)
+    assert found.fields["body_pos"] == pytest.approx(arrays["body_pos"], abs=1e-10)
+    (target,) = found.targets
+    weight = np.ones((60, 3))
+    weight[3, 1] = weight[5, 0] = 0
+    assert np.array_equal(target.weight[:, :, 0], weight)
+    assert target.value[:, :, 0] == pytest.approx(weight * arrays["target:touch"][:, :, 2], abs=1e-9)
+    assert target.clock_width == 0.2 and target.floor == 0.002 and target.channels == (2,)
+    fit = tgdsl.calibrate(path, folder / "press.yaml", ["touch.normal_stiffness", "touch.depth_exponent"], starts=2)
+    assert fit.parameters["touch.depth_exponent"].value == pytest.approx(1.3, abs=0.03)
+    assert fit.nuisances["press.yaml: clock of touch"] == pytest.approx(-LAG, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("press.yaml", "time: t", "time: tt", r'states\.csv:1:1: there is no column "tt"; did you mean "t"'),
+        ("press.yaml", "time: 0", "time: clock", r'touch\.csv:1:1: there is no column "clock"; number them from 0 to 3'),
+        ("press.yaml", "[1, 2, 3]", "[1, 2, 4]", r"touch\.csv:1:1: there is no column 4; there are 4, from 0"),
+        ("press.yaml", "unit: mm", "unit: furlong", r"press\.yaml:5:9: states\.unit"),
+        ("press.yaml", "file: touch.csv", "file: tuch.csv", r"tuch\.csv: cannot be read as CSV"),
+        ("states.csv", "0,0,0,34", "0,oops,0,34", r'states\.csv:2:2: column x: found "oops", expected a number'),
+        ("states.csv", "0,0,0,34", "0,0,0,", r"states\.csv:2:4: column z: this cell is empty"),
+    ],
+)
+def test_mistakes_are_said_by_line_and_column(folder, file, old, new, message):
+    text = (folder / file).read_text()
+    assert old in text
+    (folder / file).write_text(text.replace(old, new, 1))
+    with pytest.raises(SpecError, match=message):
+        read_tables(folder / "press.yaml")

@@ -1,0 +1,191 @@
+"""Recordings in CSV files, described by a YAML document.
+
+    tgdsl: 1
+    states:
+      file: states.csv
+      time: t                              # a column by its name in the first line, or by its number from 0
+      unit: mm
+      position: {ball: [x, y, z]}          # columns, or fixed numbers with a unit such as 0 m
+      orientation: {ball: [qw, qx, qy, qz]}    # default: that of the world
+    targets:
+      load:
+        file: scale.csv
+        time: 0
+        unit: N
+        channels: {force_z: 4}             # one column, or a list of one for each row of the reading
+        scale: -0.00981                    # from the column to the unit
+        invalid: [-1]                      # numbers that mean: none was read
+        clock_width: 0.5 s
+
+A body without a position stands at the world's origin. Empty cells, and those that are `invalid`, get the weight 0 in targets;
+in states they are errors. A file that starts with numbers has no names.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from tgdsl.errors import Problem, SpecError, did_you_mean, listed
+from tgdsl.fields.models import Quantity, SpecModel
+from tgdsl.fields.units import UNITS
+from tgdsl.schema.load import read_spec
+
+Column = int | str
+Three = tuple[Column, Column, Column]
+Four = tuple[Column, Column, Column, Column]
+
+
+class StatesSpec(SpecModel):
+    """Poses of bodies in a CSV file."""
+
+    file: str
+    """The file, relative to this one."""
+    time: Column
+    """Column of the clock [s]."""
+    unit: Literal["m", "mm", "cm", "um"]
+    """Unit of the positions."""
+    position: dict[str, Three]
+    """Columns of each body's position."""
+    orientation: dict[str, Four] = {}
+    """Columns of each body's quaternion, w first."""
+
+
+class TargetSpec(SpecModel):
+    """What a sensor read, in a CSV file."""
+
+    file: str
+    """The file, relative to this one."""
+    time: Column
+    """Column of the clock [s]."""
+    unit: str
+    """Unit of the numbers, once scaled."""
+    channels: Annotated[dict[str, Column | tuple[Column, ...]], Field(min_length=1)]
+    """Columns of each channel, one for each row of the reading."""
+    scale: float = 1.0
+    """Factor from the columns' numbers to the unit."""
+    invalid: tuple[float, ...] = ()
+    """Numbers that mean: none was read."""
+    clock_width: Annotated[float, Quantity("time", ge=0.0)] = 0.0
+    """Standard deviation of the clock's unknown offset from the states' [s]."""
+    floor: float = 0.0
+    """RMS noise, in the unit; 0: unknown."""
+
+
+class TablesSpec(SpecModel):
+    """A recording in CSV files."""
+
+    tgdsl: Literal[1]
+    """Version of the grammar."""
+    states: StatesSpec
+    """Poses of the bodies."""
+    targets: Annotated[dict[str, TargetSpec], Field(min_length=1)]
+    """What sensors read, by the reading's name."""
+
+
+@dataclass
+class _Table:
+    """A CSV file's numbers, and the mistakes in the columns that were read.
+
+    Attributes:
+        path: The file.
+        names: Names of the columns; empty if it has none.
+        lines: Its lines with the number of each, from 1.
+        problems: The mistakes.
+    """
+
+    path: Path
+    names: list[str] = field(default_factory=list)
+    lines: list[tuple[int, list[str]]] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        try:
+            with self.path.open(newline="", encoding="utf-8-sig") as file:
+                reader = csv.reader(file)
+                self.lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if line]
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            raise SpecError([Problem(str(self.path), 0, 0, "", f"cannot be read as CSV: {error}")]) from error
+        if self.lines and not all(_is_number(cell) for cell in self.lines[0][1] if cell):
+            self.names = self.lines.pop(0)[1]
+
+    def column(self, which: Column, invalid: Sequence[float] = (), may_lack: bool = False) -> Float[np.ndarray, " line"]:
+        """Return a column's numbers; NaN where there is none, which is a mistake unless it may lack."""
+        width = len(self.names) or (len(self.lines[0][1]) if self.lines else 0)
+        if isinstance(which, str) and which not in self.names:
+            hint = did_you_mean(which, self.names, "columns") if self.names else f"number them from 0 to {width - 1}"
+            self.problems.append(Problem(str(self.path), 1, 1, "", f'there is no column "{which}"', hint))
+            return np.zeros(len(self.lines))
+        place = self.names.index(which) if isinstance(which, str) else which
+        if not 0 <= place < width:
+            self.problems.append(Problem(str(self.path), 1, 1, "", f"there is no column {place}", f"there are {width}, from 0"))
+            return np.zeros(len(self.lines))
+        result = np.full(len(self.lines), np.nan)
+        for i, (line, cells) in enumerate(self.lines):
+            cell = cells[place] if place < len(cells) else ""
+            value = float(cell) if _is_number(cell) else np.nan
+            is_none = not cell or not np.isfinite(value) or value in invalid
+            if (cell and not _is_number(cell)) or (is_none and not may_lack):
+                what = f"column {which}: " + (f'found "{cell}", expected a number' if cell else "this cell is empty")
+                self.problems.append(Problem(str(self.path), line, place + 1, "", what))
+                break  # of each column the first
+            result[i] = np.nan if is_none else value
+        return result
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def read_tables(path: str | Path) -> dict[str, Any]:
+    """Return the recording that a YAML document and its CSV files hold, with the keys of an `.npz` recording.
+
+    Raises:
+        SpecError: All mistakes in the document, or in the files, by line and column.
+    """
+    path = Path(path)
+    spec, _ = read_spec(path, TablesSpec, ("tgdsl", "states", "targets"))
+    names = dict.fromkeys([spec.states.file, *(target.file for target in spec.targets.values())])
+    tables = {name: _Table(path.parent / name) for name in names}
+    result = _states(spec.states, tables[spec.states.file])
+    for name, target in spec.targets.items():
+        table = tables[target.file]
+        columns = [(c,) if isinstance(c, (int, str)) else c for c in target.channels.values()]
+        if len({len(each) for each in columns}) > 1:
+            counts = listed([f"{channel}: {len(each)}" for channel, each in zip(target.channels, columns, strict=True)])
+            raise SpecError(
+                [Problem(str(path), 0, 0, f"targets.{name}.channels", f"expected as many columns each, found {counts}")]
+            )
+        numbers = [[table.column(c, target.invalid, may_lack=True) for c in each] for each in columns]
+        value = target.scale * np.stack([np.stack(each, axis=-1) for each in numbers], axis=-1)
+        result |= {
+            f"target:{name}": value, f"weight:{name}": np.isfinite(value).astype(np.float64),
+            f"clock:{name}": table.column(target.time), f"clock_width:{name}": target.clock_width,
+            f"channels:{name}": list(target.channels), f"unit:{name}": target.unit, f"floor:{name}": target.floor,
+        }  # fmt: skip
+    if problems := [problem for table in tables.values() for problem in table.problems]:
+        raise SpecError(problems)
+    return result
+
+
+def _states(spec: StatesSpec, table: _Table) -> dict[str, Any]:
+    bodies, factor = list(spec.position), UNITS["length"][spec.unit]
+    pos = np.stack([np.stack([factor * table.column(c) for c in spec.position[body]], axis=-1) for body in bodies], axis=1)
+    quat = np.zeros((*pos.shape[:2], 4))
+    quat[..., 0] = 1.0
+    for body, columns in spec.orientation.items():
+        if body not in bodies:
+            raise SpecError([Problem(str(table.path), 0, 0, "", f'"{body}" has an orientation, but no position')])
+        quat[:, bodies.index(body)] = np.stack([table.column(c) for c in columns], axis=-1)
+    return {"time": table.column(spec.time), "body_pos": pos, "body_quat": quat, "bodies": bodies}
