@@ -117,7 +117,7 @@ def is_followed() -> bool:
 
 
 def is_exporting() -> bool:
-    """Return whether torch.export traces this code: torch.compile of torch 2.11 takes `torch.compiler.is_exporting` for true."""
+    """Return whether torch.export traces: to torch.compile of torch 2.11 `torch.compiler.is_exporting` is always true."""
     return torch.compiler._is_exporting_flag
 
 
