@@ -124,7 +124,6 @@ def _loudest(modes: Modes, is_heard: np.ndarray, count: int | None) -> np.ndarra
 
 
 def _told(shapes: ModeShapes) -> str:
-    """Return what an account says of mode shapes."""
     num = " × ".join(str(count) for count in shapes.num.tolist())
     return f"mode shapes on {num} nodes; interpolated within {shapes.error.max():.1%} of a mode's mean on the surface"
 
