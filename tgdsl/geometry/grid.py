@@ -75,7 +75,6 @@ METHODS = {"trilinear": trilinear, "tricubic": tricubic}
 
 
 def _linear_weights(t: Tensor) -> Nodes:
-    """Return weight and its derivative for nodes 0 and 1, at 0 ≤ t ≤ 1 between them."""
     one = torch.ones_like(t)
     return (1 - t, -one), (t, one)
 

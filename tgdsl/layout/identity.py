@@ -97,7 +97,6 @@ def check_same_rows(here: Columns, there: Columns, what: str) -> None:
 
 
 def _same_rows(here: Columns, there: Columns, num: int) -> Bool[np.ndarray, " row"]:
-    """Return which of the first rows are the same."""
     shared = [name for name in COMPARED if name in here and name in there]
     return np.logical_and.reduce([_same(name, here[name][:num], there[name][:num]) for name in shared])
 
@@ -112,7 +111,6 @@ def _same(name: str, here: Shaped[np.ndarray, "row ..."], there: Shaped[np.ndarr
 
 
 def _places(table: Columns) -> list[tuple[Any, ...]]:
-    """Return links and positions to a tenth of a millimetre, sorted: nearly always alike for the same taxels in any order."""
     rounded = np.round(np.asarray(table["pos"], dtype=np.float64), 4)
     return sorted((str(link), *pos) for link, pos in zip(table["link"], rounded.tolist(), strict=True))
 

@@ -80,7 +80,6 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progr
 
 
 def _shapes(shape: Spectrum, size: float, middle: np.ndarray) -> ModeShapes:
-    """Return mode shapes in metres of the body's frame."""
     low = shape.grid.low * size + shape.axes @ middle
     return ModeShapes(shape.axes, low, shape.grid.step * size, shape.grid.num, shape.grid.value, shape.owner, shape.grid.error)
 

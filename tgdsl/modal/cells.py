@@ -82,7 +82,6 @@ def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lagrange() -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients, ascending, of the polynomials that are 1 at one Gauss point, and of their integrals from 0."""
     powers = np.vander(gauss(POINTS)[0], increasing=True)
     basis = np.linalg.inv(powers)  # column i: coefficients of the i-th polynomial
     return basis, np.concatenate([np.zeros((1, POINTS)), basis / np.arange(1, POINTS + 1)[:, None]])

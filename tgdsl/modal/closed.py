@@ -103,7 +103,6 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _directed(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the undirected edges, which of them each side of a face runs along, and in which sense."""
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges, which = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
     return edges, which.reshape(-1), np.where(sides[:, 0] < sides[:, 1], 1, -1)

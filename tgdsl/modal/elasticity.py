@@ -33,7 +33,6 @@ NODES = 27
 
 
 def _shape_functions(pos: Float[np.ndarray, "point 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (node, point) and gradients (node, axis, point) of a cell's shape functions at points of [0, 1]³."""
     results = [_ELEMENT.lbasis(pos.T, node) for node in range(NODES)]
     return np.stack([value for value, _ in results]), np.stack([gradient for _, gradient in results])
 

@@ -353,7 +353,6 @@ def _errors(
 
 
 def _halves(*both: np.ndarray) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """Return the parts of S0 and the parts of S1."""
     return tuple(part[:, :1] for part in both), tuple(part[:, 1:4] for part in both)
 
 

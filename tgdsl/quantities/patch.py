@@ -210,7 +210,6 @@ def _sorted(points: list[Point]) -> list[Point]:
 
 
 def _angle(x: Tensor, y: Tensor) -> Tensor:
-    """Return a number from 0 to 4 that grows with a point's angle."""
     size = x.abs() + y.abs()
     along = x / torch.where(size > 0, size, 1.0)
     return torch.where(y >= 0, 1.0 - along, 3.0 + along)

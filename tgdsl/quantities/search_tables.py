@@ -103,7 +103,6 @@ def geom_tables(objects: Sequence[Geoms]) -> tuple[Tensor, Tensor]:
 
 
 def _filled(like: Tensor, values: Sequence[float]) -> Float[Tensor, "1 value"]:
-    """Return numbers as a tensor, without a copy from the host."""
     runs = [(value, len(list(run))) for value, run in groupby(values)]
     return torch.cat([like.new_full((1, count), value) for value, count in runs], dim=1)
 

@@ -147,7 +147,6 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
 
 
 def _places(spec: ContactAudioSpec, layout: Layout) -> Places:
-    """Return the request for where the sound comes from."""
     if spec.of == "object":
         return Places(spec.feels)
     return Places(bodies=layout.bodies, offset=np.zeros((len(layout.bodies), 3)))

@@ -139,7 +139,6 @@ def _rounded(name: str, exact: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _by_parts(name: str, turn: Float[np.ndarray, "2 row mode"]) -> Float[np.ndarray, "2 row both"]:
-    """Return what Re z′ and Im z′ have of their own part of z, Re p twice, and of the other part, −Im p and Im p."""
     real, imag = turn
     sign = 1.0 if name.endswith("share") else -1.0
     return np.stack([np.concatenate([real, real], axis=-1), np.concatenate([sign * imag, imag], axis=-1)])

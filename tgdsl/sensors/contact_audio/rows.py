@@ -18,9 +18,9 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, listed
 from tgdsl.layout.layout import Layout
 from tgdsl.modal.modes import Modes, ModeShapes
+from tgdsl.modal.spec import ShapeModes
 from tgdsl.sensors.base import Axis, body_axis
 from tgdsl.sensors.contact_audio.bands import band_numbers
-from tgdsl.sensors.contact_audio.given_modes import modes_of
 from tgdsl.sensors.contact_audio.operators import HIGHEST, highest
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec, ModesField
 from tgdsl.surfaces.surface import Surface
@@ -85,7 +85,7 @@ def ringing(
             raise LowerError(problem, field="bodies", hint=f"it has {listed([name for name, _ in rows])}")
     below, each, notes = highest(spec.samples, step), [], []
     for name, names in rows:
-        modes = modes_of(_given(spec, names), name, lambda own=name: surface(own), below, progress)
+        modes = _modes_of(_given(spec, names), name, lambda own=name: surface(own), below, progress)
         is_heard = modes.frequency <= below * (1 + 1e-12)
         if not is_heard.any():
             raise _unheard(name, modes, spec, step)
@@ -124,7 +124,6 @@ def _loudest(modes: Modes, is_heard: np.ndarray, count: int | None) -> np.ndarra
 
 
 def _told(shapes: ModeShapes) -> str:
-    """Return what an account says of mode shapes."""
     num = " × ".join(str(count) for count in shapes.num.tolist())
     return f"mode shapes on {num} nodes; interpolated within {shapes.error.max():.1%} of a mode's mean on the surface"
 
@@ -147,3 +146,28 @@ def _unheard(name: str, modes: Modes, spec: ContactAudioSpec, step: float) -> Lo
     problem = f'the lowest mode of "{name}" is at {lowest:.5g} Hz, and {spec.samples} samples of a step of {step:g} s hold '
     needed = math.ceil(lowest * step / HIGHEST * (1 - 1e-12))
     return LowerError(f"{problem}{highest(spec.samples, step):.5g} Hz", "samples", f"it needs `samples: {needed}`")
+
+
+def _modes_of(given: ModesField, name: str, surface: Callable[[], Surface], below: float, progress: Progress = silent) -> Modes:
+    """Return the modes of a body.
+
+    Args:
+        given: What the document says of them.
+        name: What the body is called in messages.
+        surface: Returns its surface in its frame; called where its shape is wanted.
+        below: Frequency beyond which a mode is not heard [Hz]. Those that are listed are returned all the same.
+        progress: Called with a line of text for each long job.
+
+    Raises:
+        LowerError: If its shape gives none.
+    """
+    if isinstance(given, ShapeModes):
+        from tgdsl.modal.analysis import analysed
+
+        return analysed(name, surface(), given, below, progress)
+    ordered = sorted(given, key=lambda mode: mode.frequency)
+    return Modes(
+        frequency=np.array([mode.frequency for mode in ordered]),
+        decay=np.array([mode.decay for mode in ordered]),
+        gain=np.array([mode.gain for mode in ordered]),
+    )

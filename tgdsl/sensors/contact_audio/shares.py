@@ -92,6 +92,5 @@ def shares(center: Vec, along: Vec, constants: Constants) -> Float[Tensor, "env 
 
 
 def _of_modes(fields: Tensor, owner: Tensor) -> Tensor:
-    """Return the shares of modes: their field with its sign, or of several the root of the sum of their squares."""
     own = fields[..., None] * owner
     return torch.where(owner.sum(dim=-2) > 1, planes.safe_sqrt((own * own).sum(dim=-2)), own.sum(dim=-2))

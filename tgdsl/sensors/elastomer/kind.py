@@ -174,7 +174,6 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
 
 
 def _flat_links(layout: Layout) -> list[int]:
-    """Return the first taxel of each link all of whose taxels have the same normal."""
     starts = np.flatnonzero(np.diff(layout.link_id, prepend=-1)).tolist()
     ends = [*starts[1:], layout.num_taxels]
     return [first for first, end in zip(starts, ends, strict=True) if (layout.normal[first:end] == layout.normal[first]).all()]

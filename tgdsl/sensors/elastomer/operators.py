@@ -204,7 +204,6 @@ def _joined(planes: list[Tensor]) -> Tensor:
 
 
 def _padded(num: int) -> int:
-    """Return an even length that FFTs like and that holds all offsets of a row of cells."""
     from scipy.fft import next_fast_len
 
     return 2 * (next_fast_len(num, real=True) or num)

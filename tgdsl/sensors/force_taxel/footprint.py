@@ -255,7 +255,6 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def _times(matrix: list[Tensor], right: Vec) -> Vec:
-    """Return A b: planes, A symmetric, its upper triangle row by row."""
     xx, xy, xz, yy, yz, zz = matrix
     return planes.dot((xx, xy, xz), right), planes.dot((xy, yy, yz), right), planes.dot((xz, yz, zz), right)
 

@@ -81,7 +81,6 @@ class Crosstalk(Stage):
 
 
 def _product(signal: Signal, kernels: Sequence[Tensor]) -> Signal:
-    """Return the signal with each link's rows multiplied by its kernel, (from, to)."""
     lines = signal.flatten(0, 1)  # of all environments and channels: one product, not one for each environment
     return LINK_PRODUCTS(lines, [kernel[:, None] for kernel in kernels])[0].view(signal.shape)
 

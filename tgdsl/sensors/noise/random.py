@@ -109,7 +109,6 @@ def uniform(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> Tensor:
 
 
 def _share(word: Int[Tensor, "*row taxel"], num_bits: int, dtype: torch.dtype) -> Tensor:
-    """Return the middle of one of 2ⁿ equal parts of 0 to 1, by a word's first n bits."""
     return ((word >> (32 - num_bits)) & (2**num_bits - 1)).to(dtype) * 2.0**-num_bits + 2.0 ** -(num_bits + 1)
 
 

@@ -169,7 +169,6 @@ def noise_model(more: tuple[type[SpecModel], ...]) -> type[NoiseSpec]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a knob's value without the zeros of mappings."""
     if isinstance(value, Mapping):
         return {name: part for name, part in value.items() if part != ZERO}
     return tuple(_plain(part) for part in value) if isinstance(value, tuple) else value

@@ -77,7 +77,6 @@ def advanced(patches: ContactPatch, context: Context, constants: Constants, stat
 
 
 def _with_objects(cells: Tensor, objects: Tensor, rows: Rows) -> Tensor:
-    """Return the cells of links and of objects as one batch (env, row, x, y, z)."""
     size = num_cells(rows)
     x, y, z = size
     return torch.cat([padded(cells, size), padded(objects[..., :x, :y, :z], size)], dim=1)

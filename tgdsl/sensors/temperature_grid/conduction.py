@@ -137,7 +137,6 @@ class _Two(NamedTuple):
 
 
 def _square(found: Response) -> Float[Tensor, "env row both both"]:
-    """Return matrices of four parts (env, row, side, side) as one, H and means first."""
     upper, lower = torch.cat([found[0], found[1]], dim=-1), torch.cat([found[2], found[3]], dim=-1)
     return torch.cat([upper, lower], dim=-2)
 
@@ -257,12 +256,10 @@ def _positive(values: Tensor) -> Tensor:
 
 
 def _at_nodes(sides: Sides, values: Float[Tensor, "env row side"]) -> Float[Tensor, "env node"]:
-    """Return the sums over the sides at each node."""
     if sides.is_plain:
         return values.sum(dim=1)
     return torch.nn.functional.pad(values.flatten(1), (0, 1))[:, sides.tables["at_node"]].sum(dim=-1)
 
 
 def _of_nodes(sides: Sides, values: Float[Tensor, "env node"]) -> Float[Tensor, "env row side"]:
-    """Return what the node of each side has."""
     return values[:, None] if sides.is_plain else values[:, sides.tables["node"]]

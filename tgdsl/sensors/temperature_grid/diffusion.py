@@ -180,7 +180,6 @@ def from_modes(parts: Cells, modes: tuple[Modes, ...]) -> Spread:
 
 
 def _there(modes: tuple[Modes, ...]) -> Tensor:
-    """Return 1 for the cells that a row has (row, x, y, z)."""
     return outer([(own.vectors[:, 0] > 0).to(own.vectors.dtype) for own in modes], torch.mul)
 
 

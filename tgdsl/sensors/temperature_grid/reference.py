@@ -378,7 +378,6 @@ def _touch(
 
 
 def _responses(phi: list[Any], sigma: float) -> list[Any]:
-    """Return what H and J show in the mean and at the end: the equation of `response`."""
     of_heat = lambda a, b, c: ((1 - sigma) * a + 6 * sigma * (b - c)) / (1 + 2 * sigma)  # noqa: E731
     of_rate = lambda a, b, c: ((sigma - 1) * a + (1 - 4 * sigma) * b + 6 * sigma * c) / (1 + 2 * sigma)  # noqa: E731
     return [of_heat(*phi[1:]), of_rate(*phi[1:]), of_heat(*phi[:3]), of_rate(*phi[:3])]

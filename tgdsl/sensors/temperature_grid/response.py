@@ -131,7 +131,6 @@ def of_sides(
 
 
 def _between(parts: Tensor, factor: Tensor) -> Tensor:
-    """Return Σ over cells or modes of parts of two sides times a factor (env, row, side, side)."""
     return ((parts * factor[:, :, None])[:, :, :, None] * parts[:, :, None]).sum(dim=(-3, -2, -1))
 
 

@@ -128,7 +128,6 @@ def padded(cells: Tensor, num_cells: tuple[int, int, int]) -> Tensor:
 
 
 def _beside(links: Tensor, objects: Tensor) -> Tensor:
-    """Return values of links (1, link) and of objects (env, object) as (env, row)."""
     return torch.cat([links.expand(len(objects), -1), objects], dim=1)
 
 

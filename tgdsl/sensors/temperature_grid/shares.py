@@ -130,7 +130,6 @@ def _along(centre: Tensor, half: Tensor, length: Tensor, num_cells: int) -> Axis
 
 
 def _inside(point: Tensor, top: Tensor) -> Tensor:
-    """Return the nearest point between the centres of the first and the last cell."""
     return torch.minimum(point.clamp(min=0.5), top)
 
 

@@ -157,7 +157,6 @@ def _surfaces(
 
 
 def _of_nodes(patches: ContactPatch, of_objects: Tensor) -> Tensor:
-    """Return what objects (env, object) have, of those of one temperature."""
     where = patches.topology
     return of_objects if where.is_plain else of_objects[:, list(where.lumped)]
 
@@ -178,7 +177,6 @@ def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> dif
 
 
 def _exponents(rows: Rows, dt: Tensor) -> Tensor:
-    """Return what modes decay by in a step (env, row, x, y, z) [1]."""
     return diffusion.exponents(dt * torch.stack(rows.rates, dim=-1), rows.modes)
 
 

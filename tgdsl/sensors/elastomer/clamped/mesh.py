@@ -67,7 +67,6 @@ def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> MeshTri:
 
 
 def _sides(ends: Int[np.ndarray, "seg 2"]) -> Int[np.ndarray, " seg"]:
-    """Return one number for each pair of points, in whichever order."""
     return np.sort(ends, axis=1).astype(np.int64) @ [1 << 32, 1]
 
 
@@ -129,7 +128,6 @@ def _inside(points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]) 
 
 
 def _dense(points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]) -> Float[np.ndarray, "more 2"]:
-    """Return points a quarter apart along the edge."""
     a, b = points[pieces[:, 0]], points[pieces[:, 1]]
     return np.concatenate([a + part * (b - a) for part in np.arange(4) / 4])
 
@@ -137,7 +135,6 @@ def _dense(points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]) -
 def _is_within(
     where: Float[np.ndarray, "q 2"], points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return which points are inside the edge."""
     return np.abs(igl.winding_number(points, pieces, where)) > 0.5
 
 

@@ -133,7 +133,6 @@ def _located(
 
 
 def _axes(jacobian: Float[np.ndarray, "q 3 2"], normal: Float[np.ndarray, "q 3"]) -> Float[np.ndarray, "q 2 3"]:
-    """Return the orthonormal tangents nearest to the directions of the plane's axes, perpendicular to the normals."""
     tangent = jacobian - normal[:, :, None] * np.einsum("qx,qxu->qu", normal, jacobian)[:, None, :]
     left, _, right = np.linalg.svd(tangent, full_matrices=False)
     return np.swapaxes(left @ right, 1, 2)

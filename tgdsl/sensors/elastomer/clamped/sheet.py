@@ -51,7 +51,6 @@ def half_edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, " h"], In
 
 
 def _edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, " h"], Int[np.ndarray, " e"]]:
-    """Return the number of the undirected edge that each side runs along, and how many sides each edge has."""
     ends = np.sort(np.stack(half_edges(faces), axis=1), axis=1)
     _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
     return edge.ravel(), count
