@@ -41,7 +41,7 @@ class Planner:
     def __init__(self, env: TouchEnv, row: int):
         """Begin with a plan to rest; `row` is which of the environments is planned for."""
         setup, self.row = env.task.setup, row
-        self.env, self.scale, self.actuators = env, env.spec.action.scale, setup.actuators
+        self.env, self.scale, self.actuators = env, env.actuation.scale.numpy(), setup.actuators
         self.item = env.sim.model.body(setup.object).id
         self.tips = sorted({env.sim.model.body(body).id for body in env.touch.rows["gap"]["body"].tolist()})
         self.random, self.plan = np.random.default_rng(row), np.zeros((KNOTS, env.num_actions))

@@ -190,7 +190,7 @@ class FindRidge(Task[FindRidgeSpec]):
         passed = torch.where(balance < -0.6, 0.5, -0.5)
         bend = torch.where(is_on_plate, passed, (-0.1 * balance).clamp(-0.5, 0.5))
         bend = torch.where(depth.amax(dim=(1, 2)) > 0.0, bend, 0.0)
-        press = ((0.225 - target[:, 1]) / self.spec.action.scale).clamp(-1.0, 1.0)
+        press = ((0.225 - target[:, 1]) / float(self.spec.action.scale)).clamp(-1.0, 1.0)
         return torch.stack([bend, press, torch.zeros_like(bend)], dim=1)
 
     def _motion(self, now: Now) -> Float[Tensor, "env 3"]:

@@ -34,4 +34,4 @@ def gait(env: TouchEnv, obs: Mapping[str, Tensor]) -> Tensor:
     time = (env.steps * env.control_step).to(start)[:, None]
     phase = 2.0 * math.pi * FREQUENCY * time
     wanted = middle + sine * phase.sin() + cosine * phase.cos()
-    return (time / BEGIN).clamp(max=1.0) * (wanted - start) / env.spec.action.scale
+    return (time / BEGIN).clamp(max=1.0) * (wanted - start) / env.actuation.scale

@@ -234,7 +234,7 @@ class Actuation:
         scale = 0.5 * (actuators.high - actuators.low)
         if not isinstance(action.scale, str):
             scale = np.where(actuators.is_slide, action.slide_scale, action.scale)
-        self._scale = torch.from_numpy(scale).to(device, dtype)
+        self.scale = torch.from_numpy(scale).to(device, dtype)
         values = [f.name for f in fields(actuators) if f.name not in ("names", "is_slide", *self._index)]
         self._values = {name: torch.from_numpy(getattr(actuators, name)).to(device, dtype) for name in values}
         ideal = DriveSpec()
@@ -295,7 +295,7 @@ class Actuation:
             command = low + 0.5 * (action + 1.0) * (high - low)
         else:
             origin = self.start if self.action.mode == "offset" else self.target
-            command = torch.minimum(torch.maximum(origin + self._scale * action, low), high)
+            command = torch.minimum(torch.maximum(origin + self.scale * action, low), high)
         command = torch.lerp(command, self.target, self.action.smoothing)
         return torch.where(action.isfinite(), command, self.target)
 

@@ -20,7 +20,7 @@ from tgdsl.module.outputs import Output
 from tgdsl.module.taxels.identity import Columns
 from tgdsl.rl.datasets.episode import EPS, Episode, LinkTaxels, Source
 from tgdsl.rl.deploying.deploy import Deployment
-from tgdsl.rl.deploying.prepared import EMULATED
+from tgdsl.rl.deploying.hand import EMULATED
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, rollout
 from tgdsl.rl.sensed import GROUP
