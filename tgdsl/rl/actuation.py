@@ -202,6 +202,7 @@ class Actuation:
         start: Those that episodes began with [rad].
         torque: What each drive exerted in the last physics step [N·m].
         drawn: What was drawn for each drive, by the names of `DriveSpec`.
+        scale: What an action of 1 is for each joint [rad, m].
     """
 
     target: Float[Tensor, "env joint"]
