@@ -159,7 +159,7 @@ def test_a_picture_that_grows_too_large(base):
 )
 def test_a_wrong_path_is_found_before_the_work(base, here, monkeypatch, arguments, message):
     (base / "made" / "picture.png").mkdir(parents=True)
-    monkeypatch.setattr("tgdsl.compiler.pipeline.compile_plan", None)  # nothing is compiled, let alone stepped
+    monkeypatch.setattr("tgdsl.compiler.pipeline.compile_document", None)  # nothing is compiled, let alone stepped
     before = sorted(base.rglob("*"))
     code, _, error = here(base, *arguments)
     assert (code, error) == (2, f"tgdsl: {message.format(base=base)}\n")

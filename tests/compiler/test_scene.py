@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.compiler.scene import instrument, scene_file
 from tgdsl.errors import ArtifactError, RobotError
 from tgdsl.formats.robot import load_model
@@ -327,12 +327,12 @@ def test_an_artefact_does_not_depend_on_the_current_folder(tmp_path, monkeypatch
     included(project)
     (project / "hand.yaml").write_text(DOCUMENT)
     monkeypatch.chdir(tmp_path)
-    save_plan(compile_plan("project/hand.yaml"), "one.safetensors")
+    save_plan(compile_document("project/hand.yaml").plan, "one.safetensors")
     monkeypatch.chdir(project)
-    save_plan(compile_plan("hand.yaml"), "two.safetensors")
+    save_plan(compile_document("hand.yaml").plan, "two.safetensors")
     (project / "deep").mkdir()
     monkeypatch.chdir(project / "deep")
-    save_plan(compile_plan("../hand.yaml"), "three.safetensors")
+    save_plan(compile_document("../hand.yaml").plan, "three.safetensors")
     contents = [
         path.read_bytes()
         for path in (tmp_path / "one.safetensors", project / "two.safetensors", project / "deep" / "three.safetensors")
@@ -362,7 +362,7 @@ def test_urdf_scenes(tmp_path, monkeypatch):
 
 
 def test_the_palm_scene_is_found_by_name_in_another_checkout(tmp_path, monkeypatch):
-    plan = compile_plan(ROBOTS.parent / "examples" / "xhand1_palm.yaml")
+    plan = compile_document(ROBOTS.parent / "examples" / "xhand1_palm.yaml").plan
     assert plan.scene.assets
     assert all(asset.path.startswith("robots:xhand1/") for asset in plan.scene.assets)
     shutil.copytree(ROBOTS, tmp_path / "robots")

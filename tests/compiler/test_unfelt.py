@@ -8,7 +8,7 @@ import pytest
 from covered_hands import hand
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan, placed
+from tgdsl.compiler.pipeline import compile_document, placed
 from tgdsl.errors import UnfeltWarning
 
 POINTS = {
@@ -42,7 +42,7 @@ def told(made: dict) -> tuple[list[str], list[str]]:
     """Return what compiling warns of, and what the plan keeps."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        plan = compile_plan(made)
+        plan = compile_document(made).plan
     assert all(issubclass(warning.category, UnfeltWarning) for warning in caught)
     return [str(warning.message) for warning in caught], [str(own) for own in plan.unfelt]
 
@@ -116,7 +116,7 @@ def test_the_account_and_the_artefact_say_the_same(tmp_path):
 def test_taxels_stay_where_they_are(tmp_path):
     """What cannot feel is told, not moved."""
     with pytest.warns(UnfeltWarning):
-        plan = compile_plan(document(tmp_path, {"a": DEPTH}))
+        plan = compile_document(document(tmp_path, {"a": DEPTH})).plan
     assert plan.layout.pos.tolist() == [pos for own in POINTS.values() for pos in own]
 
 

@@ -9,7 +9,7 @@ import trimesh
 from torch._dynamo.utils import counters
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.compiler.variants import aligned
 from tgdsl.errors import SimulationError, SpecError, StateError
 from tgdsl.module.module import TactileModule
@@ -140,7 +140,7 @@ def test_variants_and_sizes_against_the_reference(tmp_path, size):
     variants = ODD if size == "fixed" else [BOXES[0], CYLINDERS[0], {"type": "ellipsoid", "size": [0.01, 0.02, 0.03]}]
     sensors = {"s": {"kind": "kinematic_taxel", "gate": "geometric"}}
     doc = document(tmp_path, "<geom size='.01'/>", sensors, variants=variants, size=size)
-    touch = TactileModule(compile_plan(doc), dtype=torch.float64)
+    touch = TactileModule(compile_document(doc).plan, dtype=torch.float64)
     assert ("object_size" in touch.inputs.fields) == (size == "per_env")
     kind = next(kind for kind in KINDS if kind.name == "kinematic_taxel")
     reference = ReferenceModule(touch.plan, kind, kind.spec.model_validate({**doc["sensors"]["s"]}))
@@ -322,7 +322,7 @@ def test_places_are_shared_in_order():
 
 
 def test_the_same_document_is_the_same_plan(tmp_path):
-    first, second = (compile_plan(document(tmp_path, "<geom size='.01'/>", variants=ODD)) for _ in range(2))
+    first, second = (compile_document(document(tmp_path, "<geom size='.01'/>", variants=ODD)).plan for _ in range(2))
     assert first.to_json() == second.to_json() and json.loads(first.to_json())["scene"]["objects"][0]["name"] == "item"
 
 

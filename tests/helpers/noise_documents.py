@@ -2,7 +2,7 @@
 
 import pytest
 
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.errors import SpecError
 from tgdsl.sensors import KINDS
 
@@ -52,7 +52,7 @@ def document(folder, kind: str, noise, profiles=None, observations=(), **sensor)
 
 def planned(folder, *arguments, **keys):
     """Return the stages in the plan, and the values of their knobs."""
-    plan = compile_plan(document(folder, *arguments, **keys))
+    plan = compile_document(document(folder, *arguments, **keys)).plan
     (sensor,) = (own for own in plan.sensors if own.name == "s")
     if sensor.noise is None:
         return (), {}
@@ -61,5 +61,5 @@ def planned(folder, *arguments, **keys):
 
 def mistakes(folder, *arguments, **keys) -> list[str]:
     with pytest.raises(SpecError) as caught:
-        compile_plan(document(folder, *arguments, **keys))
+        compile_document(document(folder, *arguments, **keys))
     return [f"{problem.path}: {problem.what}" for problem in caught.value.problems]

@@ -13,7 +13,7 @@ import torch
 from safetensors.numpy import load, save
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.plan import tree
@@ -57,7 +57,7 @@ def document(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def artifact(document):
-    save_plan(compile_plan(document), document.parent / "hand.safetensors")
+    save_plan(compile_document(document).plan, document.parent / "hand.safetensors")
     return document.parent / "hand.safetensors"
 
 
@@ -66,17 +66,17 @@ def test_an_artefact_says_what_it_was_made_from(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE.replace("<worldbody>", '<include file="more.xml"/><worldbody>', 1))
     (tmp_path / "more.xml").write_text("<mujocoinclude><option timestep='0.002'/></mujocoinclude>")
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
-    origin = compile_plan(tmp_path / "hand.yaml").origin
+    origin = compile_document(tmp_path / "hand.yaml").plan.origin
     content = (tmp_path / "scene.xml").read_bytes() + (tmp_path / "more.xml").read_bytes()
     assert origin.robot_sha256 == hashlib.sha256(content).hexdigest()
     (tmp_path / "hand.yaml").write_text("# a remark\n" + DOCUMENT)
-    assert compile_plan(tmp_path / "hand.yaml").origin.document_sha256 == origin.document_sha256
+    assert compile_document(tmp_path / "hand.yaml").plan.origin.document_sha256 == origin.document_sha256
     (tmp_path / "hand.yaml").write_text(DOCUMENT.replace("1 mm", "1.1 mm"))
-    assert compile_plan(tmp_path / "hand.yaml").origin.document_sha256 != origin.document_sha256
+    assert compile_document(tmp_path / "hand.yaml").plan.origin.document_sha256 != origin.document_sha256
 
 
 def test_the_same_bytes_twice(document, artifact, tmp_path):
-    size = save_plan(compile_plan(document), tmp_path / "again.safetensors")
+    size = save_plan(compile_document(document).plan, tmp_path / "again.safetensors")
     content = artifact.read_bytes()
     assert (tmp_path / "again.safetensors").read_bytes() == content
     assert size == len(content)
@@ -84,7 +84,7 @@ def test_the_same_bytes_twice(document, artifact, tmp_path):
 
 @pytest.mark.slow
 def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
-    program = "import sys; from tgdsl.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_plan(sys.argv[1]), sys.argv[2])"
+    program = "import sys; from tgdsl.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_document(sys.argv[1]).plan, sys.argv[2])"
     for seed in ("1", "4242"):
         out = tmp_path / f"{seed}.safetensors"
         command = [sys.executable, "-c", program, str(document), str(out)]
@@ -93,7 +93,7 @@ def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
 
 
 def test_a_plan_comes_back_whole(document, artifact):
-    plan, found = compile_plan(document), load_plan(artifact)
+    plan, found = compile_document(document).plan, load_plan(artifact)
     for field in dataclasses.fields(plan):
         (own, _), (other, _) = (tree.flatten(getattr(of, field.name), field.name) for of in (plan, found))
         assert other == own and type(getattr(found, field.name)) is type(getattr(plan, field.name)), field.name

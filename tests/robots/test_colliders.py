@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hand_colliders import ROOT, fit, written
 
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.formats.robot import load_model
 from tgdsl.scene.colliders import with_colliders
 from tgdsl.schema.colliders import load_colliders
@@ -93,7 +93,7 @@ def test_where_objects_touch_a_link_primitives_are_within_a_millimetre(hand, rob
 def test_every_taxel_of_every_layout_is_near_a_primitive(hand, colliders):
     """Taxels are on the mesh: the distance of each from its own link's primitives is that of the surface."""
     for resolution in ("low", "med", "high"):
-        plan = compile_plan(ROOT / "examples" / hand.example, {"resolution": resolution})
+        plan = compile_document(ROOT / "examples" / hand.example, {"resolution": resolution}).plan
         for i, link in enumerate(plan.layout.links):
             own = [collider for collider in colliders if collider.body == link.body]
             apart = np.abs(fit.distance(own, plan.layout.pos[plan.layout.link_id == i]).min(axis=0))
@@ -130,7 +130,7 @@ def test_a_link_is_fitted_again_to_the_same_numbers(hand, robot, colliders):
 @pytest.mark.slow
 def test_taxels_of_a_task_are_the_same_with_either_colliders(hand):
     file = ROOT / "examples" / "tasks" / hand.task
-    plans = [compile_plan(file, {"robot.collision": word}, sensors=["felt", "load"]) for word in ("mesh", "primitive")]
+    plans = [compile_document(file, {"robot.collision": word}, sensors=["felt", "load"]).plan for word in ("mesh", "primitive")]
     assert plans[0].taxels_id == plans[1].taxels_id
     assert plans[0].inputs.pairs == plans[1].inputs.pairs and plans[0].inputs.bodies == plans[1].inputs.bodies
     assert plans[0].scene.mjcf == plans[1].scene.mjcf and len(plans[1].scene.colliders) > hand.num_meshes

@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.formats.robot import load_model
 
 FOLDER = Path(__file__).resolve().parents[2] / "robots" / "sharpa"
@@ -187,7 +187,7 @@ def test_surfaces_are_closed_and_made_again_byte_for_byte():
 
 @pytest.mark.parametrize("resolution", ["med", *(pytest.param(name, marks=pytest.mark.slow) for name in ("low", "high"))])
 def test_counts_are_the_papers(document, resolution):
-    plan = compile_plan(document, {"resolution": resolution})
+    plan = compile_document(document, {"resolution": resolution}).plan
     layout = plan.layout
     per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.layout.links)}
     assert {group: sum(per_link[name] for name in names) for group, names in plan.layout.groups.items()} == COUNTS[resolution]
@@ -204,7 +204,7 @@ def test_counts_are_the_papers(document, resolution):
 @pytest.mark.slow
 def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
     """MuJoCo collides convex hulls: they may leave out a little of a pad, and only the palm's hollow is spanned by one."""
-    plan = compile_plan(document, {"resolution": "high"})
+    plan = compile_document(document, {"resolution": "high"}).plan
     layout, robot = plan.layout, load_model(MODEL)
     for i, link in enumerate(plan.layout.links):
         pos = layout.pos[layout.link_id == i]
@@ -227,7 +227,7 @@ def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
 @pytest.mark.slow
 def test_pads_face_away_from_the_bone(document):
     """In the straight hand all fingers' taxels look out of the palm, as the palm's own do; a thumb's look along its pad."""
-    plan = compile_plan(document, {"resolution": "high"})
+    plan = compile_document(document, {"resolution": "high"}).plan
     layout, hand = plan.layout, mujoco.MjModel.from_xml_path(str(MODEL))
     data = mujoco.MjData(hand)
     mujoco.mj_forward(hand, data)

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.module.artifact import save_plan
 from tgdsl.runtime.rollout import scripted_controls
 
@@ -62,7 +62,7 @@ def test_surfaces_are_closed_and_made_again_byte_for_byte(tmp_path):
 
 @pytest.mark.parametrize("resolution", ["med", *(pytest.param(name, marks=pytest.mark.slow) for name in ("low", "high"))])
 def test_counts_are_the_papers(resolution):
-    plan = compile_plan(EXAMPLE, {"resolution": resolution})
+    plan = compile_document(EXAMPLE, {"resolution": resolution}).plan
     layout = plan.layout
     per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.layout.links)}
     assert {group: sum(per_link[name] for name in names) for group, names in plan.layout.groups.items()} == COUNTS[resolution]
@@ -73,7 +73,7 @@ def test_counts_are_the_papers(resolution):
 @pytest.mark.slow
 def test_the_example_gives_the_same_bytes_twice(tmp_path):
     for name in ("a", "b"):
-        save_plan(compile_plan(EXAMPLE), tmp_path / name)
+        save_plan(compile_document(EXAMPLE).plan, tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 

@@ -12,7 +12,7 @@ import trimesh
 from safetensors.numpy import load, save
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.compiler.scene import scene_file
 from tgdsl.errors import ArtifactError, RobotError
 from tgdsl.files.find import robots_folder
@@ -47,7 +47,7 @@ def project(tmp_path_factory):
     (folder / "scene.xml").write_text(SCENE)
     (folder / "more.xml").write_text("<mujoco><worldbody><site name='s'/></worldbody></mujoco>")
     (folder / "hand.yaml").write_text(DOCUMENT)
-    save_plan(compile_plan(folder / "hand.yaml"), folder / "hand.safetensors")
+    save_plan(compile_document(folder / "hand.yaml").plan, folder / "hand.safetensors")
     return folder
 
 

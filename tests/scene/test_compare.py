@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mujoco.introspect import structs
 
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.compiler.scene import instrument, scene_file
 from tgdsl.compiler.variants import NewBody, OwnObjects, with_bodies
 from tgdsl.errors import RobotError
@@ -226,7 +226,7 @@ sensors: {touch: {kind: contact_depth, links: r_pad, feels: [item]}, load: {kind
 
 def test_what_is_saved_and_loaded_again_is_the_scene_with_its_sensors(rich, tmp_path):
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
-    plan = compile_plan(tmp_path / "hand.yaml")
+    plan = compile_document(tmp_path / "hand.yaml").plan
     save_plan(plan, tmp_path / "hand.safetensors")
     for file in ("scene.xml", "hand.xml", "hand.yaml"):
         Path(tmp_path / file).unlink()

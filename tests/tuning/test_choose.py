@@ -167,7 +167,7 @@ def test_the_same_document_gives_the_same_bytes(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_origin_is_the_document_as_written(tmp_path):
     made = chosen_document(tmp_path, depth_at("10 %"))
-    unchosen = pipeline.compile_plan(made, choice=Choice(notes={"depth": ()}))
+    unchosen = pipeline.compile_document(made, choice=Choice(notes={"depth": ()})).plan
     assert compile_plan(made).origin == unchosen.origin
 
 
@@ -195,7 +195,7 @@ def test_all_variants_of_objects_choose_and_verify():
 
 def test_a_compiler_without_a_simulator_refuses_it(tmp_path):
     with pytest.raises(TgdslError, match=r"pad\.yaml: depth: `accuracy` takes a run of the scene"):
-        pipeline.compile_plan(chosen_document(tmp_path, depth_at("1 %")))
+        pipeline.compile_document(chosen_document(tmp_path, depth_at("1 %")))
 
 
 def place_of(document, text):

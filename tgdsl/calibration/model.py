@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from tgdsl.calibration.recordings import DERIVED, Recording, Target, velocities
 from tgdsl.compiler.lowered import LoweredSensor, ways
-from tgdsl.compiler.pipeline import Document, compiled
+from tgdsl.compiler.pipeline import Document, compile_document
 from tgdsl.console.progress import silent
 from tgdsl.errors import SpecError, TgdslError, did_you_mean
 from tgdsl.fields import units
@@ -174,7 +174,7 @@ class Model:
         with warnings.catch_warnings():
             if changes:
                 warnings.simplefilter("ignore")  # those of values on the way
-            result = compiled(self.document, {**self._overrides, **changes}, self._own_kinds)
+            result = compile_document(self.document, {**self._overrides, **changes}, self._own_kinds)
         self._loaded, self._resolved, self.plan = result
         self.module = TactileModule(self.plan, self._kinds, torch.float64)
         kinds = {kind.name: kind for kind in self._kinds}

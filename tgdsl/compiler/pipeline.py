@@ -59,7 +59,15 @@ UNCHOSEN = Choice()
 """Of documents without an `accuracy`."""
 
 
-def compile_plan(
+class Compiled(NamedTuple):
+    """A document on the way: as read, as resolved on its robot, and its Plan."""
+
+    loaded: Loaded
+    resolved: Resolved
+    plan: Plan
+
+
+def compile_document(
     document: Document,
     overrides: Mapping[str, Any] | None = None,
     kinds: Sequence[Kind] = (),
@@ -67,8 +75,8 @@ def compile_plan(
     sensors: Collection[str] | None = None,
     choice: Choice = UNCHOSEN,
     scene: Model | None = None,
-) -> Plan:
-    """Return the Plan of a document.
+) -> Compiled:
+    """Compile a document to its Plan, and return the values that the Plan follows from with it.
 
     Args:
         document: A YAML file, or the same as a mapping.
@@ -84,27 +92,6 @@ def compile_plan(
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
         TgdslError: If a sensor has an `accuracy` and nothing was chosen.
     """
-    return compiled(document, overrides, kinds, progress, sensors, choice, scene).plan
-
-
-class Compiled(NamedTuple):
-    """A document on the way: as read, as resolved on its robot, and its Plan."""
-
-    loaded: Loaded
-    resolved: Resolved
-    plan: Plan
-
-
-def compiled(
-    document: Document,
-    overrides: Mapping[str, Any] | None = None,
-    kinds: Sequence[Kind] = (),
-    progress: Progress | None = None,
-    sensors: Collection[str] | None = None,
-    choice: Choice = UNCHOSEN,
-    scene: Model | None = None,
-) -> Compiled:
-    """Return what `compile_plan` does, with the values before the Plan."""
     all_kinds, tell = known_kinds(kinds), progress or silent
     loaded = load(document, {**(overrides or {}), **choice.changes}, all_kinds, sensors=sensors, has_scene=scene is not None)
     resolved = resolve(loaded, tell, None if scene is None else models_of(loaded, scene))

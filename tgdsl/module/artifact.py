@@ -10,7 +10,6 @@ import torch
 
 from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
-from tgdsl.module.plan_file import METADATA_KEY as METADATA_KEY
 from tgdsl.module.plan_file import load_plan, save_plan
 from tgdsl.module.taxels.identity import Taxels, check_taxels
 from tgdsl.sensors import Kind

@@ -20,7 +20,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.errors import UnfeltWarning
 from tgdsl.module.accuracy.reference import ReferenceModule
 from tgdsl.module.accuracy.states import moved, only
@@ -91,7 +91,7 @@ def _plan_of(document: str, kinds: tuple[Kind, ...]) -> Plan:
     """Return the plan of a document, which is given as JSON; its poses are made up, so objects are inside links too."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnfeltWarning)
-        return compile_plan(json.loads(document), kinds=kinds)
+        return compile_document(json.loads(document), kinds=kinds).plan
 
 
 class KindConformance:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from tgdsl.compiler.pipeline import Choice, Document, compile_plan
+from tgdsl.compiler.pipeline import Choice, Document, compile_document
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, SpecError, TgdslError, listed
 from tgdsl.fields.accuracy import Accuracy
@@ -176,7 +176,7 @@ def key_of(task: Task) -> str:
         SpecError: If the document has mistakes.
     """
     unchosen = Choice(notes=dict.fromkeys(task.wanted, ()))
-    plan = compile_plan(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen)
+    plan = compile_document(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen).plan
     blank = dataclasses.replace(plan.origin, document_sha256="")
     specs = {"sensors": task.loaded.spec.sensors, "objects": task.loaded.spec.objects}
     written = {f"{part}.{name}": sorted(spec.model_fields_set) for part, each in specs.items() for name, spec in each.items()}
@@ -277,7 +277,7 @@ def _states(task: Task) -> Recording:
         SpecError: If the scene cannot be run.
     """
     changes = {key: value for name in task.wanted for key, value in bare(name).items()}
-    plan = compile_plan(task.document, {**task.overrides, **changes}, task.kinds, task.progress, list(task.wanted))
+    plan = compile_document(task.document, {**task.overrides, **changes}, task.kinds, task.progress, list(task.wanted)).plan
     inputs = plan.inputs
     num_envs = max([ENVS, *(2 * num for num in (*inputs.num_variants, *inputs.num_materials))])
     try:

@@ -34,7 +34,7 @@ def compile_plan(
         RobotError: If a robot or scene file cannot be read, or has something unsupported.
     """
     choice = choose(document, overrides, kinds, progress, sensors)
-    return pipeline.compile_plan(document, overrides, kinds, progress, sensors, choice)
+    return pipeline.compile_document(document, overrides, kinds, progress, sensors, choice).plan
 
 
 def compile(
@@ -83,5 +83,5 @@ def compile(
     if scene is None:
         plan = compile_plan(document, all_overrides, kinds, progress, sensors)
     else:
-        plan = pipeline.compile_plan(document, all_overrides, kinds, progress, sensors, scene=built_scene(scene))
+        plan = pipeline.compile_document(document, all_overrides, kinds, progress, sensors, scene=built_scene(scene)).plan
     return TactileModule(plan, known_kinds(kinds), dtype).to(device)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from tgdsl.compiler.pipeline import Document, compile_plan
+from tgdsl.compiler.pipeline import Document, compile_document
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
 from tgdsl.module.accuracy.errors import Magnitude, magnitude_of
@@ -124,7 +124,7 @@ def quiet_plan(document: Document, overrides: Mapping[str, Any], name: str, kind
     """Return the Plan of one sensor, without what compiling the whole document warns of."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return compile_plan(document, overrides, kinds, sensors=[name])
+        return compile_document(document, overrides, kinds, sensors=[name]).plan
 
 
 class Exact(NamedTuple):

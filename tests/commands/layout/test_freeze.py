@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.compiler.pipeline import all_layouts, compile_plan, placed
+from tgdsl.compiler.pipeline import all_layouts, compile_document, placed
 from tgdsl.files.write import atomic_write_all
 from tgdsl.layout.layout import Layout
 from tgdsl.placement.freeze import frozen_files
@@ -100,7 +100,7 @@ def test_a_module_reads_the_same_to_the_last_bit(tmp_path, here):
     assert readings[0].any()
     assert torch.equal(*readings)
     with pytest.raises(tgdsl.SpecError, match="unknown resolution"):
-        compile_plan(document, {"robot.layout": str(tmp_path / "layout_frozen.yaml"), "resolution": "low.1"})
+        compile_document(document, {"robot.layout": str(tmp_path / "layout_frozen.yaml"), "resolution": "low.1"})
 
 
 def test_nothing_is_replaced_unless_forced(tmp_path, here):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from oracles.setups.scenes import folder
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.errors import UnfeltWarning
 from tgdsl.module.accuracy.reference import ReferenceModule, row_errors
 from tgdsl.module.module import TactileModule
@@ -135,7 +135,7 @@ def _planned(kind: str, scale: float) -> tuple[Plan, Mapping[str, Any]]:
             "objects": {name: {"body": name, **made_of.get(name, {})} for name in OBJECTS},
             "sensors": {"s": fields_of(kind), **READ.get(kind, {})},
         }
-        return compile_plan(document), load(document).spec.sensors
+        return compile_document(document).plan, load(document).spec.sensors
 
 
 def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0) -> Pair:

@@ -5,7 +5,7 @@ import torch
 from oracles.setups.scenes import state
 
 import tgdsl
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.errors import SpecError
 from tgdsl.module.module import TactileModule
 from tgdsl.schema.load import load
@@ -40,11 +40,11 @@ def test_state_is_for_pairs_that_can_meet(tmp_path):
     text = touch.explain()
     assert "remembers anchor_x, anchor_y, anchor_z, held (800 bytes per environment)" in text
     assert "50 points of item against a" in text
-    both = compile_plan(on_two_links(tmp_path, gate="geometric"))
+    both = compile_document(on_two_links(tmp_path, gate="geometric")).plan
     assert both.sensors[0].state["held"].shape == (100,)
     unsheared = on_two_links(tmp_path, gate="geometric", shear_strength=0)
     del unsheared["sensors"]["s"]["anchors"], unsheared["sensors"]["s"]["points"]
-    still = compile_plan(unsheared)
+    still = compile_document(unsheared).plan
     assert not still.sensors[0].state and "points" not in still.quantities
 
 
@@ -84,7 +84,7 @@ def test_what_cannot_be_is_refused_where_it_stands(tmp_path, fields, target, mes
     sensor = {**document["sensors"]["s"], **fields}
     document["sensors"]["s"] = {name: value for name, value in sensor.items() if value is not None}
     with pytest.raises(SpecError) as caught:
-        compile_plan(document)
+        compile_document(document)
     assert message in str(caught.value) and hint in str(caught.value)
 
 
@@ -93,7 +93,7 @@ def test_a_mistake_is_named_once_however_a_sensor_is_read(tmp_path, readout):
     """A sensor that is read both ways with noise of its radii is computed twice, and has one place in the document."""
     document = on_two_links(tmp_path, readout=readout, noise={"radius_noise": 0.1}, feels=["item", "floor"])
     with pytest.raises(SpecError) as caught:
-        compile_plan(document)
+        compile_document(document)
     assert [problem.path for problem in caught.value.problems] == ["sensors.s.feels[1]"]
 
 
@@ -102,4 +102,4 @@ def test_the_papers_model_anchors_points(tmp_path):
     del document["sensors"]["s"]["anchors"]
     spec = load(document).spec.sensors["s"]
     assert isinstance(spec, ElastomerSpec) and spec.anchored == "points"
-    assert TactileModule(compile_plan(document)).plan.sensors[0].state["held"].shape == (50,)
+    assert TactileModule(compile_document(document).plan).plan.sensors[0].state["held"].shape == (50,)

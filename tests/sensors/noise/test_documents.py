@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from noise_documents import document, mistakes, planned
 
-from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.pipeline import compile_document
 from tgdsl.sensors import KINDS
 
 TISSUE = {"gain_low": 0.85, "gain_high": 1.15, "hysteresis_strength": 0.5, "hysteresis_time": 0.05}
@@ -187,7 +187,7 @@ def test_links_that_a_sensor_is_not_on(tmp_path):
 def test_a_profile_with_links_that_a_sensor_is_not_on(tmp_path):
     made = document(tmp_path, "contact_depth", "own", {"own": {"bias": 1, "links": {"palm": {"bias": 2}}}}, links="tips")
     made["sensors"]["t"] = {**made["sensors"]["s"], "links": "palm"}
-    plan = compile_plan(made)
+    plan = compile_document(made).plan
     assert [plan.arrays[f"sensors/{name}/noise/bias"].tolist() for name in ("s", "t")] == [[[1.0]], [[2.0]]]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from tgdsl.compiler.pipeline import Document, compile_plan
+from tgdsl.compiler.pipeline import Document, compile_document
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module.accuracy.variants import bare
@@ -72,7 +72,7 @@ def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], 
     _check(what.options)
     progress("compiling")
     choice = choose(what.document, what.overrides, progress=progress)
-    touch = TactileModule(compile_plan(what.document, what.overrides, progress=progress, choice=choice), known_kinds())
+    touch = TactileModule(compile_document(what.document, what.overrides, progress=progress, choice=choice).plan, known_kinds())
     what = replace(what, overrides={**what.overrides, **choice.changes})
     names = tuple(dict.fromkeys(sensor.sensor for sensor in touch.plan.sensors))
     wanted = _wanted(what.sensors, names)
@@ -101,7 +101,7 @@ def _recording(what: Bench, names: Sequence[str], progress: Progress) -> Recordi
     if what.states is not None:
         return load_recording(what.states)
     changes = {key: value for name in names for key, value in bare(name).items()}
-    touch = TactileModule(compile_plan(what.document, {**what.overrides, **changes}), known_kinds())
+    touch = TactileModule(compile_document(what.document, {**what.overrides, **changes}).plan, known_kinds())
     recording = record(
         touch, what.state_envs, steps=what.steps, substeps=what.substeps, seed=what.options.seed, progress=progress
     )
