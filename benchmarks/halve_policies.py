@@ -45,7 +45,7 @@ def largest_change(one: torch.jit.ScriptModule, other: torch.jit.ScriptModule, r
     torch.manual_seed(0)
     x = buffers["mean"].flatten() + deviation * torch.randn(rows, len(deviation))
     with torch.no_grad():
-        return float((other(x) - one(x)).abs().max())
+        return float((other(x.float()) - one(x.float())).abs().max())
 
 
 def _text(value: str | bytes) -> str:
