@@ -307,7 +307,7 @@ def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
     sensor, is_tiled = TILES[name]
     document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], **sensor}}
     options = tgdsl.compile(document).inductor_options()
-    tiles = {"triton.prefer_nd_tiling": is_tiled, "triton.autotune_pointwise": not is_tiled}
+    tiles = {"triton.prefer_nd_tiling": is_tiled, "triton.enable_pdl": is_tiled, "triton.autotune_pointwise": not is_tiled}
     assert options == {"assert_indirect_indexing": False} | tiles
 
 
