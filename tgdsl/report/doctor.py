@@ -32,10 +32,13 @@ DEVELOPMENT = ("dev", "docs")
 WITHOUT: Mapping[str, tuple[Level, str]] = {
     "gymnasium": ("missing", "no vector environments of gymnasium: TouchEnv and rsl_rl's adapter remain"),
     "imageio-ffmpeg": ("missing", "`tgdsl play --video` is refused"),
+    "mcap": ("missing", "`tgdsl export-dataset --to mcap` is refused"),
     "mujoco-warp": ("missing", 'physics on a GPU is refused: `tgdsl.simulate(device="cuda")`; MuJoCo on the CPU remains'),
     "onnx": ("missing", "`tgdsl export --to onnx` is refused"),
     "onnxruntime": ("missing", "`tgdsl verify` is refused for ONNX files"),
     "onnxscript": ("missing", "`tgdsl export --to onnx` is refused"),
+    "pandas": ("missing", "`tgdsl export-dataset --to lerobot` is refused"),
+    "pyarrow": ("missing", "`tgdsl export-dataset --to lerobot` is refused"),
     "pycollada": ("missing", "Collada meshes (.dae) of URDF files are refused"),
     "pyserial": ("missing", "a real hand cannot be connected; its emulator and logs remain"),
     "ray": ("missing", "`tgdsl sweep` is refused; single runs remain"),
@@ -45,6 +48,7 @@ WITHOUT: Mapping[str, tuple[Level, str]] = {
     "triton": ("slower", "on a GPU, torch's operations stand in for the kernels written in Triton; a CPU needs none"),
     "viser": ("missing", "`tgdsl view` and `tgdsl.show` are refused"),
     "warp-lang": ("missing", "`query: raycast` is refused; analytic shapes and distance grids remain"),
+    "zarr": ("missing", "`tgdsl export-dataset --to zarr` is refused"),
 }
 """What follows if a package is not installed that tgdsl can do without."""
 CPP = "C++, for modules on a CPU"
