@@ -18,9 +18,8 @@ def text_of(name: str) -> str:
 
 def test_the_comparison_has_every_kind_with_its_file():
     table = text_of("docs/which-kind.md").split("\n\n")[1]
-    rows = [re.fullmatch(r"\[`(\w+)`\]\(\.\./(tgdsl/\S+)\)", line.split("|")[2].strip()) for line in table.splitlines()[2:]]
-    files = {row[1]: row[2] for row in rows}
-    assert len(rows) == len(files) and files.keys() == {kind.name for kind in KINDS}
+    files = dict(re.findall(r"^\|[^|]*\| \[`(\w+)`\]\(\.\./(tgdsl/[^)]+)\) \|", table, re.M))
+    assert files.keys() == {kind.name for kind in KINDS} and len(table.splitlines()) == len(KINDS) + 2
     for kind in KINDS:
         assert files[kind.name] in {part.__module__.replace(".", "/") + ".py" for part in (kind.forward, kind.spec)}
 
