@@ -1,6 +1,6 @@
 """Intervals of 95 % on recordings made with known parameters, noise and two clocks, for each kind that has parameters.
 
-    PYTHONPATH=tests/helpers python tests/calibration/test_coverage.py 200     # the share that holds, of so many sets of each
+`PYTHONPATH=tests/helpers python tests/calibration/test_coverage.py 200` prints the share that holds in 200 sets of each.
 """
 
 import json
