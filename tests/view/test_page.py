@@ -1,21 +1,33 @@
 """The live page: what its handles are set to, and, in a real browser, what is seen and what its controls do."""
 
+import io
 import re
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from faulty_lines import FaultyEmulator
+from first_order_hands import first_order_hand
+from hand_logs import write_log
 from scipy.spatial.transform import Rotation
+from xhand1_hands import PATIENT
 
 import tgdsl
 from tgdsl.commands.view import View
 from tgdsl.errors import SimulationError, TgdslError
+from tgdsl.runtime.xhand1.driver import Reading, XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import TipForces
+from tgdsl.runtime.xhand1.log.log import Fault
+from tgdsl.runtime.xhand1.observe import TIP_BODIES
+from tgdsl.runtime.xhand1.wire.payloads import JOINTS, STATE_SIZE, decode_state
+from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
 from tgdsl.view.page import Page
 from tgdsl.view.stages import RunStage, SceneStage, SimStage, Stage
 
@@ -229,6 +241,115 @@ def test_what_is_saved_is_shown_and_mistakes_have_their_line(document):
     document.write_text(DOCUMENT)
 
 
+def test_the_plot_begins_again_when_another_environment_is_chosen(document):
+    with opened(SceneStage(tgdsl.compile(document), num_envs=2)) as page:
+        page.run(seconds=0.3)
+        assert len(page._history) > 1
+        assert page._env is not None
+        page._env.value = 1
+        page._react()
+        page.draw()
+        assert len(page._history) == 1
+
+
+def test_frames_are_saved_as_they_were_drawn(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch, num_envs=2)) as page:
+        assert page._env is not None
+        page._env.value = 1
+        expected = []
+        for _ in range(3):
+            page.stage.advance()
+            page.draw()
+            page.draw()  # the same instant is saved once
+            pos, quat = page.stage.body_poses(1)
+            readings = {name: page.stage.readings[name][1].numpy().copy() for name in ("touch", "near")}
+            expected.append({"time": page.stage.time, "env": 1, "body_pos": pos.copy(), "body_quat": quat.copy(), **readings})
+        with np.load(io.BytesIO(page.saved_frames()), allow_pickle=False) as arrays:
+            for name in expected[0]:
+                np.testing.assert_array_equal(arrays[name][-3:], np.stack([frame[name] for frame in expected]))
+            assert len(arrays["time"]) == 4  # the first frame is that of the start
+
+
+# Hands -------------------------------------------------------------------------------------------------------------------------
+
+
+def reading_at(time: float, position: np.ndarray, counts: np.ndarray) -> Reading:
+    state = decode_state(bytes(STATE_SIZE))
+    state = replace(state, position=position.astype(np.float32), total_force=counts.astype(np.int16))
+    return Reading(1 + round(100 * time), time - 0.008, time, state)
+
+
+def hand_log(path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    position, counts = rng.uniform(0.1, 0.5, (5, 12)), rng.integers(-100, 100, (5, 5, 3))
+    readings = [reading_at(1.0 + 0.01 * i, position[i], counts[i]) for i in range(5)]
+    fault = Fault(1.022, "HandTimeoutError", "no reply")
+    return write_log(path, readings, (fault,)), position, counts
+
+
+def test_a_log_of_a_hand_is_posed_at_its_angles_and_forces(tmp_path):
+    path, position, counts = hand_log(tmp_path / "log.npz")
+    stage = View(path)._stage()
+    assert isinstance(stage, HandLogStage)
+    assert stage.num_steps == 5
+    stage.seek(2)
+    model = stage.model
+    data = mujoco.MjData(model)
+    for joint, angle in zip(JOINTS, position[2].astype(np.float32), strict=True):
+        data.joint(f"right_hand_{joint}").qpos[0] = angle
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(stage.body_poses(0)[0], data.xpos, atol=1e-12)
+    by_finger = [next(i for i, name in enumerate(TIP_BODIES) if body.endswith(name)) for body in stage.outputs[0].bodies]
+    np.testing.assert_array_equal(stage.readings["tips"][0].numpy(), counts[2][by_finger])
+    assert stage.outputs[0].units == ("counts",) * 3
+    assert stage.time == pytest.approx(0.02)
+    assert stage.notes(0) == {"then no reading": "HandTimeoutError: no reply"}
+    with opened(stage) as page:
+        assert "[counts]" in page._legend.content
+        assert page._instant is not None
+        page._instant.value = 4
+        page._react()
+        page.draw()
+        assert stage.step_index == 4
+        total = np.linalg.norm(counts[4], axis=1).sum()
+        assert float(re.search(r"([\d.e+-]+) counts", page._reads.content)[1]) == pytest.approx(total, rel=1e-3)
+
+
+def test_a_calibration_gives_the_log_of_a_hand_newtons(tmp_path):
+    path, _, counts = hand_log(tmp_path / "log.npz")
+    calibration = ROOT / "examples/xhand1_calibration.yaml"
+    stage = View(path, calibration=calibration)._stage()
+    assert stage.outputs[0].units == ("N",) * 3
+    bodies = stage.outputs[0].bodies
+    thumb, index = (next(i for i, body in enumerate(bodies) if name in body) for name in ("thumb", "index"))
+    force = stage.readings["tips"][0].numpy()
+    np.testing.assert_allclose(force[thumb], 0.1 * counts[0, 0], rtol=1e-6)
+    np.testing.assert_allclose(force[index], 0.1 * counts[0, 1, ::-1], rtol=1e-6)  # its sensor looks along the link's x
+
+
+def test_a_calibration_needs_a_hand(document):
+    with pytest.raises(TgdslError, match=r"press\.yaml is neither a hand nor the log of one"):
+        View(document, calibration=ROOT / "examples/xhand1_calibration.yaml")._stage()
+
+
+def test_an_emulated_hand_is_shown_and_an_unplugged_one_says_so():
+    forces = TipForces.zero()
+    forces.total[1] = (3, 4, 12)
+    with FaultyEmulator(first_order_hand(forces=lambda time, position: forces)) as emulator:
+        hand = XHand1.open(emulator.device, timing=PATIENT, max_age_s=20.0)
+        stage = LiveHandStage(hand)
+        stage.opened.callback(hand.close)
+        with opened(stage) as page:
+            stage.advance()
+            page.draw()
+            assert "13 counts" in page._reads.content
+            emulator.unplug()
+            assert soon(lambda: (stage.advance(), "NO NEW READING" in stage.notes(0))[1])
+            emulator.replug()
+            assert soon(lambda: (stage.advance(), "NO NEW READING" not in stage.notes(0))[1])
+
+
 # In a browser ------------------------------------------------------------------------------------------------------------------
 
 
@@ -281,8 +402,6 @@ def soon(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
 
 def drawn_share(view) -> float:
     """Return the share of the picture's left half that is not background."""
-    import io
-
     from matplotlib.image import imread
 
     pixels = imread(io.BytesIO(view.screenshot()))[:, :600, :3]
@@ -365,4 +484,32 @@ def test_a_browser_shows_a_task_with_its_policy_and_reward_terms(browser):
         assert soon(lambda: drawn_share(view) > 0.02)
         assert view.get_by_text("object_distance").count() > 0
         assert view.get_by_text("199 taxels").count() > 0
+        view.close()
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_log_of_a_hand_and_scrubs_it(browser, tmp_path):
+    path, _, _ = hand_log(tmp_path / "log.npz")
+    with serving(View(path)) as page:
+        view = open_page(browser, page)
+        assert soon(lambda: drawn_share(view) > 0.02)
+        view.get_by_text("pause").locator("xpath=ancestor::*[.//input][1]").locator("input").dispatch_event("click")
+        assert soon(lambda: page._paused.value)
+        write(view, "step", "2")
+        view.get_by_text("then no reading").wait_for()
+        view.close()
+
+
+@pytest.mark.slow
+def test_a_browser_shows_an_emulated_hand_and_saves_what_was_seen(browser, tmp_path):
+    with serving(View(Path("emulator"))) as page:
+        view = open_page(browser, page)
+        assert soon(lambda: drawn_share(view) > 0.02)
+        assert view.get_by_text("joints with errors").count() > 0
+        with view.expect_download() as download:
+            view.get_by_role("button", name="save last minute").dispatch_event("click")
+        download.value.save_as(tmp_path / "seen.npz")
+        with np.load(tmp_path / "seen.npz") as arrays:
+            assert arrays["tips"].shape[1:] == (5, 3)
+            assert (np.diff(arrays["time"]) > 0).all()
         view.close()

@@ -1,4 +1,4 @@
-"""`tgdsl view`: a live page in the browser of a document, a task or a recorded run."""
+"""`tgdsl view`: a live page in the browser of a document, a task, a recorded run, or an XHand1 and its logs."""
 
 from __future__ import annotations
 
@@ -27,9 +27,12 @@ class View:
     """
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
-    """A document or a task (.yaml), an artefact (.safetensors), or a run that `tgdsl run` recorded (.npz)."""
+    """A document or a task (.yaml), an artefact (.safetensors), a run of `tgdsl run` or a log of `tgdsl hand record` (.npz),
+    `xhand1`, `xhand1:PORT` or `emulator`. A hand is only read."""
     policy: OptionalFile = None
     """A task's policy; default: zero actions."""
+    calibration: OptionalFile = None
+    """A hand's calibration file; default: that of the log, else forces are counts."""
     envs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
     """Environments; the page shows one at a time."""
     port: int = 8080
@@ -46,8 +49,6 @@ class View:
         """Serve the page until Ctrl-C."""
         from tgdsl.view.page import Page
 
-        if str(self.source).partition(":")[0] in HANDS:
-            raise TgdslError(f"{self.source}: a hand is shown in the terminal: tgdsl hand monitor")
         with StatusLine() as progress:
             stage = self._stage(progress)
             progress("starting the page")
@@ -63,8 +64,17 @@ class View:
 
     def _stage(self, progress: StatusLine | None = None) -> Stage:
         """Return what the source is shown as."""
+        from tgdsl.commands.hand.arguments import calibration_of
+        from tgdsl.runtime.xhand1.log.log import is_hand_log, open_log
+        from tgdsl.view.hand_stage import HandLogStage, live_hand
         from tgdsl.view.stages import RunStage, SceneStage, read_run
 
+        if str(self.source).partition(":")[0] in HANDS:
+            return live_hand(self.source, calibration_of(self.calibration))
+        if is_hand_log(self.source):
+            return HandLogStage(open_log(self.source), calibration_of(self.calibration))
+        if self.calibration is not None:
+            raise TgdslError(f"--calibration {self.calibration}: {self.source} is neither a hand nor the log of one")
         if self.source.suffix == ".npz":
             document = Path(str(read_run(self.source)["document"]))
             return RunStage(module_of(document, self.set, progress), self.source)

@@ -18,7 +18,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
-from io import StringIO
+from io import BytesIO, StringIO
 from queue import SimpleQueue
 from typing import Any, NamedTuple
 
@@ -38,7 +38,6 @@ from tgdsl.view.boxes import boxes_of, is_boxed
 from tgdsl.view.cameras import facing_camera
 from tgdsl.view.markers import Markers, markers_of
 from tgdsl.view.meshes import body_triangles, robot_bodies
-from tgdsl.view.overview import drawn_outputs
 from tgdsl.view.stages import SimStage, Stage
 from tgdsl.view.style import HEAT, WARMTH
 from tgdsl.view.taxels import Pose
@@ -50,6 +49,8 @@ FRAME = 1 / 30
 """Least time between two frames [s]."""
 PLOT_SECONDS = 10.0
 """How much of the past the plot shows [s]."""
+SAVED_FRAMES = 1800
+"""Number of frames that the page can save: the last minute at 30 per second."""
 MAX_STEPS = 5
 """Most control steps per frame: a scene slower than that runs behind real time."""
 _CARRIER, _ROBOT, _OBJECT, _REST = (176, 181, 190), (128, 134, 145), (60, 112, 186), (62, 72, 88)
@@ -103,6 +104,7 @@ class Page:
         self._picked: int | None = None
         self._range: dict[tuple[str, str], float] = {}
         self._history: deque[tuple[float, float]] = deque()
+        self._frames_seen: deque[dict[str, Array]] = deque(maxlen=SAVED_FRAMES)
         with self.server.atomic():
             self.server.scene.reset()
             self.server.gui.reset()
@@ -171,6 +173,27 @@ class Page:
             if self.stage.readings:
                 self._draw_touch(env)
             self._draw_text()
+        self._record(env, pos, quat)
+
+    def saved_frames(self) -> bytes:
+        """Return the frames drawn in the last minute as an `.npz` file.
+
+        Its arrays are `time` (frame,) [s], `env` (frame,), `body_pos` (frame, body, 3) [m], `body_quat` (frame, body, 4) as
+        w, x, y, z, both in the world, and each reading by its name, (frame, ...) as in `touch.outputs` without `env`.
+        """
+        file = BytesIO()
+        arrays = {name: np.stack([frame[name] for frame in self._frames_seen]) for name in self._frames_seen[0]}
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+        return file.getvalue()
+
+    def _record(self, env: int, pos: Float[Array, "body 3"], quat: Float[Array, "body 4"]) -> None:
+        """Keep a frame for `saved_frames`; an instant of one environment is kept once."""
+        last = self._frames_seen[-1] if self._frames_seen else None
+        if not self.stage.readings or (last is not None and (last["time"], last["env"]) == (self.stage.time, env)):
+            return
+        frame = {"time": np.array(self.stage.time), "env": np.array(env), "body_pos": pos.copy(), "body_quat": quat.copy()}
+        readings = {o.name: self.stage.readings[o.name][env].detach().cpu().numpy().copy() for o in self._outputs.values()}
+        self._frames_seen.append({**readings, **frame})
 
     # The scene -------------------------------------------------------------------------------------------------------------
 
@@ -198,6 +221,7 @@ class Page:
         for handle in self._discs.values():
             handle.remove()
         self._discs = {}
+        self._is_boxed = is_boxed(self.stage.touch, self._output)
         table = self._table()
         angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
         corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])
@@ -269,7 +293,7 @@ class Page:
         output, channel = self._output, self._channel.value
         readings = self.stage.readings[output.name]
         vector, markers = None, None
-        if is_boxed(self.stage.touch, output):
+        if self._is_boxed:
             boxes = boxes_of(self.stage.touch, output, readings, env)
             value, unit, colours = boxes.value[boxes.chosen], boxes.unit, WARMTH
             norm, label = boxes.norm, boxes.label
@@ -288,11 +312,11 @@ class Page:
         self._draw_arrows(markers, vector)
         self._legend.content = _legend(colours, norm, label)
         picked = self._picked
-        shown = value.mean() if is_boxed(self.stage.touch, output) else value.sum()
+        shown = value.mean() if self._is_boxed else value.sum()
         self._history.append((self.stage.time, float(shown if picked is None else value[picked])))
         while self._history and not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
             self._history.popleft()
-        name = ("mean" if is_boxed(self.stage.touch, output) else "sum") if picked is None else self._table_now.labels[picked]
+        name = ("mean" if self._is_boxed else "sum") if picked is None else self._table_now.labels[picked]
         reads = f"{self._history[-1][1]:.4g} {unit}" if self._history else ""
         self._reads.content = f"**{name}**: {label.split(' [')[0]} {reads}"
         if len(self._history) > 1:
@@ -343,11 +367,12 @@ class Page:
         self._status = gui.add_markdown("")
         self._env = gui.add_slider("environment", 0, stage.num_envs - 1, 1, 0) if stage.num_envs > 1 else None
         self._instant = gui.add_slider("step", 0, max(1, (stage.num_steps or 2) - 1), 1, 0) if stage.num_steps else None
-        self._seen_instant = 0
+        self._seen_instant, self._seen_env = 0, 0
         self._paused = gui.add_checkbox("pause", False)
         self._speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
         gui.add_button("step once").on_click(lambda _: self._clicks.put(self._step_once))
         gui.add_button("restart").on_click(lambda _: self._clicks.put(self._restart))
+        gui.add_button("save last minute").on_click(lambda event: self._clicks.put(lambda: self._save(event.client)))
         with gui.add_folder("touch"):
             names = list(self._outputs)
             self._reading = gui.add_dropdown("reading", names, initial_value=reading if reading in names else names[0])
@@ -394,6 +419,9 @@ class Page:
             self._add_discs()
         elif self._channel.value not in self._channels():
             self._channel.value = self._channels()[0]
+        if self._env_index != self._seen_env:
+            self._seen_env = self._env_index
+            self._history.clear()
         if self._instant is not None and int(self._instant.value) != self._seen_instant:
             self._seen_instant = int(self._instant.value)
             self.stage.seek(self._seen_instant)
@@ -421,6 +449,11 @@ class Page:
     def _step_once(self) -> None:
         self._paused.value = True
         self.stage.advance()
+
+    def _save(self, client: Any) -> None:
+        """Send the saved frames to the browser that asked for them."""
+        if self._frames_seen:
+            client.send_file_download("seen.npz", self.saved_frames(), save_immediately=True)
 
     def _restart(self) -> None:
         self.stage.restart()
@@ -464,7 +497,7 @@ def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int 
 
 def _drawn(stage: Stage) -> dict[str, Output]:
     """Return the readings that a page can show, by name."""
-    outputs = {output.name: output for output in drawn_outputs(stage.touch)}
+    outputs = {output.name: output for output in stage.outputs}
     if not outputs:
         raise TgdslError("no sensor of this document has taxels, bodies or cells to draw")
     return outputs

@@ -6,7 +6,7 @@ Shapes: `env` environments, `step` control steps, `actuator` actuators.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -19,10 +19,12 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
 from tgdsl.runtime.scripted import substeps_of
 from tgdsl.runtime.simulate import simulate
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.scene import scene_model
+from tgdsl.view.overview import drawn_outputs
 
 Array = np.ndarray
 
@@ -71,7 +73,12 @@ class Stage(ABC):
         """Which instant of a recorded run this is."""
         return 0
 
-    def notes(self, env: int) -> Mapping[str, float]:
+    @property
+    def outputs(self) -> Sequence[Output]:
+        """Readings that a page can draw: of taxels, of bodies, and of boxes of links."""
+        return drawn_outputs(self.touch)
+
+    def notes(self, env: int) -> Mapping[str, float | str]:
         """Return what else there is to say of this instant in one environment, by name, such as a task's reward terms."""
         return {}
 
@@ -182,8 +189,13 @@ class RunStage(Stage):
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         """Return where MuJoCo's kinematics put the bodies."""
         self._data.qpos[:] = self._qpos[self._index, env]
-        mujoco.mj_kinematics(self.model, self._data)
-        return self._data.xpos.copy(), self._data.xquat.copy()
+        return kinematic_poses(self.model, self._data)
+
+
+def kinematic_poses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+    """Return origins [m] and quaternions w, x, y, z of all bodies in the world at `data.qpos`."""
+    mujoco.mj_kinematics(model, data)
+    return data.xpos.copy(), data.xquat.copy()
 
 
 def read_run(path: Path) -> dict[str, Any]:

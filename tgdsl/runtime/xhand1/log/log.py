@@ -148,6 +148,14 @@ class HandLog:
                     yield Reading(int(self.sequence[i]), *times, state)
 
 
+def is_hand_log(path: Path) -> bool:
+    """Return whether a file is an archive with a log's description, damaged or not."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "about.npy" in archive.namelist()
+
+
 def open_log(path: str | Path) -> HandLog:
     """Read a log's times and failures, and check every byte of it.
 

@@ -1,0 +1,195 @@
+"""An XHand1 on the live page: its joints, and the forces that it reports on its fingertips. No command is sent.
+
+Shapes: `joint` and `finger` as in `payloads`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float, Num
+
+from tgdsl.module.outputs import Output
+from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+from tgdsl.runtime.xhand1.log.log import Fault, HandLog
+from tgdsl.runtime.xhand1.motion import JointControls
+from tgdsl.runtime.xhand1.observe import finger_of
+from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandError
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS, HandState
+from tgdsl.runtime.xhand1.wire.ports import the_hand
+from tgdsl.scene.scene import scene_model
+from tgdsl.tuning.compile import compile
+from tgdsl.view.hand_table import StreamCounter
+from tgdsl.view.stages import Stage, kinematic_poses
+
+Array = np.ndarray
+LIVE_STEP = 0.02
+"""Time between readings of a live hand that are shown [s]."""
+_DOCUMENT = {
+    "tgdsl": 1,
+    "robot": {"model": "xhand1"},
+    "resolution": "low",
+    "objects": {"palm": {"body": "right_hand_link"}},
+    "sensors": {"tips": {"kind": "link_contact", "links": "tips", "feels": ["palm"], "outputs": ["force"]}},
+}
+"""Fingertips with one force each. The hand reports the forces: nothing is simulated, so `feels` has no effect."""
+
+
+class HandStage(Stage):
+    """A hand at one instant, drawn as the right hand: which bytes say left or right is unverified.
+
+    Attributes:
+        calibration: What the hand's counts mean.
+    """
+
+    def __init__(self, calibration: Calibration):
+        self.touch, self.calibration, self.num_envs = compile(_DOCUMENT), calibration, 1
+        self.model = scene_model(self.touch.plan.scene)
+        (output,) = self.touch.outputs
+        self._output = dataclasses.replace(output, units=(calibration.units,) * 3)
+        self._fingers = [i for body in output.bodies if (i := finger_of(body)) is not None]
+        self._qpos_id = JointControls.of_model(self.model).qpos_id
+        self._data = mujoco.MjData(self.model)
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """The forces on the fingertips, in the calibration's unit."""
+        return (self._output,)
+
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return where MuJoCo's kinematics put the bodies at the hand's joint angles."""
+        return kinematic_poses(self.model, self._data)
+
+    def _take(self, position: Float[Array, " joint"], counts: Num[Array, "finger 3"]) -> None:
+        """Take joint angles [rad] and the fingertips' counts along the sensors' axes."""
+        self._data.qpos[self._qpos_id] = position
+        force = self.calibration.apply(counts)[self._fingers]
+        self.readings = {"tips": torch.from_numpy(force).float().unsqueeze(0)}
+
+
+class LiveHandStage(HandStage):
+    """A hand that is connected, or an emulated one.
+
+    Attributes:
+        opened: What is closed with the stage.
+    """
+
+    control_step = LIVE_STEP
+
+    def __init__(self, hand: XHand1, calibration: Calibration | None = None):
+        """Show a hand.
+
+        Args:
+            hand: The hand.
+            calibration: What its counts mean; default: they stay counts.
+        """
+        super().__init__(calibration or Calibration.none())
+        self._hand, self.opened = hand, ExitStack()
+        self._counter = StreamCounter()
+        reading = hand.read()
+        self._stats = self._counter.add(reading)
+        self._start, self.time = reading.received_at, 0.0
+        self._state: HandState = reading.state
+        self._take(reading.state.position, reading.state.total_force)
+
+    def advance(self) -> None:
+        """Take the hand's next reading; where none comes, the last stays and the page says why.
+
+        Raises:
+            HandClosedError: If the hand was closed.
+        """
+        try:
+            reading = self._hand.read()
+        except HandClosedError:
+            raise
+        except HandError as error:
+            self._stats = self._counter.add(Fault.of(error, time.monotonic()))
+            return
+        self._stats = self._counter.add(reading)
+        self.time, self._state = reading.received_at - self._start, reading.state
+        self._take(self._state.position, self._state.total_force)
+
+    def restart(self) -> None:
+        """Count time from now on; the hand does not move."""
+        self._start, self.time = self._start + self.time, 0.0
+
+    def notes(self, env: int) -> Mapping[str, float | str]:
+        """Return why no reading comes, how many failed, how many joints report errors, and the fingertips' temperatures."""
+        fault = self._stats.fault
+        trouble = {} if fault is None else {"NO NEW READING": f"{fault.kind}: {fault.message}"}
+        temperatures = {
+            f"{name} [°C]": float(value) for name, value in zip(FINGERS, self._state.total_temperature, strict=True)
+        }
+        errors = float(self._state.joint_error.any(axis=-1).sum())
+        return {**trouble, "failures": float(self._stats.num_faults), "joints with errors": errors, **temperatures}
+
+    def close(self) -> None:
+        """Close what was opened for the stage."""
+        self.opened.close()
+
+
+class HandLogStage(HandStage):
+    """A log of `tgdsl hand record`, reading by reading."""
+
+    def __init__(self, log: HandLog, calibration: Calibration | None = None):
+        """Show a log.
+
+        Args:
+            log: The log.
+            calibration: What its counts mean; default: what the log says, and counts if it says nothing.
+        """
+        super().__init__(calibration or log.calibration or Calibration.none())
+        self._log, self.num_steps = log, log.num_readings
+        self._position, self._counts = log.column("position"), log.column("total_force")
+        self._faults = {int(i) - 1: fault for i, fault in zip(log.fault_reading, log.faults, strict=True)}
+        self.control_step = log.seconds / max(1, log.num_readings - 1) or LIVE_STEP
+        self.seek(0)
+
+    def seek(self, step: int) -> None:
+        """Go to a reading."""
+        self._index = int(np.clip(step, 0, self._log.num_readings - 1))
+        self.time = float(self._log.received_at[self._index] - self._log.received_at[0])
+        self._take(self._position[self._index], self._counts[self._index])
+
+    @property
+    def step_index(self) -> int:
+        """Which reading this is."""
+        return self._index
+
+    def advance(self) -> None:
+        """Go to the next reading."""
+        self.seek(self._index + 1)
+
+    def restart(self) -> None:
+        """Go to the first reading."""
+        self.seek(0)
+
+    def notes(self, env: int) -> Mapping[str, float | str]:
+        """Return the failure that came before the next reading, if one did."""
+        fault = self._faults.get(self._index)
+        return {} if fault is None else {"then no reading": f"{fault.kind}: {fault.message}"}
+
+
+def live_hand(source: Path, calibration: Calibration | None) -> LiveHandStage:
+    """Return the stage of `emulator`, `xhand1` or `xhand1:PORT`.
+
+    Raises:
+        HandError: If no hand answers, or several do.
+    """
+    name, _, port = str(source).partition(":")
+    with ExitStack() as opened:
+        device = opened.enter_context(Emulator()).device if name == "emulator" else port or None
+        address = the_hand(device)
+        hand = opened.enter_context(XHand1.open(address.device, address.addresses))
+        stage = LiveHandStage(hand, calibration)
+        stage.opened = opened.pop_all()
+    return stage
