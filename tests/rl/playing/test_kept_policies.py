@@ -21,7 +21,7 @@ SAYS = {
     *("groups", "joints", "iterations", "samples", "minutes", "command", "score", "task", "overrides", "seed", "device"),
     *("taxels", "versions", "spec"),
 }
-PER_TAXEL = {"bool": 1, "depth": 1, "force_taxel": 3, "force": 3, "proximity": 6, "force_torque": 6}
+PER_TAXEL = {"none": 0, "bool": 1, "depth": 1, "force_taxel": 3, "force": 3, "proximity": 6, "force_torque": 6}
 
 
 @cache
@@ -29,8 +29,8 @@ def taxels_of(document, touch, resolution, placement):
     """Return the module of a task's taxels, the link of each, and the joints that its policies move."""
     loaded = load_task(document, {"touch": touch, "resolution": resolution, "placement": placement})
     sensed = compile_sensed(loaded, "cpu")
-    (felt,) = sensed.groups.values()
-    return sensed.touch, felt.layout.link_id.tolist(), moved_joints(loaded, sensed)
+    links = [link for felt in sensed.groups.values() for link in felt.layout.link_id.tolist()]
+    return sensed.touch, links, moved_joints(loaded, sensed)
 
 
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
