@@ -6,6 +6,7 @@ Shapes: as in `episode`, `env` environments.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,13 @@ from tgdsl.errors import TgdslError, did_you_mean, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.module.taxels.identity import Columns
-from tgdsl.rl.datasets.episode import EPS, Episode, LinkTaxels, Source
+from tgdsl.rl.datasets.episode import EPS, FORCE, Episode, Header, LinkTaxels
 from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.deploying.hand import EMULATED
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, rollout
 from tgdsl.rl.sensed import GROUP
+from tgdsl.rl.task import Task
 from tgdsl.runtime.connect import kind_of
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S
@@ -32,7 +34,6 @@ from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS
 from tgdsl.scene.scene import scene_model
 
-FORCE = ("force_x", "force_y", "force_z")
 LOG_FPS = 30.0
 """Frames per second of a hand's log unless others are asked for."""
 
@@ -60,7 +61,7 @@ class _Watching(Actor):
 
 def of_environments(
     env: TouchEnv, actor: Actor, episodes: int, fps: float | None = None, reading: str | None = None, least: float | None = None
-) -> tuple[Source, Iterator[Episode]]:
+) -> tuple[Header, Iterator[Episode]]:
     """Return episodes of environments that were just made: as many of each environment, its first ones.
 
     Args:
@@ -79,15 +80,14 @@ def of_environments(
     table = env.touch.taxels[output.sensor]
     rows, links = _links(table)
     columns = [output.channels.index(name) for name in FORCE]
-    source = Source(
+    header = Header(
         env.loaded.source.file,
         env.spec.task.replace("_", " "),
         env.joint_names,
         links,
-        FORCE,
         output.units[columns[0]],
         env.control_step,
-        _checked_fps(fps or 1.0 / env.control_step, env.control_step),
+        _frame_rate(fps, env.control_step),
         has_outcome=True,
         has_policy=True,
     )
@@ -109,13 +109,13 @@ def of_environments(
                 pending[i] = []
                 touch = samples.pop("touch")[:, :, columns]
                 time = np.arange(len(touch)) * env.control_step
-                is_good = whole[i] if least is None else (score[i] <= least if env.task.is_less_better else score[i] >= least)
+                is_success = _is_success(env.task, score[i], whole[i], least)
                 by_link = {link: touch[:, taxels] for link, taxels in rows.items()}
-                yield Episode(time, touch=by_link, score=float(score[i]), is_success=bool(is_good), **samples)
+                yield Episode(time, touch=by_link, score=float(score[i]), is_success=is_success, **samples)
             if not any(quota):
                 return
 
-    return source, play()
+    return header, play()
 
 
 def of_deployment(
@@ -125,7 +125,7 @@ def of_deployment(
     seconds: float | None = None,
     fps: float | None = None,
     least: float | None = None,
-) -> tuple[Source, Iterator[Episode]]:
+) -> tuple[Header, Iterator[Episode]]:
     """Return episodes of a policy on an emulated hand, a real one or a log: the force on each fingertip, as the hand says it.
 
     Args:
@@ -145,57 +145,48 @@ def of_deployment(
         raise TgdslError(f"{prepared.saved.file}: {problem}; of a hand, expected one that feels {EMULATED}, and proprio")
     if deployment.has_scene and "motion" not in kind_of(deployment.source).options:
         raise TgdslError(f"--source {deployment.source}: a simulation's forces on taxels come from --source environments")
-    num, task = len(prepared.moved.names), prepared.loaded.task
-    bodies = {link.name: LinkTaxels(link.body) for link in prepared.sensed.groups[felt.group].layout.links}
-    source = Source(
+    num = len(prepared.moved.names)
+    links = {link.name: LinkTaxels(link.body) for link in prepared.sensed.groups[felt.group].layout.links}
+    header = Header(
         prepared.loaded.source.file,
         prepared.loaded.spec.task.replace("_", " "),
         prepared.moved.names,
-        bodies,
-        FORCE,
+        links,
         unit,
         prepared.control_step,
-        _checked_fps(fps or 1.0 / prepared.control_step, prepared.control_step),
+        _frame_rate(fps, prepared.control_step),
         has_outcome=deployment.has_scene,
         has_policy=True,
     )
 
-    def ended(rows: list[dict[str, np.ndarray]], last: Any) -> Episode:
+    def episode_of(rows: list[dict[str, np.ndarray]]) -> Episode:
         samples = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-        force, outcome = samples.pop("touch"), dict[str, Any]()
+        force, reward = samples.pop("touch"), samples.pop("reward")
+        score, is_whole = (samples.pop(name)[-1] for name in ("score", "is_whole"))
+        outcome: dict[str, Any] = {}
         if deployment.has_scene:
-            score = float(last.step.info.score)
-            is_good = (
-                bool(~last.step.info.ended[0] | last.step.truncated[0])
-                if least is None
-                else (score <= least if task.is_less_better else score >= least)
-            )
-            outcome = {"score": score, "is_success": is_good, "reward": samples["reward"]}
-        del samples["reward"]
-        touch = {link: force[:, None, i] for i, link in enumerate(bodies)}
+            is_success = _is_success(prepared.loaded.task, score, is_whole, least)
+            outcome = {"score": float(score), "is_success": is_success, "reward": reward}
+        touch = {link: force[:, None, i] for i, link in enumerate(links)}
         return Episode(np.arange(len(force)) * prepared.control_step, touch=touch, **samples, **outcome)
 
     def act() -> Iterator[Episode]:
-        rows: list[dict[str, np.ndarray]] = []
-        last = None
-        for moment in deployment.steps(episodes, seconds):
-            if last is not None and moment.episode != last.episode:
-                yield ended(rows, last)
-                rows = []
-            force = moment.obs[GROUP][0].view(-1, 3, len(bodies))[-1].T  # of stacked samples the newest
-            values = {"state": moment.obs["proprio"][0, :num], "touch": force, "policy_action": moment.action[0]}
-            values |= {"action": moment.target[0], "reward": moment.step.reward[0]}
-            rows.append({name: value.cpu().numpy().copy() for name, value in values.items()})
-            last = moment
-        if rows:
-            yield ended(rows, last)
+        for _, moments in groupby(deployment.steps(episodes, seconds), lambda moment: moment.episode):
+            rows = []
+            for moment in moments:
+                step, force = moment.step, moment.obs[GROUP][0].view(-1, 3, len(links))[-1].T  # of stacked samples the newest
+                values = {"state": moment.obs["proprio"][0, :num], "touch": force, "policy_action": moment.action[0]}
+                values |= {"action": moment.target[0], "reward": step.reward[0], "score": step.info.score[0]}
+                values |= {"is_whole": ~step.info.ended[0] | step.truncated[0]}
+                rows.append({name: value.cpu().numpy().copy() for name, value in values.items()})
+            yield episode_of(rows)
 
-    return source, act()
+    return header, act()
 
 
 def of_run(
     file: Path, touch: TactileModule, fps: float | None = None, reading: str | None = None
-) -> tuple[Source, Iterator[Episode]]:
+) -> tuple[Header, Iterator[Episode]]:
     """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of the actuators.
 
     A recording has positions and readings after each step: a frame's action is that of the next one.
@@ -217,15 +208,14 @@ def of_run(
     rows, links = _links({name: arrays[f"{output.name}:{name}"] for name in ("link", "body", "pos", "normal")})
     names, addresses = _actuated(touch)
     step = float(np.median(np.diff(arrays["time"])))
-    source = Source(
+    header = Header(
         str(file),
         Path(str(arrays["document"])).stem.replace("_", " "),
         names,
         links,
-        FORCE,
         str(arrays[f"{output.name}:units"][columns[0]]),
         step,
-        _checked_fps(fps or 1.0 / step, step),
+        _frame_rate(fps, step),
     )
 
     def read() -> Iterator[Episode]:
@@ -236,12 +226,12 @@ def of_run(
             by_link = {link: force[:-1, env, taxels] for link, taxels in rows.items()}
             yield Episode(arrays["time"][:-1], qpos[:-1, env][:, addresses], action[1:], by_link)
 
-    return source, read()
+    return header, read()
 
 
 def of_log(
     file: Path, fps: float | None = None, calibration: Calibration | None = None, side: str | None = None
-) -> tuple[Source, Iterator[Episode]]:
+) -> tuple[Header, Iterator[Episode]]:
     """Return what a real hand has said, or an emulated one over its line: the force on each fingertip.
 
     A log does not hold commands: the action is where the joints are a frame later. Where no reading came for 0.1 s, the next
@@ -267,9 +257,9 @@ def of_log(
     time, position = log.received_at, log.column("position").astype(np.float64)
     force = meaning.apply(log.column("total_force"))
     step = float(np.median(np.diff(time)))
-    rate = _checked_fps(fps or min(LOG_FPS, 1.0 / step), step)
+    rate = _frame_rate(fps or min(LOG_FPS, 1.0 / step), step)
     joints, links = tuple(f"{prefix}{name}" for name in JOINTS), {body: LinkTaxels(body) for body in bodies}
-    source = Source(str(file), file.stem.replace("_", " "), joints, links, FORCE, meaning.units, step, rate)
+    header = Header(str(file), file.stem.replace("_", " "), joints, links, meaning.units, step, rate)
 
     def read() -> Iterator[Episode]:
         for part in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > MAX_AGE_S) + 1):
@@ -277,13 +267,20 @@ def of_log(
             by_link = {body: force[part][:, None, i] for i, body in enumerate(bodies)}
             yield Episode(time[part], position[part], position[part][later], by_link)
 
-    return source, read()
+    return header, read()
 
 
-def _checked_fps(fps: float, step: float) -> float:
+def _frame_rate(fps: float | None, step: float) -> float:
+    fps = fps or 1.0 / step
     if not 0 < fps * step <= 1.0 + 1e-6:
         raise TgdslError(f"--fps {fps:g}: expected more than 0, and at most the source's rate, {1.0 / step:.4g}")
     return float(round(fps)) if abs(fps - round(fps)) < 1e-6 * fps else fps
+
+
+def _is_success(task: Task[Any] | type[Task[Any]], score: float, is_whole: bool, least: float | None) -> bool:
+    if least is None:
+        return bool(is_whole)
+    return bool(score <= least if task.is_less_better else score >= least)
 
 
 def _force_of(outputs: Any, name: str | None) -> Output:
