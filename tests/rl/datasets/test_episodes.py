@@ -7,9 +7,10 @@ from hand_logs import random_readings, write_log
 from pressing_hands import CALIBRATION, Blind, press_policy, press_task
 from small_tasks import small_task
 
+import tgdsl
 from tgdsl.errors import TgdslError
 from tgdsl.rl.datasets.episode import Episode, Header, LinkTaxels, features, frames
-from tgdsl.rl.datasets.sources import of_deployment, of_environments, of_log
+from tgdsl.rl.datasets.sources import of_deployment, of_environments, of_log, of_run
 from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actions import RandomActor
@@ -105,6 +106,24 @@ def test_a_policy_that_feels_no_force_is_refused_by_name(tmp_path):
     env = TouchEnv(small_task(tmp_path), 1, threads=1, overrides={"touch": "bool"})
     with pytest.raises(TgdslError, match=r"no reading is a force on taxels, in newtons: there are .*--set touch=force"):
         of_environments(env, RandomActor(env, 0), 1)
+
+
+def test_a_run_has_the_joints_that_actuators_move_directly(tmp_path):
+    """The first actuator pulls on a tendon, which is no joint: its control is no set-point of one."""
+    felt_task(tmp_path)
+    scene, file, rng = tmp_path / "scene.xml", tmp_path / "run.npz", np.random.default_rng(0)
+    pull = '<tendon><fixed name="both"><joint joint="swing" coef="1"/></fixed></tendon><actuator><motor tendon="both"/>'
+    scene.write_text(scene.read_text().replace("<actuator>", pull).replace('ctrl="0 0"', 'ctrl="0 0 0"'))
+    touch = tgdsl.compile(tmp_path / "sensors.yaml")
+    output = next(output for output in touch.outputs if output.name == "push")
+    arrays = {"time": 0.01 * np.arange(6), "qpos": rng.normal(size=(6, 1, 9)), "ctrl": rng.normal(size=(6, 3))}
+    arrays |= {"push": rng.normal(size=(6, 1, *output.shape)), "push:channels": output.channels, "push:units": output.units}
+    arrays |= {f"push:{name}": touch.taxels["push"][name] for name in ("link", "body", "pos", "normal")}
+    np.savez(file, document="sensors.yaml", **arrays)
+    header, (episode,) = of_run(file, touch)
+    assert header.joints == ("swing", "bend")
+    np.testing.assert_array_equal(episode.state, arrays["qpos"][:-1, 0, :2])
+    np.testing.assert_array_equal(episode.action, arrays["ctrl"][1:, 1:])
 
 
 def test_a_hands_log_is_cut_where_no_reading_came(tmp_path):

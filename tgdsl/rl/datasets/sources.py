@@ -10,6 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -187,7 +188,7 @@ def of_deployment(
 def of_run(
     file: Path, touch: TactileModule, fps: float | None = None, reading: str | None = None
 ) -> tuple[Header, Iterator[Episode]]:
-    """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of the actuators.
+    """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of joints' actuators.
 
     A recording has positions and readings after each step: a frame's action is that of the next one.
 
@@ -206,12 +207,14 @@ def of_run(
     output = _force_of(recorded, reading)
     columns = [list(arrays[f"{output.name}:channels"]).index(name) for name in FORCE]
     rows, links = _links({name: arrays[f"{output.name}:{name}"] for name in ("link", "body", "pos", "normal")})
-    names, addresses = _actuated(touch)
+    model = scene_model(touch.plan.scene)
+    actuators = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    joints = model.actuator_trnid[actuators, 0]
     step = float(np.median(np.diff(arrays["time"])))
     header = Header(
         str(file),
         Path(str(arrays["document"])).stem.replace("_", " "),
-        names,
+        tuple(model.joint(int(i)).name for i in joints),
         links,
         str(arrays[f"{output.name}:units"][columns[0]]),
         step,
@@ -219,12 +222,12 @@ def of_run(
     )
 
     def read() -> Iterator[Episode]:
-        force, qpos, ctrl = arrays[output.name][..., columns], arrays["qpos"], arrays["ctrl"]
+        force, qpos, ctrl = arrays[output.name][..., columns], arrays["qpos"], arrays["ctrl"][..., actuators]
         force = force if force.ndim == 4 else force[:, :, -1]  # of stacked samples the newest
         for env in range(qpos.shape[1]):
             action = ctrl if ctrl.ndim == 2 else ctrl[:, env]
             by_link = {link: force[:-1, env, taxels] for link, taxels in rows.items()}
-            yield Episode(arrays["time"][:-1], qpos[:-1, env][:, addresses], action[1:], by_link)
+            yield Episode(arrays["time"][:-1], qpos[:-1, env][:, model.jnt_qposadr[joints]], action[1:], by_link)
 
     return header, read()
 
@@ -303,10 +306,3 @@ def _links(table: Columns | np.ndarray) -> tuple[dict[str, np.ndarray], dict[str
         for link, of_link in rows.items()
     }
     return rows, taxels
-
-
-def _actuated(touch: TactileModule) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the joint of each actuator, and where it stands in `qpos`."""
-    model = scene_model(touch.plan.scene)
-    ids = model.actuator_trnid[:, 0]
-    return tuple(model.joint(int(i)).name for i in ids), model.jnt_qposadr[ids]
