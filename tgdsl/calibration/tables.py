@@ -5,8 +5,8 @@
       file: states.csv
       time: t                              # a column by its name in the first line, or by its number from 0
       unit: mm
-      position: {ball: [x, y, z]}
-      orientation: {ball: [qw, qx, qy, qz]}    # default: the world's
+      position: {ball: [x, y, z], pad: [px, py, pz]}
+      orientation: {ball: [qw, qx, qy, qz]}  # default: the world's
     targets:
       load:
         file: scale.csv
@@ -17,8 +17,8 @@
         invalid: [-1]                      # numbers that stand for a missing reading
         clock_width: 0.5 s
 
-A body without a position stands at the world's origin. Empty cells, and those that are `invalid`, get the weight 0 in targets;
-in states they are errors. A file that starts with numbers has no names.
+Each body that the module reads needs columns for its position. Empty and `invalid` cells get the weight 0 in targets; in states
+an empty cell is an error. A file that starts with numbers has no names.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class ExportDataset:
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
     """Of a task without a policy: who acts, as for tgdsl play."""
     source: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "environments"
-    """Of a policy: where it acts. environments: those of the task, many at a time; emulator, xhand1:PORT or a log as for tgdsl
+    """Of a policy: where it acts. environments: the task's, many at a time; emulator, xhand1:PORT or a log as for tgdsl
     deploy, for a policy that feels agg_force."""
     episodes: int = 16
     """Of a task: number of episodes."""
@@ -62,7 +62,7 @@ class ExportDataset:
     device: str = "cpu"
     """Where environments are computed: cpu, or cuda."""
     seed: int = 0
-    """What all that is random follows from."""
+    """Seed of everything random."""
     set: Overrides = ()
 
     def run(self) -> None:

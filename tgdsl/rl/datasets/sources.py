@@ -190,7 +190,7 @@ def of_run(
 ) -> tuple[Header, Iterator[Episode]]:
     """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of joints' actuators.
 
-    A recording has positions and readings after each step: a frame's action is that of the next one.
+    A recording has positions and readings after each step: a frame's action is the next step's.
 
     Args:
         file: The recording.
