@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean, listed
@@ -39,8 +39,8 @@ LOG_FPS = 30.0
 """Frames per second of a hand's log unless others are asked for."""
 
 
-class _Watching(Actor):
-    """An actor; notes joints, touch and set-points before each step."""
+class _Sampler(Actor):
+    """Acts as another actor does, and samples joints, touch and set-points before each step."""
 
     def __init__(self, actor: Actor, env: TouchEnv, output: Output):
         self._actor, self._env, self._output = actor, env, output
@@ -55,15 +55,14 @@ class _Watching(Actor):
         self.row = {name: value.detach().cpu().numpy().copy() for name, value in values.items()}
         return action
 
-    def begin(self, ended: Tensor) -> None:
-        """Tell the actor."""
+    def begin(self, ended: Bool[Tensor, " env"]) -> None:
         self._actor.begin(ended)
 
 
 def of_environments(
     env: TouchEnv, actor: Actor, episodes: int, fps: float | None = None, reading: str | None = None, least: float | None = None
 ) -> tuple[Header, Iterator[Episode]]:
-    """Return episodes of environments that were just made: as many of each environment, its first ones.
+    """Return the first episodes of fresh environments, as many of each.
 
     Args:
         env: The environments.
@@ -71,11 +70,11 @@ def of_environments(
         episodes: How many.
         fps: Frames per second; default: one per control step.
         reading: The reading that is exported; default: the first force on taxels.
-        least: Score with which an episode succeeds, of a task in which less is better the most; default: it succeeds if it
-            lasts as long as one may.
+        least: Least score with which an episode succeeds, or the largest where less is better; default: it succeeds if it
+            lasts to the end.
 
     Raises:
-        TgdslError: If there is no such reading, or it is of no taxels.
+        TgdslError: If there is no such reading of a force on taxels.
     """
     output = _force_of(env.touch.outputs, reading)
     table = env.touch.taxels[output.sensor]
@@ -96,13 +95,13 @@ def of_environments(
     def play() -> Iterator[Episode]:
         quota = [episodes // env.num_envs + (i < episodes % env.num_envs) for i in range(env.num_envs)]
         pending: list[list[dict[str, Any]]] = [[] for _ in quota]
-        watching = _Watching(actor, env, output)
+        sampler = _Sampler(actor, env, output)
         actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-        for moment in rollout(watching, env):
+        for moment in rollout(sampler, env):
             info, reward = moment.step.info, moment.step.reward.cpu().numpy()
             ended, whole, score = (value.cpu().numpy() for value in (info.ended, info.is_whole(env.max_steps), info.score))
             for i in np.flatnonzero(quota):
-                pending[i].append({name: value[i] for name, value in watching.row.items()} | {"reward": reward[i]})
+                pending[i].append({name: value[i] for name, value in sampler.row.items()} | {"reward": reward[i]})
                 if not ended[i]:
                     continue
                 quota[i] -= 1
