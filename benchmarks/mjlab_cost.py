@@ -5,7 +5,7 @@
 
 Needs tgdsl and mjlab, and no network: `pip install --no-index --find-links WHEELS tgdsl mjlab`. The scene is that of the task
 Tgdsl-In-Palm-Rotate, an XHand1 with 199 taxels of `kinematic_taxel` and a cube. The share is (with − without) / with, by the
-medians of blocks of steps that take turns.
+medians of alternating blocks of steps.
 
 - `eager`: the module as the adapter reads it
 - `compiled`: the same after `torch.compile`
@@ -18,8 +18,11 @@ import argparse
 import json
 import statistics
 import time
+from collections.abc import Callable
 
 import torch
+
+from tgdsl.tensors.graphed import captured
 
 
 def environment(num_envs: int, device: str, has_touch: bool):
@@ -39,14 +42,18 @@ def environment(num_envs: int, device: str, has_touch: bool):
     return env
 
 
+def seconds_per_call(call: Callable[[], object], device: str, calls: int) -> float:
+    wait(device)
+    start = time.perf_counter()
+    for _ in range(calls):
+        call()
+    wait(device)
+    return (time.perf_counter() - start) / calls
+
+
 def seconds_per_step(env, steps: int) -> float:
     action = torch.zeros((env.num_envs, env.action_manager.total_action_dim), device=env.device)
-    wait(env.device)
-    start = time.perf_counter()
-    for _ in range(steps):
-        env.step(action)
-    wait(env.device)
-    return (time.perf_counter() - start) / steps
+    return seconds_per_call(lambda: env.step(action), env.device, steps)
 
 
 def wait(device) -> None:
@@ -60,21 +67,9 @@ def captured_seconds(env, steps: int) -> float:
     touch, state = sensor.touch, sensor._state()
     state.dt = env.step_dt
     memory = touch.initial_memory(env.num_envs, env.step_dt)
-    stream = torch.cuda.Stream()
     with torch.no_grad():
-        with torch.cuda.stream(stream):
-            for _ in range(3):
-                touch.step(state, memory)
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            touch.step(state, memory)
-    wait(env.device)
-    start = time.perf_counter()
-    for _ in range(steps):
-        graph.replay()
-    wait(env.device)
-    return (time.perf_counter() - start) / steps
+        replay, _ = captured(lambda: touch.step(state, memory)[0])
+    return seconds_per_call(replay, env.device, steps)
 
 
 def main() -> None:

@@ -22,9 +22,9 @@ import numpy as np
 import tyro
 
 import tgdsl
+from tgdsl.calibration.compare import Comparison
 from tgdsl.calibration.fit import Fit
 from tgdsl.calibration.problem import ReadingMap
-from tgdsl.console.tables import text_table
 
 PX = 18.8e3
 """Pixels per metre of the GelSight's images, from the marker pitch."""
@@ -41,31 +41,68 @@ PRESSED = {**LAYER, "thickness": 6.85e-3, "poissons_ratio": 0.374, "marker_depth
 OF_LAYER = ["skin.thickness=2 mm:20 mm", "skin.poissons_ratio", "skin.marker_depth=0 mm:2 mm"]
 OF_HALF_SPACE = ["skin.poissons_ratio", "skin.marker_depth=0 mm:2 mm"]
 FRICTION = "skin.friction=0.02:3"
+DOME_RADIUS = 28.41e-3
+"""Radius of the sphere that the dome's nodes lie on, within 1 µm [m]."""
+DOME_BALL = 1e-3
+"""Radius of the ball that stands for the load on its node [m]."""
+DRAG_STARTS = ((0.0, 0.0), (1.5e-4, 5e-5), (1.5e-4, 9e-5))
+"""Where the search for the dragged ball starts, from the loaded node [m]: its place has several minima."""
+DOME_NEAR = 1.5e-3
+"""Distance from that node up to which all nodes are used [m]."""
+DOME_SHARE = 0.03
+"""Share of the other nodes, with as much more weight."""
 
 
-def document(
-    folder: Path, places: np.ndarray, normals: np.ndarray, skin: dict[str, Any], ball: float, half: float, pitch: float
+def write_document(
+    folder: Path, name: str, sensor: dict[str, Any], resolutions: dict[str, Any], pad: float, ball: float
 ) -> Path:
-    """Write a pad under a ball, taxels on a square in its middle, and markers at some places [m]; return the document."""
+    """Write a ball over a box whose upper face is the plane z = 0, and a document with one sensor on the box.
+
+    Args:
+        folder: Where the files go.
+        name: Name of the sensor and the document.
+        sensor: The sensor.
+        resolutions: The box's taxels by resolution; the sensor has the first.
+        pad: Half the box's width [m].
+        ball: Radius of the ball [m].
+
+    Returns:
+        The document.
+    """
     (folder / "scene.xml").write_text(
-        f'<mujoco><worldbody><body name="pad"><geom type="box" size=".03 .03 .01" pos="0 0 -.01"/></body>'
+        f'<mujoco><worldbody><body name="pad"><geom type="box" size="{pad} {pad} .01" pos="0 0 -.01"/></body>'
         f'<body name="ball" pos="0 0 .1"><freejoint/><geom type="sphere" size="{ball}"/></body></worldbody></mujoco>'
     )
+    content = {
+        "tgdsl": 1,
+        "robot": {"model": "scene.xml", "layout": {"resolutions": resolutions}},
+        "resolution": next(iter(resolutions)),
+        "objects": {"ball": {"body": "ball"}},
+        "sensors": {name: {"links": "pad", "feels": ["ball"], "gate": "geometric", **sensor}},
+    }
+    file = folder / f"{name}.yaml"
+    file.write_text(json.dumps(content))  # which is YAML too
+    return file
+
+
+def skin_document(
+    folder: Path, places: np.ndarray, normals: np.ndarray, skin: dict[str, Any], ball: float, half: float, pitch: float
+) -> Path:
+    """Write an elastomer with taxels on a square, and markers at places [m] with normals; return the document."""
     num = round(2 * half / pitch)
     square = {"box": {"min": [-half, -half, -1e-3], "max": [half, half, 1e-3]}}
     grid = {"method": "grid", "rows": num, "columns": num, "direction": [0, 0, -1], "radius": 1e-3, "region": square}
     dots = [{"pos": p.tolist(), "normal": n.tolist(), "radius": 1e-3} for p, n in zip(places, normals, strict=True)]
-    layout = {"resolutions": {"taxels": {"pad": grid}, "dots": {"pad": {"method": "points", "points": dots}}}}
-    sensor = {"kind": "elastomer", "links": "pad", "feels": ["ball"], "gate": "geometric", "markers": "dots", **skin}
-    content = {
-        "tgdsl": 1,
-        "robot": {"model": "scene.xml", "layout": layout},
-        "resolution": "taxels",
-        "objects": {"ball": {"body": "ball"}},
-        "sensors": {"skin": sensor},
-    }
-    (folder / "skin.yaml").write_text(json.dumps(content))  # which is YAML too
-    return folder / "skin.yaml"
+    resolutions = {"taxels": {"pad": grid}, "dots": {"pad": {"method": "points", "points": dots}}}
+    return write_document(folder, "skin", {"kind": "elastomer", "markers": "dots", **skin}, resolutions, 0.03, ball)
+
+
+def probe_document(folder: Path, law: dict[str, Any]) -> Path:
+    """Write one probe under a ball, whose force is the load; return the document."""
+    probe = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 0.014}
+    sensor = {"kind": "kinematic_taxel", "outputs": ["force"], "normal_stiffness": 1e4, "depth_exponent": 1.5}
+    sensor |= {"normal_damping": 0, "shear_damping": 0, **law}
+    return write_document(folder, "load", sensor, {"r": {"pad": {"method": "points", "points": [probe]}}}, 0.02, 0.02)
 
 
 def poses(*places: tuple[float, float, float]) -> dict[str, Any]:
@@ -73,11 +110,6 @@ def poses(*places: tuple[float, float, float]) -> dict[str, Any]:
     pos, quat = np.zeros((len(places), 2, 3)), np.zeros((len(places), 2, 4))
     pos[:, 1], quat[..., 0] = places, 1.0
     return {"time": np.arange(len(places)), "body_pos": pos, "body_quat": quat, "bodies": ["pad", "ball"]}
-
-
-def width(value: np.ndarray) -> dict[str, Any]:
-    """Return standard deviations of the poses' offsets [m]."""
-    return {"width:body_pos": value}
 
 
 def target(time_s: list[float], value: np.ndarray, kept: np.ndarray, floor: float) -> dict[str, Any]:
@@ -90,42 +122,39 @@ def target(time_s: list[float], value: np.ndarray, kept: np.ndarray, floor: floa
 
 def gelsight_recordings(data: Path, folder: Path) -> np.ndarray:
     """Write press.npz, drag.npz and raw.npz; return the unloaded places of the markers [m]."""
-    found = np.load(data / "gelsight" / "subpixel.npz")
-    press, drag = found["press"] / PX, found["drag"] / PX
+    markers = np.load(data / "gelsight" / "subpixel.npz")
+    press, drag = markers["press"] / PX, markers["drag"] / PX
     deep, wide = BALL - 1e-3, np.array([4e-4, 4e-4, 4e-4])
     still = np.zeros((1, 2, 3))
     still[0, 1] = wide
-    size = np.sqrt((press[found["press_kept"]] ** 2).mean())
-    np.savez(
-        folder / "press.npz", **poses((0, 0, deep)), **target([0], press, found["press_kept"], 0.105 * size), **width(still)
-    )
+    size = np.sqrt((press[markers["press_kept"]] ** 2).mean())
+    once = {**poses((0, 0, deep)), "width:body_pos": still}
+    np.savez(folder / "press.npz", **once, **target([0], press, markers["press_kept"], 0.105 * size))
     moved = np.zeros((2, 2, 3))
     moved[0, 1], moved[1, 1] = wide, [1e-3, 1e-3, 4e-4]
     turned = np.zeros((2, 2, 4))
     turned[1, 1, 3] = 0.05  # half the angle about the normal by which the drag turned the ball [rad]
     both = poses((0, 0, deep), (0, 3e-4, deep))
     motion = {"zero:skin": 0.0, "width:body_pos": moved, "width:body_quat": turned}
-    size = np.sqrt((drag[found["drag_kept"]] ** 2).mean())
-    np.savez(folder / "drag.npz", **both, **target([1], drag, found["drag_kept"], 0.01 * size), **motion)
+    size = np.sqrt((drag[markers["drag_kept"]] ** 2).mean())
+    np.savez(folder / "drag.npz", **both, **target([1], drag, markers["drag_kept"], 0.01 * size), **motion)
     raw = [np.loadtxt(data / "gelsight" / f"{i}.csv", delimiter=",", skiprows=1)[:, 2:4] / PX for i in (0, 1)]
     raw_drag, every = raw[1] - raw[0], np.ones(len(drag))
     size = np.sqrt((raw_drag**2).mean())
     np.savez(folder / "raw.npz", **both, **target([1], raw_drag, every, 0.113 * size), **motion)
-    return np.column_stack([(found["unloaded"] - CENTRE) / PX, np.zeros(len(press))])
+    return np.column_stack([(markers["unloaded"] - CENTRE) / PX, np.zeros(len(press))])
 
 
-def show(rows: list[tuple[str, Fit, float]]) -> None:
-    """Print a line for each target of each fit."""
-    lines = []
-    for name, fit, seconds in rows:
-        for error in fit.errors:
-            held = "" if error.held_out is None else f"{error.held_out:.3f}"
-            floor = "" if error.floor is None else f"{error.floor:.3f}"
-            values = ", ".join(f"{f.path.split('.')[1]} {f.value:.4g}" for f in fit.parameters.values())
-            lines.append(
-                (name, error.recording, f"{error.error:.3f}", held, floor, f"{error.alone:.3f}", values, f"{seconds:.0f}")
-            )
-    print(text_table(("model", "recording", "error", "held out", "floor", "without", "parameters", "s"), lines))
+def fit_case(
+    label: str, sheet: Path, recordings: Any, parameters: list[str], out: Path | None, prefix: str = "", **options: Any
+) -> Fit:
+    """Fit, print the fit and its duration, and draw it if there is a folder for pictures."""
+    start = time.perf_counter()
+    result = tgdsl.calibrate(sheet, recordings, parameters, intervals="none", **options)
+    print(f"{label}: {time.perf_counter() - start:.0f} s\n\n{result}\n", flush=True)
+    if out is not None:
+        result.plot(out / f"reality-{prefix}{label.replace(', ', '-').replace(' ', '-')}.png")
+    return result
 
 
 def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
@@ -147,29 +176,13 @@ def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
             ("half_space, raw drag, offset", {**HALF_SPACE, "friction": 0.3}, [raw], [*OF_HALF_SPACE, FRICTION], "offset"),
             ("layer, both, offset", {**PRESSED, "friction": 0.6}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
         ]  # fmt: skip
-        rows = []
+        normals, fits = np.tile([0.0, 0.0, 1.0], (len(places), 1)), dict[str, Fit]()
         for label, skin, recordings, fit, reading in cases:
-            if only not in label:
-                continue
-            sheet = document(folder, places, np.tile([0.0, 0.0, 1.0], (len(places), 1)), skin, BALL, 4e-3, 0.4e-3)
-            start = time.perf_counter()
-            result = tgdsl.calibrate(
-                sheet,
-                recordings,
-                fit,
-                reading=reading,
-                gain=True,
-                hold_out="taxel",
-                intervals="none",
-                starts=starts,
-            )
-            rows.append((label, result, time.perf_counter() - start))
-            show(rows[-1:])
-            print("\n".join(result.warnings), flush=True)
-            print({key: float(f"{value:.3g}") for key, value in result.nuisances.items()}, flush=True)
-            if out is not None:
-                result.plot(out / f"reality-{label.replace(', ', '-').replace(' ', '-')}.png")
-        show(rows)
+            if only in label:
+                sheet = skin_document(folder, places, normals, skin, BALL, 4e-3, 0.4e-3)
+                options = {"reading": reading, "gain": True, "hold_out": "taxel", "starts": starts}
+                fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
+        print(Comparison(fits))
 
 
 def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -204,7 +217,7 @@ def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
 def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the finite-element dome: its material from the press, which then predicts the drag."""
     with tempfile.TemporaryDirectory() as name:
-        folder, rows = Path(name), []
+        folder, fits = Path(name), dict[str, Fit]()
         places, normals = dome_recordings(data, folder)
         poisson, depth = "skin.poissons_ratio", "skin.marker_depth=0 mm:0.3 mm"
         elastic = {"youngs_modulus": 1e6, "normal_stiffness": 1e10, "poissons_ratio": 0.45, "marker_depth": 5e-5}
@@ -219,22 +232,15 @@ def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
         for kernel, (skin, material) in cases.items():
             if only not in kernel:
                 continue
-            sheet = document(folder, places, normals, {**skin, "enter": 0}, DOME_BALL, 4.5e-4, 9e-5)
-            start = time.perf_counter()
-            press = tgdsl.calibrate(
-                sheet, folder / "press.npz", material, gain=True, hold_out="blocks", intervals="none", starts=starts
-            )
+            sheet = skin_document(folder, places, normals, {**skin, "enter": 0}, DOME_BALL, 4.5e-4, 9e-5)
+            options = {"prefix": "dome-", "gain": True, "starts": starts}
+            press = fit_case(f"{kernel}, press", sheet, folder / "press.npz", material, out, hold_out="blocks", **options)
             fitted = press.document(folder / "fitted.yaml")
-            between = time.perf_counter()
-            drags = [
-                tgdsl.calibrate(fitted, folder / f"drag{i}.npz", gain=True, intervals="none", starts=starts)
-                for i in range(len(DRAG_STARTS))
-            ]
-            drag = min(drags, key=lambda fit: fit.errors[0].error)
-            rows += [(f"{kernel}, press", press, between - start)]
-            rows += [(f"{kernel}, drag by the press's material", drag, time.perf_counter() - between)]
-            print(press, drag, sep="\n\n", flush=True)
-        show(rows)
+            files = [folder / f"drag{i}.npz" for i in range(len(DRAG_STARTS))]
+            drags = [fit_case(f"{kernel}, {file.stem}", fitted, file, [], out, **options) for file in files]
+            fits[f"{kernel}, press"] = press
+            fits[f"{kernel}, drag by the press's material"] = min(drags, key=lambda fit: fit.errors[0].error)
+        print(Comparison(fits))
 
 
 def eflesh_recording(data: Path, run: str, contact: float, every: int, cycles: slice = slice(None)) -> dict[str, Any]:
@@ -256,7 +262,7 @@ def eflesh_recording(data: Path, run: str, contact: float, every: int, cycles: s
     return {
         **poses(*[(0.0, 0.0, z) for z in ball]), "time": time_s, "target:load": -9.81e-3 * load[valid, None, None],
         "clock:load": time_s[valid], "clock_width:load": 0.5, "unit:load": "N", "channels:load": ["force_z"],
-        **width(np.array([[0, 0, 0], [0, 0, 2e-3]])),
+        "width:body_pos": np.array([[0, 0, 0], [0, 0, 2e-3]]),
     }  # fmt: skip
 
 
@@ -277,58 +283,13 @@ def eflesh(data: Path, out: Path | None, only: str, starts: int) -> None:
         "shear, loop, densification": ({"loop": loop, **lattice}, [shear], [stiffness, exponent, *of_loop, closing], False),
     }
     with tempfile.TemporaryDirectory() as name:
-        folder, rows = Path(name), []
+        fits: dict[str, Fit] = {}
         for label, (law, recordings, fit, gain) in cases.items():
-            if only not in label:
-                continue
-            start = time.perf_counter()
-            result = tgdsl.calibrate(
-                probe_document(folder, law),
-                recordings,
-                fit,
-                gain=gain,
-                hold_out="time",
-                folds=10,
-                intervals="none",
-                starts=starts,
-            )
-            rows.append((label, result, time.perf_counter() - start))
-            print(result, flush=True)
-            if out is not None:
-                result.plot(out / f"reality-eflesh-{label.replace(', ', '-').replace(' ', '-')}.png")
-        show(rows)
-
-
-DOME_RADIUS = 28.41e-3
-"""Radius of the sphere that the dome's nodes lie on, within 1 µm [m]."""
-DOME_BALL = 1e-3
-"""Radius of the ball that stands for the load on its node [m]."""
-DRAG_STARTS = ((0.0, 0.0), (1.5e-4, 5e-5), (1.5e-4, 9e-5))
-"""Where the search for the dragged ball starts, from the loaded node [m]: its place has several minima."""
-DOME_NEAR = 1.5e-3
-"""Distance from that node up to which all nodes are used [m]."""
-DOME_SHARE = 0.03
-"""Share of the other nodes, with as much more weight."""
-
-
-def probe_document(folder: Path, law: dict[str, Any]) -> Path:
-    """Write one probe under a ball, whose force is the load; return the document."""
-    (folder / "scene.xml").write_text(
-        '<mujoco><worldbody><body name="pad"><geom type="box" size=".02 .02 .01" pos="0 0 -.01"/></body>'
-        '<body name="ball" pos="0 0 .05"><freejoint/><geom type="sphere" size=".02"/></body></worldbody></mujoco>'
-    )
-    probe = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 0.014}
-    layout = {"resolutions": {"r": {"pad": {"method": "points", "points": [probe]}}}}
-    sensor = {"kind": "kinematic_taxel", "links": "pad", "feels": ["ball"], "gate": "geometric", "outputs": ["force"]}
-    sensor |= {"normal_stiffness": 1e4, "depth_exponent": 1.5, "normal_damping": 0, "shear_damping": 0, **law}
-    content = {
-        "tgdsl": 1,
-        "robot": {"model": "scene.xml", "layout": layout},
-        "objects": {"ball": {"body": "ball"}},
-        "sensors": {"load": sensor},
-    }
-    (folder / "load.yaml").write_text(json.dumps(content))
-    return folder / "load.yaml"
+            if only in label:
+                sheet = probe_document(Path(name), law)
+                options = {"prefix": "eflesh-", "gain": gain, "hold_out": "time", "folds": 10, "starts": starts}
+                fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
+        print(Comparison(fits))
 
 
 def main(

@@ -18,7 +18,7 @@ import zarr
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from mcap.reader import make_reader
 
-from tgdsl.rl.datasets.episode import Episode, LinkTaxels, Source, frames
+from tgdsl.rl.datasets.episode import Episode, Header, LinkTaxels, frames
 from tgdsl.rl.datasets.lerobot import write_lerobot
 from tgdsl.rl.datasets.mcap_file import write_mcap
 from tgdsl.rl.datasets.zarr_store import write_zarr
@@ -27,22 +27,22 @@ from tgdsl.rl.datasets.zarr_store import write_zarr
 def made_up():
     rng = np.random.default_rng(0)
     links = {"tip": LinkTaxels("tip", rng.normal(size=(4, 3)), rng.normal(size=(4, 3))), "palm": LinkTaxels("palm")}
-    source = Source("made up", "press it", ("a", "b"), links, ("x", "y", "z"), "N", 0.01, 50.0, True, True)
+    header = Header("made up", "press it", ("a", "b"), links, "N", 0.01, 50.0, True, True)
     episodes = []
     for num in (31, 12, 24):
         touch = {"tip": rng.normal(size=(num, 4, 3)), "palm": rng.normal(size=(num, 1, 3))}
         state, action, policy = rng.normal(size=(3, num, 2))
         outcome = {"reward": rng.normal(size=num), "score": float(num), "is_success": num > 20}
         episodes.append(Episode(np.arange(num) * 0.01, state, action, touch, policy, **outcome))
-    return source, episodes
+    return header, episodes
 
 
 def test_lerobot_reads_every_frame(tmp_path):
-    source, episodes = made_up()
-    assert write_lerobot(source, episodes, tmp_path) == (3, 16 + 6 + 12)
+    header, episodes = made_up()
+    assert write_lerobot(header, episodes, tmp_path) == (3, 16 + 6 + 12)
     dataset = LeRobotDataset("local/touch", root=tmp_path)
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (3, 34, 50)
-    each = [frames(source, episode) for episode in episodes]
+    each = [frames(header, episode) for episode in episodes]
     expected = {name: np.concatenate([own[name] for own in each]) for name in each[0]}
     assert expected["observation.tactile_window.tip"].shape == (34, 2, 4, 3)
     for i in range(34):
@@ -61,25 +61,25 @@ def test_lerobot_reads_every_frame(tmp_path):
     np.testing.assert_array_equal(before[20]["observation.tactile.tip"], expected["observation.tactile.tip"][19:21])
     tactile = json.loads((tmp_path / "meta/tactile.json").read_text())
     assert tactile["unit"] == "N" and tactile["links"]["palm"]["pos"] is None
-    np.testing.assert_array_equal(tactile["links"]["tip"]["normal"], source.links["tip"].normal)
+    np.testing.assert_array_equal(tactile["links"]["tip"]["normal"], header.links["tip"].normal)
 
 
 def test_zarr_reads_every_frame(tmp_path):
-    source, episodes = made_up()
-    assert write_zarr(source, episodes, tmp_path / "store") == (3, 34)
+    header, episodes = made_up()
+    assert write_zarr(header, episodes, tmp_path / "store") == (3, 34)
     root = zarr.open_group(str(tmp_path / "store"), mode="r")
-    each = [frames(source, episode) for episode in episodes]
+    each = [frames(header, episode) for episode in episodes]
     for name in each[0]:
         np.testing.assert_array_equal(root["data"][name][:], np.concatenate([own[name] for own in each]))
     assert root["meta/episode_ends"][:].tolist() == [16, 22, 34] and root["meta/success"][:].tolist() == [1.0, 0.0, 1.0]
-    np.testing.assert_array_equal(root["meta/tactile/tip/pos"][:], source.links["tip"].pos)
+    np.testing.assert_array_equal(root["meta/tactile/tip/pos"][:], header.links["tip"].pos)
     assert root.attrs["fps"] == 50.0
 
 
 def test_mcap_reads_every_frame(tmp_path):
-    source, episodes = made_up()
-    assert write_mcap(source, episodes, tmp_path) == (3, 34)
-    each = [frames(source, episode) for episode in episodes]
+    header, episodes = made_up()
+    assert write_mcap(header, episodes, tmp_path) == (3, 34)
+    each = [frames(header, episode) for episode in episodes]
     starts = (0.0, 16 / 50 + 1.0, 22 / 50 + 2.0)
     with (tmp_path / "episodes.mcap").open("rb") as file:
         reader = make_reader(file)
@@ -92,7 +92,7 @@ def test_mcap_reads_every_frame(tmp_path):
                 np.testing.assert_array_equal(np.asarray(content["value"], value.dtype), value)
                 assert message.log_time == pytest.approx(1e9 * (starts[content["episode"]] + message.sequence / 50), abs=2)
         (tactile,) = reader.iter_metadata()
-    assert json.loads(tactile.metadata["links"])["tip"]["pos"] == source.links["tip"].pos.tolist()
+    assert json.loads(tactile.metadata["links"])["tip"]["pos"] == header.links["tip"].pos.tolist()
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

@@ -33,6 +33,8 @@ def test_mistakes_have_a_place(tmp_path):
     (tmp_path / "models.yaml").write_text(MODELS.replace("set:", "sett:"))
     with pytest.raises(SpecError, match=r"models\.yaml:4:\d+: compare\.linear spring"):
         tgdsl.compare(document(tmp_path), {}, tmp_path / "models.yaml")
+    with pytest.raises(SpecError, match=r'compare\.linear spring\.sett: unknown key "sett"'):
+        tgdsl.compare(document(tmp_path), {}, {"linear spring": {"sett": {}}})
 
 
 def test_the_command_prints_the_table(tmp_path, here):

@@ -68,6 +68,18 @@ def test_a_recording_in_tables_is_the_recording(folder):
         ("press.yaml", "time: t", "time: tt", r'states\.csv:1:1: there is no column "tt"; did you mean "t"'),
         ("press.yaml", "time: 0", "time: clock", r'touch\.csv:1:1: there is no column "clock"; number them from 0 to 3'),
         ("press.yaml", "[1, 2, 3]", "[1, 2, 4]", r"touch\.csv:1:1: there is no column 4; there are 4, from 0"),
+        (
+            "press.yaml",
+            "[1, 2, 3]}",
+            "[1, 2], force_x: [1]}",
+            r"press\.yaml:12:\d+: targets\.touch\.channels: expected as many columns each, found force_z: 2, force_x: 1",
+        ),
+        (
+            "press.yaml",
+            "targets:",
+            "  orientation: {bal: [x, x, x, x]}\ntargets:",
+            r'press\.yaml:7:\d+: states\.orientation\.bal: "bal" has an orientation, but no position',
+        ),
         ("press.yaml", "unit: mm", "unit: furlong", r"press\.yaml:5:9: states\.unit"),
         ("press.yaml", "file: touch.csv", "file: tuch.csv", r"tuch\.csv: cannot be read as CSV"),
         ("states.csv", "0,0,0,34", "0,oops,0,34", r'states\.csv:2:2: column x: found "oops", expected a number'),

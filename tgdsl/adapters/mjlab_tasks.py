@@ -21,9 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from mjlab.actuator.xml_actuator import XmlActuatorCfg
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
-from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.envs.mdp import action_rate_l2, joint_pos_rel, joint_vel_rel, last_action, reset_root_state_uniform, time_out
-from mjlab.envs.mdp import reset_joints_by_offset as reset_joints
+from mjlab.envs import ManagerBasedRlEnvCfg, mdp
 from mjlab.envs.mdp.actions import JointPositionActionCfg
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.observation_manager import ObservationGroupCfg, ObservationTermCfg
@@ -177,13 +175,8 @@ def drop(env: Any) -> Bool[Tensor, " env"]:
     return turning(env).distance > DROP_DISTANCE
 
 
-def dropped(env: Any) -> Float[Tensor, " env"]:
-    """`drop` as a term of the reward."""
-    return drop(env).float()
-
-
 def goal(env: Any) -> Float[Tensor, "env feature"]:
-    """Six numbers of the goal's orientation, and the angle from there to the cube's [rad]."""
+    """The goal's orientation in the world, six numbers, and the angle from there to the cube's [rad]."""
     turns = turning(env)
     quat = rotations.product(rotations.about(turns.up, turns.goal), turns.start[:, 3:])
     return torch.cat([rotations.six_numbers(quat), rotations.between(quat, pose_of(env)[:, 3:])[:, None]], dim=1)
@@ -204,9 +197,9 @@ def env_cfg() -> ManagerBasedRlEnvCfg:
     cube = EntityCfg(spec_fn=cube_spec, init_state=EntityCfg.InitialStateCfg(pos=CUBE_POS, joint_pos={}, joint_vel={}))
     robot = SceneEntityCfg("robot", joint_names=JOINTS)
     terms = {
-        "joint_pos": ObservationTermCfg(func=joint_pos_rel, params={"asset_cfg": robot}),
-        "joint_vel": ObservationTermCfg(func=joint_vel_rel, params={"asset_cfg": robot}),
-        "action": ObservationTermCfg(func=last_action),
+        "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel, params={"asset_cfg": robot}),
+        "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, params={"asset_cfg": robot}),
+        "action": ObservationTermCfg(func=mdp.last_action),
         "touch": ObservationTermCfg(func=observation, params={"sensor": "touch", "group": "policy"}),
         "goal": ObservationTermCfg(func=goal),
     }
@@ -226,9 +219,9 @@ def env_cfg() -> ManagerBasedRlEnvCfg:
             )
         },
         events={
-            "hand": EventTermCfg(func=reset_joints, mode="reset", params=still),
+            "hand": EventTermCfg(func=mdp.reset_joints_by_offset, mode="reset", params=still),
             "place": EventTermCfg(
-                func=reset_root_state_uniform,
+                func=mdp.reset_root_state_uniform,
                 mode="reset",
                 params={"pose_range": place, "asset_cfg": SceneEntityCfg("object")},
             ),
@@ -239,11 +232,11 @@ def env_cfg() -> ManagerBasedRlEnvCfg:
             "success": RewardTermCfg(func=success, weight=150.0),
             "tilt": RewardTermCfg(func=tilt, weight=-1.0),
             "object_distance": RewardTermCfg(func=object_distance, weight=-20.0),
-            "drop": RewardTermCfg(func=dropped, weight=-100.0),
-            "action_rate": RewardTermCfg(func=action_rate_l2, weight=-5e-4),
+            "drop": RewardTermCfg(func=mdp.is_terminated, weight=-100.0),
+            "action_rate": RewardTermCfg(func=mdp.action_rate_l2, weight=-5e-4),
         },
         terminations={
-            "time_out": TerminationTermCfg(func=time_out, time_out=True),
+            "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
             "drop": TerminationTermCfg(func=drop),
         },
         sim=SimulationCfg(

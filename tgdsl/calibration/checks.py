@@ -54,6 +54,12 @@ class TargetErrors:
     rms: float
     unit: str
 
+    def texts(self, digits: int) -> tuple[str, ...]:
+        """Return `error`, `held_out`, `floor` and `alone` with so many decimals; empty where None."""
+        return tuple(
+            "" if value is None else f"{value:.{digits}f}" for value in (self.error, self.held_out, self.floor, self.alone)
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:

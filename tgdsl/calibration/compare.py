@@ -2,10 +2,10 @@
 
 tgdsl: 1
 compare:
-half space:
-set: {sensors.skin: {kind: elastomer, kernel: half_space, ...}}
-fit: [skin.poissons_ratio]
-as written: {}
+  half space:
+    set: {sensors.skin: {kind: elastomer, kernel: half_space, ...}}
+    fit: [skin.poissons_ratio]
+  as written: {}
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tgdsl.calibration.recordings import Arrays
 from tgdsl.compiler.pipeline import Document
 from tgdsl.console.tables import text_table
 from tgdsl.fields.models import SpecModel
-from tgdsl.schema.load import read_spec
+from tgdsl.schema.load import parse_spec, read_spec
 
 
 class CandidateSpec(SpecModel):
@@ -50,16 +50,10 @@ class Comparison:
     fits: Mapping[str, Fit]
 
     def __str__(self) -> str:
-        def number(value: float | None) -> str:
-            return "" if value is None else f"{value:.3f}"
-
         rows = []
         for name, fit in self.fits.items():
             values = ", ".join(f"{path} {fitted.value:.4g}" for path, fitted in fit.parameters.items())
-            rows += [
-                (name, e.recording, e.reading, number(e.error), number(e.held_out), number(e.floor), number(e.alone), values)
-                for e in fit.errors
-            ]
+            rows += [(name, e.recording, e.reading, *e.texts(3), values) for e in fit.errors]
         head = ("model", "recording", "reading", "error", "held out", "floor", "without a sensor", "parameters")
         notes = [f"{name}: {text}" for name, fit in self.fits.items() for text in fit.warnings]
         return "\n".join([text_table(head, rows), *([""] if notes else []), *notes])
@@ -78,7 +72,7 @@ def compare(
     Args:
         document: A YAML file, or the same as a mapping.
         recordings: What to fit them to, as `tgdsl.calibrate` takes them.
-        models: A YAML file with `compare:`, or its content: by name `set` and `fit`.
+        models: A YAML file with `compare:`, or what stands there as a mapping: by name `set` and `fit`.
         overrides: Values by dotted path, for all models.
         options: Other options of `tgdsl.calibrate`, for all models.
 
@@ -86,10 +80,11 @@ def compare(
         SpecError: All mistakes in the file, the document or a recording.
         TgdslError: As `tgdsl.calibrate`.
     """
+    required = ("tgdsl", "compare")
     if isinstance(models, Mapping):
-        spec = ComparisonSpec.model_validate({"tgdsl": 1, "compare": models})
+        spec, _ = parse_spec({"tgdsl": 1, "compare": models}, "<mapping>", ComparisonSpec, required)
     else:
-        spec, _ = read_spec(Path(models), ComparisonSpec, ("tgdsl", "compare"))
+        spec, _ = read_spec(Path(models), ComparisonSpec, required)
     fits = {
         name: calibrate(document, recordings, each.fit, overrides={**(overrides or {}), **each.set}, **options)
         for name, each in spec.compare.items()

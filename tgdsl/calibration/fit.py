@@ -71,16 +71,13 @@ class Fit:
     solution: Solution
 
     def __str__(self) -> str:
-        def of(value: float | None) -> str:
-            return "" if value is None else f"{value:.4f}"
-
         parts = []
         if self.parameters:
             rows = [
                 (f.path, f"{f.value:.5g}", f"{f.low:.4g} to {f.high:.4g}", f.parameter.unit) for f in self.parameters.values()
             ]
             parts.append(text_table(("parameter", "value", "95 %", "unit"), rows))
-        errors = [(e.recording, e.reading, of(e.error), of(e.held_out), of(e.floor), of(e.alone)) for e in self.errors]
+        errors = [(e.recording, e.reading, *e.texts(4)) for e in self.errors]
         parts.append(text_table(("recording", "reading", "relative RMSE", "held out", "floor", "without a sensor"), errors))
         if self.nuisances:
             parts.append(text_table(("nuisance", "value"), [(name, f"{value:.4g}") for name, value in self.nuisances.items()]))

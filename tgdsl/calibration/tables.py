@@ -5,8 +5,8 @@
       file: states.csv
       time: t                              # a column by its name in the first line, or by its number from 0
       unit: mm
-      position: {ball: [x, y, z]}          # columns, or fixed numbers with a unit such as 0 m
-      orientation: {ball: [qw, qx, qy, qz]}    # default: that of the world
+      position: {ball: [x, y, z], pad: [px, py, pz]}
+      orientation: {ball: [qw, qx, qy, qz]}  # default: the world's
     targets:
       load:
         file: scale.csv
@@ -14,18 +14,17 @@
         unit: N
         channels: {force_z: 4}             # one column, or a list of one for each row of the reading
         scale: -0.00981                    # from the column to the unit
-        invalid: [-1]                      # numbers that mean: none was read
+        invalid: [-1]                      # numbers that stand for a missing reading
         clock_width: 0.5 s
 
-A body without a position stands at the world's origin. Empty cells, and those that are `invalid`, get the weight 0 in targets;
-in states they are errors. A file that starts with numbers has no names.
+Each body that the module reads needs columns for its position. Empty and `invalid` cells get the weight 0 in targets; in states
+an empty cell is an error. A file that starts with numbers has no names.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,6 +36,7 @@ from tgdsl.errors import Problem, SpecError, did_you_mean, listed
 from tgdsl.fields.models import Quantity, SpecModel
 from tgdsl.fields.units import UNITS
 from tgdsl.schema.load import read_spec
+from tgdsl.schema.yaml import Source
 
 Column = int | str
 Three = tuple[Column, Column, Column]
@@ -72,7 +72,7 @@ class TargetSpec(SpecModel):
     scale: float = 1.0
     """Factor from the columns' numbers to the unit."""
     invalid: tuple[float, ...] = ()
-    """Numbers that mean: none was read."""
+    """Numbers that stand for a missing reading."""
     clock_width: Annotated[float, Quantity("time", ge=0.0)] = 0.0
     """Standard deviation of the clock's unknown offset from the states' [s]."""
     floor: float = 0.0
@@ -90,7 +90,6 @@ class TablesSpec(SpecModel):
     """What sensors read, by the reading's name."""
 
 
-@dataclass
 class _Table:
     """A CSV file's numbers, and the mistakes in the columns that were read.
 
@@ -101,23 +100,19 @@ class _Table:
         problems: The mistakes.
     """
 
-    path: Path
-    names: list[str] = field(default_factory=list)
-    lines: list[tuple[int, list[str]]] = field(default_factory=list)
-    problems: list[Problem] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
+    def __init__(self, path: Path):
+        self.path, self.names, self.problems = path, list[str](), list[Problem]()
         try:
-            with self.path.open(newline="", encoding="utf-8-sig") as file:
+            with path.open(newline="", encoding="utf-8-sig") as file:
                 reader = csv.reader(file)
                 self.lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if line]
         except (OSError, UnicodeDecodeError, csv.Error) as error:
-            raise SpecError([Problem(str(self.path), 0, 0, "", f"cannot be read as CSV: {error}")]) from error
-        if self.lines and not all(_is_number(cell) for cell in self.lines[0][1] if cell):
+            raise SpecError([Problem(str(path), 0, 0, "", f"cannot be read as CSV: {error}")]) from error
+        if self.lines and any(cell and _number(cell) is None for cell in self.lines[0][1]):
             self.names = self.lines.pop(0)[1]
 
-    def column(self, which: Column, invalid: Sequence[float] = (), may_lack: bool = False) -> Float[np.ndarray, " line"]:
-        """Return a column's numbers; NaN where there is none, which is a mistake unless it may lack."""
+    def column(self, which: Column, invalid: Sequence[float] | None = None) -> Float[np.ndarray, " line"]:
+        """Return a column's numbers; NaN where one is missing or in `invalid`: a mistake if that is None."""
         width = len(self.names) or (len(self.lines[0][1]) if self.lines else 0)
         if isinstance(which, str) and which not in self.names:
             hint = did_you_mean(which, self.names, "columns") if self.names else f"number them from 0 to {width - 1}"
@@ -130,22 +125,21 @@ class _Table:
         result = np.full(len(self.lines), np.nan)
         for i, (line, cells) in enumerate(self.lines):
             cell = cells[place] if place < len(cells) else ""
-            value = float(cell) if _is_number(cell) else np.nan
-            is_none = not cell or not np.isfinite(value) or value in invalid
-            if (cell and not _is_number(cell)) or (is_none and not may_lack):
+            value = _number(cell) if cell else np.nan
+            is_missing = value is None or not np.isfinite(value) or value in (invalid or ())
+            if value is None or (is_missing and invalid is None):
                 what = f"column {which}: " + (f'found "{cell}", expected a number' if cell else "this cell is empty")
                 self.problems.append(Problem(str(self.path), line, place + 1, "", what))
                 break  # of each column the first
-            result[i] = np.nan if is_none else value
+            result[i] = np.nan if is_missing else value
         return result
 
 
-def _is_number(cell: str) -> bool:
+def _number(cell: str) -> float | None:
     try:
-        float(cell)
+        return float(cell)
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def read_tables(path: str | Path) -> dict[str, Any]:
@@ -155,19 +149,18 @@ def read_tables(path: str | Path) -> dict[str, Any]:
         SpecError: All mistakes in the document, or in the files, by line and column.
     """
     path = Path(path)
-    spec, _ = read_spec(path, TablesSpec, ("tgdsl", "states", "targets"))
+    spec, source = read_spec(path, TablesSpec, ("tgdsl", "states", "targets"))
     names = dict.fromkeys([spec.states.file, *(target.file for target in spec.targets.values())])
     tables = {name: _Table(path.parent / name) for name in names}
-    result = _states(spec.states, tables[spec.states.file])
+    result = _states(spec.states, tables[spec.states.file], source)
     for name, target in spec.targets.items():
         table = tables[target.file]
         columns = [(c,) if isinstance(c, (int, str)) else c for c in target.channels.values()]
         if len({len(each) for each in columns}) > 1:
             counts = listed([f"{channel}: {len(each)}" for channel, each in zip(target.channels, columns, strict=True)])
-            raise SpecError(
-                [Problem(str(path), 0, 0, f"targets.{name}.channels", f"expected as many columns each, found {counts}")]
-            )
-        numbers = [[table.column(c, target.invalid, may_lack=True) for c in each] for each in columns]
+            problem = f"expected as many columns each, found {counts}"
+            raise SpecError([source.problem(("targets", name, "channels"), problem)])
+        numbers = [[table.column(c, target.invalid) for c in each] for each in columns]
         value = target.scale * np.stack([np.stack(each, axis=-1) for each in numbers], axis=-1)
         result |= {
             f"target:{name}": value, f"weight:{name}": np.isfinite(value).astype(np.float64),
@@ -179,13 +172,13 @@ def read_tables(path: str | Path) -> dict[str, Any]:
     return result
 
 
-def _states(spec: StatesSpec, table: _Table) -> dict[str, Any]:
+def _states(spec: StatesSpec, table: _Table, source: Source) -> dict[str, Any]:
     bodies, factor = list(spec.position), UNITS["length"][spec.unit]
     pos = np.stack([np.stack([factor * table.column(c) for c in spec.position[body]], axis=-1) for body in bodies], axis=1)
     quat = np.zeros((*pos.shape[:2], 4))
     quat[..., 0] = 1.0
     for body, columns in spec.orientation.items():
         if body not in bodies:
-            raise SpecError([Problem(str(table.path), 0, 0, "", f'"{body}" has an orientation, but no position')])
+            raise SpecError([source.problem(("states", "orientation", body), f'"{body}" has an orientation, but no position')])
         quat[:, bodies.index(body)] = np.stack([table.column(c) for c in columns], axis=-1)
     return {"time": table.column(spec.time), "body_pos": pos, "body_quat": quat, "bodies": bodies}

@@ -15,7 +15,7 @@ from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
-    from tgdsl.rl.datasets.episode import Episode, Source
+    from tgdsl.rl.datasets.episode import Episode, Header
 
 Input = Annotated[
     tyro.conf.Positional[Path],
@@ -37,7 +37,7 @@ class ExportDataset:
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
     """Of a task without a policy: who acts, as for tgdsl play."""
     source: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "environments"
-    """Of a policy: where it acts. environments: those of the task, many at a time; emulator, xhand1:PORT or a log as for tgdsl
+    """Of a policy: where it acts. environments: the task's, many at a time; emulator, xhand1:PORT or a log as for tgdsl
     deploy, for a policy that feels agg_force."""
     episodes: int = 16
     """Of a task: number of episodes."""
@@ -62,7 +62,7 @@ class ExportDataset:
     device: str = "cpu"
     """Where environments are computed: cpu, or cuda."""
     seed: int = 0
-    """What all that is random follows from."""
+    """Seed of everything random."""
     set: Overrides = ()
 
     def run(self) -> None:
@@ -77,19 +77,18 @@ class ExportDataset:
             raise TgdslError(f"{out}: is there already; remove it, or name another folder with --out")
         if self.episodes < 1:
             raise TgdslError(f"--episodes {self.episodes}: expected at least 1")
-        source, episodes = self._recorded() if self.input.suffix == ".npz" else self._played()
+        header, episodes = self._recorded() if self.input.suffix == ".npz" else self._played()
         with StatusLine() as progress, TemporaryDirectory(prefix=f".{out.name}", dir=with_folder(out).parent) as temporary:
             progress("writing episodes")
             partial = Path(temporary) / out.name
             partial.mkdir()
             write = {"lerobot": write_lerobot, "mcap": write_mcap, "zarr": write_zarr}[self.to]
-            num, frames = write(source, episodes, partial)
+            num, frames = write(header, episodes, partial)
             partial.rename(out)
-        print(
-            f"{out}: {num} episodes, {frames} frames at {source.fps:g} Hz; touch in {source.unit} on {len(source.links)} links"
-        )
+        touch = f"touch in {header.unit} on {len(header.links)} links"
+        print(f"{out}: {num} episodes, {frames} frames at {header.fps:g} Hz; {touch}")
 
-    def _recorded(self) -> tuple[Source, Iterator[Episode]]:
+    def _recorded(self) -> tuple[Header, Iterator[Episode]]:
         import numpy as np
 
         from tgdsl.rl.datasets.sources import of_log, of_run
@@ -113,7 +112,7 @@ class ExportDataset:
             touch = module_of(Path(document), self.set, progress)
         return of_run(self.input, touch, self.fps, self.reading)
 
-    def _played(self) -> tuple[Source, Iterator[Episode]]:
+    def _played(self) -> tuple[Header, Iterator[Episode]]:
         from tgdsl.rl.datasets.sources import of_deployment, of_environments
         from tgdsl.rl.deploying.deploy import Deployment
         from tgdsl.rl.env import TouchEnv

@@ -21,7 +21,7 @@ class Grasps:
     num: int | None = None
     """How many, as many of each variant of the object; default: as the document says."""
     seed: int | None = None
-    """What all that is random follows from; default: as the document says."""
+    """Seed of everything random; default: as the document says."""
     out: Annotated[Path | None, OUT] = None
     """A file to write them to, for `grasps: {file: …}` of the document; default: the user's cache alone."""
     set: Overrides = ()

@@ -41,7 +41,7 @@ class Play:
     seconds: float | None = None
     """Duration [s]; default: an episode's."""
     seed: int = 0
-    """What all that is random follows from."""
+    """Seed of everything random."""
     device: str = "cpu"
     """Where physics and touch are computed: cpu, or cuda."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("out")

@@ -40,7 +40,7 @@ class View:
     address: str = "127.0.0.1"
     """Address to serve at; 0.0.0.0 lets others in the network see and control the scene."""
     seed: int = 0
-    """What all that is random in a task follows from."""
+    """Seed of everything random in a task."""
     seconds: float | None = None
     """When to stop [s]; default: at Ctrl-C."""
     set: Overrides = ()

@@ -197,13 +197,13 @@ def read_spec(path: Path, model: type[S], required: tuple[str, ...]) -> tuple[S,
     return parse_spec(_content(path, str(path)), str(path), model, required)
 
 
-def parse_spec(content: bytes, name: str, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
-    """Read what `read_spec` reads from a file's content, whose mistakes then go by a name.
+def parse_spec(content: bytes | Mapping[str, Any], name: str, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
+    """Read what `read_spec` reads from a file's content, or from a mapping; mistakes then go by a name.
 
     Raises:
         SpecError: All its mistakes, each at its place.
     """
-    source = _source(content, name)
+    source = yaml.from_mapping(content, name) if isinstance(content, Mapping) else _source(content, name)
     problems = list(source.problems)
     spec = validate(source, (), model, problems, required=required)
     if problems or not isinstance(spec, model):

@@ -210,13 +210,15 @@ class KinematicTaxelConstants(Generic[Array]):
     patch: Array | None = None
     """Radius of each probe [m]."""
     densification: Array | None = None
+    """D [m]."""
     loop_stiffness: Array | None = None
     """Q/r [N/m]."""
     loop_width: Array | None = None
+    """r [m]."""
 
 
 class LoopState(NamedTuple):
-    """Stretch e of the loop's element and the last depth [m]; None without a loop."""
+    """Stretch e of the loop's element and the last depth, (env, taxel) [m]; None without a loop."""
 
     stretch: Tensor | None = None
     depth: Tensor | None = None

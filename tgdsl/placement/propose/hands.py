@@ -216,7 +216,7 @@ def free_standing(tree: KinematicTree) -> list[int]:
 
 
 def loose_parts(tree: KinematicTree) -> list[int]:
-    """Return the bodies that are farther from all that is fixed to them than twice their size: they mark a place in the air."""
+    """Return the bodies that mark a place in the air: all bodies fixed to them are farther away than twice their size."""
     result = []
     for segment, bodies in tree.bodies.items():
         if len(bodies) < 2:
@@ -238,9 +238,9 @@ def _is_driven(tree: KinematicTree, segment: int) -> bool:
 
 
 def hands(tree: KinematicTree) -> list[Hand]:
-    """Return what may be a hand; trees that a hinge or slide joins to the world make up one.
+    """Return the candidates for hands; trees that a hinge or slide joins to the world make up one.
 
-    A tree without two chains that part is one as a whole, without a palm; where a jaw turns against a fixed one, these are.
+    A tree without two chains that part is one candidate as a whole, without a palm, or its grippers with one jaw if it has any.
     """
     left_out = set(free_standing(tree))
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
@@ -253,7 +253,7 @@ def hands(tree: KinematicTree) -> list[Hand]:
 
 
 def _with_jaws(tree: KinematicTree, hand: Hand) -> list[Hand]:
-    """Return the grippers of one jaw in a hand of one chain, or whose chains are arms; if there are none, the hand."""
+    """Return the grippers with one jaw in a hand that has one chain or arms for chains; the hand if there are none."""
     if len(hand.chains) > 1 and hand.length <= MAX_FINGER:
         return [hand]
     results = [gripper for chain in hand.chains for s in chain if (gripper := _gripper_of(tree, s)) is not None]
@@ -261,11 +261,11 @@ def _with_jaws(tree: KinematicTree, hand: Hand) -> list[Hand]:
 
 
 def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
-    """Return the gripper of which a segment is the moving jaw; None if it is none.
+    """Return the gripper whose moving jaw is a segment; None if it is no jaw.
 
-    A jaw is the only child of its parent, carries nothing, and turns on one hinge. It is closed at the end of the hinge's range
-    at which its parent's surface goes on farther in the direction in which it points, which is away from where the parent
-    is carried: a forearm that folds onto its upper arm points to there.
+    A jaw is the only child of its parent, carries nothing, and turns on one hinge. It points away from where the parent is
+    carried; a forearm that folds onto its upper arm points back. It is closed at the end of the hinge's range where its
+    parent's surface reaches farther in the jaw's direction.
     """
     parent, joints, model = tree.parent[segment], tree.joints(segment), tree.model
     if not parent or len(joints) != 1 or tree.children(segment) or len(tree.children(parent)) != 1 or not tree.bodies[parent]:
@@ -289,7 +289,7 @@ def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
 def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[int, float]:
     """Return how far bodies of a jaw and of its parent reach beyond the hinge in the jaw's direction [m].
 
-    Nothing, if this direction is toward where the parent is carried.
+    Empty if the jaw points back to where the parent is carried.
     """
     data, segment = mujoco.MjData(tree.model), tree.segment[int(tree.model.jnt_bodyid[joint])]
     data.qpos[:] = tree.model.qpos0

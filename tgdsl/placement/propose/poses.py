@@ -21,9 +21,9 @@ RESIDUAL = 1e-5
 """Largest residual of an equality in a pose [m or rad]."""
 INDEPENDENT = 1e-3
 """Least share of a joint's motion that the equalities must leave free."""
-MOST = 0.5
-"""Least share of its way to which the limits of a driven joint must let it go: else limits and equality contradict each other,
-as those of a mimic joint of the wrong sign do, and each joint by itself says more."""
+MIN_OVERLAP = 0.5
+"""Least share of a driven joint's way that its limits must allow. Below it limits and equality contradict each other, as with a
+mimic joint of the wrong sign, and the equality is ignored."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _JOINT, _TENDON = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)
 _BODIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -137,7 +137,7 @@ class Poses:
         return result
 
     def _is_within_limits(self, equality: int, driven: int, driver: int) -> bool:
-        """Return whether most of the driver's range takes the driven joint to where its limits let it go."""
+        """Return whether the limits of the driven joint allow most of the way on which its driver's range takes it."""
         model = self.model
         if not (model.jnt_limited[driven] and model.jnt_limited[driver]):
             return True
@@ -145,7 +145,7 @@ class Poses:
         driven_to = start[0] + np.polyval(model.eq_data[equality, 4::-1], model.jnt_range[driver] - start[1])
         low, high = np.sort(driven_to)
         common = min(high, model.jnt_range[driven, 1]) - max(low, model.jnt_range[driven, 0])
-        return bool(common >= MOST * (high - low))
+        return bool(common >= MIN_OVERLAP * (high - low))
 
     def _bound(self, qpos: Float[np.ndarray, " qpos"], dofs: Sequence[int] | np.ndarray) -> np.ndarray | None:
         """Return a pose near another at which the equalities hold, by motion of some degrees of freedom."""

@@ -149,8 +149,8 @@ def propose(
 def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
     """Return how the hands of a robot close: by name, each joint's open and closed end [rad, of slides m].
 
-    A joint that has no name, or of which it is not clear which end is the closed one, is not in it. Where limits are misread,
-    see `angles_are_misread`, the ends are those that the simulator keeps to.
+    Joints without a name or a clear closed end are left out. Where limits are misread, see `angles_are_misread`, the ends are
+    those in the simulator.
     """
     scale = RADIANS_AS_DEGREES if angles_are_misread(robot.compiled) else 1.0
     motion: dict[str, tuple[float, float]] = {}
@@ -162,22 +162,22 @@ def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
 
 
 def chosen_hands(tree: KinematicTree) -> list[Flexion]:
-    """Return the hands of a robot: those of which two chains or a jaw are known to close, or else all that may be one.
+    """Return the hands of a robot that close, by two chains or a jaw; if none does, all candidates.
 
-    Where none is known to close, hinges without limits are tried within assumed ones.
+    If none closes within the model's limits, hinges without limits are tried within assumed ones.
     """
     results = [Flexion(tree, hand) for hand in hands(tree)]
-    closing = _that_close(results)
+    closing = _closing(results)
     if not closing:
         free = replace(tree, model=with_assumed_limits(tree.model), doubt=NO_LIMITS)
-        closing = _that_close([Flexion(free, hand) for hand in hands(free) if hand.jaw is None])
+        closing = _closing([Flexion(free, hand) for hand in hands(free) if hand.jaw is None])
     for flexion in closing:
         if flexion.hand.palm is not None:
             flexion.hand = replace(flexion.hand, mounts=PalmFront(flexion).mounts())
     return closing or results
 
 
-def _that_close(flexions: Sequence[Flexion]) -> list[Flexion]:
+def _closing(flexions: Sequence[Flexion]) -> list[Flexion]:
     return [flexion for flexion in flexions if flexion.num_closing > (flexion.hand.jaw is None)]
 
 

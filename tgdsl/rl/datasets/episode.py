@@ -9,12 +9,17 @@ components.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from tgdsl.errors import TgdslError
+
+FORCE = ("force_x", "force_y", "force_z")
+"""The components of touch, in the frame of the taxels' body."""
 TOUCH = "observation.tactile"
 EPS = 1e-6
 """Share of a frame by which a sample may be late."""
@@ -22,7 +27,7 @@ EPS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LinkTaxels:
-    """Where the taxels of a link are; of a hand that reports the sum of a fingertip's forces alone, that is not known.
+    """The taxels of a link. A hand that reports only the sum of a fingertip's forces has one, at an unknown place.
 
     Attributes:
         body: The link's body.
@@ -34,9 +39,14 @@ class LinkTaxels:
     pos: Float[np.ndarray, "taxel 3"] | None = None
     normal: Float[np.ndarray, "taxel 3"] | None = None
 
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels."""
+        return 1 if self.pos is None else len(self.pos)
+
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class Header:
     """What all episodes of a dataset have in common.
 
     Attributes:
@@ -44,8 +54,7 @@ class Source:
         task: The task in words.
         joints: Names of the joints.
         links: Taxels by link.
-        channels: Names of the components of touch.
-        unit: Their unit.
+        unit: Unit of touch.
         control_step: Time between samples, of a log its median [s].
         fps: Frames per second.
         has_outcome: Whether there are rewards and success.
@@ -56,7 +65,6 @@ class Source:
     task: str
     joints: tuple[str, ...]
     links: Mapping[str, LinkTaxels]
-    channels: tuple[str, ...]
     unit: str
     control_step: float
     fps: float
@@ -68,6 +76,19 @@ class Source:
         """Samples of touch per frame."""
         return max(1, round(1.0 / (self.fps * self.control_step)))
 
+    def describe(self) -> dict[str, Any]:
+        """Return unit, channels and window of touch, and the taxels of each link, as values for JSON."""
+        links = {
+            name: {
+                "body": link.body,
+                "pos": None if link.pos is None else link.pos.tolist(),
+                "normal": None if link.normal is None else link.normal.tolist(),
+            }
+            for name, link in self.links.items()
+        }
+        touch = {"source": self.name, "unit": self.unit, "channels": list(FORCE), "frame": "body"}
+        return touch | {"window": self.window, "sample_step": self.control_step, "links": links}
+
 
 @dataclass(frozen=True, eq=False)
 class Episode:
@@ -77,7 +98,7 @@ class Episode:
         time: Time of each sample [s].
         state: Joint positions [rad].
         action: Set-points of the joints [rad].
-        touch: Touch by link.
+        touch: Touch by link, in the header's unit and the frame of the taxels' body.
         policy_action: The policy's actions, from −1 to 1.
         reward: Reward of the step that follows each sample.
         score: Score of the episode.
@@ -109,41 +130,45 @@ class Feature:
     names: tuple[str, ...] | None = None
 
 
-def features(source: Source, num_taxels: Mapping[str, int]) -> dict[str, Feature]:
-    """Return the columns of a source's frames, given the taxels of each link."""
-    joints, channels, window = source.joints, source.channels, source.window
+def features(header: Header) -> dict[str, Feature]:
+    """Return the columns of a dataset's frames."""
+    joints, window = header.joints, header.window
+    num_taxels = {name: link.num_taxels for name, link in header.links.items()}
     vector = Feature("float32", (len(joints),), joints)
     result = {"observation.state": vector, "action": vector}
-    flat = tuple(f"{link}/{i}/{name}" for link, num in num_taxels.items() for i in range(num) for name in channels)
+    flat = tuple(f"{link}/{i}/{name}" for link, num in num_taxels.items() for i in range(num) for name in FORCE)
     result[TOUCH] = Feature("float32", (len(flat),), flat)
     for link, num in num_taxels.items():
-        result[f"{TOUCH}.{link}"] = Feature("float32", (num, len(channels)), ("taxel", "channel"))
+        result[f"{TOUCH}.{link}"] = Feature("float32", (num, len(FORCE)), ("taxel", "channel"))
         if window > 1:
-            shape = (window, num, len(channels))
+            shape = (window, num, len(FORCE))
             result[f"{TOUCH}_window.{link}"] = Feature("float32", shape, ("sample", "taxel", "channel"))
     if window > 1:
         result[f"{TOUCH}_window_time"] = Feature("float32", (window,))
-    result |= {"policy_action": vector} if source.has_policy else {}
-    if source.has_outcome:
+    result |= {"policy_action": vector} if header.has_policy else {}
+    if header.has_outcome:
         result |= {"next.reward": Feature("float32", (1,)), "next.success": Feature("bool", (1,))}
     return result | {"next.done": Feature("bool", (1,))}
 
 
-def frames(source: Source, episode: Episode) -> dict[str, np.ndarray]:
-    """Return an episode's frames by the names of `features`; a frame's reward is the sum over its time."""
+def frames(header: Header, episode: Episode) -> dict[str, np.ndarray]:
+    """Return an episode's frames by the names of `features`, (frame, …); a feature of shape (1,) has (frame,).
+
+    A frame's reward is the sum over its time.
+    """
     time = episode.time - episode.time[0]
-    ticks = np.arange(int(np.floor(time[-1] * source.fps + EPS)) + 1)
-    newest: Int[np.ndarray, " frame"] = np.searchsorted(time, (ticks + EPS) / source.fps, side="right") - 1
-    back = np.arange(source.window)[::-1]
+    ticks = np.arange(int(np.floor(time[-1] * header.fps + EPS)) + 1)
+    newest: Int[np.ndarray, " frame"] = np.searchsorted(time, (ticks + EPS) / header.fps, side="right") - 1
+    back = np.arange(header.window)[::-1]
     past = np.maximum(newest[:, None] - back, 0)
     result = {"observation.state": episode.state[newest], "action": episode.action[newest]}
     result[TOUCH] = np.concatenate([touch[newest].reshape(len(newest), -1) for touch in episode.touch.values()], axis=1)
     for link, touch in episode.touch.items():
         result[f"{TOUCH}.{link}"] = touch[newest]
-        if source.window > 1:
+        if header.window > 1:
             result[f"{TOUCH}_window.{link}"] = touch[past]
-    if source.window > 1:
-        result[f"{TOUCH}_window_time"] = time[past] - (ticks / source.fps)[:, None]
+    if header.window > 1:
+        result[f"{TOUCH}_window_time"] = time[past] - (ticks / header.fps)[:, None]
     is_last = ticks == ticks[-1]
     if episode.policy_action is not None:
         result["policy_action"] = episode.policy_action[newest]
@@ -151,4 +176,18 @@ def frames(source: Source, episode: Episode) -> dict[str, np.ndarray]:
         result["next.reward"] = np.add.reduceat(episode.reward, newest)
         result["next.success"] = is_last & bool(episode.is_success)
     result["next.done"] = is_last
-    return {name: value if value.dtype == bool else value.astype(np.float32) for name, value in result.items()}
+    result = {name: value if value.dtype == bool else value.astype(np.float32) for name, value in result.items()}
+    return {name: value.ravel() if value.shape[1:] == (1,) else value for name, value in result.items()}
+
+
+def numbered_frames(header: Header, episodes: Iterable[Episode]) -> Iterator[tuple[int, Episode, dict[str, np.ndarray]]]:
+    """Yield each episode's number, from 0, itself and its frames.
+
+    Raises:
+        TgdslError: If there is no episode.
+    """
+    number = -1
+    for number, episode in enumerate(episodes):
+        yield number, episode, frames(header, episode)
+    if number < 0:
+        raise TgdslError(f"{header.name}: there is no episode to write")

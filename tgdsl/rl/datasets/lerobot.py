@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tgdsl.errors import TgdslError
-from tgdsl.rl.datasets.episode import Episode, Feature, Source, features, frames
+from tgdsl.rl.datasets.episode import Episode, Feature, Header, features, numbered_frames
 
 FILE_MB = 100
 PATHS = {name: name + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet" for name in ("data", "meta/episodes")}
@@ -23,7 +23,7 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 INDICES = {name: Feature("int64", (1,)) for name in ("frame_index", "episode_index", "index", "task_index")}
 
 
-def write_lerobot(source: Source, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
+def write_lerobot(header: Header, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
     """Write a dataset into an empty folder; return the numbers of episodes and frames.
 
     Raises:
@@ -35,46 +35,39 @@ def write_lerobot(source: Source, episodes: Iterable[Episode], folder: Path) -> 
         import pyarrow.parquet as pq
     except ImportError as error:
         raise TgdslError(f'a dataset of LeRobot needs pyarrow and pandas: pip install "tgdsl[data]" ({error})') from error
-    columns: dict[str, Feature] = {}
+    columns = features(header) | {"timestamp": Feature("float32", (1,)), **INDICES}
     rows: list[dict[str, Any]] = []
     stats: list[dict[str, dict[str, np.ndarray]]] = []
     writer, file, size, total = None, 0, 0, 0
-    schema = pa.schema([])
-    for number, episode in enumerate(episodes):
-        values = frames(source, episode)
-        if not columns:
-            columns = features(source, {link: touch.shape[1] for link, touch in episode.touch.items()})
-            columns |= {"timestamp": Feature("float32", (1,)), **INDICES}
-            schema = pa.schema([(name, _type(pa, feature)) for name, feature in columns.items()])
+    for number, episode, values in numbered_frames(header, episodes):
         num = len(values["action"])
         indices = np.arange(num)
-        values |= {"timestamp": (indices / source.fps).astype(np.float32), "frame_index": indices, "index": total + indices}
-        values |= {name: np.full(num, value) for name, value in (("episode_index", number), ("task_index", 0))}
+        values |= {"timestamp": (indices / header.fps).astype(np.float32), "frame_index": indices, "index": total + indices}
+        values |= {"episode_index": np.full(num, number), "task_index": np.zeros(num, int)}
+        table = pa.table({name: _array(pa, values[name]) for name in columns})
         if writer is None or size > FILE_MB * 2**20:
             file, size = file + (writer is not None), 0
             if writer is not None:
                 writer.close()
             path = folder / PATHS["data"].format(chunk_index=file // 1000, file_index=file % 1000)
             path.parent.mkdir(parents=True, exist_ok=True)
-            writer = pq.ParquetWriter(path, schema)
-        arrays = [_array(pa, values[name], schema.field(name).type) for name in columns]
-        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+            writer = pq.ParquetWriter(path, table.schema)
+        writer.write_table(table)
         size += sum(value.nbytes for value in values.values())
         stats.append({name: _statistics(values[name]) for name in columns})
         place = {"data/chunk_index": file // 1000, "data/file_index": file % 1000}
-        row = {"episode_index": number, "tasks": [source.task], "length": num, **place}
+        row = {"episode_index": number, "tasks": [header.task], "length": num, **place}
         row |= {"dataset_from_index": total, "dataset_to_index": total + num}
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         row |= {} if episode.score is None else {"score": episode.score, "success": episode.is_success}
         rows.append(row | {f"stats/{name}/{key}": s.tolist() for name, parts in stats[-1].items() for key, s in parts.items()})
         total += num
-    if writer is None:
-        raise TgdslError(f"{source.name}: there is no episode to write")
+    assert writer is not None
     writer.close()
     path = folder / PATHS["meta/episodes"].format(chunk_index=0, file_index=0)
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.Table.from_pylist(rows), path)
-    pandas.DataFrame({"task_index": [0]}, index=pandas.Index([source.task])).to_parquet(folder / "meta/tasks.parquet")
+    pandas.DataFrame({"task_index": [0]}, index=pandas.Index([header.task])).to_parquet(folder / "meta/tasks.parquet")
     described = {name: {"dtype": f.dtype, "shape": list(f.shape), "names": f.names} for name, f in columns.items()}
     info = {
         "codebase_version": "v3.0",
@@ -84,46 +77,22 @@ def write_lerobot(source: Source, episodes: Iterable[Episode], folder: Path) -> 
         "total_tasks": 1,
     }
     info |= {"chunks_size": 1000, "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": 200}
-    info |= {"fps": int(source.fps) if source.fps.is_integer() else source.fps, "splits": {"train": f"0:{len(rows)}"}}
+    info |= {"fps": int(header.fps) if header.fps.is_integer() else header.fps, "splits": {"train": f"0:{len(rows)}"}}
     info |= {"data_path": PATHS["data"], "video_path": None, "features": described}
     joined = {
         name: {key: s.tolist() for key, s in _joined([episode_stats[name] for episode_stats in stats]).items()}
         for name in columns
     }
-    for name, value in {"info": info, "stats": joined, "tactile": description(source)}.items():
+    for name, value in {"info": info, "stats": joined, "tactile": header.describe()}.items():
         (folder / "meta" / f"{name}.json").write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return len(rows), total
 
 
-def description(source: Source) -> dict[str, Any]:
-    """Return what touch is, as plain values: unit, channels, window, and by link the taxels' positions [m] and normals."""
-    links = {
-        name: {
-            "body": link.body,
-            "pos": None if link.pos is None else link.pos.tolist(),
-            "normal": None if link.normal is None else link.normal.tolist(),
-        }
-        for name, link in source.links.items()
-    }
-    touch = {"source": source.name, "unit": source.unit, "channels": list(source.channels), "frame": "body"}
-    return touch | {"window": source.window, "sample_step": source.control_step, "links": links}
-
-
-def _type(pa: Any, feature: Feature) -> Any:
-    result = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}[feature.dtype]
-    for size in reversed(feature.shape if feature.shape != (1,) else ()):
-        result = pa.list_(result, size if len(feature.shape) == 1 else -1)
-    return result
-
-
-def _array(pa: Any, values: np.ndarray, kind: Any) -> Any:
-    if values.ndim == 1 and kind.__class__.__name__ == "DataType":
-        return pa.array(values, kind)
+def _array(pa: Any, values: np.ndarray) -> Any:
     result = pa.array(values.ravel())
-    for level in range(values.ndim - 1, 0, -1):
-        size = values.shape[level]
-        if values.ndim == 2:
-            return pa.FixedSizeListArray.from_arrays(result, size)
+    if values.ndim == 2:
+        return pa.FixedSizeListArray.from_arrays(result, values.shape[1])
+    for size in values.shape[:0:-1]:
         result = pa.ListArray.from_arrays(np.arange(0, len(result) + 1, size, dtype=np.int32), result)
     return result
 

@@ -9,14 +9,13 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from tgdsl.errors import TgdslError
-from tgdsl.rl.datasets.episode import Episode, Source, features, frames
-from tgdsl.rl.datasets.lerobot import description
+from tgdsl.rl.datasets.episode import Episode, Header, features, numbered_frames
 
 FILE = "episodes.mcap"
 SECOND = 1_000_000_000
 
 
-def write_mcap(source: Source, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
+def write_mcap(header: Header, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
     """Write `episodes.mcap` into a folder; return the numbers of episodes and frames.
 
     A message is `{"episode": …, "value": …}`; the next episode begins a second after the last frame of the one before. The
@@ -31,26 +30,22 @@ def write_mcap(source: Source, episodes: Iterable[Episode], folder: Path) -> tup
         raise TgdslError(f'an MCAP file needs mcap: pip install "tgdsl[data]" ({error})') from error
     schema = {"type": "object", "properties": {"episode": {"type": "integer"}, "value": {}}}
     channels: dict[str, int] = {}
-    number, total, start = -1, 0, 0
+    number, total, start = 0, 0, 0
     with (folder / FILE).open("wb") as file:
         writer = Writer(file)
         writer.start()
         kind = writer.register_schema("tgdsl.Feature", "jsonschema", json.dumps(schema).encode())
-        for number, episode in enumerate(episodes):
-            values = frames(source, episode)
-            if not channels:
-                for name, feature in features(source, {link: t.shape[1] for link, t in episode.touch.items()}).items():
-                    metadata = {"names": json.dumps(feature.names), "shape": json.dumps(feature.shape)}
-                    channels[name] = writer.register_channel(f"/{name.replace('.', '/')}", "json", kind, metadata)
+        for name, feature in features(header).items():
+            metadata = {"names": json.dumps(feature.names), "shape": json.dumps(feature.shape)}
+            channels[name] = writer.register_channel(f"/{name.replace('.', '/')}", "json", kind, metadata)
+        for number, _, values in numbered_frames(header, episodes):
             for frame in range(len(values["action"])):
-                time = start + round(frame * SECOND / source.fps)
+                time = start + round(frame * SECOND / header.fps)
                 for name, channel in channels.items():
                     message = json.dumps({"episode": number, "value": values[name][frame].tolist()}).encode()
                     writer.add_message(channel, time, message, time, frame)
             total += len(values["action"])
-            start += round(len(values["action"]) * SECOND / source.fps) + SECOND
-        writer.add_metadata("tactile", {name: json.dumps(value) for name, value in description(source).items()})
+            start += round(len(values["action"]) * SECOND / header.fps) + SECOND
+        writer.add_metadata("tactile", {name: json.dumps(value) for name, value in header.describe().items()})
         writer.finish()
-    if number < 0:
-        raise TgdslError(f"{source.name}: there is no episode to write")
     return number + 1, total

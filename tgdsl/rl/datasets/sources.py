@@ -6,24 +6,27 @@ Shapes: as in `episode`, `env` environments.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.module.taxels.identity import Columns
-from tgdsl.rl.datasets.episode import EPS, Episode, LinkTaxels, Source
+from tgdsl.rl.datasets.episode import EPS, FORCE, Episode, Header, LinkTaxels
 from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.deploying.hand import EMULATED
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, rollout
 from tgdsl.rl.sensed import GROUP
+from tgdsl.rl.task import Task
 from tgdsl.runtime.connect import kind_of
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S
@@ -32,13 +35,12 @@ from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS
 from tgdsl.scene.scene import scene_model
 
-FORCE = ("force_x", "force_y", "force_z")
 LOG_FPS = 30.0
 """Frames per second of a hand's log unless others are asked for."""
 
 
-class _Watching(Actor):
-    """An actor; notes joints, touch and set-points before each step."""
+class _Sampler(Actor):
+    """Acts as another actor does, and samples joints, touch and set-points before each step."""
 
     def __init__(self, actor: Actor, env: TouchEnv, output: Output):
         self._actor, self._env, self._output = actor, env, output
@@ -53,15 +55,14 @@ class _Watching(Actor):
         self.row = {name: value.detach().cpu().numpy().copy() for name, value in values.items()}
         return action
 
-    def begin(self, ended: Tensor) -> None:
-        """Tell the actor."""
+    def begin(self, ended: Bool[Tensor, " env"]) -> None:
         self._actor.begin(ended)
 
 
 def of_environments(
     env: TouchEnv, actor: Actor, episodes: int, fps: float | None = None, reading: str | None = None, least: float | None = None
-) -> tuple[Source, Iterator[Episode]]:
-    """Return episodes of environments that were just made: as many of each environment, its first ones.
+) -> tuple[Header, Iterator[Episode]]:
+    """Return the first episodes of fresh environments, as many of each.
 
     Args:
         env: The environments.
@@ -69,25 +70,24 @@ def of_environments(
         episodes: How many.
         fps: Frames per second; default: one per control step.
         reading: The reading that is exported; default: the first force on taxels.
-        least: Score with which an episode succeeds, of a task in which less is better the most; default: it succeeds if it
-            lasts as long as one may.
+        least: Least score with which an episode succeeds, or the largest where less is better; default: it succeeds if it
+            lasts to the end.
 
     Raises:
-        TgdslError: If there is no such reading, or it is of no taxels.
+        TgdslError: If there is no such reading of a force on taxels.
     """
     output = _force_of(env.touch.outputs, reading)
     table = env.touch.taxels[output.sensor]
     rows, links = _links(table)
     columns = [output.channels.index(name) for name in FORCE]
-    source = Source(
+    header = Header(
         env.loaded.source.file,
         env.spec.task.replace("_", " "),
         env.joint_names,
         links,
-        FORCE,
         output.units[columns[0]],
         env.control_step,
-        _checked_fps(fps or 1.0 / env.control_step, env.control_step),
+        _frame_rate(fps, env.control_step),
         has_outcome=True,
         has_policy=True,
     )
@@ -95,13 +95,13 @@ def of_environments(
     def play() -> Iterator[Episode]:
         quota = [episodes // env.num_envs + (i < episodes % env.num_envs) for i in range(env.num_envs)]
         pending: list[list[dict[str, Any]]] = [[] for _ in quota]
-        watching = _Watching(actor, env, output)
+        sampler = _Sampler(actor, env, output)
         actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-        for moment in rollout(watching, env):
+        for moment in rollout(sampler, env):
             info, reward = moment.step.info, moment.step.reward.cpu().numpy()
             ended, whole, score = (value.cpu().numpy() for value in (info.ended, info.is_whole(env.max_steps), info.score))
             for i in np.flatnonzero(quota):
-                pending[i].append({name: value[i] for name, value in watching.row.items()} | {"reward": reward[i]})
+                pending[i].append({name: value[i] for name, value in sampler.row.items()} | {"reward": reward[i]})
                 if not ended[i]:
                     continue
                 quota[i] -= 1
@@ -109,13 +109,13 @@ def of_environments(
                 pending[i] = []
                 touch = samples.pop("touch")[:, :, columns]
                 time = np.arange(len(touch)) * env.control_step
-                is_good = whole[i] if least is None else (score[i] <= least if env.task.is_less_better else score[i] >= least)
+                is_success = _is_success(env.task, score[i], whole[i], least)
                 by_link = {link: touch[:, taxels] for link, taxels in rows.items()}
-                yield Episode(time, touch=by_link, score=float(score[i]), is_success=bool(is_good), **samples)
+                yield Episode(time, touch=by_link, score=float(score[i]), is_success=is_success, **samples)
             if not any(quota):
                 return
 
-    return source, play()
+    return header, play()
 
 
 def of_deployment(
@@ -125,7 +125,7 @@ def of_deployment(
     seconds: float | None = None,
     fps: float | None = None,
     least: float | None = None,
-) -> tuple[Source, Iterator[Episode]]:
+) -> tuple[Header, Iterator[Episode]]:
     """Return episodes of a policy on an emulated hand, a real one or a log: the force on each fingertip, as the hand says it.
 
     Args:
@@ -145,60 +145,51 @@ def of_deployment(
         raise TgdslError(f"{prepared.saved.file}: {problem}; of a hand, expected one that feels {EMULATED}, and proprio")
     if deployment.has_scene and "motion" not in kind_of(deployment.source).options:
         raise TgdslError(f"--source {deployment.source}: a simulation's forces on taxels come from --source environments")
-    num, task = len(prepared.moved.names), prepared.loaded.task
-    bodies = {link.name: LinkTaxels(link.body) for link in prepared.sensed.groups[felt.group].layout.links}
-    source = Source(
+    num = len(prepared.moved.names)
+    links = {link.name: LinkTaxels(link.body) for link in prepared.sensed.groups[felt.group].layout.links}
+    header = Header(
         prepared.loaded.source.file,
         prepared.loaded.spec.task.replace("_", " "),
         prepared.moved.names,
-        bodies,
-        FORCE,
+        links,
         unit,
         prepared.control_step,
-        _checked_fps(fps or 1.0 / prepared.control_step, prepared.control_step),
+        _frame_rate(fps, prepared.control_step),
         has_outcome=deployment.has_scene,
         has_policy=True,
     )
 
-    def ended(rows: list[dict[str, np.ndarray]], last: Any) -> Episode:
+    def episode_of(rows: list[dict[str, np.ndarray]]) -> Episode:
         samples = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-        force, outcome = samples.pop("touch"), dict[str, Any]()
+        force, reward = samples.pop("touch"), samples.pop("reward")
+        score, is_whole = (samples.pop(name)[-1] for name in ("score", "is_whole"))
+        outcome: dict[str, Any] = {}
         if deployment.has_scene:
-            score = float(last.step.info.score)
-            is_good = (
-                bool(~last.step.info.ended[0] | last.step.truncated[0])
-                if least is None
-                else (score <= least if task.is_less_better else score >= least)
-            )
-            outcome = {"score": score, "is_success": is_good, "reward": samples["reward"]}
-        del samples["reward"]
-        touch = {link: force[:, None, i] for i, link in enumerate(bodies)}
+            is_success = _is_success(prepared.loaded.task, score, is_whole, least)
+            outcome = {"score": float(score), "is_success": is_success, "reward": reward}
+        touch = {link: force[:, None, i] for i, link in enumerate(links)}
         return Episode(np.arange(len(force)) * prepared.control_step, touch=touch, **samples, **outcome)
 
     def act() -> Iterator[Episode]:
-        rows: list[dict[str, np.ndarray]] = []
-        last = None
-        for moment in deployment.steps(episodes, seconds):
-            if last is not None and moment.episode != last.episode:
-                yield ended(rows, last)
-                rows = []
-            force = moment.obs[GROUP][0].view(-1, 3, len(bodies))[-1].T  # of stacked samples the newest
-            values = {"state": moment.obs["proprio"][0, :num], "touch": force, "policy_action": moment.action[0]}
-            values |= {"action": moment.target[0], "reward": moment.step.reward[0]}
-            rows.append({name: value.cpu().numpy().copy() for name, value in values.items()})
-            last = moment
-        if rows:
-            yield ended(rows, last)
+        for _, moments in groupby(deployment.steps(episodes, seconds), lambda moment: moment.episode):
+            rows = []
+            for moment in moments:
+                step, force = moment.step, moment.obs[GROUP][0].view(-1, 3, len(links))[-1].T  # of stacked samples the newest
+                values = {"state": moment.obs["proprio"][0, :num], "touch": force, "policy_action": moment.action[0]}
+                values |= {"action": moment.target[0], "reward": step.reward[0], "score": step.info.score[0]}
+                values |= {"is_whole": ~step.info.ended[0] | step.truncated[0]}
+                rows.append({name: value.cpu().numpy().copy() for name, value in values.items()})
+            yield episode_of(rows)
 
-    return source, act()
+    return header, act()
 
 
 def of_run(
     file: Path, touch: TactileModule, fps: float | None = None, reading: str | None = None
-) -> tuple[Source, Iterator[Episode]]:
-    """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of the actuators.
+) -> tuple[Header, Iterator[Episode]]:
+    """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of joints' actuators.
 
-    A recording has positions and readings after each step: a frame's action is that of the next one.
+    A recording has positions and readings after each step: a frame's action is the next step's.
 
     Args:
         file: The recording.
@@ -215,33 +206,34 @@ def of_run(
     output = _force_of(recorded, reading)
     columns = [list(arrays[f"{output.name}:channels"]).index(name) for name in FORCE]
     rows, links = _links({name: arrays[f"{output.name}:{name}"] for name in ("link", "body", "pos", "normal")})
-    names, addresses = _actuated(touch)
+    model = scene_model(touch.plan.scene)
+    actuators = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    joints = model.actuator_trnid[actuators, 0]
     step = float(np.median(np.diff(arrays["time"])))
-    source = Source(
+    header = Header(
         str(file),
         Path(str(arrays["document"])).stem.replace("_", " "),
-        names,
+        tuple(model.joint(int(i)).name for i in joints),
         links,
-        FORCE,
         str(arrays[f"{output.name}:units"][columns[0]]),
         step,
-        _checked_fps(fps or 1.0 / step, step),
+        _frame_rate(fps, step),
     )
 
     def read() -> Iterator[Episode]:
-        force, qpos, ctrl = arrays[output.name][..., columns], arrays["qpos"], arrays["ctrl"]
+        force, qpos, ctrl = arrays[output.name][..., columns], arrays["qpos"], arrays["ctrl"][..., actuators]
         force = force if force.ndim == 4 else force[:, :, -1]  # of stacked samples the newest
         for env in range(qpos.shape[1]):
             action = ctrl if ctrl.ndim == 2 else ctrl[:, env]
             by_link = {link: force[:-1, env, taxels] for link, taxels in rows.items()}
-            yield Episode(arrays["time"][:-1], qpos[:-1, env][:, addresses], action[1:], by_link)
+            yield Episode(arrays["time"][:-1], qpos[:-1, env][:, model.jnt_qposadr[joints]], action[1:], by_link)
 
-    return source, read()
+    return header, read()
 
 
 def of_log(
     file: Path, fps: float | None = None, calibration: Calibration | None = None, side: str | None = None
-) -> tuple[Source, Iterator[Episode]]:
+) -> tuple[Header, Iterator[Episode]]:
     """Return what a real hand has said, or an emulated one over its line: the force on each fingertip.
 
     A log does not hold commands: the action is where the joints are a frame later. Where no reading came for 0.1 s, the next
@@ -267,9 +259,9 @@ def of_log(
     time, position = log.received_at, log.column("position").astype(np.float64)
     force = meaning.apply(log.column("total_force"))
     step = float(np.median(np.diff(time)))
-    rate = _checked_fps(fps or min(LOG_FPS, 1.0 / step), step)
+    rate = _frame_rate(fps or min(LOG_FPS, 1.0 / step), step)
     joints, links = tuple(f"{prefix}{name}" for name in JOINTS), {body: LinkTaxels(body) for body in bodies}
-    source = Source(str(file), file.stem.replace("_", " "), joints, links, FORCE, meaning.units, step, rate)
+    header = Header(str(file), file.stem.replace("_", " "), joints, links, meaning.units, step, rate)
 
     def read() -> Iterator[Episode]:
         for part in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > MAX_AGE_S) + 1):
@@ -277,13 +269,20 @@ def of_log(
             by_link = {body: force[part][:, None, i] for i, body in enumerate(bodies)}
             yield Episode(time[part], position[part], position[part][later], by_link)
 
-    return source, read()
+    return header, read()
 
 
-def _checked_fps(fps: float, step: float) -> float:
+def _frame_rate(fps: float | None, step: float) -> float:
+    fps = fps or 1.0 / step
     if not 0 < fps * step <= 1.0 + 1e-6:
         raise TgdslError(f"--fps {fps:g}: expected more than 0, and at most the source's rate, {1.0 / step:.4g}")
     return float(round(fps)) if abs(fps - round(fps)) < 1e-6 * fps else fps
+
+
+def _is_success(task: Task[Any] | type[Task[Any]], score: float, is_whole: bool, least: float | None) -> bool:
+    if least is None:
+        return bool(is_whole)
+    return bool(score <= least if task.is_less_better else score >= least)
 
 
 def _force_of(outputs: Any, name: str | None) -> Output:
@@ -306,10 +305,3 @@ def _links(table: Columns | np.ndarray) -> tuple[dict[str, np.ndarray], dict[str
         for link, of_link in rows.items()
     }
     return rows, taxels
-
-
-def _actuated(touch: TactileModule) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the joint of each actuator, and where it stands in `qpos`."""
-    model = scene_model(touch.plan.scene)
-    ids = model.actuator_trnid[:, 0]
-    return tuple(model.joint(int(i)).name for i in ids), model.jnt_qposadr[ids]

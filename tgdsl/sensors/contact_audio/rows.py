@@ -85,7 +85,7 @@ def ringing(
             raise LowerError(problem, field="bodies", hint=f"it has {listed([name for name, _ in rows])}")
     below, each, notes = highest(spec.samples, step), [], []
     for name, names in rows:
-        modes = _modes_of(_given(spec, names), name, lambda own=name: surface(own), below, progress)
+        modes = _modes_of(_given(spec, names), name, surface, below, progress)
         is_heard = modes.frequency <= below * (1 + 1e-12)
         if not is_heard.any():
             raise _unheard(name, modes, spec, step)
@@ -109,7 +109,7 @@ def ringing(
     for (name, _), (modes, is_kept) in zip(rows, each, strict=True):
         if spec.gains == "contact" and modes.shapes is not None:
             shapes.append(modes.shapes.of(is_kept))
-            notes.append(f"{name}: {_told(shapes[-1])}")
+            notes.append(f"{name}: {_describe(shapes[-1])}")
     return Ringing(frequency, decay, gain, bands, tuple(notes), tuple(shapes))
 
 
@@ -123,7 +123,7 @@ def _loudest(modes: Modes, is_heard: np.ndarray, count: int | None) -> np.ndarra
     return is_kept
 
 
-def _told(shapes: ModeShapes) -> str:
+def _describe(shapes: ModeShapes) -> str:
     num = " × ".join(str(count) for count in shapes.num.tolist())
     return f"mode shapes on {num} nodes; interpolated within {shapes.error.max():.1%} of a mode's mean on the surface"
 
@@ -148,13 +148,13 @@ def _unheard(name: str, modes: Modes, spec: ContactAudioSpec, step: float) -> Lo
     return LowerError(f"{problem}{highest(spec.samples, step):.5g} Hz", "samples", f"it needs `samples: {needed}`")
 
 
-def _modes_of(given: ModesField, name: str, surface: Callable[[], Surface], below: float, progress: Progress = silent) -> Modes:
+def _modes_of(given: ModesField, name: str, surface: SurfaceByName, below: float, progress: Progress) -> Modes:
     """Return the modes of a body.
 
     Args:
         given: What the document says of them.
         name: What the body is called in messages.
-        surface: Returns its surface in its frame; called where its shape is wanted.
+        surface: Returns its surface in its frame; called if the modes follow from its shape.
         below: Frequency beyond which a mode is not heard [Hz]. Those that are listed are returned all the same.
         progress: Called with a line of text for each long job.
 
@@ -164,7 +164,7 @@ def _modes_of(given: ModesField, name: str, surface: Callable[[], Surface], belo
     if isinstance(given, ShapeModes):
         from tgdsl.modal.analysis import analysed
 
-        return analysed(name, surface(), given, below, progress)
+        return analysed(name, surface(name), given, below, progress)
     ordered = sorted(given, key=lambda mode: mode.frequency)
     return Modes(
         frequency=np.array([mode.frequency for mode in ordered]),
