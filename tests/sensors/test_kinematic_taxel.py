@@ -40,7 +40,7 @@ class TestKinematicTaxelInTheCone(KindConformance):
 
 class TestKinematicTaxelOfALattice(KindConformance):
     kind = KINEMATIC_TAXEL
-    parameters = {"densification": 0.02, "loop": {"force": 0.3, "width": 0.001}}
+    parameters = {"densification": 0.02, "loop": {"force": "300 mN", "width": "1 mm"}}
     test_compiled_equals_eager = None  # pointwise
 
 

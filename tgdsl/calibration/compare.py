@@ -2,10 +2,10 @@
 
 tgdsl: 1
 compare:
-half space:
-set: {sensors.skin: {kind: elastomer, kernel: half_space, ...}}
-fit: [skin.poissons_ratio]
-as written: {}
+  half space:
+    set: {sensors.skin: {kind: elastomer, kernel: half_space, ...}}
+    fit: [skin.poissons_ratio]
+  as written: {}
 """
 
 from __future__ import annotations
@@ -86,10 +86,8 @@ def compare(
         SpecError: All mistakes in the file, the document or a recording.
         TgdslError: As `tgdsl.calibrate`.
     """
-    if isinstance(models, Mapping):
-        spec = ComparisonSpec.model_validate({"tgdsl": 1, "compare": models})
-    else:
-        spec, _ = read_spec(Path(models), ComparisonSpec, ("tgdsl", "compare"))
+    source = {"tgdsl": 1, "compare": models} if isinstance(models, Mapping) else Path(models)
+    spec, _ = read_spec(source, ComparisonSpec, ("tgdsl", "compare"))
     fits = {
         name: calibrate(document, recordings, each.fit, overrides={**(overrides or {}), **each.set}, **options)
         for name, each in spec.compare.items()
