@@ -87,7 +87,7 @@ def of_environments(
         FORCE,
         output.units[columns[0]],
         env.control_step,
-        _checked_fps(fps or 1.0 / env.control_step, env.control_step),
+        _checked_fps(fps, env.control_step),
         has_outcome=True,
         has_policy=True,
     )
@@ -155,7 +155,7 @@ def of_deployment(
         FORCE,
         unit,
         prepared.control_step,
-        _checked_fps(fps or 1.0 / prepared.control_step, prepared.control_step),
+        _checked_fps(fps, prepared.control_step),
         has_outcome=deployment.has_scene,
         has_policy=True,
     )
@@ -207,7 +207,7 @@ def of_run(
         reading: As for `of_environments`.
 
     Raises:
-        TgdslError: If the recording holds no such reading.
+        TgdslError: If the recording holds no such reading or less than two steps, or is of another scene.
     """
     with np.load(file, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -216,6 +216,14 @@ def of_run(
     columns = [list(arrays[f"{output.name}:channels"]).index(name) for name in FORCE]
     rows, links = _links({name: arrays[f"{output.name}:{name}"] for name in ("link", "body", "pos", "normal")})
     names, addresses = _actuated(touch)
+    if len(arrays["time"]) < 2:
+        raise TgdslError(f"{file}: {len(arrays['time'])} steps, expected two at least")
+    model, sizes = scene_model(touch.plan.scene), (arrays["qpos"].shape[-1], arrays["ctrl"].shape[-1])
+    if sizes != (model.nq, model.nu):
+        raise TgdslError(
+            f"{file}: {sizes[0]} positions and {sizes[1]} controls, its document now has {model.nq} and {model.nu}: "
+            "record it again"
+        )
     step = float(np.median(np.diff(arrays["time"])))
     source = Source(
         str(file),
@@ -225,7 +233,7 @@ def of_run(
         FORCE,
         str(arrays[f"{output.name}:units"][columns[0]]),
         step,
-        _checked_fps(fps or 1.0 / step, step),
+        _checked_fps(fps, step),
     )
 
     def read() -> Iterator[Episode]:
@@ -267,7 +275,7 @@ def of_log(
     time, position = log.received_at, log.column("position").astype(np.float64)
     force = meaning.apply(log.column("total_force"))
     step = float(np.median(np.diff(time)))
-    rate = _checked_fps(fps or min(LOG_FPS, 1.0 / step), step)
+    rate = _checked_fps(min(LOG_FPS, 1.0 / step) if fps is None else fps, step)
     joints, links = tuple(f"{prefix}{name}" for name in JOINTS), {body: LinkTaxels(body) for body in bodies}
     source = Source(str(file), file.stem.replace("_", " "), joints, links, FORCE, meaning.units, step, rate)
 
@@ -280,7 +288,8 @@ def of_log(
     return source, read()
 
 
-def _checked_fps(fps: float, step: float) -> float:
+def _checked_fps(fps: float | None, step: float) -> float:
+    fps = 1.0 / step if fps is None else fps
     if not 0 < fps * step <= 1.0 + 1e-6:
         raise TgdslError(f"--fps {fps:g}: expected more than 0, and at most the source's rate, {1.0 / step:.4g}")
     return float(round(fps)) if abs(fps - round(fps)) < 1e-6 * fps else fps
