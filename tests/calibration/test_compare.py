@@ -5,7 +5,7 @@ import pytest
 from recorded_presses import document, recording
 
 import tgdsl
-from tgdsl.errors import SpecError
+from tgdsl.errors import SpecError, TgdslError
 
 MODELS = """\
 tgdsl: 1
@@ -35,6 +35,8 @@ def test_mistakes_have_a_place(tmp_path):
         tgdsl.compare(document(tmp_path), {}, tmp_path / "models.yaml")
     with pytest.raises(SpecError, match=r'compare\.linear spring\.sett: unknown key "sett"'):
         tgdsl.compare(document(tmp_path), {}, {"linear spring": {"sett": {}}})
+    with pytest.raises(TgdslError, match=r"touch\.loop: the document gives no value, expected one to start from"):
+        tgdsl.compare(document(tmp_path), {}, {"rubber": {"fit": ["touch.loop.force"]}})
 
 
 def test_the_command_prints_the_table(tmp_path, here):

@@ -46,6 +46,10 @@ BAD = {
     ),
     "another name": (lambda a: a.update({"bodies": np.array(["bal", "pad"])}), 'bodies: "ball" is missing; did you mean "bal"'),
     "unknown key": (lambda a: a.update({"targt:touch": np.zeros(3)}), 'targt:touch: unknown key; did you mean "target:touch"'),
+    "quaternions of no length": (
+        lambda a: a.update({"body_quat": with_value(a["body_quat"], (7, 1), 0.0)}),
+        r"body_quat: \[7, 1\] is \[0\. 0\. 0\. 0\.\]; expected a quaternion of length 1, w first",
+    ),
     "another shape": (
         lambda a: a.update({"target:touch": a["target:touch"][:, :2]}),
         r"target:touch: found shape \(60, 2, 3\), expected \(60, 3, 3\): samples, taxels, channels",
@@ -77,10 +81,18 @@ def test_all_that_is_wrong_is_said_at_once(pressed, tmp_path):
     assert str(raised.value).startswith(f"{tmp_path / 'bad.npz'}: clock:touch: ")
 
 
+def test_a_wrong_name_of_a_reading_is_one_mistake(pressed):
+    _, touch, arrays = pressed
+    with pytest.raises(SpecError) as error:
+        read(touch, {key.replace(":touch", ":toch"): value for key, value in arrays.items()})
+    assert str(error.value) == '<arrays>: target:toch: unknown key; did you mean "target:touch"?'
+
+
 def test_what_is_no_recording_is_refused(pressed, tmp_path):
     _, touch, _ = pressed
     (tmp_path / "text.npz").write_text("no archive")
-    for name, message in (("text.npz", "no .npz file"), ("none.npz", "there is no such file")):
+    (tmp_path / "empty.npz").touch()
+    for name, message in (("text.npz", "no .npz file"), ("empty.npz", "no .npz file"), ("none.npz", "there is no such file")):
         with pytest.raises(SpecError, match=message):
             read(touch, tmp_path / name)
 

@@ -84,6 +84,26 @@ def test_a_recording_in_tables_is_the_recording(folder):
         ("press.yaml", "file: touch.csv", "file: tuch.csv", r"tuch\.csv: cannot be read as CSV"),
         ("states.csv", "0,0,0,34", "0,oops,0,34", r'states\.csv:2:2: column x: found "oops", expected a number'),
         ("states.csv", "0,0,0,34", "0,0,0,", r"states\.csv:2:4: column z: this cell is empty"),
+        ("states.csv", "0,0,0,34", "0,0,0,34,0", r"states\.csv:2:8: found \d columns, expected 7; write decimals with a point"),
+        ("states.csv", "t,x,y,z,", "t,x,x,z,", r'states\.csv:1:1: column "x" stands twice; number them from 0 to 6'),
+        ("states.csv", "t,x,y", '"t,x,y', r"states\.csv: cannot be read as CSV: unexpected end of data"),
+        ("press.yaml", "time: 0", "time: true", r"press\.yaml:10:11: targets\.touch\.time: found True"),
+        ("press.yaml", "[px, py, pz]", "[px, py, -1]", r"press\.yaml:6:45: states\.position\.pad\[2\]: found -1"),
+        ("press.yaml", "[px, py, pz]", "[px, py, 1 N]", r'states\.csv:1:1: there is no column "1 N"'),
+        (
+            "press.yaml",
+            "{ball: [x, y, z], pad: [px, py, pz]}",
+            "{}",
+            r"press\.yaml:6:13: states\.position: found a mapping of 0",
+        ),
+        ("press.yaml", "[1, 2, 3]", "[]", r"press\.yaml:12:25: targets\.touch\.channels\.force_z: found a list of 0"),
+        ("press.yaml", "0.002", "-1", r"press\.yaml:16:12: targets\.touch\.floor: -1 is out of range"),
+        (
+            "press.yaml",
+            "targets:",
+            "  orientation: {bal: [x, x, x, x]}\ntargets:",
+            r'press\.yaml:7:22: states\.orientation\.bal: "bal" has an',
+        ),
     ],
 )
 def test_mistakes_are_said_by_line_and_column(folder, file, old, new, message):
@@ -92,3 +112,25 @@ def test_mistakes_are_said_by_line_and_column(folder, file, old, new, message):
     (folder / file).write_text(text.replace(old, new, 1))
     with pytest.raises(SpecError, match=message):
         read_tables(folder / "press.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "there is no line of numbers"),
+        ("t,x,y,z,px,py,pz\n", "there is no line of numbers"),
+        ("t;x;y;z;px;py;pz\n0;0;0;34;0;0;0\n", 'found one column, "t;x;y;z;px;py;pz"; expected commas between columns'),
+        ("0 0 0 34\n", 'found one column, "0 0 0 34"; expected commas between columns'),
+    ],
+)
+def test_a_file_that_is_no_table_is_one_mistake(folder, text, message):
+    (folder / "states.csv").write_text(text)
+    with pytest.raises(SpecError) as error:
+        read_tables(folder / "press.yaml")
+    assert str(error.value) == f"{folder / 'states.csv'}:1:1: {message}"
+
+
+def test_a_position_may_be_fixed(folder):
+    text = (folder / "press.yaml").read_text()
+    (folder / "press.yaml").write_text(text.replace("[px, py, pz]", "[0 m, -2 mm, px]"))
+    assert read_tables(folder / "press.yaml")["body_pos"][:, 1].tolist() == [[0.0, -0.002, 0.0]] * 1200

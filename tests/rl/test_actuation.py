@@ -247,6 +247,8 @@ def test_offsets_of_half_a_range_reach_as_far_as_it_is_wide(tmp_path):
     assert actuation.target[:, 0].tolist() == pytest.approx([-2.0, 0.5, 1.5])
     with pytest.raises(ValueError, match="scale is half_range, but absolute actions have none"):
         ActionSpec(mode="absolute", scale="half_range")
+    with pytest.raises(ValueError, match="Input should be 'half_range'"):
+        ActionSpec(scale="halfrange")
 
 
 # What is drawn

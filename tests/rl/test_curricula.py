@@ -141,6 +141,7 @@ def test_a_curriculum_of_ones_own_and_its_state(tmp_path):
         (("rewards.effort", "max_force"), "terms.more", "max_force would be -0.5: -0.5 is out of range, expected more than 0"),
         (("rewards.effort", "hold.coasting_pay"), "terms.more", "hold.coasting_pay would be -0.5: "),
         (("last: 30", "last: 10"), "terms.more", "first and last are both 10"),
+        (("last: 30", "last: 5"), "terms.more", "last, iteration 5, is before first, 10"),
     ],
 )
 def test_what_is_wrong_with_a_curriculum_is_told_at_its_place(tmp_path, change, path, says):

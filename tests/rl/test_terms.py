@@ -240,3 +240,5 @@ def test_a_group_of_forces_is_of_links_that_a_document_names(folder):
     assert torch.equal(obs, env.now.link_force[:, 1].float())
     with pytest.raises(SimulationError, match='no link matches "tip"; known links: left, right'):
         tiny_env(folder, more="terms: {tip: {term: link_force, links: [tip]}}\n")
+    with pytest.raises(SpecError, match=r"terms\.tip\.links: found a list of 0, expected at least 1 entry"):
+        tiny_env(folder, more="terms: {tip: {term: link_force, links: []}}\n")

@@ -12,7 +12,7 @@ from tgdsl.quantities import ContactDepth, Contacts, Gathered
 from tgdsl.quantities.contacts import ContactPoints
 from tgdsl.quantities.depth_search import Penetration
 from tgdsl.sensors.base import UNTIMED
-from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
+from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL, LoopState
 from tgdsl.testing import KindConformance
 
 
@@ -40,7 +40,7 @@ class TestKinematicTaxelInTheCone(KindConformance):
 
 class TestKinematicTaxelOfALattice(KindConformance):
     kind = KINEMATIC_TAXEL
-    parameters = {"densification": 0.02, "loop": {"force": 0.3, "width": 0.001}}
+    parameters = {"densification": 0.02, "loop": {"force": "300 mN", "width": "1 mm"}}
     test_compiled_equals_eager = None  # pointwise
 
 
@@ -209,7 +209,7 @@ def pressed_by_hand(tmp_path, depth, load, friction, dtype, **sensor):
     pos = vec(touch.constants["quantities/contact_depth/queries/0/pos"])
     felt = Penetration(pos, depth, (none, none, -one), velocity, angular, {}, {})
     gathered = Gathered({ContactDepth: felt, Contacts: contacts})
-    return KINEMATIC_TAXEL.forward(gathered, UNTIMED, constants, {})[0]
+    return KINEMATIC_TAXEL.forward(gathered, UNTIMED, constants, LoopState())[0]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

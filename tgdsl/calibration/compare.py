@@ -22,7 +22,7 @@ from tgdsl.calibration.recordings import Arrays
 from tgdsl.compiler.pipeline import Document
 from tgdsl.console.tables import text_table
 from tgdsl.fields.models import SpecModel
-from tgdsl.schema.load import parse_spec, read_spec
+from tgdsl.schema.load import read_spec
 
 
 class CandidateSpec(SpecModel):
@@ -80,11 +80,8 @@ def compare(
         SpecError: All mistakes in the file, the document or a recording.
         TgdslError: As `tgdsl.calibrate`.
     """
-    required = ("tgdsl", "compare")
-    if isinstance(models, Mapping):
-        spec, _ = parse_spec({"tgdsl": 1, "compare": models}, "<mapping>", ComparisonSpec, required)
-    else:
-        spec, _ = read_spec(Path(models), ComparisonSpec, required)
+    source = {"tgdsl": 1, "compare": models} if isinstance(models, Mapping) else Path(models)
+    spec, _ = read_spec(source, ComparisonSpec, ("tgdsl", "compare"))
     fits = {
         name: calibrate(document, recordings, each.fit, overrides={**(overrides or {}), **each.set}, **options)
         for name, each in spec.compare.items()

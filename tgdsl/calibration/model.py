@@ -222,7 +222,9 @@ class Model:
             raise TgdslError(f"{path}: expected a sensor and a field; {hint}")
         value: Any = specs[sensor]
         annotation, metadata = None, ()
-        for name in fields:
+        for i, name in enumerate(fields):
+            if value is None:
+                raise TgdslError(f"{'.'.join([sensor, *fields[:i]])}: the document gives no value, expected one to start from")
             if not isinstance(value, BaseModel) or name not in type(value).model_fields:
                 known = list(type(value).model_fields) if isinstance(value, BaseModel) else []
                 raise TgdslError(f'{path}: there is no field "{name}"; {did_you_mean(name, known, "fields")}')

@@ -41,6 +41,8 @@ from tgdsl.plan.inputs import Inputs
 NAMES_OF = {axis: f"{axis}s" for axis in ("pair", "object", "joint", "actuator")} | {"body": "bodies", "heated": "heated"}
 """Key of the names along each axis of the state."""
 OF_TARGET = ("target", "unit", "clock", "clock_width", "channels", "weight", "floor", "zero")
+ROUNDING = 0.01
+"""Largest error of a quaternion's length: recordings are rounded."""
 DERIVED = {"body_linvel": "body_pos", "body_angvel": "body_quat"}
 """Velocities that follow from other fields."""
 Arrays = Mapping[str, np.ndarray]
@@ -152,7 +154,7 @@ def _arrays(source: str | Path | Arrays, name: str) -> dict[str, np.ndarray]:
     try:
         with np.load(source) as file:
             return dict(file)
-    except (OSError, ValueError, BadZipFile, AttributeError) as error:
+    except (OSError, EOFError, ValueError, BadZipFile, TypeError, AttributeError) as error:
         why = "there is no such file" if isinstance(error, FileNotFoundError) else "this is no .npz file of plain arrays"
         raise SpecError([Problem(name, 0, 0, "", why)]) from error
 
@@ -191,7 +193,8 @@ class _Reader:
         known = {"time", *SHAPES, *NAMES_OF.values(), *(f"width:{name}" for name in SHAPES)}
         known |= {f"{what}:{name}" for what in OF_TARGET for name in self.outputs}
         for key in self.arrays:
-            if key not in known:
+            what, _, name = key.partition(":")
+            if key not in known and (what not in OF_TARGET[1:] or f"target:{name}" not in self.arrays):
                 self.note(key, "unknown key", did_you_mean(key, known, "keys"))
 
     def _numbers(self, key: str) -> np.ndarray | None:
@@ -224,6 +227,9 @@ class _Reader:
         if (bad := np.argwhere(~np.isfinite(value))).size:
             place = ", ".join(map(str, bad[0]))
             self.note(name, f"[{place}] is {value[tuple(bad[0])]}", "expected a finite number: leave the step out")
+        elif name == "body_quat" and (bad := np.argwhere(abs(np.linalg.norm(value, axis=-1) - 1) > ROUNDING)).size:
+            place = ", ".join(map(str, bad[0]))
+            self.note(name, f"[{place}] is {value[tuple(bad[0])]}", "expected a quaternion of length 1, w first")
         axis = shape[0]
         order = self._order(str(axis), NAMES_OF[str(axis)])
         if order is not None and value.ndim > 1 and value.shape[1] == len(self.arrays[NAMES_OF[str(axis)]]):

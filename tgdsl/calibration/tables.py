@@ -5,8 +5,8 @@
       file: states.csv
       time: t                              # a column by its name in the first line, or by its number from 0
       unit: mm
-      position: {ball: [x, y, z], pad: [px, py, pz]}
-      orientation: {ball: [qw, qx, qy, qz]}  # default: the world's
+      position: {ball: [x, y, z], pad: [0 m, 0 m, 0 m]}    # columns, or fixed numbers with a unit
+      orientation: {ball: [qw, qx, qy, qz]}    # default: that of the world
     targets:
       load:
         file: scale.csv
@@ -17,28 +17,29 @@
         invalid: [-1]                      # numbers that stand for a missing reading
         clock_width: 0.5 s
 
-Each body that the module reads needs columns for its position. Empty and `invalid` cells get the weight 0 in targets; in states
-an empty cell is an error. A file that starts with numbers has no names.
+Each body that the module reads needs a position. Empty and `invalid` cells get the weight 0 in targets; in states an empty cell
+is an error. A file that starts with numbers has no names.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
+from pydantic import Field, StrictInt, Tag
 
 from tgdsl.errors import Problem, SpecError, did_you_mean, listed
-from tgdsl.fields.models import Quantity, SpecModel
-from tgdsl.fields.units import UNITS
+from tgdsl.fields.models import TEXT_OR_OTHER, NonNegative, Quantity, SpecModel, Text
+from tgdsl.fields.units import UNITS, parse
 from tgdsl.schema.load import read_spec
 from tgdsl.schema.yaml import Source
 
-Column = int | str
+Column = Annotated[Text | Annotated[StrictInt, Field(ge=0), Tag("other")], TEXT_OR_OTHER]
 Three = tuple[Column, Column, Column]
 Four = tuple[Column, Column, Column, Column]
 
@@ -52,8 +53,8 @@ class StatesSpec(SpecModel):
     """Column of the clock [s]."""
     unit: Literal["m", "mm", "cm", "um"]
     """Unit of the positions."""
-    position: dict[str, Three]
-    """Columns of each body's position."""
+    position: Annotated[dict[str, Three], Field(min_length=1)]
+    """Columns of each body's position, or fixed numbers with a unit."""
     orientation: dict[str, Four] = {}
     """Columns of each body's quaternion, w first."""
 
@@ -67,7 +68,7 @@ class TargetSpec(SpecModel):
     """Column of the clock [s]."""
     unit: str
     """Unit of the numbers, once scaled."""
-    channels: Annotated[dict[str, Column | tuple[Column, ...]], Field(min_length=1)]
+    channels: Annotated[dict[str, Column | Annotated[tuple[Column, ...], Field(min_length=1)]], Field(min_length=1)]
     """Columns of each channel, one for each row of the reading."""
     scale: float = 1.0
     """Factor from the columns' numbers to the unit."""
@@ -75,7 +76,7 @@ class TargetSpec(SpecModel):
     """Numbers that stand for a missing reading."""
     clock_width: Annotated[float, Quantity("time", ge=0.0)] = 0.0
     """Standard deviation of the clock's unknown offset from the states' [s]."""
-    floor: float = 0.0
+    floor: NonNegative = 0.0
     """RMS noise, in the unit; 0: unknown."""
 
 
@@ -104,22 +105,34 @@ class _Table:
         self.path, self.names, self.problems = path, list[str](), list[Problem]()
         try:
             with path.open(newline="", encoding="utf-8-sig") as file:
-                reader = csv.reader(file)
+                reader = csv.reader(file, strict=True)
                 self.lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if line]
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             raise SpecError([Problem(str(path), 0, 0, "", f"cannot be read as CSV: {error}")]) from error
+        if self.lines and len(first := self.lines[0][1]) == 1:
+            what = f'found one column, "{first[0]:.40}"'
+            raise SpecError([Problem(str(path), 1, 1, "", what, "expected commas between columns")])
         if self.lines and any(cell and _number(cell) is None for cell in self.lines[0][1]):
             self.names = self.lines.pop(0)[1]
+        if not self.lines:
+            raise SpecError([Problem(str(self.path), 1, 1, "", "there is no line of numbers")])
+        width = len(self.names or self.lines[0][1])
+        for line, cells in self.lines:
+            if any(cells[width:]):
+                what = f"found {len(cells)} columns, expected {width}"
+                raise SpecError([Problem(str(self.path), line, width + 1, "", what, "write decimals with a point")])
 
     def column(self, which: Column, invalid: Sequence[float] | None = None) -> Float[np.ndarray, " line"]:
         """Return a column's numbers; NaN where one is missing or in `invalid`: a mistake if that is None."""
-        width = len(self.names) or (len(self.lines[0][1]) if self.lines else 0)
-        if isinstance(which, str) and which not in self.names:
-            hint = did_you_mean(which, self.names, "columns") if self.names else f"number them from 0 to {width - 1}"
-            self.problems.append(Problem(str(self.path), 1, 1, "", f'there is no column "{which}"', hint))
+        width = len(self.names or self.lines[0][1])
+        if isinstance(which, str) and self.names.count(which) != 1:
+            has_hint, numbers = self.names and which not in self.names, f"number them from 0 to {width - 1}"
+            hint = did_you_mean(which, self.names, "columns") if has_hint else numbers
+            what = f'column "{which}" stands twice' if which in self.names else f'there is no column "{which}"'
+            self.problems.append(Problem(str(self.path), 1, 1, "", what, hint))
             return np.zeros(len(self.lines))
         place = self.names.index(which) if isinstance(which, str) else which
-        if not 0 <= place < width:
+        if place >= width:
             self.problems.append(Problem(str(self.path), 1, 1, "", f"there is no column {place}", f"there are {width}, from 0"))
             return np.zeros(len(self.lines))
         result = np.full(len(self.lines), np.nan)
@@ -173,8 +186,8 @@ def read_tables(path: str | Path) -> dict[str, Any]:
 
 
 def _states(spec: StatesSpec, table: _Table, source: Source) -> dict[str, Any]:
-    bodies, factor = list(spec.position), UNITS["length"][spec.unit]
-    pos = np.stack([np.stack([factor * table.column(c) for c in spec.position[body]], axis=-1) for body in bodies], axis=1)
+    bodies = list(spec.position)
+    pos = np.stack([np.stack([_position(table, c, spec.unit) for c in spec.position[b]], axis=-1) for b in bodies], axis=1)
     quat = np.zeros((*pos.shape[:2], 4))
     quat[..., 0] = 1.0
     for body, columns in spec.orientation.items():
@@ -182,3 +195,11 @@ def _states(spec: StatesSpec, table: _Table, source: Source) -> dict[str, Any]:
             raise SpecError([source.problem(("states", "orientation", body), f'"{body}" has an orientation, but no position')])
         quat[:, bodies.index(body)] = np.stack([table.column(c) for c in columns], axis=-1)
     return {"time": table.column(spec.time), "body_pos": pos, "body_quat": quat, "bodies": bodies}
+
+
+def _position(table: _Table, which: Column, unit: str) -> Float[np.ndarray, " line"]:
+    """Return positions [m], of a column or the same at all lines."""
+    if isinstance(which, str) and which not in table.names and _number(which) is None:
+        with suppress(ValueError):
+            return np.full(len(table.lines), parse(which, "length"))
+    return UNITS["length"][unit] * table.column(which)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
+from zipfile import BadZipFile
 
 import tyro
 
@@ -67,7 +68,7 @@ class ExportDataset:
 
     def run(self) -> None:
         """Read or play the episodes, and write them."""
-        from tgdsl.files.write import with_folder
+        from tgdsl.files.write import as_file_error, check_writable, with_folder
         from tgdsl.rl.datasets.lerobot import write_lerobot
         from tgdsl.rl.datasets.mcap_file import write_mcap
         from tgdsl.rl.datasets.zarr_store import write_zarr
@@ -75,10 +76,15 @@ class ExportDataset:
         out = self.out or Path("out") / f"{self.input.stem}_{self.to}"
         if out.exists():
             raise TgdslError(f"{out}: is there already; remove it, or name another folder with --out")
+        check_writable(out)
         if self.episodes < 1:
             raise TgdslError(f"--episodes {self.episodes}: expected at least 1")
         header, episodes = self._recorded() if self.input.suffix == ".npz" else self._played()
-        with StatusLine() as progress, TemporaryDirectory(prefix=f".{out.name}", dir=with_folder(out).parent) as temporary:
+        with (
+            as_file_error(out),
+            StatusLine() as progress,
+            TemporaryDirectory(prefix=f".{out.name}", dir=with_folder(out).parent) as temporary,
+        ):
             progress("writing episodes")
             partial = Path(temporary) / out.name
             partial.mkdir()
@@ -94,20 +100,19 @@ class ExportDataset:
         from tgdsl.rl.datasets.sources import of_log, of_run
         from tgdsl.runtime.xhand1.calibration import load_calibration
 
+        expected = "expected a recording of tgdsl run, or a log of tgdsl hand record"
         if self.policy is not None:
             raise TgdslError(f"--policy {self.policy}: a recording has its actions; a policy acts on a task: see --source")
         try:
-            with np.load(self.input, allow_pickle=False) as archive:
+            with self.input.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 names, document = archive.files, str(archive["document"]) if "document" in archive.files else ""
-        except (OSError, ValueError) as error:
-            raise TgdslError(f"{self.input}: cannot read this file: {error}") from error
+        except (OSError, EOFError, ValueError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
+            raise TgdslError(f"{self.input}: {expected}: {error}") from error
         if "about" in names:
             return of_log(self.input, self.fps, load_calibration(self.calibration) if self.calibration else None, self.side)
         if not document:
-            known = "expected a recording of tgdsl run, or a log of tgdsl hand record"
-            raise TgdslError(
-                f"{self.input}: found {', '.join(names[:6])}, …; {known}; to export what a policy does, name its task"
-            )
+            contents = ", ".join([*names[:6], *(["…"] if len(names) > 6 else [])]) or "no array"
+            raise TgdslError(f"{self.input}: found {contents}; {expected}; to export what a policy does, name its task")
         with StatusLine() as progress:
             touch = module_of(Path(document), self.set, progress)
         return of_run(self.input, touch, self.fps, self.reading)

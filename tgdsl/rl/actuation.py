@@ -58,7 +58,7 @@ Factor = Annotated[Range, RangeOf("number", gt=0.0)]
 
 Scale = Annotated[
     Annotated[Literal["half_range"], Tag("word")] | Annotated[float, Quantity("angle", gt=0.0), Tag("angle")],
-    Discriminator(lambda value: "word" if value == "half_range" else "angle"),
+    Discriminator(lambda value: "word" if isinstance(value, str) and value.isidentifier() else "angle"),
 ]
 
 

@@ -28,7 +28,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import create_model, model_validator
+from pydantic import Field, create_model, model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
@@ -331,7 +331,7 @@ class LinkForce(ObservationTerm):
     """The object's force on each link, in the link's frame [N]."""
 
     senses = ("link_contact",)
-    links: tuple[str, ...] = ("*",)
+    links: Annotated[tuple[str, ...], Field(min_length=1)] = ("*",)
     """Names or shell wildcards of the links, which stand in the order of the `link_contact` sensor."""
 
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
@@ -482,6 +482,8 @@ class Linear(CurriculumTerm):
     def _check(self) -> Linear:
         if self.first == self.last:
             raise ValueError(f"first and last are both {self.first:g}, expected a change that takes some time")
+        if self.by == "iteration" and self.last < self.first:
+            raise ValueError(f"last, iteration {self.last:g}, is before first, {self.first:g}")
         return self
 
     def extremes(self) -> tuple[float, ...]:

@@ -183,18 +183,20 @@ def load_layout(path: Path) -> LoadedLayout:
     return LoadedLayout(spec=spec, source=source, folder=path.parent, problems=[])
 
 
-def read_spec(path: Path, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
+def read_spec(document: Path | Mapping[str, Any], model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
     """Read a file that holds one model and nothing else, and where its values stand.
 
     Args:
-        path: The file.
+        document: The file, or the same as a mapping.
         model: What it holds.
         required: Keys that it must have.
 
     Raises:
         SpecError: All its mistakes, each at its place.
     """
-    return parse_spec(_content(path, str(path)), str(path), model, required)
+    if isinstance(document, Mapping):
+        return parse_spec(document, "<mapping>", model, required)
+    return parse_spec(_content(document, str(document)), str(document), model, required)
 
 
 def parse_spec(content: bytes | Mapping[str, Any], name: str, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:

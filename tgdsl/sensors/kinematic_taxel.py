@@ -58,7 +58,7 @@ import torch
 from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 
-from tgdsl.fields.models import NonNegative, Positive, PositiveLength, SpecModel, Usual
+from tgdsl.fields.models import NonNegative, Positive, PositiveLength, Quantity, SpecModel, Usual
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
@@ -88,7 +88,7 @@ CLOSED = 0.99
 class LoopSpec(SpecModel):
     """A loop of loading and unloading: Prandtl's elastoplastic element."""
 
-    force: Annotated[Positive, Usual("number", high=1e4)]
+    force: Annotated[float, Quantity("force", gt=0.0), Usual("force", high=1e4)]
     """Q, half the distance of the two branches [N]."""
     width: Annotated[PositiveLength, Usual("length", high=0.1)]
     """r, depth over which the element yields [m]."""

@@ -10,6 +10,7 @@ from task_records import Recorder, assert_reference
 from task_references import in_palm_rotate
 from tiny_tasks import tiny_env
 
+from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.tasks.holding import are_fingers
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
@@ -71,6 +72,8 @@ def test_a_document_says_what_is_seen_of_the_goal(tmp_path):
     quarter = [0, 1, 0, -1, 0, 0]  # the turned x and y axes
     np.testing.assert_allclose(goal[:, 1:], [quarter] * 2, atol=1e-3)
     env.close()
+    with pytest.raises(SpecError, match="goal names angle twice"):
+        tiny_env(tmp_path, 2, more="goal: [angle, angle]\n")
 
 
 @pytest.mark.slow

@@ -198,7 +198,7 @@ def of_run(
         reading: As for `of_environments`.
 
     Raises:
-        TgdslError: If the recording holds no such reading.
+        TgdslError: If the recording holds no such reading or less than two steps, or is of another scene.
     """
     with np.load(file, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -206,7 +206,14 @@ def of_run(
     output = _force_of(recorded, reading)
     columns = [list(arrays[f"{output.name}:channels"]).index(name) for name in FORCE]
     rows, links = _links({name: arrays[f"{output.name}:{name}"] for name in ("link", "body", "pos", "normal")})
-    model = scene_model(touch.plan.scene)
+    if len(arrays["time"]) < 2:
+        raise TgdslError(f"{file}: {len(arrays['time'])} steps, expected two at least")
+    model, sizes = scene_model(touch.plan.scene), (arrays["qpos"].shape[-1], arrays["ctrl"].shape[-1])
+    if sizes != (model.nq, model.nu):
+        raise TgdslError(
+            f"{file}: {sizes[0]} positions and {sizes[1]} controls, its document now has {model.nq} and {model.nu}: "
+            "record it again"
+        )
     actuators = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
     joints = model.actuator_trnid[actuators, 0]
     step = float(np.median(np.diff(arrays["time"])))
@@ -259,7 +266,7 @@ def of_log(
     time, position = log.received_at, log.column("position").astype(np.float64)
     force = meaning.apply(log.column("total_force"))
     step = float(np.median(np.diff(time)))
-    rate = _frame_rate(fps or min(LOG_FPS, 1.0 / step), step)
+    rate = _frame_rate(min(LOG_FPS, 1.0 / step) if fps is None else fps, step)
     joints, links = tuple(f"{prefix}{name}" for name in JOINTS), {body: LinkTaxels(body) for body in bodies}
     header = Header(str(file), file.stem.replace("_", " "), joints, links, meaning.units, step, rate)
 
@@ -273,7 +280,7 @@ def of_log(
 
 
 def _frame_rate(fps: float | None, step: float) -> float:
-    fps = fps or 1.0 / step
+    fps = 1.0 / step if fps is None else fps
     if not 0 < fps * step <= 1.0 + 1e-6:
         raise TgdslError(f"--fps {fps:g}: expected more than 0, and at most the source's rate, {1.0 / step:.4g}")
     return float(round(fps)) if abs(fps - round(fps)) < 1e-6 * fps else fps

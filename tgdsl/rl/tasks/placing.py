@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from jaxtyping import Float
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
@@ -26,6 +26,12 @@ class PlacedTaskSpec(TaskSpec):
     the object to the goal in world axes; the `angle` of that turn [rad]."""
     drop_measure: Literal["distance", "below"] = "distance"
     """What `drop_distance` bounds: how far the object is from where it started, or how far below."""
+
+    @model_validator(mode="after")
+    def _has_each_part_once(self) -> PlacedTaskSpec:
+        if twice := [part for part in self.goal if self.goal.count(part) > 1]:
+            raise ValueError(f"goal names {twice[0]} twice")
+        return self
 
     def drop_extent(self, offset: Float[Tensor, "env 3"]) -> Float[Tensor, " env"]:
         """Return what `drop_distance` bounds, of an object's position less that at its start [m]."""
