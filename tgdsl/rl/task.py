@@ -5,7 +5,8 @@ terms, `reset`, `advance`, `is_over`, `observe`, `score`. Numbers of the documen
 change them, but for those that the class lists as its `constants`.
 
 A term of the reward is a method marked by `reward_term`, or a shared one of `tgdsl.rl.terms` such as `near = Near.of_task(0.1,
-width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order.
+width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order; so do keys such as
+`near_width`, unless the spec has them.
 
 All methods take and return tensors of all environments, and change memory in place, so that on a GPU a whole step can be
 captured as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host. `is_over`,
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -237,7 +239,7 @@ class Task(ABC, Generic[S]):
     memory: dict[str, Tensor]
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Collect the terms of the reward, and add `rewards`, their weights, to the model of the document."""
+        """Collect the terms of the reward; add `rewards`, their weights, and their parameters to the document's model."""
         super().__init_subclass__(**options)
         terms_of_class = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
         cls.terms = {**cls.terms, **terms_of_class}
@@ -249,11 +251,14 @@ class Task(ABC, Generic[S]):
             }
             doc = "Weights of the reward's terms; null leaves one out."
             cls.Rewards = create_model("Rewards", __base__=SpecModel, __module__=cls.__module__, __doc__=doc, **fields)
-            rewards: Any = (cls.Rewards, Field(cls.Rewards(), description="Weights of the reward's terms."))
             base = cls.Spec
-            cls.Spec = create_model(
-                base.__name__, __base__=base, __module__=cls.__module__, __doc__=base.__doc__, rewards=rewards
-            )
+            shared = [(term.term.model_fields, term.parameters) for term in cls.terms.values() if term.term is not None]
+            parameters = {key: numbers[name] for numbers, names in shared for name, key in names.items()}
+            keys: dict[str, Any] = {
+                key: (number.annotation, copy(number)) for key, number in parameters.items() if key not in base.model_fields
+            }
+            keys["rewards"] = (cls.Rewards, Field(cls.Rewards(), description="Weights of the reward's terms."))
+            cls.Spec = create_model(base.__name__, __base__=base, __module__=cls.__module__, __doc__=base.__doc__, **keys)
 
     def __init__(self, spec: S, setup: Setup):
         self.spec, self.setup, self.memory = spec, setup, {}

@@ -30,14 +30,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Angle, PositiveLength, Quantity
+from tgdsl.fields.models import Angle, PositiveLength
 from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.features import Features
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
@@ -70,20 +70,12 @@ class InPalmRotateSpec(PlacedTaskSpec, ProgressSpec):
     """θ_max: no goal is reached with a larger tilt [rad]."""
     spin_tilt: Angle | None = None
     """With a larger tilt `spin` is 0 [rad]; null: it never is."""
-    near_width: PositiveLength = 0.02
-    """λ, decay length of `near` [m]."""
     free_distance: PositiveLength = 0.02
     """r: closer to where it started, the object costs nothing [m]."""
     drop_distance: PositiveLength = 0.07
     """Further from where it started, or below, the object is lost [m]."""
-    max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
-    """f_max: less force on a link costs nothing [N]."""
     hold: HoldSpec = HoldSpec()
     """What progress pays while the object coasts; by default as much as while it is held."""
-    free_speed: Annotated[float, Quantity("speed", gt=0.0)] = 0.2
-    """v_free: a slower object costs nothing [m/s]."""
-    free_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
-    """ω_free: the same of its angular velocity, about whatever axis [rad/s]."""
 
 
 def _way(spec: InPalmRotateSpec) -> float:
@@ -196,10 +188,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
             "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": [
-                *features.object_props(self.setup.object),
-                *features.distances(*self.setup.rows["surface_distance"]),
-            ],
+            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
         }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
