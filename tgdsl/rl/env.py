@@ -511,7 +511,7 @@ class TouchEnv:
         measured = replace(now, joint_vel=self._speeds.value) if self._speeds else now
         count = (self.resets << 32) | self.steps
         proprio = groups.noisy_proprio(measured, self.spec.proprio, self._draws, count)
-        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, groups.proprio(now))}
+        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now)}
         task = type(self.task).__name__
         for name, term in self.curricula.terms.items():
             if isinstance(term, ObservationTerm):

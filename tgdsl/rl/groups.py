@@ -68,9 +68,9 @@ def noisy_proprio(now: Now, spec: ProprioSpec, draws: Draws, count: Int[Tensor, 
     return proprio(now, spec.vel_scale)
 
 
-def priv_proprio(now: Now, own: Float[Tensor, "env shared"]) -> Float[Tensor, "env feature"]:
-    """Return `proprio`, which is `own` and exact, and the object's force on each link, in its frame [N], link by link."""
-    return torch.cat([own, now.link_force.flatten(1)], dim=1)
+def priv_proprio(now: Now) -> Float[Tensor, "env feature"]:
+    """Return exact `proprio` and the object's force on each link, in the link's frame [N], link by link."""
+    return torch.cat([proprio(now), now.link_force.flatten(1)], dim=1)
 
 
 def goal(parts: Sequence[GoalPart], wanted: Quat, quat: Quat) -> Float[Tensor, "env feature"]:

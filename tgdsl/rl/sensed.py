@@ -72,9 +72,15 @@ class Sensed:
     groups: Mapping[str, Source]  # groups of observations of what is felt
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the groups of touch, in the units of their sensors."""
         observed = self.touch.observe(readings) if self.groups else {}
         parts = {name: (observed[source.observation], source.columns) for name, source in self.groups.items()}
         return {name: value if columns is None else value.index_select(1, columns) for name, (value, columns) in parts.items()}
+
+    def num_variants(self, name: str) -> int:
+        """Return how many variants an object of the document has; 1 if it has none."""
+        inputs = self.touch.inputs
+        return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 
     def forces(
         self, readings: Mapping[str, Tensor], like: Float[Tensor, "env joint"]

@@ -99,7 +99,7 @@ class _Trials:
     def __init__(self, loaded: LoadedTask, sensed: Sensed, spec: GraspSpec):
         inputs, task = sensed.touch.inputs, loaded.spec
         self.spec, self.joints = spec, moved_joints(loaded, sensed)
-        self.num_variants = inputs.num_variants[inputs.objects.index(task.object)] if task.object in inputs.objects else 1
+        self.num_variants = sensed.num_variants(task.object)
         num_envs = max(self.num_variants, min(SIDE_BY_SIDE, 2 * spec.num))
         sim = make_simulation(loaded, sensed, self.joints, num_envs, "cpu", "mujoco")
         assert isinstance(sim, BatchSimulation)

@@ -102,13 +102,13 @@ def read_policy(file: Path) -> PolicyFile:
     return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
 
 
-def write_policy(scripted: torch.nn.Module, touch: TactileModule, card: Mapping[str, Any], file: Path) -> None:
-    """Write a policy as TorchScript, in it its card and the taxels that it feels with, and the card beside it.
+def write_policy(scripted: torch.nn.Module, texts: Mapping[str, str], file: Path) -> None:
+    """Write a policy as TorchScript with its `card_texts` in it, and the card beside it.
 
     Raises:
         FileError: If it cannot be written.
     """
-    content, texts = io.BytesIO(), card_texts(touch, card)
+    content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
         torch.jit.save(scripted, content, _extra_files=dict(texts))

@@ -137,6 +137,6 @@ def write_students(
         card = distiller.card(run, seconds, command, sizes)
         card["samples"] = distiller.samples // len(distiller.keys)
         card |= {"teacher": origin["teacher"], "score": found[i].plain() if found else None}
-        network = acting(distiller.student(i))
-        write_policy(deployed(network), touch, card, folder / f"{key.name}.pt")
-        write_onnx_policy(network, card_texts(touch, card), folder / f"{key.name}.onnx")
+        network, texts = acting(distiller.student(i)), card_texts(touch, card)
+        write_policy(deployed(network), texts, folder / f"{key.name}.pt")
+        write_onnx_policy(network, texts, folder / f"{key.name}.onnx")

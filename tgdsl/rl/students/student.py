@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
 from tgdsl.rl.students.encoders import Encoder, mlp, network
+from tgdsl.rl.train.model import Normalisation
 
 
 @dataclass(frozen=True)
@@ -167,9 +168,8 @@ class Stack:
         memory: How many numbers each remembers of an episode.
         parameters: Their weights by name, (student, …).
         buffers: Means and variances by which they normalise what they see, in the same way: copies of `moments`.
-        moments: Means and variances of what they have seen, (student, feature), in float64: after many rows a change is lost in
-            float32.
-        seen: How many rows each has seen.
+        seen: Moments of what they have seen, in float64, and the number of rows of each.
+        moments: Mean and variance of it, (student, feature): views.
     """
 
     def __init__(
@@ -188,8 +188,8 @@ class Stack:
         students = [seeded_student(architecture, seed).to(device, dtype) for seed in seeds]
         self.memory = students[0].memory
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
-        self.moments = {name: self.buffers[name].to(torch.float64, copy=True) for name in ("mean", "var")}
-        self.seen = torch.zeros((), dtype=torch.float64, device=device)
+        self.seen = Normalisation([self.size, architecture.num_features]).to(device)
+        self.moments = {"mean": self.seen._mean[0], "var": self.seen._var[0]}
         self._shape = copy.deepcopy(students[0]).to("meta")
         self.optimiser = torch.optim.Adam(list(self.parameters.values()), **self._options())
         self._called: Any = vmap(self._call)
@@ -222,14 +222,8 @@ class Stack:
     @torch.no_grad()
     def observe(self, x: Float[Tensor, "student row feature"]) -> None:
         """Take rows into account in each student's mean and variance, in place."""
-        num = x.shape[1]
-        rate = num / (self.seen + num)
         var, mean = torch.var_mean(x.double(), dim=1, correction=0)
-        own_mean, own_var = self.moments["mean"], self.moments["var"]
-        delta = mean - own_mean
-        own_mean += rate * delta
-        own_var += rate * (var - own_var + delta * (mean - own_mean))
-        self.seen += num
+        self.seen.merge(x.shape[1], mean, var)
         self._normalise()
 
     def student(self, index: int) -> Student:
@@ -242,7 +236,8 @@ class Stack:
     def state_dict(self) -> dict[str, Any]:
         """Return all that teaching goes on from: live tensors."""
         networks = {name: value.detach() for name, value in self.parameters.items()}
-        return {"networks": networks, "seen": self.moments | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
+        seen = self.moments | {"rows": self.seen.count}
+        return {"networks": networks, "seen": seen, "optimiser": self.optimiser.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from what was saved, with the learning rate that the stack has.
@@ -277,7 +272,8 @@ class Stack:
             self.buffers[name].copy_(value)
 
     def _options(self) -> dict[str, Any]:
-        return {"lr": self._rate, "capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
+        is_cuda = self.seen.count.is_cuda
+        return {"lr": self._rate, "capturable": is_cuda, "fused": True if is_cuda else None}
 
     def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
         return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))

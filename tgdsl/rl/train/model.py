@@ -58,10 +58,10 @@ class Normalisation(EmpiricalNormalization):
             var = (x - mean.to(x.dtype)).square().sum(dim=0, keepdim=True, dtype=torch.float64)
             summed(var)
             var /= num
-            self._take(num, mean.view_as(self._mean), var.view_as(self._var))
+            self.merge(num, mean, var)
 
-    def _take(self, num: int, mean: Tensor, var: Tensor) -> None:
-        """Take a batch's mean and variance into account, in place."""
+    def merge(self, num: int, mean: Float[Tensor, "*feature"], var: Float[Tensor, "*feature"]) -> None:
+        """Take the mean and variance of so many rows into account, in place."""
         is_open = torch.ones_like(self.count, dtype=torch.bool) if self.until is None else self.count < self.until
         rate = is_open * (num / (self.count + num).to(mean.dtype))
         delta = mean - self._mean
