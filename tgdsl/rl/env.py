@@ -534,10 +534,10 @@ def _refuse_other(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, M
             raise SimulationError(f"the {part} that was saved is of other environments: {problem}")
 
 
-def _copied(made: Any) -> Any:
+def _copied(value: Any) -> Any:
     """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
-    if isinstance(made, Tensor):
-        return made.clone()
-    if isinstance(made, Mapping):
-        return {name: _copied(value) for name, value in made.items()}
-    return type(made)(*(_copied(value) for value in made))
+    if isinstance(value, Tensor):
+        return value.clone()
+    if isinstance(value, Mapping):
+        return {name: _copied(part) for name, part in value.items()}
+    return type(value)(*(_copied(part) for part in value))

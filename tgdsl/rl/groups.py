@@ -45,6 +45,7 @@ class MeasuredVelocity:
         self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
 
     def memory(self) -> dict[str, Tensor]:
+        """Return its state by name: live tensors, (env, joint) [rad, rad/s]."""
         return {"before": self._before, "value": self.value}
 
 

@@ -90,6 +90,7 @@ class PhysicsSpec(SpecModel):
 
     @property
     def capacities(self) -> dict[str, int]:
+        """MuJoCo Warp's capacities that differ from its defaults."""
         return self.model_dump(include={"nconmax", "njmax"}, exclude_none=True)
 
 

@@ -89,17 +89,17 @@ class Deploy:
             print(f"changed since the policy was learned: {line}")
         self._act(deployment)
 
-    def _act(self, found: Deployment) -> None:
+    def _act(self, deployment: Deployment) -> None:
         """Make all steps and report them; Ctrl-C ends them early."""
         from tqdm import tqdm
 
         from tgdsl.rl.deploying.deploy import DeployRecord
 
-        record = DeployRecord(found.prepared.moved.names)
+        record = DeployRecord(deployment.prepared.moved.names)
         failed: TgdslError | None = None
         with tqdm(desc="acting", unit="step", disable=None, leave=False) as bar:
             try:
-                for moment in found.steps(self.episodes, self.seconds):
+                for moment in deployment.steps(self.episodes, self.seconds):
                     record.add(moment)
                     bar.update()
             except KeyboardInterrupt:
@@ -107,7 +107,7 @@ class Deploy:
             except TgdslError as error:  # a hand that no longer answers: report the steps so far
                 failed = error
         if failed is None or len(record):
-            print(found.report())
+            print(deployment.report())
             print("\n".join(record.lines()))
             if self.out is not None:
                 record.write(self.out)

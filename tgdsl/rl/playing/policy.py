@@ -71,6 +71,7 @@ class PolicyFile:
     """The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none."""
 
     def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
+        """Return the TorchScript module on a device."""
         return _module(self.content, device)
 
 

@@ -43,6 +43,7 @@ class StudentKey:
 
     @property
     def name(self) -> str:
+        """Name of its files and columns, such as `depth-hand-clean-s0`."""
         return "-".join([*(part for part in self.kind if part), f"s{self.seed}"]).replace("*", "_").replace("/", "_")
 
 

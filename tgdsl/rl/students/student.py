@@ -38,6 +38,7 @@ class Architecture:
 
     @property
     def num_features(self) -> int:
+        """Number of features of all groups."""
         return sum(size for size, _ in self.groups)
 
 
@@ -85,8 +86,8 @@ class Student(nn.Module):
         scale: Any = self.var.sqrt() + architecture.eps  # pyright: ignore[reportCallIssue]
         normal = ((x - mean) / scale).clamp(-architecture.clip, architecture.clip)
         parts = normal.split([size for size, _ in architecture.groups], dim=1)
-        held = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
-        embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, held, strict=True)]
+        memories = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
+        embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, memories, strict=True)]
         return torch.cat([each for each, _ in embeddings], dim=1), torch.cat([each for _, each in embeddings], dim=1)
 
 
@@ -245,17 +246,17 @@ class Stack:
         Raises:
             RuntimeError: If it is of other networks.
         """
-        own = self.state_dict()
+        current = self.state_dict()
         for part in ("networks", "seen"):
-            if own[part].keys() != state[part].keys():
+            if current[part].keys() != state[part].keys():
                 raise RuntimeError(f"its {part} are {', '.join(state[part])}")
-            for name, value in own[part].items():
-                found = state[part][name]
-                if found.shape != value.shape:
-                    raise RuntimeError(f"{name} is {tuple(found.shape)}, not {tuple(value.shape)}")
+            for name, value in current[part].items():
+                shape = state[part][name].shape
+                if shape != value.shape:
+                    raise RuntimeError(f"{name} is {tuple(shape)}, not {tuple(value.shape)}")
         with torch.no_grad():
             for part in ("networks", "seen"):
-                for name, value in own[part].items():
+                for name, value in current[part].items():
                     value.copy_(state[part][name])
             self._normalise()
         optimiser = state["optimiser"]  # saved on another device perhaps, and at another rate; the options place its `step`

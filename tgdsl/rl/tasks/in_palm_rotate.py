@@ -97,8 +97,8 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     @reward_term(2.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:
         """Angular velocity about n, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
-        paid = self.spec.pay(self.rate) * torch.where(self.rate > 0, self.pay, 1.0)
-        return paid if self.spec.spin_tilt is None else paid * (self.tilt <= self.spec.spin_tilt)
+        rate = self.spec.pay(self.rate) * torch.where(self.rate > 0, self.pay, 1.0)
+        return rate if self.spec.spin_tilt is None else rate * (self.tilt <= self.spec.spin_tilt)
 
     near = terms.Near.of_task(0.1, width="near_width")
 

@@ -179,6 +179,7 @@ class Exported(nn.Module):
         return self.output(self.model.mlp(self.model.embed(x)))
 
     def get_dummy_inputs(self) -> tuple[Tensor]:
+        """Return an example of what it takes."""
         first = next(self.parameters())
         return (torch.zeros((2, self.model.obs_dim), dtype=first.dtype, device=first.device),)
 

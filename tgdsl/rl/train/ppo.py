@@ -265,12 +265,12 @@ class CapturedPPO(PPO):
             self._kl.copy_(distribution.kl_divergence(old_params, params).mean())
             self.losses += torch.stack([value, surrogate, entropy, error]).detach()
 
-    def _value_loss(self, found: Tensor, before: Tensor, wanted: Tensor) -> Tensor:
-        squares = (found - wanted).square()
+    def _value_loss(self, value: Tensor, old_value: Tensor, returns: Tensor) -> Tensor:
+        squares = (value - returns).square()
         if not self.use_clipped_value_loss:
             return squares.mean()
-        near = before + (found - before).clamp(-self.clip_param, self.clip_param)
-        return torch.max(squares, (near - wanted).square()).mean()
+        clipped = old_value + (value - old_value).clamp(-self.clip_param, self.clip_param)
+        return torch.max(squares, (clipped - returns).square()).mean()
 
     def _take_step(self) -> None:
         """Adapt the learning rate, and make a step of the optimisers."""
