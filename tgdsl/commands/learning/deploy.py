@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import FILE, OUT, OptionalFile, Overrides, parsed_overrides
+from tgdsl.commands.arguments import FILE, OUT, OptionalFile, Overrides, Task, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from tgdsl.rl.deploying.deploy import Deployment
     from tgdsl.runtime.xhand1.motion import MotionLimits
 
-Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 _MOVING = ("speed", "current_limit", "kp")
 
 

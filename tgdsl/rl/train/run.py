@@ -169,6 +169,18 @@ class Run:
             write_checkpoint(state, self._folder.checkpoint)
         self._saved = learner.iteration
 
+    def learn_with_bar(self, iterations: int | None, minutes: float | None, default: int) -> None:
+        """Learn up to `iterations`, else the document's `default`, or for so many minutes, with a progress bar: see `learn`."""
+        total, limit = iterations or default, math.inf if minutes is None else 60.0 * minutes
+        shown_total = total if minutes is None or iterations else None  # else time ends the run
+        unit = self._learner.env.task.score_unit
+        bar = ProgressBar(shown_total, self._learner.iteration, unit) if self._writes else None
+        try:
+            self.learn(total, limit, bar.show if bar else None)
+        finally:
+            if bar is not None:
+                bar.close()
+
     def learn(self, iterations: int, seconds: float, show: Show | None = None) -> None:
         """Learn. Ctrl-C and SIGTERM end it after the iteration under way, with a checkpoint.
 
