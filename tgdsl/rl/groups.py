@@ -61,7 +61,7 @@ def noisy_proprio(now: Now, spec: ProprioSpec, draws: Draws, count: Int[Tensor, 
         now: The instant.
         spec: Noise and scale.
         draws: Random numbers.
-        count: A count of each environment's own, another one at each control step.
+        count: Counter of each environment, another number at each control step.
     """
     if spec.pos_noise or spec.vel_noise:
         pos, vel = draws.normal("proprio", count, 2 * now.joint_pos.shape[1]).to(now.joint_pos).chunk(2, dim=1)

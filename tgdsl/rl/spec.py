@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictInt, model_validator
 
-from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Radius, Range, RangeOf, SpecModel
+from tgdsl.fields.models import NonNegative, Positive, Quantity, Radius, Range, RangeOf, SpecModel
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.train.spec import Time, TrainSpec, Whole
@@ -33,8 +33,6 @@ ForceRange = Annotated[Range, RangeOf("force")]
 Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]
 """Between the bounds that MuJoCo has."""
 Power = Annotated[float, Quantity("number", ge=1.0)]
-Weight = Number
-"""Weight of a term of the reward: of a gain more than 0, of a penalty less."""
 
 
 class PhysicsSpec(SpecModel):

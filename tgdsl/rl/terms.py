@@ -109,7 +109,7 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """A group of observations, called as the document calls it."""
+    """A group of observations, with the name that the term has in the document."""
 
     @abstractmethod
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
@@ -129,7 +129,7 @@ class Event:
     actuation: Actuation  # the drives
     chosen: Bool[Tensor, " env"]  # the environments in which it happens: decide by this mask, not by `if`
     count: Int[Tensor, " env"]
-    """How often each environment was reset; of events at intervals, how often it has happened, above that the episode."""
+    """Resets of each environment; for events at intervals, events so far, with the episode in the upper 32 bits."""
     stream: str  # what its random numbers are for
 
     def shares(self, num: int) -> Float[Tensor, "env num"]:

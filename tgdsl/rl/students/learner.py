@@ -42,10 +42,10 @@ class Rollout:
 
     Attributes:
         seen: Groups of observations of each.
-        memory: What they remember now, (student, row, memory).
-        begun: What they remembered when the rollout began.
-        x: What they saw in it, (step, student, row, feature).
-        before: What they asked for in it, (step, student, row, joint).
+        memory: Their memory now, (student, row, memory).
+        begun: Their memory at the start of the rollout.
+        x: Their observations in it, (step, student, row, feature).
+        before: Their actions in it, (step, student, row, joint).
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class Distiller(Learning):
     # What is captured
 
     def _choose(self) -> None:
-        """Have the teacher say what should be done, and each student act."""
+        """Compute the teacher's actions and those of each student."""
         with torch.no_grad():
             acting = [partial(self._act, rollout, x) for rollout, x in zip(self.rollouts, self._inputs, strict=True)]
             self._beside([lambda: self._label.copy_(self._teacher(self._seen)), *acting])
@@ -200,7 +200,7 @@ class Distiller(Learning):
         self._asked[rollout.envs].copy_(action.action.flatten(0, 1))
 
     def _answer(self) -> None:
-        """Have the students say what they would ask for now: an earlier rollout's a_0 bounds nothing any more."""
+        """Compute a_0 of an earlier rollout again, by the present weights."""
 
         def answer(rollout: Rollout) -> None:
             memory = rollout.begun

@@ -70,17 +70,6 @@ class Student(nn.Module):
         self.decoders = nn.ModuleList([mlp(latent, hidden, 1) for hidden in architecture.heads])
 
     def forward(self, x: Tensor, memory: Tensor) -> StudentOutput:
-        latent, memory = self.embed(x, memory)
-        decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
-        return StudentOutput(self.trunk(latent), decoded, memory)
-
-    def act(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions and what is remembered, and nothing that is dropped at deployment."""
-        latent, memory = self.embed(x, memory)
-        return self.trunk(latent), memory
-
-    def embed(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embeddings of all groups, side by side, and what is remembered."""
         architecture = self.architecture
         mean: Any = self.mean
         scale: Any = self.var.sqrt() + architecture.eps  # pyright: ignore[reportCallIssue]
@@ -88,7 +77,9 @@ class Student(nn.Module):
         parts = normal.split([size for size, _ in architecture.groups], dim=1)
         memories = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
         embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, memories, strict=True)]
-        return torch.cat([each for each, _ in embeddings], dim=1), torch.cat([each for _, each in embeddings], dim=1)
+        latent, memory = (torch.cat(each, dim=1) for each in zip(*embeddings, strict=True))
+        decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
+        return StudentOutput(self.trunk(latent), decoded, memory)
 
 
 class Acting(nn.Module):
@@ -102,9 +93,8 @@ class Acting(nn.Module):
 
     def forward(self, x: Tensor, memory: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """Return actions, and what is remembered."""
-        if memory is None:
-            return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
-        return self.student.act(x, memory)
+        output = self.student(x, x.new_zeros((x.shape[0], 0)) if memory is None else memory)
+        return output.action if memory is None else (output.action, output.memory)
 
     def get_dummy_inputs(self) -> tuple[Tensor, ...]:
         """Return an example of what it takes."""

@@ -78,10 +78,6 @@ class InPalmRotateSpec(PlacedTaskSpec, ProgressSpec):
     """What progress pays while the object coasts; by default as much as while it is held."""
 
 
-def _way(spec: InPalmRotateSpec) -> float:
-    return 1.0 if spec.direction == "counterclockwise" else -1.0
-
-
 class InPalmRotate(Task[InPalmRotateSpec]):
     """The task."""
 
@@ -128,7 +124,8 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
         super().__init__(spec, setup)
         self.item = setup.free_qpos()
-        self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
+        up = 1.0 if spec.direction == "counterclockwise" else -1.0
+        self.axis = torch.tensor([0.0, 0.0, up], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.holding = Holding(spec.hold, setup)
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
         self.quat = self.keep("quat", 4)

@@ -1,4 +1,4 @@
-"""One iteration of learning: its episodes, summed on the device and read once, and its durations.
+"""One iteration of learning: its episodes, add_up on the device and read once, and its durations.
 
 Shapes: `env` environments.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tgdsl.rl.env import Step, TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
-from tgdsl.rl.train.ranks import Ranks, summed
+from tgdsl.rl.train.ranks import Ranks, add_up
 
 EPISODE_NAMES = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
 """Numbers of a finished episode, before its terms: return, steps, score, whether it ended for good, and by a fault."""
@@ -48,7 +48,7 @@ class EpisodeTally:
         """Return the sums over all processes, the number of episodes first, and restart; the host does not wait."""
         assert self._sums is not None
         sums = self._sums.clone()
-        summed(sums)
+        add_up(sums)
         self._sums.zero_()
         return sums
 

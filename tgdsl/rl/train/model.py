@@ -21,7 +21,7 @@ from rsl_rl.modules import MLP, EmpiricalDiscountedVariationNormalization, Empir
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from tgdsl.rl.train.ranks import num_processes, summed
+from tgdsl.rl.train.ranks import add_up, num_processes
 
 UNTIL = 10**8
 """As rsl_rl has it: after so many states, and rewards, their normalisation does not change any more."""
@@ -53,10 +53,10 @@ class Normalisation(EmpiricalNormalization):
         with torch.no_grad():
             num = x.shape[0] * num_processes()
             mean = x.sum(dim=0, keepdim=True, dtype=torch.float64)
-            summed(mean)
+            add_up(mean)
             mean /= num
             var = (x - mean.to(x.dtype)).square().sum(dim=0, keepdim=True, dtype=torch.float64)
-            summed(var)
+            add_up(var)
             var /= num
             self.merge(num, mean, var)
 

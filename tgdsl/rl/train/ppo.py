@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from tgdsl.errors import TgdslError
 from tgdsl.rl.train.graphs import Captured
 from tgdsl.rl.train.model import Distillation, Gaussian
-from tgdsl.rl.train.ranks import num_processes, summed
+from tgdsl.rl.train.ranks import add_up, num_processes
 from tgdsl.tensors.torch_internals import copy_each
 
 LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
@@ -126,10 +126,10 @@ class CapturedPPO(PPO):
             advantages = self.storage.advantages
             num = advantages.numel() * num_processes()
             mean = advantages.sum()
-            summed(mean)
+            add_up(mean)
             advantages -= mean / num
             squares = advantages.square().sum()
-            summed(squares)
+            add_up(squares)
             advantages /= (squares / (num - 1)).sqrt() + 1e-8
 
     def update(self) -> dict[str, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -142,7 +142,7 @@ class CapturedPPO(PPO):
                 continue
             for part in self._parts:
                 part()
-                summed(self._flat)
+                add_up(self._flat)
                 self._flat /= self.gpu_world_size
                 self._applied()
         self.losses /= self.num_learning_epochs * self.num_mini_batches

@@ -92,11 +92,10 @@ class Ranks:
         return every
 
 
-def summed(*tensors: Tensor) -> None:
-    """Replace each tensor by its sum over all processes, if there are several; the host does not wait."""
-    if distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1:
-        for tensor in tensors:
-            distributed.all_reduce(tensor)
+def add_up(tensor: Tensor) -> None:
+    """Replace a tensor by its sum over all processes, if there are several; the host does not wait."""
+    if num_processes() > 1:
+        distributed.all_reduce(tensor)
 
 
 def num_processes() -> int:
