@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from ruamel.yaml import YAML
 
 from tgdsl.rl.load import load_task
-from tgdsl.rl.tasks.in_palm_rotate import InPalmRotateSpec
+from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 REPOSITORY = Path(__file__).parents[2]
 SECTIONS = re.split(r"^## ", (REPOSITORY / "docs" / "paper.md").read_text(encoding="utf-8"), flags=re.M)[1:]
@@ -25,7 +25,7 @@ def spec_of(section):
     document = re.search(r"^Document: `([^`]+)`", section, re.M)
     if document:
         return load_task(REPOSITORY / document[1]).spec
-    return InPalmRotateSpec(tgdsl=1, task="in_palm_rotate", document="palm.yaml", object="item", joints=("a",))
+    return InPalmRotate.Spec(tgdsl=1, task="in_palm_rotate", document="palm.yaml", object="item", joints=("a",))
 
 
 def rows_of(section):

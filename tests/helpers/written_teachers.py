@@ -3,7 +3,7 @@
 import torch
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.policy import write_policy
+from tgdsl.rl.playing.policy import card_texts, write_policy
 from tgdsl.rl.train.folder import run_origin
 from tgdsl.rl.train.iteration import ORIGIN_KEYS
 
@@ -44,7 +44,7 @@ def teacher(file, loaded, groups, module=None, std=None, **card):
         origin = run_origin(loaded, env, 0, {}, 1)
         own = {"groups": sizes, "joints": list(env.joint_names), "std": std, **{name: origin[name] for name in ORIGIN_KEYS}}
         traced = torch.jit.trace(network, torch.zeros((2, sum(sizes.values()))))
-        write_policy(traced, env.touch, own | card, file)
+        write_policy(traced, card_texts(env.touch, own | card), file)
     finally:
         env.close()
     return file

@@ -4,11 +4,15 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from tiny_tasks import tiny_env, write_task
 
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl.load import load_task
+from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.task import Task
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
+from tgdsl.rl.terms import ContactForce, Near
 
 OWN = '''
 import torch
@@ -242,3 +246,22 @@ def test_a_group_of_forces_is_of_links_that_a_document_names(folder):
         tiny_env(folder, more="terms: {tip: {term: link_force, links: [tip]}}\n")
     with pytest.raises(SpecError, match=r"terms\.tip\.links: found a list of 0, expected at least 1 entry"):
         tiny_env(folder, more="terms: {tip: {term: link_force, links: []}}\n")
+
+
+def test_parameters_of_shared_terms_are_keys_of_the_document():
+    """With the term's unit and default, unless the spec has the key."""
+
+    class OwnSpec(TaskSpec):
+        max_force: float = 3.0
+
+    class Reach(Task):
+        Spec = OwnSpec
+        near = Near.of_task(1.0, width="reach")
+        contact_force = ContactForce.of_task(-1.0, max_force="max_force")
+
+    common = {"tgdsl": 1, "task": "reach", "document": "palm.yaml", "object": "item", "joints": ["*"]}
+    spec = Reach.Spec.model_validate(common)
+    assert (spec.reach, spec.max_force) == (0.02, 3.0)
+    assert Near.for_spec(Reach.Spec.model_validate(common | {"reach": "5 mm"}), {"width": "reach"}).width == 0.005
+    with pytest.raises(ValidationError, match="reach"):
+        Reach.Spec.model_validate(common | {"reach": "-5 mm"})

@@ -19,6 +19,10 @@ FILE = tyro.conf.arg(metavar="FILE")
 """Marks the path of a file."""
 OUT = tyro.conf.arg(aliases=["-o"], metavar="FILE")
 """Marks the path of the file that a command writes."""
+FOLDER = tyro.conf.arg(metavar="FOLDER")
+"""Marks the path of a folder."""
+OUT_FOLDER = tyro.conf.arg(aliases=["-o"], metavar="FOLDER")
+"""Marks the path of the folder that a command writes."""
 OptionalFile = Annotated[Path | None, FILE]
 Document = Annotated[tyro.conf.Positional[Path], FILE]
 DocumentOrArtefact = Annotated[Document, tyro.conf.arg(help="The YAML document, or an artefact (.safetensors).")]
@@ -26,6 +30,7 @@ Robot = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(help="A file (MJCF, URDF, USD), or the name of a robot that tgdsl brings.", metavar="ROBOT"),
 ]
+Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 Replace = Annotated[bool, tyro.conf.arg(help="Replace the file if it is there.")]
 Overrides = Annotated[
     tuple[str, ...],

@@ -33,7 +33,7 @@ class Grasps:
         from tgdsl.files.cache import folder
         from tgdsl.files.write import check_writable
         from tgdsl.rl.grasps.grasps import grasp_spec, write_grasps
-        from tgdsl.rl.grasps.sampling import kept_grasps
+        from tgdsl.rl.grasps.sampling import cached_grasps
         from tgdsl.rl.load import load_task
         from tgdsl.rl.sensed import compile_sensed
         from tgdsl.rl.start import moved_joints
@@ -51,10 +51,10 @@ class Grasps:
         joints, scene = moved_joints(loaded, sensed), sensed.touch.plan.scene
         with tqdm(total=spec.num, desc="sampling", unit="grasp", disable=None, leave=False) as bar:
 
-            def found(num: int, _: int) -> None:
+            def count(num: int, _: int) -> None:
                 bar.update(num - bar.n)
 
-            grasps = kept_grasps(loaded, scene, joints, found)
+            grasps = cached_grasps(loaded, scene, joints, count)
         variants = len(set(grasps.variant.tolist()))
         print(f"{len(grasps)} grasps of {variants} variant{'s' if variants > 1 else ''} of {grasps.object}: {folder()}")
         if self.out is not None:

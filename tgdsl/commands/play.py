@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import OptionalFile, Overrides, parsed_overrides
+from tgdsl.commands.arguments import OUT_FOLDER, OptionalFile, Overrides, Task, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from tgdsl.view.trace import TouchTrace
 
 _FILES = {"record": "played.npz", "video": "played.mp4"}
-Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK", help="The task's YAML document.")]
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Play:
     """Seed of everything random."""
     device: str = "cpu"
     """Where physics and touch are computed: cpu, or cuda."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("out")
+    out: Annotated[Path, OUT_FOLDER] = Path("out")
     """Folder for played.npz and played.mp4."""
     video: bool = True
     """Whether to draw the video."""

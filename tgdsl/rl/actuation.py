@@ -340,6 +340,7 @@ class Actuation:
         arrays["qfrc_applied"][:, self._index["dof"]] = torque - plain
 
     def memory(self) -> dict[str, Tensor]:
+        """Return its state by name: live tensors, (env, joint) each but for delayed targets and the count."""
         memory = {"target": self.target, "start": self.start, "torque": self.torque}
         memory |= {"play": self._play, "past": self._past, "count": self._count}
         return memory | {f"drawn/{name}": value for name, value in self.drawn.items()}

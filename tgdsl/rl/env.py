@@ -43,7 +43,7 @@ from tgdsl.tensors.threads import one_thread
 from tgdsl.tensors.torch_internals import below_autograd
 
 SINGLE_THREAD_MAX_TAXELS = 2**16
-"""Up to so many taxels of all environments one thread reads on a CPU: each of two would get less than 2¹⁵ numbers."""
+"""On a CPU one thread reads up to so many taxels of all environments: each of two would get fewer than 2¹⁵ numbers."""
 FAR_BEYOND = 10.0
 """Actions of that size are a mistake, such as angles in degrees."""
 PREPARING_STEPS = 3
@@ -54,11 +54,11 @@ Observations = dict[str, Float[Tensor, "env feature"]]
 
 
 class StepInfo(NamedTuple):
-    """What else a step returns. Rows of what is of an episode are of that which has just ended, where one has.
+    """Further results of a step. Values of an episode are those of the one that has just ended, where one has.
 
     Attributes:
         ended: Episodes that have ended, terminated or truncated.
-        final_obs: Observations before the reset; other than those that the step returns where an episode has ended.
+        final_obs: Observations before the reset: they differ from `Step.obs` where an episode has ended.
         terms: Terms of the reward of this step by name, weights and Δt included.
         score: Score of the episode, in `task.score_unit`.
         episode_return: Sum of its rewards.
@@ -80,19 +80,19 @@ class StepInfo(NamedTuple):
         return "StepInfo\n" + listing((name, shapes(value)) for name, value in self._asdict().items())
 
     def is_whole(self, max_steps: int) -> Bool[Tensor, " env"]:
-        """Return which episodes have lasted as long as one may, in control steps, and were not ended by a fault."""
+        """Return which episodes have reached the largest number of control steps, without a fault."""
         return (self.episode_steps >= max_steps) & ~self.faults
 
 
 class Step(NamedTuple):
-    """What a step returns.
+    """Result of a control step.
 
     Attributes:
         obs: Observations by group; of episodes that have ended, the first of the next one.
         reward: Sum of the terms.
         terminated: Episodes that have ended for good.
         truncated: Episodes that have merely lasted long enough.
-        info: What else there is to tell.
+        info: Further results.
     """
 
     obs: Observations
@@ -134,7 +134,7 @@ class TouchEnv:
     steps: Int[Tensor, " env"]
     resets: Int[Tensor, " env"]
 
-    @torch.inference_mode(False)  # what is remembered is written outside of inference mode too
+    @torch.inference_mode(False)  # memory is written outside of inference mode too
     def __init__(
         self,
         task: str | PathLike[str] | Mapping[str, Any] | LoadedTask,
@@ -157,13 +157,13 @@ class TouchEnv:
             task: The task's document: a YAML file, or the same as a mapping.
             num_envs: Number of environments.
             device: "cpu" (MuJoCo on its threads) or "cuda", "cuda:1" (MuJoCo Warp).
-            seed: What all that is random follows from.
+            seed: Seed of all random numbers.
             overrides: Values of the document to set first by dotted path, such as `{"rewards.spin": 3}`.
             simulator: "mujoco", "warp" or one that a package brings; default: by the device. MuJoCo Warp on a CPU is slow, and
                 meant for tests.
             threads: CPU threads of physics; 0: one per CPU.
             compiled: Whether the module, and all of a step but for physics, is compiled by torch; default: on a GPU.
-            first_env: Number of the first environment among those of all processes: of it, random numbers and variants.
+            first_env: Index of the first environment among all processes: random numbers and variants follow from it.
             feels: What several policies feel, each a group of observations `Felt.group`, in place of the document's `touch`,
                 `placement` and `noise`, and of `tactile_sensors`.
             sensed: The result of `compile_sensed`, instead of the document's sensors; its module is used as it is.
@@ -231,10 +231,10 @@ class TouchEnv:
 
     @property
     def now(self) -> Now:
-        """The instant that the last observations are of; its tensors hold until the next step.
+        """State at the last observations; its tensors are valid until the next step.
 
         Raises:
-            SimulationError: If a state was loaded, which has no instant: it is there again after the next step.
+            SimulationError: If a state was loaded: there is none until the next step.
         """
         if self._is_loaded:
             raise SimulationError("a state was loaded: what was read then is there again after the next step")
@@ -244,10 +244,10 @@ class TouchEnv:
         """Begin a new episode in all environments.
 
         Args:
-            seed: What all that is random follows from, as if the environments were made with it; default: go on.
+            seed: Seed of all random numbers, as if the environments were made with it; default: go on.
         """
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.sim.qpos.device)
-        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
+        with torch.inference_mode(False), torch.no_grad():  # memory is written outside of inference mode too
             if seed is not None:
                 self._draws.reseed(seed)
                 self.resets.zero_()
@@ -292,11 +292,11 @@ class TouchEnv:
         return dict(self._obs)
 
     def describe(self) -> Description:
-        """Return what each feature of each group of observations is: it prints as a table."""
+        """Return a description of each feature of each group of observations; it prints as a table."""
         return describe(self.loaded, self._sensed, self.task, self.curricula.terms, self.groups)
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
-        """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
+        """Make one control step towards set-points from elsewhere, such as a hand's serial line, without a policy.
 
         Actions count as zeros. Episodes that end do not begin again: call `reset`.
 
@@ -312,7 +312,7 @@ class TouchEnv:
         return step
 
     def images(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return what the policy feels as one image per link, and where its pixels are taxels: see `TactileModule.images`.
+        """Return the policy's touch as one image per link, and which pixels are taxels: see `TactileModule.images`.
 
         Raises:
             SimulationError: If it feels nothing, or there are several; or a state was loaded, and no step made since.
@@ -322,7 +322,7 @@ class TouchEnv:
         return self.touch.images(self._sensed.felt, self.now.readings)
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
-        """Return copies of all that the future follows from, but for the policy.
+        """Return copies of the whole state of the environments; the policy is not part of it.
 
         Another `TouchEnv` of the same document and number of environments goes on from it: on a CPU bit for bit.
         """
@@ -330,10 +330,10 @@ class TouchEnv:
         return _copied(memory) | {"sim": self.sim.state_dict(), "seed": {"seed": torch.tensor(self._draws.seed)}}
 
     def load_state_dict(self, state: Mapping[str, Mapping[str, Tensor]]) -> Observations:
-        """Go on where environments of the same document and number were saved; return the observations there.
+        """Restore the state of environments of the same document and number; return the observations there.
 
         Raises:
-            SimulationError: If they were others; nothing has changed.
+            SimulationError: If the state is of other environments; nothing has changed then.
         """
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
         _refuse_other(own, {part: saved for part, saved in state.items() if part != "sim"})
@@ -364,7 +364,7 @@ class TouchEnv:
         return {part: tensors for part, tensors in memory.items() if tensors or part == "task"}
 
     def _prepare(self, seed: int) -> None:
-        """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
+        """Compile kernels and, on a GPU, capture the step, by a few steps before a reset."""
         self._has_stepped = True
         for _ in range(PREPARING_STEPS):
             self.step(torch.zeros_like(self._action))
@@ -390,7 +390,7 @@ class TouchEnv:
     def _advance(self) -> tuple[Step, Now]:
         """Make one control step with the action that was copied, and return the instant it ends at: see the top of this page.
 
-        A captured step runs no Python: what it makes is known by what it returned when it was captured.
+        A captured step runs no Python: its results are in the tensors that were returned at its capture.
         """
         sim = self.sim
         with self._logic_by():
@@ -409,7 +409,7 @@ class TouchEnv:
         return self.sim.read()
 
     def _conclude(self, readings: dict[str, Tensor]) -> tuple[Step, Now]:
-        """Return what a control step has brought, by its readings, and its instant; begin episodes where some have ended."""
+        """Return result and instant of a control step from its readings; begin episodes where some have ended."""
         sim, now = self.sim, self._advance_task(readings)
         step = self._judged(now, sim.faults)
         if may_be_nonempty(step.info.ended):
@@ -419,7 +419,7 @@ class TouchEnv:
         return step, now
 
     def _advance_task(self, readings: dict[str, Tensor]) -> Now:
-        """Return the instant at the end of a control step, of which the task has taken note."""
+        """Update the task; return the instant at the end of a control step."""
         now = self._now(readings)
         if self._speeds:
             self._speeds.update(now.joint_pos)
@@ -436,7 +436,7 @@ class TouchEnv:
         return now
 
     def _command(self, action: Float[Tensor, "env joint"], ctrl: Float[Tensor, "env nu"]) -> Float[Tensor, "env nu"]:
-        """Take an action over; return the simulation's controls, which are no numbers where an action is none."""
+        """Set targets from an action; return the simulation's controls, NaN where an action is not finite."""
         action = action.to(self._used)
         is_bad = ~action.isfinite().all(dim=1)
         self.actuation.command(action)
@@ -444,7 +444,7 @@ class TouchEnv:
         return torch.where(is_bad[:, None], torch.nan, ctrl)
 
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
-        """Return what a control step has brought, and add it up, as if no episode were to begin."""
+        """Return ends, rewards and observations of a control step before any reset, and add rewards up."""
         terminated = self.task.is_over(now) | faults
         rates = self._rates(now, terminated)
         for name, term in self.curricula.terms.items():
@@ -511,7 +511,7 @@ class TouchEnv:
         measured = replace(now, joint_vel=self._speeds.value) if self._speeds else now
         count = (self.resets << 32) | self.steps
         proprio = groups.noisy_proprio(measured, self.spec.proprio, self._draws, count)
-        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, groups.proprio(now))}
+        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now)}
         task = type(self.task).__name__
         for name, term in self.curricula.terms.items():
             if isinstance(term, ObservationTerm):
@@ -534,10 +534,10 @@ def _refuse_other(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, M
             raise SimulationError(f"the {part} that was saved is of other environments: {problem}")
 
 
-def _copied(made: Any) -> Any:
+def _copied(value: Any) -> Any:
     """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
-    if isinstance(made, Tensor):
-        return made.clone()
-    if isinstance(made, Mapping):
-        return {name: _copied(value) for name, value in made.items()}
-    return type(made)(*(_copied(value) for value in made))
+    if isinstance(value, Tensor):
+        return value.clone()
+    if isinstance(value, Mapping):
+        return {name: _copied(part) for name, part in value.items()}
+    return type(value)(*(_copied(part) for part in value))

@@ -45,12 +45,12 @@ class Events:
     """The events of all environments.
 
     Attributes:
-        memory: By name, control steps until the next event, negative while one lasts, and how many there were, above them the
-            episode: live tensors.
+        memory: Live tensors by name: control steps until the next event, negative while one lasts; number of events, with the
+            episode in the upper 32 bits.
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], sim: Simulation, setup: Setup, actuation: Actuation):
-        """Begin; an episode's begin draws when the first ones come.
+        """Make the counters of events at intervals; each reset draws when the first ones come.
 
         Raises:
             SimulationError: If an event would come more often than control steps.

@@ -70,9 +70,10 @@ def distances(sensor: str, table: TaxelTable) -> list[Features]:
     ]
 
 
-def object_props(body: str) -> list[Features]:
-    """Describe `groups.object_props`, the distances left out."""
-    return [Features("friction", 1, "1", "", body), Features("mass", 1, "kg", "", body)]
+def object_props(body: str, probes: tuple[str, TaxelTable] | None = None) -> list[Features]:
+    """Describe `groups.object_props`; without `probes`, a row of `Setup.rows`, friction and mass alone."""
+    props = [Features("friction", 1, "1", "", body), Features("mass", 1, "kg", "", body)]
+    return props + (distances(*probes) if probes else [])
 
 
 def link_forces(links: Sequence[str]) -> list[Features]:

@@ -45,6 +45,7 @@ class MeasuredVelocity:
         self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
 
     def memory(self) -> dict[str, Tensor]:
+        """Return its state by name: live tensors, (env, joint) [rad, rad/s]."""
         return {"before": self._before, "value": self.value}
 
 
@@ -60,7 +61,7 @@ def noisy_proprio(now: Now, spec: ProprioSpec, draws: Draws, count: Int[Tensor, 
         now: The instant.
         spec: Noise and scale.
         draws: Random numbers.
-        count: A count of each environment's own, another one at each control step.
+        count: Counter of each environment, another number at each control step.
     """
     if spec.pos_noise or spec.vel_noise:
         pos, vel = draws.normal("proprio", count, 2 * now.joint_pos.shape[1]).to(now.joint_pos).chunk(2, dim=1)
@@ -68,9 +69,9 @@ def noisy_proprio(now: Now, spec: ProprioSpec, draws: Draws, count: Int[Tensor, 
     return proprio(now, spec.vel_scale)
 
 
-def priv_proprio(now: Now, own: Float[Tensor, "env shared"]) -> Float[Tensor, "env feature"]:
-    """Return `proprio`, which is `own` and exact, and the object's force on each link, in its frame [N], link by link."""
-    return torch.cat([own, now.link_force.flatten(1)], dim=1)
+def priv_proprio(now: Now) -> Float[Tensor, "env feature"]:
+    """Return exact `proprio` and the object's force on each link, in the link's frame [N], link by link."""
+    return torch.cat([proprio(now), now.link_force.flatten(1)], dim=1)
 
 
 def goal(parts: Sequence[GoalPart], wanted: Quat, quat: Quat) -> Float[Tensor, "env feature"]:

@@ -33,7 +33,7 @@ REQUIRED = ("tgdsl", "task", "document", "object", "joints")
 
 @dataclass(frozen=True, eq=False)
 class LoadedTask:
-    """A task's document, as found and as read."""
+    """A task's document: its model, and the values and places of its text."""
 
     spec: TaskSpec  # the document
     task: type[Task[Any]]  # the task's class
@@ -43,9 +43,11 @@ class LoadedTask:
 
     @property
     def senses(self) -> tuple[str, ...]:
+        """Kinds of sensors that the task and its terms read."""
         return tuple(dict.fromkeys(kind for part in (self.task, *self.terms.values()) for kind in part.senses))
 
     def error(self, place: Place, what: str, hint: str = "") -> SpecError:
+        """Return an error at a place of the document."""
         return SpecError([self.source.problem(place, what, hint)])
 
 
@@ -138,13 +140,13 @@ def _class_of(
     """Return the class that a document names: of `known`, or as `package.module:Class` or `file.py:Class`."""
     module, colon, class_ = name.partition(":")
     if name in known:
-        found = known[name]
-        return getattr(importlib.import_module(found[0]), found[1]) if isinstance(found, tuple) else found
+        entry = known[name]
+        return getattr(importlib.import_module(entry[0]), entry[1]) if isinstance(entry, tuple) else entry
     if not colon:
         hint = f"{did_you_mean(name, known, which)}; one of your own is package.module:Class or file.py:Class"
         raise SpecError([source.problem(place, f'there is no {which[:-1]} "{name}"', hint)])
     try:
-        user_module = _own_module(module, folder)
+        user_module = _user_module(module, folder)
     except Exception as error:  # whatever a user's code raises
         line = f"{raised_at(str((folder / module).resolve()), error)}: " if module.endswith(".py") else ""
         problem = f'cannot import "{name}": {line}{type(error).__name__}: {error}'
@@ -161,7 +163,7 @@ def _class_of(
     return result
 
 
-def _own_module(name: str, folder: Path) -> Any:
+def _user_module(name: str, folder: Path) -> Any:
     """Import a module by its name, or from a file, relative to the document."""
     if not name.endswith(".py"):
         return importlib.import_module(name)

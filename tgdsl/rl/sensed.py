@@ -65,16 +65,22 @@ class Sensed:
     felt: str | None  # name of the sensor that the policy feels; None if it feels nothing
     contact: str | None  # name of the `link_contact` sensor; None if the task takes none
     channels: tuple[str, ...]
-    """Names of its channels: those of the force, and of the normal force if the task wants it, among them."""
+    """Its channels: the force is among them, and the normal force if the task wants it."""
     distance: str | None  # name of the `surface_distance` sensor; None if the task takes none
     object: str  # body of the task's object in the scene
     by_kind: Mapping[str, str]  # name of the sensor of each kind that the task looks at
     groups: Mapping[str, Source]  # groups of observations of what is felt
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the groups of touch, in the units of their sensors."""
         observed = self.touch.observe(readings) if self.groups else {}
         parts = {name: (observed[source.observation], source.columns) for name, source in self.groups.items()}
         return {name: value if columns is None else value.index_select(1, columns) for name, (value, columns) in parts.items()}
+
+    def num_variants(self, name: str) -> int:
+        """Return how many variants an object of the document has; 1 if it has none."""
+        inputs = self.touch.inputs
+        return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 
     def forces(
         self, readings: Mapping[str, Tensor], like: Float[Tensor, "env joint"]

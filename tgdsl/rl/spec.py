@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictInt, model_validator
 
-from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Radius, Range, RangeOf, SpecModel
+from tgdsl.fields.models import NonNegative, Positive, Quantity, Radius, Range, RangeOf, SpecModel
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
 from tgdsl.rl.students.spec import DistillSpec
-from tgdsl.rl.train.spec import TrainSpec
+from tgdsl.rl.train.spec import Time, TrainSpec, Whole
 
 TouchType = Literal[
     "none", "bool", "agg_bool", "depth", "agg_force", "force", "force_torque", "elastomer", "proximity", "force_taxel",
@@ -29,14 +29,10 @@ SENSED: dict[str, tuple[str, str]] = {
     "temperature": ("temperature_grid", "reading"),
 }
 """The kind of sensor that each type reads, and the observation that is made of it."""
-Time = Annotated[float, Quantity("time", gt=0.0)]
 ForceRange = Annotated[Range, RangeOf("force")]
-Whole = Annotated[StrictInt, Field(ge=1)]
 Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]
 """Between the bounds that MuJoCo has."""
 Power = Annotated[float, Quantity("number", ge=1.0)]
-Weight = Number
-"""Weight of a term of the reward: of a gain more than 0, of a penalty less."""
 
 
 class PhysicsSpec(SpecModel):
@@ -92,6 +88,7 @@ class PhysicsSpec(SpecModel):
 
     @property
     def capacities(self) -> dict[str, int]:
+        """MuJoCo Warp's capacities that differ from its defaults."""
         return self.model_dump(include={"nconmax", "njmax"}, exclude_none=True)
 
 

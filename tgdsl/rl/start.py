@@ -87,7 +87,7 @@ def make_simulation(
     kind = simulator_for(device, simulator)
     keywords = keyword_options(kind.simulate)
     sim = kind.simulate(sensed.touch, num_envs, **{name: value for name, value in options.items() if name in keywords})
-    num_variants = _num_variants(sensed, spec.object)
+    num_variants = sensed.num_variants(spec.object)
     if first_env % num_variants:
         sim.set_objects({spec.object: (np.arange(num_envs) + first_env) % num_variants})
     return sim
@@ -105,7 +105,7 @@ def make_setup(
         actuators = Actuators.of(sim.model, joints)
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
-    num_variants = _num_variants(sensed, loaded.spec.object)
+    num_variants = sensed.num_variants(loaded.spec.object)
     friction, mass = (get(sensed.object).to(sim.qpos).clone() for get in (sim.properties.friction, sim.properties.mass))
     keyframe = sim.qpos[0].double().cpu().numpy()
     heights = [half_height(sim.env_model(i), sensed.object, keyframe) for i in range(min(num_variants, sim.num_envs))]
@@ -145,11 +145,6 @@ def make_setup(
 def contact_links(sensed: Sensed) -> tuple[str, ...]:
     """Return the bodies of the `link_contact` sensor's rows; none if the task takes none."""
     return tuple(sensed.touch.rows[sensed.contact]["body"].tolist()) if sensed.contact else ()
-
-
-def _num_variants(sensed: Sensed, name: str) -> int:
-    inputs = sensed.touch.inputs
-    return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 
 
 def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:

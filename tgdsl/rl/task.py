@@ -5,7 +5,8 @@ terms, `reset`, `advance`, `is_over`, `observe`, `score`. Numbers of the documen
 change them, but for those that the class lists as its `constants`.
 
 A term of the reward is a method marked by `reward_term`, or a shared one of `tgdsl.rl.terms` such as `near = Near.of_task(0.1,
-width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order.
+width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order; so do keys such as
+`near_width`, unless the spec has them.
 
 All methods take and return tensors of all environments, and change memory in place, so that on a GPU a whole step can be
 captured as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host. `is_over`,
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -31,12 +33,12 @@ from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable
 from tgdsl.errors import SimulationError
-from tgdsl.fields.models import SpecModel
+from tgdsl.fields.models import Number, SpecModel
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.features import Features
 from tgdsl.rl.grasps.grasps import GraspTable
-from tgdsl.rl.spec import TaskSpec, Weight
+from tgdsl.rl.spec import TaskSpec
 from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.state_values import Contacts, StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
@@ -66,7 +68,7 @@ def free_qpos(model: mujoco.MjModel, name: str) -> slice | None:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What a task is made for."""
+    """Scene, joints, object and random numbers of a task."""
 
     num_envs: int  # number of environments
     device: torch.device  # where physics runs, and a task's tensors are
@@ -91,11 +93,11 @@ class Setup:
     """Coefficient of sliding friction of each object: a live tensor, redrawn before `reset`."""
     mass: Float[Tensor, " env"]  # mass of each object [kg], in the same way
     scene_start: Float[Tensor, "env nq"]  # `start` before anything is random
-    scene_friction: Float[Tensor, " env"]  # the same of `friction`
-    scene_mass: Float[Tensor, " env"]  # the same of `mass`
+    scene_friction: Float[Tensor, " env"]  # `friction` before anything is random
+    scene_mass: Float[Tensor, " env"]  # `mass` before anything is random
     draws: Draws  # random numbers
     rows: Mapping[str, tuple[str, TaxelTable]]
-    """By kind of sensor that the task looks at: its reading's name in `Now.readings`, and a table of that one's rows."""
+    """By kind of sensor that the task looks at: the name of its reading in `Now.readings`, and the table of its rows."""
     grasps: GraspTable | None = None  # grasps that episodes begin from; None if the task's document has none
 
     def free_qpos(self, body: str | None = None) -> slice:
@@ -113,18 +115,18 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class Now:
-    """One instant of all environments: that of the readings; world axes unless said."""
+    """State of all environments at the instant of the readings, in world axes unless stated."""
 
     watched: Watched  # what the task watches, by name: see `Task.watch`
     object: BodyMotion
     """Motion of the object's body: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s]."""
     joint_pos: Float[Tensor, "env joint"]  # positions of the joints that the policy moves [rad]
     joint_vel: Float[Tensor, "env joint"]  # their velocities [rad/s]
-    target: Float[Tensor, "env joint"]  # what their drives are to reach, after the last action [rad]
+    target: Float[Tensor, "env joint"]  # position targets of their drives after the last action [rad]
     torque: Float[Tensor, "env joint"]  # what their drives exert [N·m]
     action: Float[Tensor, "env joint"]
-    """What the policy has asked for last, from −1 to 1; zero at the start of an episode."""
-    last_action: Float[Tensor, "env joint"]  # what it had asked for one control step before
+    """Last action, from −1 to 1; zero at the start of an episode."""
+    last_action: Float[Tensor, "env joint"]  # action of the control step before
     link_force: Float[Tensor, "env link 3"]
     """The object's force on each link, in the link's frame [N]; no links if the task takes no `link_contact`."""
     normal_force: Float[Tensor, "env loaded"]
@@ -135,23 +137,23 @@ class Now:
     mass: Float[Tensor, " env"]  # mass of the object [kg]
     readings: Mapping[str, Tensor]  # all readings of the module by name
     time: Float[Tensor, " env"]
-    """When the instant is, in each environment, by MuJoCo's clock [s]; that of a step is its last physics step's start."""
+    """MuJoCo's clock of each environment [s]; after a control step, the start of its last physics step."""
     score: Float[Tensor, " env"]
     """Score of the episode up to now, in `Task.score_unit`; in `Task.advance`, up to the control step before."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandNow:
-    """One instant of a hand that acts without a scene: what is known of it, and what it is asked for."""
+    """State of a hand without a scene: its joints, the last action and the goal."""
 
     joint_pos: Float[Tensor, "env joint"]  # positions of the joints that the policy moves [rad]
     joint_vel: Float[Tensor, "env joint"]  # their velocities [rad/s]
-    target: Float[Tensor, "env joint"]  # what their drives are to reach, after the last action [rad]
+    target: Float[Tensor, "env joint"]  # position targets of their drives after the last action [rad]
     action: Float[Tensor, "env joint"]
-    """What the policy has asked for last, from −1 to 1; zero at the start of an episode."""
+    """Last action, from −1 to 1; zero at the start of an episode."""
     steps: int  # control steps since the start of the episode
     control_step: float  # duration of a control step Δt [s]
-    goal: Float[Tensor, "env goal"]  # what it is asked for, as `Task.asked` has it
+    goal: Float[Tensor, "env goal"]  # the goal, as `Task.asked` returns it
 
 
 class Start(NamedTuple):
@@ -211,14 +213,13 @@ class Task(ABC, Generic[S]):
         wants_normal_force: Whether it looks at the normal force of the `link_contact` sensor, besides the force.
         score_unit: Unit of its score.
         is_less_better: Whether its score is an error.
-        hand_groups: Groups of its own that `observe_hand` makes without a scene; of policies that see no others, hands can have
-            some.
+        hand_groups: Groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task.
         constants: Keys of its document that are read once, when it is made: no curriculum can change them.
         goal_units: Units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for.
         terms: Terms of its reward by name.
         Rewards: Model of their weights.
         spec: Its document.
-        setup: What it is made for.
+        setup: Its setup.
         memory: Its own state, (env, …) each, kept by `state_dict`.
     """
 
@@ -237,23 +238,26 @@ class Task(ABC, Generic[S]):
     memory: dict[str, Tensor]
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Collect the terms of the reward, and add `rewards`, their weights, to the model of the document."""
+        """Collect the terms of the reward; add `rewards`, their weights, and their parameters to the document's model."""
         super().__init_subclass__(**options)
         terms_of_class = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
         cls.terms = {**cls.terms, **terms_of_class}
         if cls.terms and (terms_of_class or "Spec" in vars(cls)):
-            weight: Any = Weight
+            weight: Any = Number
             fields: dict[str, Any] = {
                 name: (weight | None, Field(term.weight, description=f"{term.summary} [{term.unit}]."))
                 for name, term in cls.terms.items()
             }
             doc = "Weights of the reward's terms; null leaves one out."
             cls.Rewards = create_model("Rewards", __base__=SpecModel, __module__=cls.__module__, __doc__=doc, **fields)
-            rewards: Any = (cls.Rewards, Field(cls.Rewards(), description="Weights of the reward's terms."))
             base = cls.Spec
-            cls.Spec = create_model(
-                base.__name__, __base__=base, __module__=cls.__module__, __doc__=base.__doc__, rewards=rewards
-            )
+            shared = [(term.term.model_fields, term.parameters) for term in cls.terms.values() if term.term is not None]
+            parameters = {key: numbers[name] for numbers, names in shared for name, key in names.items()}
+            keys: dict[str, Any] = {
+                key: (number.annotation, copy(number)) for key, number in parameters.items() if key not in base.model_fields
+            }
+            keys["rewards"] = (cls.Rewards, Field(cls.Rewards(), description="Weights of the reward's terms."))
+            cls.Spec = create_model(base.__name__, __base__=base, __module__=cls.__module__, __doc__=base.__doc__, **keys)
 
     def __init__(self, spec: S, setup: Setup):
         self.spec, self.setup, self.memory = spec, setup, {}
@@ -266,20 +270,20 @@ class Task(ABC, Generic[S]):
         return Watch()
 
     def keep(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-        """Return a tensor (env, *shape) of zeros that the task remembers, in physics' dtype unless another is given."""
+        """Add zeros (env, *shape) to the task's memory, in physics' dtype unless another is given; return them."""
         setup = self.setup
         self.memory[name] = torch.zeros((setup.num_envs, *shape), dtype=dtype or setup.dtype, device=setup.device)
         return self.memory[name]
 
     def begin(self, chosen: Bool[Tensor, " env"], **values: Tensor | float) -> None:
-        """Set what is remembered of some environments, by name."""
+        """Set the memory of some environments, by name."""
         for name, value in values.items():
             tensor = self.memory[name]
             put_rows(tensor, chosen, value.to(tensor.dtype) if isinstance(value, Tensor) else value)
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
-        """Return where episodes of some environments begin, and begin what is remembered of them.
+        """Reset the memory of some environments; return where their episodes begin.
 
         Args:
             chosen: The environments.
@@ -288,10 +292,10 @@ class Task(ABC, Generic[S]):
 
     @abstractmethod
     def advance(self, now: Now) -> None:
-        """Bring what is remembered up to date: once per control step, after its physics."""
+        """Update the memory: once per control step, after its physics."""
 
     def advance_healthy(self, now: Now, faults: Bool[Tensor, " env"]) -> None:
-        """Bring what is remembered up to date, but for environments with a fault, whose instant is none."""
+        """Update the memory, leaving environments with a fault unchanged."""
         saved_memory = {name: value.clone() for name, value in self.memory.items()} if may_be_nonempty(faults) else {}
         self.advance(now)
         for name, value in saved_memory.items():
@@ -320,19 +324,19 @@ class Task(ABC, Generic[S]):
         return {}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
-        """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""
+        """Return privileged numbers that `distill.decoders` may name, which students learn to predict; by default none."""
         return {}
 
     def step_progress(self) -> Float[Tensor, " env"] | None:
-        """Return what this control step has brought the object, such as an angle, less than 0 for the wrong way; None: nothing.
+        """Return the object's progress in this control step, such as an angle, negative for the wrong way; None: it has none.
 
-        Of it `tgdsl evaluate` says which share was made while no finger touched the object.
+        `tgdsl evaluate` reports the share that is made while no finger touches the object.
         """
         return None
 
     @classmethod
     def asked_for(cls, spec: S, goal: tuple[float, ...]) -> S:
-        """Return the document in which just this goal is asked for, of as many numbers as there are `goal_units`.
+        """Return the document with this goal, one number per entry of `goal_units`.
 
         Raises:
             LowerError: If it is not one that the document can ask for.
@@ -340,12 +344,12 @@ class Task(ABC, Generic[S]):
         return spec
 
     def asked(self) -> Float[Tensor, "env goal"]:
-        """Return what is asked for now, in `goal_units`; by default nothing."""
+        """Return the present goal, in `goal_units`; by default none."""
         return torch.zeros((self.setup.num_envs, 0), dtype=self.setup.dtype, device=self.setup.device)
 
     @classmethod
     def observe_hand(cls, spec: S, now: HandNow) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return `hand_groups` as `observe` does, without a scene: of what is known of a hand, and what it is asked for."""
+        """Return `hand_groups` as `observe` does, from the state of a hand without a scene."""
         return {}
 
     @abstractmethod

@@ -33,7 +33,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from tgdsl.errors import SimulationError, did_you_mean
-from tgdsl.fields.models import Number, PositiveLength, Quantity, Range, RangeOf, SpecModel
+from tgdsl.fields.models import Number, Positive, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl import features, groups, rotations
 from tgdsl.rl.actuation import ZERO, Actuation, Factor
 from tgdsl.rl.draws import within
@@ -48,7 +48,6 @@ FREE_SHARE = 0.95
 """Share of a joint's range that costs nothing."""
 Force = Annotated[float, Quantity("force", gt=0.0)]
 Speed = Annotated[float, Quantity("speed", gt=0.0)]
-Spin = Annotated[float, Quantity("number", gt=0.0)]
 
 
 class Term(SpecModel, ABC):
@@ -110,7 +109,7 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """A group of observations, called as the document calls it."""
+    """A group of observations, with the name that the term has in the document."""
 
     @abstractmethod
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
@@ -130,7 +129,7 @@ class Event:
     actuation: Actuation  # the drives
     chosen: Bool[Tensor, " env"]  # the environments in which it happens: decide by this mask, not by `if`
     count: Int[Tensor, " env"]
-    """How often each environment was reset; of events at intervals, how often it has happened, above that the episode."""
+    """Resets of each environment; for events at intervals, events so far, with the episode in the upper 32 bits."""
     stream: str  # what its random numbers are for
 
     def shares(self, num: int) -> Float[Tensor, "env num"]:
@@ -252,7 +251,7 @@ class Near(RewardTerm):
 
     senses = ("surface_distance",)
     width: PositiveLength = 0.02
-    """λ, decay length [m]."""
+    """λ, decay length of `near` [m]."""
     nearest: Whole | None = None
     """How many of the nearest probes count; null: all."""
 
@@ -285,8 +284,8 @@ class ObjectSpeed(RewardTerm):
 
     free_speed: Speed = 0.2
     """v_free: a slower object costs nothing [m/s]."""
-    free_spin: Spin = 4.0
-    """ω_free: the same for its angular velocity [rad/s]."""
+    free_spin: Positive = 4.0
+    """ω_free: the same for its angular velocity, about any axis [rad/s]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         velocities, free = (now.object.linvel, now.object.angvel), (self.free_speed, self.free_spin)

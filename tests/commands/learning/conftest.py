@@ -6,4 +6,4 @@ import pytest
 @pytest.fixture(autouse=True)
 def checked_often(monkeypatch):
     """Look after each episode's length whether all have ended."""
-    monkeypatch.setattr("tgdsl.rl.playing.evaluation.CHECKED_EVERY", 8)
+    monkeypatch.setattr("tgdsl.rl.playing.evaluation.CHECK_INTERVAL", 8)

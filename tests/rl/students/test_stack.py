@@ -113,7 +113,7 @@ def test_means_and_variances_follow_what_changes_late():
     found = dict(stack.buffers)  # in place: a graph that was captured reads these
     x = torch.randn((3, 64, 17), generator=generator) + torch.linspace(0.0, 300.0, 17)
     stack.observe(x)
-    stack.seen.mul_(before)  # the same rows again and again change nothing else
+    stack.seen.count.mul_(before)  # the same rows again and again change nothing else
     for _ in range(looks):
         stack.observe(x + 1.0)
     rows = x.double(), (x + 1.0).double()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import FILE, OUT, OptionalFile, Overrides, parsed_overrides
+from tgdsl.commands.arguments import FILE, OUT, OptionalFile, Overrides, Task, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from tgdsl.rl.deploying.deploy import Deployment
     from tgdsl.runtime.xhand1.motion import MotionLimits
 
-Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 _MOVING = ("speed", "current_limit", "kp")
 
 
@@ -89,17 +88,17 @@ class Deploy:
             print(f"changed since the policy was learned: {line}")
         self._act(deployment)
 
-    def _act(self, found: Deployment) -> None:
+    def _act(self, deployment: Deployment) -> None:
         """Make all steps and report them; Ctrl-C ends them early."""
         from tqdm import tqdm
 
         from tgdsl.rl.deploying.deploy import DeployRecord
 
-        record = DeployRecord(found.prepared.moved.names)
+        record = DeployRecord(deployment.prepared.moved.names)
         failed: TgdslError | None = None
         with tqdm(desc="acting", unit="step", disable=None, leave=False) as bar:
             try:
-                for moment in found.steps(self.episodes, self.seconds):
+                for moment in deployment.steps(self.episodes, self.seconds):
                     record.add(moment)
                     bar.update()
             except KeyboardInterrupt:
@@ -107,7 +106,7 @@ class Deploy:
             except TgdslError as error:  # a hand that no longer answers: report the steps so far
                 failed = error
         if failed is None or len(record):
-            print(found.report())
+            print(deployment.report())
             print("\n".join(record.lines()))
             if self.out is not None:
                 record.write(self.out)

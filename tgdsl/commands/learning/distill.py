@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from tgdsl.commands.arguments import Overrides, joined_overrides, parsed_overrides
+from tgdsl.commands.arguments import FOLDER, OUT_FOLDER, Overrides, Task, joined_overrides, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from tgdsl.rl.students.results import Row
     from tgdsl.rl.train.run import Run
 
-Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
-Folder = tyro.conf.arg(metavar="FOLDER")
 Names = tyro.conf.arg(metavar="A,B,…")
 ENVS = 13824
 OPTIONS = {"touch": "types", "placement": "placements", "noise": "noise", "resolution": "resolutions"}
@@ -62,9 +60,9 @@ class Distill:
     """Time to learn from now on in each simulation [min], start-up not counted; default: no limit."""
     seed: int | None = None
     """Seed of the environments; default: 0."""
-    resume: Annotated[Path | None, Folder] = None
+    resume: Annotated[Path | None, FOLDER] = None
     """Folder of a run that goes on from its last checkpoints, with the same students and overrides."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    out: Annotated[Path | None, OUT_FOLDER] = None
     """Folder of the run, with one per resolution in it; default: out/NAME_students."""
     episodes: int = 1000
     """Episodes of each student's evaluation at the end; 0: none."""
@@ -244,7 +242,7 @@ class _Part:
         from tgdsl.rl.students.learner import Distiller
         from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import run_origin
-        from tgdsl.rl.train.run import ProgressBar, Run
+        from tgdsl.rl.train.run import Run
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
         state = self._state
@@ -266,15 +264,8 @@ class _Part:
                 _write(file, self._asked | {"overrides": self._given, "teacher_from_here": relative_path})
             folder.begin(origin | taught, loaded, env)
             run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
-            total = command.iterations or loaded.spec.distill.iterations
-            limit = float("inf") if command.minutes is None else 60.0 * command.minutes
             print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self.envs} environments: {folder.path}")
-            shown_total = total if command.minutes is None or command.iterations else None  # else time ends the run
-            bar = ProgressBar(shown_total, distiller.iteration, env.task.score_unit)
-            try:
-                run.learn(total, limit, bar.show)
-            finally:
-                bar.close()
+            run.learn_with_bar(command.iterations, command.minutes, loaded.spec.distill.iterations)
             return self._finish(distiller, origin, run), env.task.score_unit
         finally:
             env.close()

@@ -10,11 +10,9 @@ from typing import Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import OUT, Overrides, parsed_overrides
+from tgdsl.commands.arguments import OUT, Overrides, Task, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
-
-Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 
 
 @dataclass(frozen=True)

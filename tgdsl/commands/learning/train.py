@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
-from tgdsl.commands.arguments import Overrides, joined_overrides, parsed_overrides
+from tgdsl.commands.arguments import FOLDER, OUT_FOLDER, Overrides, Task, joined_overrides, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
     from tgdsl.rl.train.ranks import Ranks
     from tgdsl.rl.train.run import Run
 
-Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
-Folder = tyro.conf.arg(metavar="FOLDER")
 ENVS = 8192
 INITIAL_STD = "train.networks.initial_std:"
 
@@ -44,10 +40,10 @@ class Train:
     """Time to learn from now on [min], start-up not counted; default: no limit."""
     seed: int | None = None
     """Random seed; default: 0, or as in the run that is resumed."""
-    resume: Annotated[Path | None, Folder] = None
+    resume: Annotated[Path | None, FOLDER] = None
     """Folder of a run that goes on from its last checkpoint, with its overrides; with another --out a run of its own begins
     from there, with those that are given now alone."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    out: Annotated[Path | None, OUT_FOLDER] = None
     """Folder of the run; default: out/NAME of the document, or that of the run that is resumed."""
     episodes: int = 1000
     """Episodes of the evaluation at the end; 0: none."""
@@ -113,7 +109,7 @@ class Train:
         from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import changes, run_origin
         from tgdsl.rl.train.learner import Learner
-        from tgdsl.rl.train.run import ProgressBar, Run
+        from tgdsl.rl.train.run import Run
 
         envs = self.envs or before.get("envs", ENVS)
         seed = self.seed if self.seed is not None else before.get("seed", 0)
@@ -135,15 +131,7 @@ class Train:
             run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
             if ranks.is_first and not run.has_board:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
-            total = self.iterations or loaded.spec.train.iterations
-            limit = float("inf") if self.minutes is None else 60.0 * self.minutes
-            shown_total = total if self.minutes is None or self.iterations else None  # else time ends the run
-            bar = ProgressBar(shown_total, learner.iteration, env.task.score_unit) if ranks.is_first else None
-            try:
-                run.learn(total, limit, bar.show if bar is not None else None)
-            finally:
-                if bar is not None:
-                    bar.close()
+            run.learn_with_bar(self.iterations, self.minutes, loaded.spec.train.iterations)
             if ranks.is_first:
                 self._finish(learner, folder, origin, run)
         finally:

@@ -101,6 +101,7 @@ class Scores(NamedTuple):
 
     @classmethod
     def of(cls, scores: Sequence[float], are_held: Sequence[bool]) -> Scores:
+        """Return the mean of scores and the share of episodes of full length, with their intervals."""
         num = len(scores)
         mean, share = math.fsum(scores) / num, sum(are_held) / num
         interval = mean_interval(mean, math.fsum(score**2 for score in scores), num)

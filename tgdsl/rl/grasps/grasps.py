@@ -96,6 +96,7 @@ class Grasps:
         return len(self.qpos)
 
     def packed(self) -> dict[str, np.ndarray]:
+        """Return the arrays of a file of grasps, by name."""
         words = {"format": FORMAT, "scene": self.scene, "object": self.object, "settings": self.settings}
         arrays = {"qpos": self.qpos, "ctrl": self.ctrl, "variant": self.variant}
         return {name: np.array(word) for name, word in words.items()} | arrays

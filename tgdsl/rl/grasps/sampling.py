@@ -54,11 +54,11 @@ SHARE = 0.25
 """Most that `spread` may be, as a share of a joint's range, so that few grasps begin at a joint's limit."""
 LEAST_SHARE, ENOUGH = 0.01, 1000
 """Share of trials that must be kept of a variant, once so many were made."""
-Found = Callable[[int, int], None]
-"""Called with how many grasps were found, and how many are wanted."""
+Count = Callable[[int, int], None]
+"""Called with the number of grasps so far and the number wanted."""
 
 
-def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -> Grasps:
+def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -> Grasps:
     """Sample a task's grasps, on the CPU.
 
     Raises:
@@ -71,7 +71,7 @@ def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -
     wanted = torch.tensor([spec.num // num + (v < spec.num % num) for v in range(num)])
     kept, rounds, trials_of = torch.zeros_like(wanted), [], torch.bincount(trials.variant)
     while not rounds or bool((kept < wanted).any()):
-        rounds.append(trials.made(len(rounds)))
+        rounds.append(trials.run(len(rounds)))
         kept += torch.bincount(rounds[-1][0], minlength=num)
         for v, tried in enumerate((len(rounds) * trials_of).tolist()):
             if kept[v] < min(int(wanted[v]), LEAST_SHARE * tried) and tried >= ENOUGH:
@@ -79,7 +79,7 @@ def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -
                     f"only {int(kept[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
                 )
                 raise loaded.error(("grasps",), problem, "start the hand nearer to the object, or ask for less")
-        found(int(torch.minimum(kept, wanted).sum()), spec.num)
+        count(int(torch.minimum(kept, wanted).sum()), spec.num)
     trials.sim.close()
     variant, qpos, ctrl = (torch.cat(parts) for parts in zip(*rounds, strict=True))
     ids = torch.cat([torch.nonzero(variant == v).flatten()[: int(wanted[v])] for v in range(num)])
@@ -99,7 +99,7 @@ class _Trials:
     def __init__(self, loaded: LoadedTask, sensed: Sensed, spec: GraspSpec):
         inputs, task = sensed.touch.inputs, loaded.spec
         self.spec, self.joints = spec, moved_joints(loaded, sensed)
-        self.num_variants = inputs.num_variants[inputs.objects.index(task.object)] if task.object in inputs.objects else 1
+        self.num_variants = sensed.num_variants(task.object)
         num_envs = max(self.num_variants, min(SIDE_BY_SIDE, 2 * spec.num))
         sim = make_simulation(loaded, sensed, self.joints, num_envs, "cpu", "mujoco")
         assert isinstance(sim, BatchSimulation)
@@ -128,8 +128,8 @@ class _Trials:
         """Why trials were not kept, in words."""
         return ", ".join(f"{num} {reason}" for reason, num in self._failed.items())
 
-    def made(self, round_: int) -> tuple[Int[Tensor, " grasp"], Float[Tensor, "grasp nq"], Float[Tensor, "grasp nu"]]:
-        """Make a round of trials; return variant, positions and controls of the grasps that hold."""
+    def run(self, round_: int) -> tuple[Int[Tensor, " grasp"], Float[Tensor, "grasp nq"], Float[Tensor, "grasp nu"]]:
+        """Run a round of trials; return variant, positions and controls of the grasps that hold."""
         sim, spec = self.sim, self.spec
         count = torch.full((sim.num_envs,), round_)
         qpos = self._start(count)
@@ -270,21 +270,19 @@ def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneF
             grasps = read_grasps(loaded.folder / spec.file, scene_digest(scene), loaded.spec.object)
         else:
             joints = setup.actuators.names
-            grasps = kept_grasps(loaded, scene, joints, lambda num, of: tell(f"sampling grasps: {num} of {of}"), progress)
+            grasps = cached_grasps(loaded, scene, joints, lambda num, of: tell(f"sampling grasps: {num} of {of}"), progress)
         return replace(setup, grasps=GraspTable(grasps, sim, setup.object, setup.variant, setup.draws))
     except SimulationError as error:
         raise loaded.error(("grasps",) if spec.file is None else ("grasps", "file"), str(error)) from error
 
 
-def kept_grasps(
-    loaded: LoadedTask, scene: SceneFile, joints: tuple[str, ...], found: Found, progress: Progress | None = None
+def cached_grasps(
+    loaded: LoadedTask, scene: SceneFile, joints: tuple[str, ...], count: Count, progress: Progress | None = None
 ) -> Grasps:
-    """Return the grasps of the user's cache; those that it does not have are sampled now, which takes a minute or more.
-
-    They are kept under a hash of the scene and of all settings, so these are found again.
+    """Return the task's grasps from the user's cache, under a hash of scene and settings; sample them if it has none.
 
     Raises:
         SpecError: If there is no such keyframe, the object cannot be held as asked, or hardly any grasp holds.
     """
     key = cache_key(scene_digest(scene), settings_of(loaded.spec, joints))
-    return cached(key, lambda: sample(loaded, found, progress), Grasps.packed, Grasps.unpacked)
+    return cached(key, lambda: sample(loaded, count, progress), Grasps.packed, Grasps.unpacked)

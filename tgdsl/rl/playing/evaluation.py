@@ -25,7 +25,7 @@ from tgdsl.rl.playing.rollout import Actor, rollout
 SEED = 1_000_003
 """What is random in the episodes follows from it, whatever a policy was learned with."""
 Z95 = 1.959963984540054
-CHECKED_EVERY = 40
+CHECK_INTERVAL = 40
 """Control steps after which the host looks whether all episodes have ended."""
 DIMENSIONS = {"score": "number", "held": SHARE} | {name: dimension for name, (_, dimension) in METRICS.items()}
 """What may be required of a policy: names of `Evaluation` and `Gait`, and what each is."""
@@ -116,15 +116,15 @@ def evaluate_each(
         numbers = [score, score.square(), info.is_whole(env.max_steps), info.episode_return, info.episode_steps, info.faults]
         sums += torch.where(counts, torch.stack([value.double() for value in numbers]), 0.0)
         done += counts
-        if (moment.index + 1) % CHECKED_EVERY == 0:
+        if (moment.index + 1) % CHECK_INTERVAL == 0:
             left = int((quota - done).sum())
             progress(f"evaluating: {blocks * episodes - left:,} of {blocks * episodes:,} episodes")
             if not left:
                 break
     results = []
     for block_sums, gait in zip(sums.view(6, blocks, size).sum(dim=2).T.tolist(), meter.gaits(), strict=True):
-        total, squares, whole, paid, steps, faults = block_sums
-        score, held = total / episodes, whole / episodes
+        scores, squares, whole, returns, steps, faults = block_sums
+        score, held = scores / episodes, whole / episodes
         results.append(
             Evaluation(
                 task=env.spec.task,
@@ -136,7 +136,7 @@ def evaluate_each(
                 score_interval=mean_interval(score, squares, episodes),
                 held=held,
                 held_interval=share_interval(held, episodes),
-                episode_return=paid / episodes,
+                episode_return=returns / episodes,
                 seconds=steps / episodes * env.control_step,
                 faults=round(faults),
                 gait=gait,
@@ -154,9 +154,9 @@ class Requirement:
     sign: str
     bound: float
 
-    def failure(self, found: Evaluation) -> str | None:
+    def failure(self, evaluation: Evaluation) -> str | None:
         """Return why an evaluation does not meet this; None if it does."""
-        value = getattr(found if self.name in ("score", "held") else found.gait, self.name)
+        value = getattr(evaluation if self.name in ("score", "held") else evaluation.gait, self.name)
         if value is None:
             return f"not met: {self.text}: it was not measured: the task has none, or nothing was touched"
         unit = UNITS.get(DIMENSIONS[self.name], "")

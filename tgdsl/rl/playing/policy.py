@@ -71,6 +71,7 @@ class PolicyFile:
     """The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none."""
 
     def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
+        """Return the TorchScript module on a device."""
         return _module(self.content, device)
 
 
@@ -102,13 +103,13 @@ def read_policy(file: Path) -> PolicyFile:
     return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
 
 
-def write_policy(scripted: torch.nn.Module, touch: TactileModule, card: Mapping[str, Any], file: Path) -> None:
-    """Write a policy as TorchScript, in it its card and the taxels that it feels with, and the card beside it.
+def write_policy(scripted: torch.nn.Module, texts: Mapping[str, str], file: Path) -> None:
+    """Write a policy as TorchScript with its `card_texts` in it, and the card beside it.
 
     Raises:
         FileError: If it cannot be written.
     """
-    content, texts = io.BytesIO(), card_texts(touch, card)
+    content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
         torch.jit.save(scripted, content, _extra_files=dict(texts))

@@ -37,6 +37,7 @@ class Record:
         return len(next(iter(self._columns.values()), ()))
 
     def add_rows(self, columns: Mapping[str, Column]) -> None:
+        """Append rows to columns, by name."""
         for name, rows in columns.items():
             self._columns.setdefault(name, []).append(rows)
 
@@ -126,6 +127,7 @@ class Tally:
             self._sums[name] = self._sums.get(name, 0.0) + float(value[info.ended].double().sum())
 
     def lines(self, time: float) -> list[str]:
+        """Return the table at a time of the simulation [s]."""
         faults = f", {self.num_faults} by a fault" if self.num_faults else ""
         first = f"t = {time:.2f} s, {self._env.num_envs} environments, {self.num_ended} episodes ended{faults}"
         count = self.num_ended

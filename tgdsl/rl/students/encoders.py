@@ -162,10 +162,10 @@ class RecurrentConvolution(Images):
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         links, *image = self.grid.shape
-        held = memory.unflatten(1, (2, links, self.width, *image)).transpose(0, 1).flatten(1, 2)
-        h, c = gated(self.norm(self.gates(torch.cat([self.marked(x), held[0]], dim=1))), held[1])
-        held = torch.stack([h, c]).unflatten(1, (x.shape[0], links)) * self.masks()
-        return self.projection(held[0].flatten(1)), held.transpose(0, 1).flatten(1)
+        state = memory.unflatten(1, (2, links, self.width, *image)).transpose(0, 1).flatten(1, 2)
+        h, c = gated(self.norm(self.gates(torch.cat([self.marked(x), state[0]], dim=1))), state[1])
+        state = torch.stack([h, c]).unflatten(1, (x.shape[0], links)) * self.masks()
+        return self.projection(state[0].flatten(1)), state.transpose(0, 1).flatten(1)
 
 
 def gated(gates: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:

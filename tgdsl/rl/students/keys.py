@@ -1,4 +1,4 @@
-"""Who is taught in which environments: a student per type, placement, noise and seed, each in a block of its own.
+"""Students and their environments: one per type, placement, noise and seed, each in its block.
 
 Shapes: `feature` numbers of a group.
 """
@@ -31,7 +31,7 @@ class StudentError(TgdslError):
 
 @dataclass(frozen=True)
 class StudentKey:
-    """Who is taught: what it feels (None: nothing), and the seed of its first weights."""
+    """A student: what it feels (None: nothing), and the seed of its first weights."""
 
     felt: Felt | None
     seed: int
@@ -43,6 +43,7 @@ class StudentKey:
 
     @property
     def name(self) -> str:
+        """Name of its files and columns, such as `depth-hand-clean-s0`."""
         return "-".join([*(part for part in self.kind if part), f"s{self.seed}"]).replace("*", "_").replace("/", "_")
 
 
@@ -139,12 +140,13 @@ def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequ
     return Architecture(tuple(parts), networks.hidden, env.num_actions, heads, networks.eps, networks.clip)
 
 
-def _touch_encoder(own: StudentNetworksSpec, felt: Felt, layout: Layout, size: int) -> Encoder:
-    widths, kind = own.touch_encoder, own.touch_kind
+def _touch_encoder(networks: StudentNetworksSpec, felt: Felt, layout: Layout, size: int) -> Encoder:
+    widths, kind = networks.touch_encoder, networks.touch_kind
     if kind in ("cnn", "convrnn") and felt.type not in PER_LINK and layout.num_taxels and size % layout.num_taxels == 0:
-        return Encoder(kind, own.convolution.channels, widths.size, own.convolution.kernel, grid_of(layout, size, felt))
-    plain = {"cnn": "mlp", "convrnn": "lstm"}
-    return Encoder("lstm" if plain.get(kind, kind) == "lstm" else "mlp", widths.hidden, widths.size)
+        return Encoder(
+            kind, networks.convolution.channels, widths.size, networks.convolution.kernel, grid_of(layout, size, felt)
+        )
+    return Encoder("lstm" if kind in ("lstm", "convrnn") else "mlp", widths.hidden, widths.size)
 
 
 def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:

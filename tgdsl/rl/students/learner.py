@@ -42,10 +42,10 @@ class Rollout:
 
     Attributes:
         seen: Groups of observations of each.
-        memory: What they remember now, (student, row, memory).
-        begun: What they remembered when the rollout began.
-        x: What they saw in it, (step, student, row, feature).
-        before: What they asked for in it, (step, student, row, joint).
+        memory: Their memory now, (student, row, memory).
+        begun: Their memory at the start of the rollout.
+        x: Their observations in it, (step, student, row, feature).
+        before: Their actions in it, (step, student, row, joint).
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class Rollout:
 
     @property
     def envs(self) -> slice:
+        """Its environments."""
         return slice(self.first, self.first + self.rows * len(self.keys))
 
     def split(self, values: Tensor, dim: int = 0) -> Tensor:
@@ -184,7 +185,7 @@ class Distiller(Learning):
     # What is captured
 
     def _choose(self) -> None:
-        """Have the teacher say what should be done, and each student act."""
+        """Compute the teacher's actions and those of each student."""
         with torch.no_grad():
             acting = [partial(self._act, rollout, x) for rollout, x in zip(self.rollouts, self._inputs, strict=True)]
             self._beside([lambda: self._label.copy_(self._teacher(self._seen)), *acting])
@@ -192,21 +193,21 @@ class Distiller(Learning):
             if self._spec.std:
                 self._action.add_(torch.randn_like(self._action), alpha=self._spec.std)
 
-    def _act(self, own: Rollout, x: Tensor) -> None:
-        x.copy_(own.inputs(self._seen))
-        action = own.stack(x, own.memory)
-        own.memory.copy_(action.memory)
-        self._asked[own.envs].copy_(action.action.flatten(0, 1))
+    def _act(self, rollout: Rollout, x: Tensor) -> None:
+        x.copy_(rollout.inputs(self._seen))
+        action = rollout.stack(x, rollout.memory)
+        rollout.memory.copy_(action.memory)
+        self._asked[rollout.envs].copy_(action.action.flatten(0, 1))
 
     def _answer(self) -> None:
-        """Have the students say what they would ask for now: an earlier rollout's a_0 bounds nothing any more."""
+        """Compute a_0 of an earlier rollout again, by the present weights."""
 
-        def answer(own: Rollout) -> None:
-            memory = own.begun
-            for x, before, ended in zip(own.x, own.before, self._ended, strict=True):
-                output = own.stack(x, memory)
+        def answer(rollout: Rollout) -> None:
+            memory = rollout.begun
+            for x, before, ended in zip(rollout.x, rollout.before, self._ended, strict=True):
+                output = rollout.stack(x, memory)
                 before.copy_(output.action)
-                memory = forgotten(output.memory, own.split(ended))
+                memory = forgotten(output.memory, rollout.split(ended))
 
         with torch.no_grad():
             self._beside([partial(answer, rollout) for rollout in self.rollouts])
@@ -215,25 +216,26 @@ class Distiller(Learning):
         each = self._losses.split([len(rollout.keys) for rollout in self.rollouts])
         self._beside([partial(self._pass, rollout, errors) for rollout, errors in zip(self.rollouts, each, strict=True)])
 
-    def _pass(self, own: Rollout, errors: Float[Tensor, " student"]) -> None:
+    def _pass(self, rollout: Rollout, errors: Float[Tensor, " student"]) -> None:
         """Have a stack go through the rollout once; add the errors of its actions."""
-        memory = own.begun
+        memory = rollout.begun
         for first in range(0, self._spec.steps, self._spec.gradient_length):
-            step_error, memory = self._descend(own, slice(first, first + self._spec.gradient_length), memory)
+            step_error, memory = self._descend(rollout, slice(first, first + self._spec.gradient_length), memory)
             errors += step_error
 
-    def _descend(self, own: Rollout, steps: slice, memory: Tensor) -> tuple[Float[Tensor, " student"], Tensor]:
+    def _descend(self, rollout: Rollout, steps: slice, memory: Tensor) -> tuple[Float[Tensor, " student"], Tensor]:
         """Take one gradient step of a stack; return the errors of its actions, and what it remembers then."""
         spec = self._spec
-        detached = total = torch.zeros(len(own.keys), device=memory.device)
-        parts = [steps] if own.stack.memory == 0 else [slice(t, t + 1) for t in range(steps.start, steps.stop)]
+        detached = total = torch.zeros(len(rollout.keys), device=memory.device)
+        parts = [steps] if rollout.stack.memory == 0 else [slice(t, t + 1) for t in range(steps.start, steps.stop)]
         with torch.enable_grad():
             for part in parts:  # without memory all steps are rows
-                x, target = (joined(values[part]) for values in (own.x, own.before))
+                x, target = (joined(values[part]) for values in (rollout.x, rollout.before))
                 label, targets, ended = (
-                    joined(own.split(values[part], 1)) for values in (self._labels, self._privileged, self._ended[..., None])
+                    joined(rollout.split(values[part], 1))
+                    for values in (self._labels, self._privileged, self._ended[..., None])
                 )
-                outputs = own.stack(x, memory if own.stack.memory else x[..., :0])
+                outputs = rollout.stack(x, memory if rollout.stack.memory else x[..., :0])
                 error = losses.behaviour(
                     outputs.action, label, target, self._std, spec.clip, is_huber=spec.loss == "huber"
                 ) / len(parts)
@@ -241,14 +243,14 @@ class Distiller(Learning):
                 total = total + error
                 if self._targets:
                     total = total + losses.decoded(outputs.decoded, targets, self._scales, self._weights) / len(parts)
-                memory = forgotten(outputs.memory, ended[..., 0]) if own.stack.memory else memory
-            own.stack.descend(total)
+                memory = forgotten(outputs.memory, ended[..., 0]) if rollout.stack.memory else memory
+            rollout.stack.descend(total)
         return detached, memory.detach()
 
     def _look(self) -> None:
-        def look(own: Rollout) -> None:
-            for x in own.x:
-                own.stack.observe(x)
+        def look(rollout: Rollout) -> None:
+            for x in rollout.x:
+                rollout.stack.observe(x)
 
         self._beside([partial(look, rollout) for rollout in self.rollouts])
 

@@ -1,4 +1,4 @@
-"""What students are taught by: errors of their actions, and of what their decoders tell; a loss per student.
+"""Losses of students: errors of their actions and of their decoders, one loss per student.
 
 With a_s a student's action, a_t the teacher's, σ_t the standard deviation of the teacher's exploration (`inverse_variance`) or
 actions (`normalise`), else 1, a_0 what the student asked for in the rollout (in an earlier one that is kept: would ask for when
@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 Actions = Float[Tensor, "student row joint"]
-Told = Float[Tensor, "student row target"]
+Targets = Float[Tensor, "student row target"]
 
 
 def behaviour(
@@ -54,7 +54,7 @@ def behaviour(
 
 
 def decoded(
-    told: Told, targets: Told, scales: Float[Tensor, " target"], weights: Float[Tensor, " target"]
+    output: Targets, targets: Targets, scales: Float[Tensor, " target"], weights: Float[Tensor, " target"]
 ) -> Float[Tensor, " student"]:
-    """Return the weighted error of what decoders tell; zeros if there are none."""
-    return ((told - scales * targets).square().mean(dim=1) * weights).sum(dim=1)
+    """Return the weighted error of the decoders; zeros if there are none."""
+    return ((output - scales * targets).square().mean(dim=1) * weights).sum(dim=1)

@@ -53,11 +53,11 @@ class Row(NamedTuple):
 
 
 def rows_of(
-    keys: Sequence[StudentKey], found: Sequence[Evaluation], resolution: str, samples: int, minutes: float
+    keys: Sequence[StudentKey], evaluations: Sequence[Evaluation], resolution: str, samples: int, minutes: float
 ) -> list[Row]:
     """Return the rows of students."""
     kinds: dict[tuple[str, str, str], list[Evaluation]] = {}
-    for key, evaluation in zip(keys, found, strict=True):
+    for key, evaluation in zip(keys, evaluations, strict=True):
         kinds.setdefault(key.kind, []).append(evaluation)
     return [
         Row(
@@ -65,23 +65,23 @@ def rows_of(
             placement=placement,
             resolution=resolution,
             noise=noise,
-            seeds=len(evaluations),
-            score=fmean(each.score for each in evaluations),
-            low=interval(evaluations)[0],
-            high=interval(evaluations)[1],
-            held=fmean(each.held for each in evaluations),
-            episodes=sum(each.episodes for each in evaluations),
+            seeds=len(of_kind),
+            score=fmean(each.score for each in of_kind),
+            low=interval(of_kind)[0],
+            high=interval(of_kind)[1],
+            held=fmean(each.held for each in of_kind),
+            episodes=sum(each.episodes for each in of_kind),
             samples=samples,
             minutes=minutes,
         )
-        for (type_, placement, noise), evaluations in kinds.items()
+        for (type_, placement, noise), of_kind in kinds.items()
     ]
 
 
-def interval(found: Sequence[Evaluation]) -> tuple[float, float]:
+def interval(evaluations: Sequence[Evaluation]) -> tuple[float, float]:
     """Return the 95 % interval of the mean score over seeds and episodes."""
-    scores, num = [each.score for each in found], len(found)
-    halves = [0.5 * (each.score_interval[1] - each.score_interval[0]) for each in found]
+    scores, num = [each.score for each in evaluations], len(evaluations)
+    halves = [0.5 * (each.score_interval[1] - each.score_interval[0]) for each in evaluations]
     half = math.sqrt(sum(half_width**2 for half_width in halves)) / num
     if num > 1:
         with np.errstate(invalid="ignore"):  # of a score that is not finite there is no interval
@@ -114,7 +114,7 @@ def write_students(
     origin: Mapping[str, Any],
     seconds: float,
     command: str,
-    found: Sequence[Evaluation],
+    evaluations: Sequence[Evaluation],
     folder: Path,
     progress: Progress,
 ) -> None:
@@ -136,7 +136,7 @@ def write_students(
         run["overrides"] = dict(origin["overrides"]) | {name: spec[name] for name in ("touch", "placement", "noise")}
         card = distiller.card(run, seconds, command, sizes)
         card["samples"] = distiller.samples // len(distiller.keys)
-        card |= {"teacher": origin["teacher"], "score": found[i].plain() if found else None}
-        network = acting(distiller.student(i))
-        write_policy(deployed(network), touch, card, folder / f"{key.name}.pt")
-        write_onnx_policy(network, card_texts(touch, card), folder / f"{key.name}.onnx")
+        card |= {"teacher": origin["teacher"], "score": evaluations[i].plain() if evaluations else None}
+        network, texts = acting(distiller.student(i)), card_texts(touch, card)
+        write_policy(deployed(network), texts, folder / f"{key.name}.pt")
+        write_onnx_policy(network, texts, folder / f"{key.name}.onnx")

@@ -8,16 +8,14 @@ embeddings, and that images of all links share their weights.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field, StrictBool, StrictInt, model_validator
+from pydantic import StrictBool, model_validator
 
-from tgdsl.fields.models import NonNegative, Positive, Quantity, SpecModel
-from tgdsl.rl.train.spec import WIDTHS, EncoderSpec, Groups, TouchEncoderSpec, Widths
+from tgdsl.fields.models import NonNegative, Positive, SpecModel
+from tgdsl.rl.train.spec import WIDTHS, EncoderSpec, Groups, Time, TouchEncoderSpec, Whole, Widths
 
-Whole = Annotated[StrictInt, Field(ge=1)]
 Loss = Literal["mse", "inverse_variance", "huber"]
-Time = Annotated[float, Quantity("time", gt=0.0)]
 
 
 class DecoderSpec(SpecModel):

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
 from tgdsl.rl.students.encoders import Encoder, mlp, network
+from tgdsl.rl.train.model import Normalisation
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Architecture:
 
     @property
     def num_features(self) -> int:
+        """Number of features of all groups."""
         return sum(size for size, _ in self.groups)
 
 
@@ -68,25 +70,16 @@ class Student(nn.Module):
         self.decoders = nn.ModuleList([mlp(latent, hidden, 1) for hidden in architecture.heads])
 
     def forward(self, x: Tensor, memory: Tensor) -> StudentOutput:
-        latent, memory = self.embed(x, memory)
-        decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
-        return StudentOutput(self.trunk(latent), decoded, memory)
-
-    def act(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions and what is remembered, and nothing that is dropped at deployment."""
-        latent, memory = self.embed(x, memory)
-        return self.trunk(latent), memory
-
-    def embed(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the embeddings of all groups, side by side, and what is remembered."""
         architecture = self.architecture
         mean: Any = self.mean
         scale: Any = self.var.sqrt() + architecture.eps  # pyright: ignore[reportCallIssue]
         normal = ((x - mean) / scale).clamp(-architecture.clip, architecture.clip)
         parts = normal.split([size for size, _ in architecture.groups], dim=1)
-        held = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
-        embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, held, strict=True)]
-        return torch.cat([each for each, _ in embeddings], dim=1), torch.cat([each for _, each in embeddings], dim=1)
+        memories = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
+        embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, memories, strict=True)]
+        latent, memory = (torch.cat(each, dim=1) for each in zip(*embeddings, strict=True))
+        decoded = torch.cat([x[:, :0], *(decoder(latent) for decoder in self.decoders)], dim=1)
+        return StudentOutput(self.trunk(latent), decoded, memory)
 
 
 class Acting(nn.Module):
@@ -100,9 +93,8 @@ class Acting(nn.Module):
 
     def forward(self, x: Tensor, memory: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """Return actions, and what is remembered."""
-        if memory is None:
-            return self.student.act(x, x.new_zeros((x.shape[0], 0)))[0]
-        return self.student.act(x, memory)
+        output = self.student(x, x.new_zeros((x.shape[0], 0)) if memory is None else memory)
+        return output.action if memory is None else (output.action, output.memory)
 
     def get_dummy_inputs(self) -> tuple[Tensor, ...]:
         """Return an example of what it takes."""
@@ -167,9 +159,8 @@ class Stack:
         memory: How many numbers each remembers of an episode.
         parameters: Their weights by name, (student, …).
         buffers: Means and variances by which they normalise what they see, in the same way: copies of `moments`.
-        moments: Means and variances of what they have seen, (student, feature), in float64: after many rows a change is lost in
-            float32.
-        seen: How many rows each has seen.
+        seen: Moments of what they have seen, in float64, and the number of rows of each.
+        moments: Mean and variance of it, (student, feature): views.
     """
 
     def __init__(
@@ -188,8 +179,8 @@ class Stack:
         students = [seeded_student(architecture, seed).to(device, dtype) for seed in seeds]
         self.memory = students[0].memory
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
-        self.moments = {name: self.buffers[name].to(torch.float64, copy=True) for name in ("mean", "var")}
-        self.seen = torch.zeros((), dtype=torch.float64, device=device)
+        self.seen = Normalisation([self.size, architecture.num_features]).to(device)
+        self.moments = {"mean": self.seen._mean[0], "var": self.seen._var[0]}
         self._shape = copy.deepcopy(students[0]).to("meta")
         self.optimiser = torch.optim.Adam(list(self.parameters.values()), **self._options())
         self._called: Any = vmap(self._call)
@@ -222,14 +213,8 @@ class Stack:
     @torch.no_grad()
     def observe(self, x: Float[Tensor, "student row feature"]) -> None:
         """Take rows into account in each student's mean and variance, in place."""
-        num = x.shape[1]
-        rate = num / (self.seen + num)
         var, mean = torch.var_mean(x.double(), dim=1, correction=0)
-        own_mean, own_var = self.moments["mean"], self.moments["var"]
-        delta = mean - own_mean
-        own_mean += rate * delta
-        own_var += rate * (var - own_var + delta * (mean - own_mean))
-        self.seen += num
+        self.seen.merge(x.shape[1], mean, var)
         self._normalise()
 
     def student(self, index: int) -> Student:
@@ -242,7 +227,8 @@ class Stack:
     def state_dict(self) -> dict[str, Any]:
         """Return all that teaching goes on from: live tensors."""
         networks = {name: value.detach() for name, value in self.parameters.items()}
-        return {"networks": networks, "seen": self.moments | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
+        seen = self.moments | {"rows": self.seen.count}
+        return {"networks": networks, "seen": seen, "optimiser": self.optimiser.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from what was saved, with the learning rate that the stack has.
@@ -250,17 +236,17 @@ class Stack:
         Raises:
             RuntimeError: If it is of other networks.
         """
-        own = self.state_dict()
+        current = self.state_dict()
         for part in ("networks", "seen"):
-            if own[part].keys() != state[part].keys():
+            if current[part].keys() != state[part].keys():
                 raise RuntimeError(f"its {part} are {', '.join(state[part])}")
-            for name, value in own[part].items():
-                found = state[part][name]
-                if found.shape != value.shape:
-                    raise RuntimeError(f"{name} is {tuple(found.shape)}, not {tuple(value.shape)}")
+            for name, value in current[part].items():
+                shape = state[part][name].shape
+                if shape != value.shape:
+                    raise RuntimeError(f"{name} is {tuple(shape)}, not {tuple(value.shape)}")
         with torch.no_grad():
             for part in ("networks", "seen"):
-                for name, value in own[part].items():
+                for name, value in current[part].items():
                     value.copy_(state[part][name])
             self._normalise()
         optimiser = state["optimiser"]  # saved on another device perhaps, and at another rate; the options place its `step`
@@ -277,7 +263,8 @@ class Stack:
             self.buffers[name].copy_(value)
 
     def _options(self) -> dict[str, Any]:
-        return {"lr": self._rate, "capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
+        is_cuda = self.seen.count.is_cuda
+        return {"lr": self._rate, "capturable": is_cuda, "fused": True if is_cuda else None}
 
     def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
         return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))

@@ -49,7 +49,7 @@ from pydantic import Field
 from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
-from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, RangeOf
+from tgdsl.fields.models import Positive, PositiveLength, Range, RangeOf
 from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.draws import whole
 from tgdsl.rl.features import Features
@@ -58,15 +58,13 @@ from tgdsl.rl.task import HandNow, Now, Setup, Start, Task, reward_term
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.tensors.env_ids import may_be_nonempty
 
-Force = Annotated[float, Quantity("force", gt=0.0)]
-
 
 class GripForceSpec(TaskSpec):
     """Press on an object as hard as commanded, and hold it."""
 
     starts: Annotated[tuple[str, ...], Field(min_length=1)]
     """Keyframes in which the object is held with `start_force`: one for each of its variants, in their order."""
-    start_force: Force = 5.0
+    start_force: terms.Force = 5.0
     """F_0, sum of normal forces in these keyframes [N]."""
     force: Annotated[Range, RangeOf("force", gt=0.0)] = (1.0, 8.0)
     """F_low and F_max, least and largest sum of normal forces that is commanded [N]."""
@@ -82,7 +80,7 @@ class GripForceSpec(TaskSpec):
     """r: closer to where it started, the object costs nothing [m]."""
     drop_distance: PositiveLength = 0.04
     """d_max: further from where it started, the object is lost [m]."""
-    max_force: Force = 15.0
+    max_force: terms.Force = 15.0
     """F_crush: a larger sum of normal forces crushes the object [N]."""
 
 
@@ -221,10 +219,7 @@ class GripForce(Task[GripForceSpec]):
                 *(Features("normal force", 1, "N", "", link) for link in self.setup.links),
             ],
             "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": [
-                *features.object_props(self.setup.object),
-                *features.distances(*self.setup.rows["surface_distance"]),
-            ],
+            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
         }
 
     def score(self) -> Float[Tensor, " env"]:

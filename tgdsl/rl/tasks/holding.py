@@ -48,6 +48,7 @@ class Holding:
         self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(setup.device)
 
     def is_held(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object is held."""
         is_loaded = vector_norm(now.link_force, dim=2) >= self.spec.load
         return (is_loaded.sum(dim=1) >= self.spec.links) & (is_loaded & self._fingers).any(dim=1)
 

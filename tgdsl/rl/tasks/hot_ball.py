@@ -70,7 +70,7 @@ class HotBallSpec(TaskSpec):
     """T_h, temperature of the hot ball at the start, as the sensors' document has it [°C]."""
     margin: Annotated[float, Quantity("number", ge=0.0, le=1.0)] = 0.12
     """m: the latch fires where a link's progress is 1 − m [1]."""
-    min_force: Annotated[float, Quantity("force", gt=0.0)] = 0.05
+    min_force: terms.Force = 0.05
     """f_min: less force of the hot ball is no contact [N]."""
     near_width: PositiveLength = 0.2
     """λ, decay length of `approach` [m]."""
@@ -177,10 +177,7 @@ class HotBall(Task[HotBallSpec]):
                 Features("whether the hot ball is touched", 1),
             ],
             "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": [
-                *features.object_props(self.setup.object),
-                *features.distances(*self.setup.rows["surface_distance"]),
-            ],
+            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
         }
 
     def score(self) -> Float[Tensor, " env"]:

@@ -45,7 +45,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import model_validator
 from torch import Tensor
 
-from tgdsl.fields.models import Angle, PositiveLength, Quantity, Range, RangeOf, with_defaults
+from tgdsl.fields.models import Angle, PositiveLength, Range, RangeOf, with_defaults
 from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.draws import within
 from tgdsl.rl.features import Features
@@ -87,12 +87,8 @@ class InHandReposeSpec(PlacedTaskSpec, ProgressSpec):
     """σ, width of `track_gaussian` [rad]."""
     track_half: Angle = 0.1
     """φ_0, angle at which `track_inverse` is half of its most [rad]."""
-    near_width: PositiveLength = 0.02
-    """λ, decay length of `near` [m]."""
     drop_distance: PositiveLength = 0.08
     """Further from where it started, or below, the object is lost [m]."""
-    max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
-    """f_max: less force on a link costs nothing [N]."""
 
     @model_validator(mode="after")
     def _within_reach(self) -> InHandReposeSpec:
@@ -209,10 +205,7 @@ class InHandRepose(Task[InHandReposeSpec]):
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
             "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": [
-                *features.object_props(self.setup.object),
-                *features.distances(*self.setup.rows["surface_distance"]),
-            ],
+            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
         }
 
     def step_progress(self) -> Float[Tensor, " env"]:

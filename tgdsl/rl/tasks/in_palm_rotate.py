@@ -30,14 +30,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Angle, PositiveLength, Quantity
+from tgdsl.fields.models import Angle, PositiveLength
 from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.features import Features
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
@@ -70,24 +70,12 @@ class InPalmRotateSpec(PlacedTaskSpec, ProgressSpec):
     """θ_max: no goal is reached with a larger tilt [rad]."""
     spin_tilt: Angle | None = None
     """With a larger tilt `spin` is 0 [rad]; null: it never is."""
-    near_width: PositiveLength = 0.02
-    """λ, decay length of `near` [m]."""
     free_distance: PositiveLength = 0.02
     """r: closer to where it started, the object costs nothing [m]."""
     drop_distance: PositiveLength = 0.07
     """Further from where it started, or below, the object is lost [m]."""
-    max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
-    """f_max: less force on a link costs nothing [N]."""
     hold: HoldSpec = HoldSpec()
     """What progress pays while the object coasts; by default as much as while it is held."""
-    free_speed: Annotated[float, Quantity("speed", gt=0.0)] = 0.2
-    """v_free: a slower object costs nothing [m/s]."""
-    free_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
-    """ω_free: the same of its angular velocity, about whatever axis [rad/s]."""
-
-
-def _way(spec: InPalmRotateSpec) -> float:
-    return 1.0 if spec.direction == "counterclockwise" else -1.0
 
 
 class InPalmRotate(Task[InPalmRotateSpec]):
@@ -105,8 +93,8 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     @reward_term(2.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:
         """Angular velocity about n, the right way: c min(Δψ/Δt, ω_max), and Δψ/Δt where Δψ < 0."""
-        paid = self.spec.pay(self.rate) * torch.where(self.rate > 0, self.pay, 1.0)
-        return paid if self.spec.spin_tilt is None else paid * (self.tilt <= self.spec.spin_tilt)
+        rate = self.spec.pay(self.rate) * torch.where(self.rate > 0, self.pay, 1.0)
+        return rate if self.spec.spin_tilt is None else rate * (self.tilt <= self.spec.spin_tilt)
 
     near = terms.Near.of_task(0.1, width="near_width")
 
@@ -136,7 +124,8 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
         super().__init__(spec, setup)
         self.item = setup.free_qpos()
-        self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
+        up = 1.0 if spec.direction == "counterclockwise" else -1.0
+        self.axis = torch.tensor([0.0, 0.0, up], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.holding = Holding(spec.hold, setup)
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
         self.quat = self.keep("quat", 4)
@@ -196,10 +185,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         return {
             "goal": features.goal(self.spec.goal, self.setup.object),
             "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": [
-                *features.object_props(self.setup.object),
-                *features.distances(*self.setup.rows["surface_distance"]),
-            ],
+            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
         }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:

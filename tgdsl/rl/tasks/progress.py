@@ -11,19 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.fields.models import Quantity, SpecModel
-
-Spin = Annotated[float, Quantity("number", gt=0.0)]
+from tgdsl.fields.models import Positive, Quantity, SpecModel
 
 
 class ProgressSpec(SpecModel):
     """Bounds of the rate that pays: part of a task's document."""
 
-    max_spin: Spin = 4.0
+    max_spin: Positive = 4.0
     """ω_max: what is faster pays no more [rad/s]."""
     min_spin: Annotated[float, Quantity("number", le=0.0)] | None = None
     """ω_min, at most 0: what goes back faster costs no more [rad/s]; null: it always does."""
-    backward: Spin = 1.0
+    backward: Positive = 1.0
     """κ, factor on what goes back."""
 
     def pay(self, rate: Float[Tensor, " env"]) -> Float[Tensor, " env"]:

@@ -35,7 +35,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated
 
 import mujoco
 import torch
@@ -43,7 +42,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel, with_defaults
+from tgdsl.fields.models import Angle, Positive, PositiveLength, SpecModel, with_defaults
 from tgdsl.rl import features, groups, rotations, terms
 from tgdsl.rl.features import Features
 from tgdsl.rl.grasps.grasps import GraspSpec
@@ -51,7 +50,7 @@ from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
 from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.tasks.progress import ProgressSpec, Spin
+from tgdsl.rl.tasks.progress import ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
 
@@ -100,20 +99,16 @@ class ScrewdriverSpec(TaskSpec, ProgressSpec):
     distill: Distill = Distill()
     """How students are taught by a policy that is there: `tgdsl distill`."""
 
-    episode: Annotated[float, Quantity("time", gt=0.0)] = 20.0
+    episode: Time = 20.0
     """Duration of an episode [s]."""
     grasps: GraspSpec = GraspSpec()
     """How the grasps are sampled that episodes begin from."""
     tip: str = "tip"
     """The scene's site at the tip."""
-    max_spin: Spin = 6.0
+    max_spin: Positive = 6.0
     """ω_max: what is faster pays no more [rad/s]."""
-    max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
-    """f_max: less force on a link costs nothing [N]."""
     hold: HoldSpec = HoldSpec()
     """What progress pays while the object coasts; by default as much as while it is held."""
-    near_width: PositiveLength = 0.02
-    """λ, decay length of `near` [m]."""
     free_distance: PositiveLength = 0.02
     """r: closer to where it stands upright, the handle costs nothing [m]."""
     drop_tilt: Angle = 0.8

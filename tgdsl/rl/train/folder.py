@@ -170,9 +170,9 @@ class RunFolder:
                 writer.writeheader()
             writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
 
-    def _no_curve(self, line: int, found: list[str], expected: str) -> TgdslError:
-        first, hint = ",".join(found[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
-        return TgdslError(f"{self.curve}:{line}: found {len(found)} values, {first!r}, expected {expected}; {hint}")
+    def _no_curve(self, line: int, values: list[str], expected: str) -> TgdslError:
+        first, hint = ",".join(values[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
+        return TgdslError(f"{self.curve}:{line}: found {len(values)} values, {first!r}, expected {expected}; {hint}")
 
     def _starts(self) -> list[dict[str, Any]]:
         try:

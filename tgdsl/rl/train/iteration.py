@@ -1,4 +1,4 @@
-"""One iteration of learning: its episodes, summed on the device and read once, and its durations.
+"""One iteration of learning: its episodes, add_up on the device and read once, and its durations.
 
 Shapes: `env` environments.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tgdsl.rl.env import Step, TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
-from tgdsl.rl.train.ranks import Ranks, summed
+from tgdsl.rl.train.ranks import Ranks, add_up
 
 EPISODE_NAMES = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
 """Numbers of a finished episode, before its terms: return, steps, score, whether it ended for good, and by a fault."""
@@ -48,7 +48,7 @@ class EpisodeTally:
         """Return the sums over all processes, the number of episodes first, and restart; the host does not wait."""
         assert self._sums is not None
         sums = self._sums.clone()
-        summed(sums)
+        add_up(sums)
         self._sums.zero_()
         return sums
 
@@ -89,7 +89,7 @@ class Learning(Actor):
     def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
         """Take the environments of this process; `steps` control steps are a rollout."""
         self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
-        self._num_steps, self._desynchronise, self._is_begun = steps, desynchronise, False
+        self._num_steps, self._desynchronise, self._has_begun = steps, desynchronise, False
         self._tally = EpisodeTally()
 
     @property
@@ -101,16 +101,16 @@ class Learning(Actor):
         """Make a rollout, and learn from it; `share` is how much of the run is over, 0 to 1."""
         self.set_rate(share)
         self.roll()
-        begun, middle = self._roll_start, self._mark()
+        start, middle = self._roll_start, self._mark()
         self.learn()
         sums, numbers = self._tally.pop(), self._numbers()
         values = torch.cat([sums, torch.stack(list(numbers.values())).double().to(sums.device)]).tolist()  # here the host waits
         end = self._mark()
         if self.env.device.type == "cuda":
             end.synchronize()
-            durations = 1e-3 * begun.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
+            durations = 1e-3 * start.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
         else:
-            durations = middle - begun, end - middle
+            durations = middle - start, end - middle
         pairs = zip(numbers, values[len(sums) :], strict=True)
         metrics = {name: value for name, value in pairs if not (name.startswith("Score/") and math.isnan(value))}
         return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | metrics, *durations)
@@ -120,7 +120,7 @@ class Learning(Actor):
 
     def roll(self) -> None:
         """Make a rollout."""
-        if not self._is_begun:
+        if not self._has_begun:
             self.go_on(torch.randint_like(self.env.steps, self.env.max_steps) if self._desynchronise else None)
         self._start_rollout()
         self._roll_start = self._mark()
@@ -129,6 +129,7 @@ class Learning(Actor):
             self._tally.add(moment.step)
 
     def learn(self) -> None:
+        """Learn from the rollout."""
         self._update()
         self.iteration += 1
         self.samples += self._num_steps * self.env.num_envs * self.ranks.size
@@ -142,7 +143,7 @@ class Learning(Actor):
 
     def go_on_here(self) -> None:
         """Go on from where the environments are, with an empty memory of their episodes."""
-        self._is_begun = True
+        self._has_begun = True
         self.begin(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
 
     def card(

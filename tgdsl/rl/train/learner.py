@@ -93,8 +93,9 @@ class Learner(Learning):
             FileError: If it cannot be written.
         """
         policy: Any = self.algorithm.get_policy()
-        write_policy(policy.as_jit(), self.env.touch, card, file)
-        write_onnx_policy(policy.as_onnx(verbose=False), card_texts(self.env.touch, card), file.with_suffix(".onnx"))
+        texts = card_texts(self.env.touch, card)
+        write_policy(policy.as_jit(), texts, file)
+        write_onnx_policy(policy.as_onnx(verbose=False), texts, file.with_suffix(".onnx"))
 
     def change_rates(self, before: Mapping[str, Any]) -> None:
         """Take over the document's learning rates, once a state was loaded; one that adapts only if the document had another.

@@ -21,7 +21,7 @@ from rsl_rl.modules import MLP, EmpiricalDiscountedVariationNormalization, Empir
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from tgdsl.rl.train.ranks import num_processes, summed
+from tgdsl.rl.train.ranks import add_up, num_processes
 
 UNTIL = 10**8
 """As rsl_rl has it: after so many states, and rewards, their normalisation does not change any more."""
@@ -53,15 +53,15 @@ class Normalisation(EmpiricalNormalization):
         with torch.no_grad():
             num = x.shape[0] * num_processes()
             mean = x.sum(dim=0, keepdim=True, dtype=torch.float64)
-            summed(mean)
+            add_up(mean)
             mean /= num
             var = (x - mean.to(x.dtype)).square().sum(dim=0, keepdim=True, dtype=torch.float64)
-            summed(var)
+            add_up(var)
             var /= num
-            self._take(num, mean.view_as(self._mean), var.view_as(self._var))
+            self.merge(num, mean, var)
 
-    def _take(self, num: int, mean: Tensor, var: Tensor) -> None:
-        """Take a batch's mean and variance into account, in place."""
+    def merge(self, num: int, mean: Float[Tensor, "*feature"], var: Float[Tensor, "*feature"]) -> None:
+        """Take the mean and variance of so many rows into account, in place."""
         is_open = torch.ones_like(self.count, dtype=torch.bool) if self.until is None else self.count < self.until
         rate = is_open * (num / (self.count + num).to(mean.dtype))
         delta = mean - self._mean
@@ -179,6 +179,7 @@ class Exported(nn.Module):
         return self.output(self.model.mlp(self.model.embed(x)))
 
     def get_dummy_inputs(self) -> tuple[Tensor]:
+        """Return an example of what it takes."""
         first = next(self.parameters())
         return (torch.zeros((2, self.model.obs_dim), dtype=first.dtype, device=first.device),)
 

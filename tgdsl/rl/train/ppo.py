@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from tgdsl.errors import TgdslError
 from tgdsl.rl.train.graphs import Captured
 from tgdsl.rl.train.model import Distillation, Gaussian
-from tgdsl.rl.train.ranks import num_processes, summed
+from tgdsl.rl.train.ranks import add_up, num_processes
 from tgdsl.tensors.torch_internals import copy_each
 
 LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
@@ -126,10 +126,10 @@ class CapturedPPO(PPO):
             advantages = self.storage.advantages
             num = advantages.numel() * num_processes()
             mean = advantages.sum()
-            summed(mean)
+            add_up(mean)
             advantages -= mean / num
             squares = advantages.square().sum()
-            summed(squares)
+            add_up(squares)
             advantages /= (squares / (num - 1)).sqrt() + 1e-8
 
     def update(self) -> dict[str, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -142,7 +142,7 @@ class CapturedPPO(PPO):
                 continue
             for part in self._parts:
                 part()
-                summed(self._flat)
+                add_up(self._flat)
                 self._flat /= self.gpu_world_size
                 self._applied()
         self.losses /= self.num_learning_epochs * self.num_mini_batches
@@ -265,12 +265,12 @@ class CapturedPPO(PPO):
             self._kl.copy_(distribution.kl_divergence(old_params, params).mean())
             self.losses += torch.stack([value, surrogate, entropy, error]).detach()
 
-    def _value_loss(self, found: Tensor, before: Tensor, wanted: Tensor) -> Tensor:
-        squares = (found - wanted).square()
+    def _value_loss(self, value: Tensor, old_value: Tensor, returns: Tensor) -> Tensor:
+        squares = (value - returns).square()
         if not self.use_clipped_value_loss:
             return squares.mean()
-        near = before + (found - before).clamp(-self.clip_param, self.clip_param)
-        return torch.max(squares, (near - wanted).square()).mean()
+        clipped = old_value + (value - old_value).clamp(-self.clip_param, self.clip_param)
+        return torch.max(squares, (clipped - returns).square()).mean()
 
     def _take_step(self) -> None:
         """Adapt the learning rate, and make a step of the optimisers."""

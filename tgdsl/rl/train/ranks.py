@@ -71,10 +71,12 @@ class Ranks:
         distributed.init_process_group("nccl" if is_gpu else "gloo", rank=self.rank, world_size=self.size)
 
     def leave(self) -> None:
+        """Leave the other processes, if this one has met them."""
         if self.size > 1 and distributed.is_initialized():
             distributed.destroy_process_group()
 
     def agreed(self, choices: tuple[bool, ...], device: torch.device | str) -> tuple[bool, ...]:
+        """Return the first process's choices."""
         if self.size == 1:
             return choices
         numbers = torch.tensor(choices, dtype=torch.int32, device=device)
@@ -90,11 +92,10 @@ class Ranks:
         return every
 
 
-def summed(*tensors: Tensor) -> None:
-    """Replace each tensor by its sum over all processes, if there are several; the host does not wait."""
-    if distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1:
-        for tensor in tensors:
-            distributed.all_reduce(tensor)
+def add_up(tensor: Tensor) -> None:
+    """Replace a tensor by its sum over all processes, if there are several; the host does not wait."""
+    if num_processes() > 1:
+        distributed.all_reduce(tensor)
 
 
 def num_processes() -> int:

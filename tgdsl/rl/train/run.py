@@ -23,7 +23,7 @@ from tgdsl.rl.train.checkpoint import not_finite, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder
 from tgdsl.rl.train.iteration import Iteration, Learning
 
-SAID_EVERY = 10.0
+LINE_INTERVAL = 10.0
 """Time between lines where there is no terminal for a progress bar [s]."""
 
 
@@ -31,7 +31,7 @@ class ProgressBar:
     """A progress bar of a run; where there is no terminal, a line now and then."""
 
     def __init__(self, iterations: int | None, done: int, unit: str):
-        self._unit, self._total, self._said = unit, iterations, -SAID_EVERY
+        self._unit, self._total, self._last_line = unit, iterations, -LINE_INTERVAL
         form = "{desc} {n_fmt}/{total_fmt} |{bar}| {postfix}" if iterations else "{desc} {n_fmt} {postfix}"
         self._bar = tqdm(total=iterations, initial=done, desc="learning", disable=None, leave=False, bar_format=form)
         self._seen: dict[str, float] = {}
@@ -48,11 +48,12 @@ class ProgressBar:
         if not self._bar.disable:
             self._bar.set_postfix_str(text, refresh=False)
             self._bar.update()
-        elif row["seconds"] - self._said >= SAID_EVERY:
-            self._said = row["seconds"]
+        elif row["seconds"] - self._last_line >= LINE_INTERVAL:
+            self._last_line = row["seconds"]
             print(f"{row['iteration']:.0f}{f'/{self._total}' if self._total else ''}: {text}", flush=True)
 
     def close(self) -> None:
+        """Clear the bar."""
         self._bar.close()
         sys.stdout.flush()
 
@@ -71,6 +72,7 @@ class Board:
 
     @property
     def is_there(self) -> bool:
+        """Whether TensorBoard is installed."""
         return self._writer is not None
 
     def add(self, metrics: Mapping[str, float], iteration: int) -> None:
@@ -90,7 +92,7 @@ class DivergedError(TgdslError):
     """A policy whose losses, or whose state, are no numbers any more."""
 
 
-Shown = Callable[[Mapping[str, float | int], float], None]
+Show = Callable[[Mapping[str, float | int], float], None]
 """Called with an iteration, as `curve.csv` has it, and the time that is left [s]."""
 
 
@@ -141,10 +143,12 @@ class Run:
 
     @property
     def iteration(self) -> int:
+        """Number of iterations so far."""
         return self._learner.iteration
 
     @property
     def has_board(self) -> bool:
+        """Whether this process writes for TensorBoard."""
         return self._board is not None and self._board.is_there
 
     def save(self) -> None:
@@ -165,7 +169,19 @@ class Run:
             write_checkpoint(state, self._folder.checkpoint)
         self._saved = learner.iteration
 
-    def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
+    def learn_with_bar(self, iterations: int | None, minutes: float | None, default: int) -> None:
+        """Learn up to `iterations`, else the document's `default`, or for so many minutes, with a progress bar: see `learn`."""
+        total, limit = iterations or default, math.inf if minutes is None else 60.0 * minutes
+        shown_total = total if minutes is None or iterations else None  # else time ends the run
+        unit = self._learner.env.task.score_unit
+        bar = ProgressBar(shown_total, self._learner.iteration, unit) if self._writes else None
+        try:
+            self.learn(total, limit, bar.show if bar else None)
+        finally:
+            if bar is not None:
+                bar.close()
+
+    def learn(self, iterations: int, seconds: float, show: Show | None = None) -> None:
         """Learn. Ctrl-C and SIGTERM end it after the iteration under way, with a checkpoint.
 
         Iterations get the share of the run that is over: of iterations, or if that is more, of time, what was learned before
@@ -177,7 +193,7 @@ class Run:
         """
         try:
             with StopRequest() as request:
-                self._iterate(iterations, seconds, shown, request)
+                self._iterate(iterations, seconds, show, request)
             self.stopped_by = request.signal
         except FileError as error:
             checkpoint = f"{self._folder.checkpoint} is whole, of iteration {self._saved}"
@@ -188,7 +204,7 @@ class Run:
             if self._board is not None:
                 self._board.close()
 
-    def _iterate(self, iterations: int, seconds: float, shown: Shown | None, request: StopRequest) -> None:
+    def _iterate(self, iterations: int, seconds: float, show: Show | None, request: StopRequest) -> None:
         """Make iterations until enough were made, time is over or someone asks to stop."""
         learner, seconds_before = self._learner, self.seconds
         begun = saved = time.monotonic()
@@ -200,7 +216,7 @@ class Run:
             now = time.monotonic()
             self.seconds = seconds_before + now - begun
             self._refuse_diverged(iteration)
-            self._tell(iteration, now - start, iterations, seconds - (now - begun), shown)
+            self._tell(iteration, now - start, iterations, seconds - (now - begun), show)
             is_over = learner.iteration >= iterations or now - begun >= seconds or request.signal is not None
             is_due = is_over or now - saved + (now - start) > self._every
             is_over, is_due = learner.ranks.agreed((is_over, is_due), learner.env.device)
@@ -208,31 +224,35 @@ class Run:
                 self.save()
                 saved = now  # until it is written, what was there before counts
 
-    def _tell(self, made: Iteration, duration: float, iterations: int, time_left: float, shown: Shown | None) -> None:
+    def _tell(self, iteration: Iteration, duration: float, iterations: int, time_left: float, show: Show | None) -> None:
         """Write an iteration into curve and TensorBoard, and show it."""
         if not self._writes:
             return
         learner = self._learner
         samples, self._samples = learner.samples - self._samples, learner.samples
         self._rate = duration if not self._rate else 0.9 * self._rate + 0.1 * duration
-        perf = {"Perf/total_fps": samples / duration, "Perf/collection_time": made.rollout, "Perf/learning_time": made.update}
+        perf = {
+            "Perf/total_fps": samples / duration,
+            "Perf/collection_time": iteration.rollout,
+            "Perf/learning_time": iteration.update,
+        }
         row: dict[str, float | int] = {
             "iteration": learner.iteration,
             "samples": learner.samples,
             "seconds": self.seconds,
             "steps_per_second": samples / self._rate,
-            "rollout": made.rollout,
-            "update": made.update,
-            "episodes": made.episodes,
+            "rollout": iteration.rollout,
+            "update": iteration.update,
+            "episodes": iteration.episodes,
         }
-        self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **made.metrics})
+        self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **iteration.metrics})
         if self._board is not None:
-            self._board.add(made.metrics | perf, learner.iteration)
-        if shown is not None:
-            shown(row | made.metrics, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
+            self._board.add(iteration.metrics | perf, learner.iteration)
+        if show is not None:
+            show(row | iteration.metrics, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
 
-    def _refuse_diverged(self, made: Iteration) -> None:
-        losses = {name: value for name, value in made.metrics.items() if name.startswith("Loss/")}
+    def _refuse_diverged(self, iteration: Iteration) -> None:
+        losses = {name: value for name, value in iteration.metrics.items() if name.startswith("Loss/")}
         problem = ", ".join(f"{name} is {value}" for name, value in losses.items() if not math.isfinite(value))
         if problem:
             raise DivergedError(
