@@ -49,30 +49,20 @@ from tgdsl.sensors.known import quantities_of
 
 @dataclass(frozen=True)
 class Observed:
-    """What a document observes.
+    """What a document observes."""
 
-    Attributes:
-        terms: The observation terms, in the document's order.
-        proprioception: Readings of joints and actuators that some of them want.
-    """
-
-    terms: tuple[PlannedObservation, ...]
-    proprioception: tuple[PlannedReading, ...]
+    terms: tuple[PlannedObservation, ...]  # the observation terms, in the document's order
+    proprioception: tuple[PlannedReading, ...]  # readings of joints and actuators that some of them want
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """The joints and actuators that a document reads.
+    """The joints and actuators that a document reads."""
 
-    Attributes:
-        rows: Those of each observation term of joints, by group and number, in its order.
-        joints: Names of all joints that are read, by observations and sensors, in the robot's order.
-        actuators: Names of all actuators that are read.
-    """
-
+    # those of each observation term of joints, by group and number, in its order
     rows: Mapping[tuple[str, int], tuple[str, ...]]
-    joints: tuple[str, ...]
-    actuators: tuple[str, ...]
+    joints: tuple[str, ...]  # names of all joints that are read, by observations and sensors, in the robot's order
+    actuators: tuple[str, ...]  # names of all actuators that are read
 
 
 def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
@@ -207,8 +197,7 @@ def _of_joints(
     return PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants)
 
 
-SHOWN = 8
-"""Links and reasons that the warning names; the account of the module names all."""
+SHOWN = 8  # links and reasons that the warning names; the account of the module names all
 
 
 def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> tuple[Unfelt, ...]:
@@ -253,8 +242,7 @@ def warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
         warnings.warn(f"{file}: {problem}", UnfeltWarning, stacklevel=3)
 
 
-Parts = Mapping[str, Any]
-"""The part of the Plan of each quantity, by its name."""
+Parts = Mapping[str, Any]  # the part of the Plan of each quantity, by its name
 FIELDS = (
     *("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found"),
     *("contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce", "variant", "object_size"),
@@ -401,11 +389,7 @@ def _quantities(
 
 
 def _check_parts(parts: Parts, asked: Sequence[Quantity]) -> None:
-    """Refuse what is no part of its quantity, or reads fields that a state does not have.
-
-    Raises:
-        TgdslError: With the quantity.
-    """
+    """Refuse what is no part of its quantity, or reads fields that a state does not have."""
     for quantity in asked:
         part = parts[quantity.name]
         if not isinstance(part, quantity.part):

@@ -129,29 +129,17 @@ def _without_idle(name: str, kind: Kind, knobs: Knobs) -> Knobs:
 
 @dataclass(frozen=True, eq=False)
 class LoweredSensor:
-    """One way to read a sensor, lowered.
+    """One way to read a sensor, lowered."""
 
-    Attributes:
-        name: Its name, see `plan.PlannedSensor`.
-        kind: Its kind.
-        spec: The sensor's spec.
-        taxels: Its taxels, rows of the layout.
-        layout: They, or its links if it is on links.
-        lowered: What its kind says of it.
-        readings: Names of its readings, reports left out.
-        noise: Its imperfections.
-        upstream: Names of the sensors whose planes it reads, in order.
-    """
-
-    name: str
-    kind: Kind
-    spec: AnySensorSpec
-    taxels: np.ndarray
-    layout: Layout
-    lowered: Lowered
-    readings: tuple[str, ...]
-    noise: LoweredNoise | None
-    upstream: tuple[str, ...] = ()
+    name: str  # its name, see `plan.PlannedSensor`
+    kind: Kind  # its kind
+    spec: AnySensorSpec  # the sensor's spec
+    taxels: np.ndarray  # its taxels, rows of the layout
+    layout: Layout  # they, or its links if it is on links
+    lowered: Lowered  # what its kind says of it
+    readings: tuple[str, ...]  # names of its readings, reports left out
+    noise: LoweredNoise | None  # its imperfections
+    upstream: tuple[str, ...] = ()  # names of the sensors whose planes it reads, in order
 
     @property
     def sensor(self) -> str:
@@ -259,11 +247,7 @@ def fitted(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) ->
 
 
 def _fitted(sensor: LoweredSensor, fitting: Fitting) -> LoweredSensor:
-    """Return a sensor, fitted to those that it reads.
-
-    Raises:
-        TgdslError: If it is not advanced as often as they are.
-    """
+    """Return a sensor, fitted to those that it reads."""
     lowered = sensor.lowered
     if sensor.kind.fit is not None:
         lowered = sensor.kind.fit(sensor.spec, lowered, fitting)
@@ -303,11 +287,7 @@ def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[Lowere
 
 
 def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: AnySensorSpec, resolved: Resolved) -> None:
-    """Refuse requests of objects that are not there, and rows that are not where they say.
-
-    Raises:
-        TgdslError: With the kind and what is wrong.
-    """
+    """Refuse requests of objects that are not there, and rows that are not where they say."""
     for request in lowered.requests:
         if request.wants_contacts and not request.objects:
             raise TgdslError(f'kind "{kind.name}": {type(request).__name__} is asked of no objects, expected at least one')

@@ -21,24 +21,16 @@ from tgdsl.quantities.pairs import Pair, PairedObject, PairTable
 from tgdsl.surfaces.sensed import SensedObject
 
 Sensors = Sequence[LoweredSensor]
-Joined = Mapping[str, tuple[LoweredSensor, ...]]
-"""The sensors that are computed as one, by the name of each of them."""
+Joined = Mapping[str, tuple[LoweredSensor, ...]]  # the sensors that are computed as one, by the name of each of them
 
 
 class Pruned(NamedTuple):
-    """Which pairs there are.
+    """Which pairs there are."""
 
-    Attributes:
-        pairs: The (link body, object) pairs that are needed, sorted by object and link.
-        contact_pairs: Those of them whose contacts are needed.
-        dropped: Those that can never be in contact.
-        hopeless: Sensors that can never feel an object of theirs, and the object.
-    """
-
-    pairs: tuple[Pair, ...]
-    contact_pairs: tuple[Pair, ...]
-    dropped: tuple[Pair, ...]
-    hopeless: tuple[tuple[str, str], ...]
+    pairs: tuple[Pair, ...]  # the (link body, object) pairs that are needed, sorted by object and link
+    contact_pairs: tuple[Pair, ...]  # those of them whose contacts are needed
+    dropped: tuple[Pair, ...]  # those that can never be in contact
+    hopeless: tuple[tuple[str, str], ...]  # sensors that can never feel an object of theirs, and the object
 
 
 def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], link_bodies: LinkBodies, scene: Model) -> Pruned:
@@ -108,15 +100,10 @@ def _equation(sensor: LoweredSensor) -> Hashable | None:
 
 
 class Shared(NamedTuple):
-    """What is asked for.
+    """What is asked for."""
 
-    Attributes:
-        uses: By quantity the distinct requests, in the order in which sensors make them.
-        of_sensor: By sensor the number of its use of each quantity.
-    """
-
-    uses: dict[str, list[Use]]
-    of_sensor: dict[str, dict[str, int]]
+    uses: dict[str, list[Use]]  # by quantity the distinct requests, in the order in which sensors make them
+    of_sensor: dict[str, dict[str, int]]  # by sensor the number of its use of each quantity
 
 
 def share(sensors: Sensors, joined: Joined, layout: Layout, quantities: Sequence[Quantity]) -> Shared:

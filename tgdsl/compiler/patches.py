@@ -26,8 +26,7 @@ from tgdsl.schema.yaml import Path
 from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
 
-Pools = dict[Hashable, dict[Hashable, Pool | None]]
-"""Points that were drawn on links, by the geoms that are sampled and by how."""
+Pools = dict[Hashable, dict[Hashable, Pool | None]]  # points that were drawn on links, by the geoms that are sampled and by how
 
 
 @dataclass(frozen=True)
@@ -177,11 +176,7 @@ def sampled(
 
 
 def _surface(robot: Model, patch: Patch) -> Surface:
-    """Return the triangles that a link's taxels are sampled on.
-
-    Raises:
-        SampleError: If they shall be on colliding geoms, and one of the link's does not collide.
-    """
+    """Return the triangles that a link's taxels are sampled on."""
     if patch.as_collided and not all(geom.is_colliding for geom in patch.geoms):
         apart = next(geom for geom in patch.geoms if not geom.is_colliding)
         raise SampleError(f"the simulator does not collide {apart.shown}", "expected `surface: mesh`")

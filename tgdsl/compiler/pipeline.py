@@ -37,14 +37,11 @@ Document = str | PathLike[str] | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen.
+    """What was chosen."""
 
-    Attributes:
-        changes: Fields that nobody wrote, by dotted path: `objects.mug.tolerance`.
-        notes: What an account of each sensor that has an `accuracy` says of it, line by line.
-    """
-
+    # fields that nobody wrote, by dotted path: `objects.mug.tolerance`
     changes: Mapping[str, Any] = field(default_factory=dict)
+    # what an account of each sensor that has an `accuracy` says of it, line by line
     notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def noted(self, plan: Plan) -> Plan:
@@ -55,8 +52,7 @@ class Choice:
         return dataclasses.replace(plan, sensors=tuple(sensors))
 
 
-UNCHOSEN = Choice()
-"""Of documents without an `accuracy`."""
+UNCHOSEN = Choice()  # of documents without an `accuracy`
 
 
 class Compiled(NamedTuple):
@@ -104,11 +100,7 @@ def compile_document(
 
 
 def _check_chosen(loaded: Loaded, choice: Choice, scene: Model | None) -> None:
-    """Refuse a document some `accuracy` of which nobody has looked at.
-
-    Raises:
-        TgdslError: With the sensors.
-    """
+    """Refuse a document some `accuracy` of which nobody has looked at."""
     names = [name for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None and name not in choice.notes]
     if names:
         problem = f"{listed(names)}: `accuracy` takes a run of the scene"
@@ -125,16 +117,11 @@ def _written(
 
 
 class Placed(NamedTuple):
-    """Where a document puts taxels.
+    """Where a document puts taxels."""
 
-    Attributes:
-        model: The model of the scene, or of the robot if there is no scene.
-        layouts: The layouts, by resolution.
-        unfelt: The taxels of each that are not collided, buried, or covered in the robot's initial state.
-    """
-
-    model: mujoco.MjModel
-    layouts: dict[str, Layout]
+    model: mujoco.MjModel  # the model of the scene, or of the robot if there is no scene
+    layouts: dict[str, Layout]  # the layouts, by resolution
+    # the taxels of each that are not collided, buried, or covered in the robot's initial state
     unfelt: dict[str, tuple[Unfelt, ...]]
 
 

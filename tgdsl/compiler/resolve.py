@@ -115,17 +115,11 @@ def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, S
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """What a document's files hold, at whatever resolution.
+    """What a document's files hold, at whatever resolution."""
 
-    Attributes:
-        robot: The robot; None if a mistake of the document says why there is none.
-        scene: The model that holds robot and objects, or None.
-        pools: Points that were drawn on links, to choose taxels from.
-    """
-
-    robot: Model | None
-    scene: Model | None
-    pools: Pools = field(default_factory=dict)
+    robot: Model | None  # the robot; None if a mistake of the document says why there is none
+    scene: Model | None  # the model that holds robot and objects, or None
+    pools: Pools = field(default_factory=dict)  # points that were drawn on links, to choose taxels from
 
     @cached_property
     def colliders(self) -> Colliders:
@@ -136,43 +130,24 @@ class Models:
 
 @dataclass(frozen=True, eq=False)
 class Resolved:
-    """A spec's meaning on one robot.
+    """A spec's meaning on one robot."""
 
-    Attributes:
-        layout: Taxels of the links that some sensor has; of all links if the document has no sensors.
-        links: Names of each sensor's links.
-        objects: The geoms of each object that count.
-        own: The objects with geoms or sizes of their own.
-        scene: The model that holds robot and objects.
-        robot: The robot's own model.
-        unused: Links and objects that are not needed, and why.
-        patches: The links that carry taxels.
-        colliders: What the simulator collides of the robot.
-        reach: What that leaves of each taxel.
-        on_links: The sensors that have a place on each link, whatever its taxels.
-        link_bodies: The bodies of each link that carries taxels or is a sensor's.
-        joints: The robot's joints and actuators.
-        on_joints: Names of the joints of each sensor that is on joints.
-        primitives: Collision shapes of links, instead of their own geoms.
-        layouts: Taxels of all links at other resolutions that were asked for.
-    """
-
-    layout: Layout
-    links: dict[str, tuple[str, ...]]
-    objects: dict[str, SensedObject]
-    own: OwnObjects
-    scene: Model
-    robot: Model
-    unused: tuple[tuple[str, str], ...]
-    patches: Mapping[str, Patch]
-    colliders: Colliders
-    reach: Reach
-    on_links: frozenset[str]
-    link_bodies: LinkBodies
-    joints: RobotJoints
-    on_joints: Mapping[str, tuple[str, ...]]
-    primitives: tuple[Collider, ...] = ()
-    layouts: dict[str, Layout] = field(default_factory=dict)
+    layout: Layout  # taxels of the links that some sensor has; of all links if the document has no sensors
+    links: dict[str, tuple[str, ...]]  # names of each sensor's links
+    objects: dict[str, SensedObject]  # the geoms of each object that count
+    own: OwnObjects  # the objects with geoms or sizes of their own
+    scene: Model  # the model that holds robot and objects
+    robot: Model  # the robot's own model
+    unused: tuple[tuple[str, str], ...]  # links and objects that are not needed, and why
+    patches: Mapping[str, Patch]  # the links that carry taxels
+    colliders: Colliders  # what the simulator collides of the robot
+    reach: Reach  # what that leaves of each taxel
+    on_links: frozenset[str]  # the sensors that have a place on each link, whatever its taxels
+    link_bodies: LinkBodies  # the bodies of each link that carries taxels or is a sensor's
+    joints: RobotJoints  # the robot's joints and actuators
+    on_joints: Mapping[str, tuple[str, ...]]  # names of the joints of each sensor that is on joints
+    primitives: tuple[Collider, ...] = ()  # collision shapes of links, instead of their own geoms
+    layouts: dict[str, Layout] = field(default_factory=dict)  # taxels of all links at other resolutions that were asked for
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame.

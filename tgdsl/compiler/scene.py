@@ -22,16 +22,13 @@ from tgdsl.scene.scene import compiled, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 """What a contact sensor hands out of each contact, in MuJoCo's order."""
-SENSED = ("found", "force", "torque", "dist", "pos", "normal", "tangent")
-"""The same and the distance, in MuJoCo's order."""
+SENSED = ("found", "force", "torque", "dist", "pos", "normal", "tangent")  # the same and the distance, in MuJoCo's order
 MIXED_NUM = 64
 """Contacts that a sensor shows where geoms have gaps and different margins: the nearest need not be those that carry force."""
 OBJECT_TYPES = {"body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ_XBODY, "geom": mujoco.mjtObj.mjOBJ_GEOM}
 """MuJoCo's types of what a part of an object or link is."""
-REDUCTIONS = ("none", "mindist", "maxforce", "netforce")
-"""MuJoCo's ways to reduce contacts, in the order of its numbers."""
-ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
-"""Elements of an MJCF file's `<asset>` that name a file."""
+REDUCTIONS = ("none", "mindist", "maxforce", "netforce")  # muJoCo's ways to reduce contacts, in the order of its numbers
+ASSET_TAGS = ("mesh", "texture", "hfield", "skin")  # elements of an MJCF file's `<asset>` that name a file
 FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
 """How they name it: the sides of a cube's texture have one each."""
 
@@ -82,13 +79,7 @@ class ContactSensor(NamedTuple):
 
 
 def _contact_sensors(inputs: Inputs, spec: mujoco.MjSpec) -> Iterator[ContactSensor]:
-    """Yield the contact sensors that are wanted of a model.
-
-    Where a gap has MuJoCo report contacts that carry no force, the nearest ones are shown, with their distance.
-
-    Raises:
-        RobotError: If the model lacks a body or geom.
-    """
+    """Yield the contact sensors that are wanted of a model."""
     wants_slots, wants_net = inputs.slots > 0, "contact_netforce" in inputs.fields
     for pair in inputs.pairs:
         for i, between in enumerate(inputs.touching(pair)):
@@ -186,15 +177,7 @@ class _Kept:
     def rewritten(
         self, root: ET.Element, file: Path, folders: list[Path], settings: dict[str, str] | None = None
     ) -> ET.Element:
-        """Rewrite one file.
-
-        Args:
-            root: Its content, changed in place.
-            file: The file, for messages.
-            folders: Where files that it names may lie: an included file's assets are looked up beside the including one,
-                and then beside itself.
-            settings: The folder attributes that hold in the including file, if there is one.
-        """
+        """Rewrite one file."""
         subfolders = {"mesh": "meshdir", "skin": "meshdir", "hfield": "meshdir", "texture": "texturedir"}
         settings = _folder_settings(root, file, folders) if settings is None else settings
         for compiler in root.iter("compiler"):
@@ -259,11 +242,7 @@ def _found(name: str, subfolders: list[str], folders: list[Path], file: Path) ->
 
 
 def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
-    """Refuse a kept scene that is not the loaded one with the contact sensors that are wanted.
-
-    Raises:
-        RobotError: If any field of its compiled model differs: see `compare.differing_fields`.
-    """
+    """Refuse a kept scene that is not the loaded one with the contact sensors that are wanted."""
     with muted_mujoco():
         loaded = instrument(model.spec.copy(), inputs).compile()
     if names := differing_fields(loaded, again, model.is_rounded):

@@ -21,8 +21,7 @@ from tgdsl.surfaces.bulk import PRIMITIVES, bulk
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.sensed import DistanceOptions, ObjectHeat, SensedObject
 
-Report = Callable[[str, str], None]
-"""Called with what is wrong with an object, and a hint."""
+Report = Callable[[str, str], None]  # called with what is wrong with an object, and a hint
 LEAST_VOLUME = 1e-9
 """Volume over area^3/2 up to which it is rounding, as where faces of an open surface do not agree which side is out."""
 

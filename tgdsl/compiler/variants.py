@@ -42,25 +42,15 @@ class Meshes:
 
 @dataclass(frozen=True)
 class NewBody:
-    """A body that the scene is given.
+    """A body that the scene is given."""
 
-    Attributes:
-        name: Its name.
-        pos: Where it starts, in the world [m].
-        quat: How it is turned there, w, x, y, z.
-        is_free: Whether it moves freely, or is fixed to the world.
-        group: Of its geoms: one that weighs, where the scene's compiler takes all inertias from geoms.
-        contype: MuJoCo's bits of its geoms.
-        conaffinity: The same.
-    """
-
-    name: str
-    pos: tuple[float, float, float]
-    quat: tuple[float, float, float, float]
-    is_free: bool
-    group: int = 0
-    contype: int = 1
-    conaffinity: int = 1
+    name: str  # its name
+    pos: tuple[float, float, float]  # where it starts, in the world [m]
+    quat: tuple[float, float, float, float]  # how it is turned there, w, x, y, z
+    is_free: bool  # whether it moves freely, or is fixed to the world
+    group: int = 0  # of its geoms: one that weighs, where the scene's compiler takes all inertias from geoms
+    contype: int = 1  # muJoCo's bits of its geoms
+    conaffinity: int = 1  # the same
 
     @property
     def geom(self) -> dict[str, tuple[Any, ...]]:
@@ -68,10 +58,8 @@ class NewBody:
         return PLAIN | {"contype": (self.contype,), "conaffinity": (self.conaffinity,), "group": (self.group,)}
 
 
-WATER = 1000.0
-"""MuJoCo's density of geoms [kg/m³]."""
-PLACEHOLDER = 0.01
-"""Radius of the ball that a new body has until it is given its own geoms [m]."""
+WATER = 1000.0  # muJoCo's density of geoms [kg/m³]
+PLACEHOLDER = 0.01  # radius of the ball that a new body has until it is given its own geoms [m]
 PLAIN: dict[str, tuple[float, ...]] = {
     "condim": (3,),
     "priority": (0,),

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TextIO
 
-Progress = Callable[[str], None]
-"""Called with what is done next, such as "object mug: distance grid"."""
+Progress = Callable[[str], None]  # called with what is done next, such as "object mug: distance grid"
 
 
 def silent(what: str) -> None:

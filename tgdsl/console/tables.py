@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-MAX_ROWS = 20
-"""Rows of a table that are shown; the rest is counted."""
+MAX_ROWS = 20  # rows of a table that are shown; the rest is counted
 _WIDTH = 110
 
 

@@ -24,12 +24,10 @@ from tgdsl.errors import FileError, TgdslError
 from tgdsl.files.write import TEMPORARY, atomic_open, with_folder
 
 T = TypeVar("T")
-MAX_BYTES = 2 * 2**30
-"""Size that the folder is kept to, if `TGDSL_CACHE_BYTES` gives no other."""
+MAX_BYTES = 2 * 2**30  # size that the folder is kept to, if `TGDSL_CACHE_BYTES` gives no other
 _ENTRY = re.compile(r"[0-9a-f]{64}\.npz")
 _TEMPORARY = re.compile(TEMPORARY.pattern + r"\.npz")
-_ABANDONED = 3600.0
-"""Age at which an unfinished file is one whose process has ended [s]."""
+_ABANDONED = 3600.0  # age at which an unfinished file is one whose process has ended [s]
 
 
 def folder() -> Path:

@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 from tgdsl.errors import TgdslError
 
 Thing = TypeVar("Thing")
-Wrong = Callable[[object], str]
-"""Returns why something is no such thing, or nothing."""
+Wrong = Callable[[object], str]  # returns why something is no such thing, or nothing
 
 
 def known(

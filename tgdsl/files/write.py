@@ -18,8 +18,7 @@ from typing import IO
 
 from tgdsl.errors import FileError
 
-TEMPORARY = re.compile(r"\.[0-9a-f]{16}")
-"""Stems of temporary files; one that is old was left by a process that was killed."""
+TEMPORARY = re.compile(r"\.[0-9a-f]{16}")  # stems of temporary files; one that is old was left by a process that was killed
 
 
 def check_writable(target: Path) -> Path:

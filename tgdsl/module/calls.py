@@ -15,8 +15,7 @@ from tgdsl.quantities.base import Quantity
 from tgdsl.tensors import torch_internals
 from tgdsl.tensors.graphed import Graphed
 
-Step = Callable[..., Any]
-"""A bound method of a module that takes tensors and memory by name, and returns tensors by name."""
+Step = Callable[..., Any]  # a bound method of a module that takes tensors and memory by name, and returns tensors by name
 
 
 class Calls:

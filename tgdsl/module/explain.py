@@ -47,8 +47,7 @@ _FREE = frozenset(
     ]
 )
 """Operations that compute nothing."""
-_FFT = 2.5
-"""Operations of a real fast Fourier transform of n numbers: this by n log2 n."""
+_FFT = 2.5  # operations of a real fast Fourier transform of n numbers: this by n log2 n
 
 
 class OperationCounter(TorchDispatchMode):
@@ -273,8 +272,7 @@ def _inputs(touch: Explained) -> list[str]:
     return [*lines, ""]
 
 
-_CLOCK_BYTES = 24
-"""What the clock holds of each environment in addition to the ages of calls: three int64, see `clock.Clock`."""
+_CLOCK_BYTES = 24  # what the clock holds of each environment in addition to the ages of calls: three int64, see `clock.Clock`
 
 
 def _costs(touch: Explained) -> list[str]:

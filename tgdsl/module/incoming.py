@@ -22,12 +22,10 @@ from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.env_ids import EnvIds, env_mask, is_out_of_sight
 from tgdsl.tensors.on_host import HostCopy
 
-TOLERANCE = 1e-3
-"""Part of a pair's force that slots may lack unnoticed: far above what single precision makes of a sum."""
+TOLERANCE = 1e-3  # part of a pair's force that slots may lack unnoticed: far above what single precision makes of a sum
 
 
-EVERY = 16
-"""On a GPU one state in so many is looked at: a dozen small kernels take as long to launch as a module's own."""
+EVERY = 16  # on a GPU one state in so many is looked at: a dozen small kernels take as long to launch as a module's own
 
 
 class SlotWatch:
@@ -170,11 +168,7 @@ class Incoming:
             warnings.warn(f"{problem}; this is said once, and not of states on a GPU: look for NaN in readings", stacklevel=7)
 
     def _dt_tensor(self, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Return dt as a tensor that is written only when it changes.
-
-        Raises:
-            StateError: If it is no time.
-        """
+        """Return dt as a tensor that is written only when it changes."""
         if not 0 < dt < math.inf:
             raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
         if self._dt is None or self._dt[0] != dt:

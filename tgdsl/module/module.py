@@ -364,7 +364,6 @@ class TactileModule(HookedModule):
         return readings, copies | updated
 
     def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return what `core` does; a kernel may write new state over the old, which is then not returned."""
         sensing = Sensing(self.plan, self._kinds, self._quantities, self._stages, self.memory.clock, self._order)
         return sense(sensing, self.constants.tree, tensors, memory, self.dtype)
 

@@ -119,11 +119,7 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
 
 
 def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
-    """Look at the readings that are observed, and return of how many environments they are.
-
-    Raises:
-        ObservationError: As `observe`.
-    """
+    """Look at the readings that are observed, and return of how many environments they are."""
     all_readings = plan.readings()
     for term in plan.observations:
         if term.type in observations.HAND_ONLY:

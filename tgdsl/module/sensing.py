@@ -32,8 +32,7 @@ from tgdsl.sensors.noise.stages import Gain, Radius, Release
 from tgdsl.sensors.upstream import Upstream
 from tgdsl.tensors.fusion import materialised
 
-Tree = Mapping[str, Any]
-"""What `parts` returns, with tensors for arrays."""
+Tree = Mapping[str, Any]  # what `parts` returns, with tensors for arrays
 
 
 def parts(plan: Plan) -> dict[str, Any]:
@@ -62,12 +61,10 @@ def bind(plan: Plan, kinds: Mapping[str, Kind], tensor_of: Callable[[str], Tenso
 
 
 def _stays_on_host(record: Any) -> bool:
-    """Return whether a part of the plan is no constant of a module, but the source of one."""
     return getattr(record, "stays_on_host", False)
 
 
 def _is_prepared(record: Any) -> bool:
-    """Return the same, after making now what is made of it: no compiler traces that."""
     return _stays_on_host(record) and record.prepared is not None
 
 
@@ -210,11 +207,7 @@ def block(
 def _answer(
     sensor: PlannedSensor, kind: Kind, gathered: Gathered, context: Context, constants: Any, state: Tensors
 ) -> tuple[Tensors, Tensors]:
-    """Return what a kind's `forward` returns, after a look at it.
-
-    Raises:
-        TgdslError: If it is not what the kind said when it was lowered.
-    """
+    """Return what a kind's `forward` returns, after a look at it."""
     answer = kind.forward(gathered, context, constants, kind.typed_state(state))
     if not torch.compiler.is_compiling():
         _check_answer(sensor, kind, answer, state)
@@ -263,23 +256,14 @@ def _phase(phase: Float[Tensor, " env"], period: Tensor, now: Now) -> Float[Tens
 
 
 class Sensing(NamedTuple):
-    """What a plan is computed with.
+    """What a plan is computed with."""
 
-    Attributes:
-        plan: The plan.
-        kinds: The kind of each sensor, by the sensor's name.
-        quantities: The quantities that some sensor asks for.
-        stages: The stages of each sensor's noise, by the sensor's name.
-        clock: Says when sensors are read.
-        order: The sensors, each after those that it reads.
-    """
-
-    plan: Plan
-    kinds: Mapping[str, Kind]
-    quantities: tuple[Quantity, ...]
-    stages: Mapping[str, Sequence[StageType]]
-    clock: Clock
-    order: tuple[PlannedSensor, ...]
+    plan: Plan  # the plan
+    kinds: Mapping[str, Kind]  # the kind of each sensor, by the sensor's name
+    quantities: tuple[Quantity, ...]  # the quantities that some sensor asks for
+    stages: Mapping[str, Sequence[StageType]]  # the stages of each sensor's noise, by the sensor's name
+    clock: Clock  # says when sensors are read
+    order: tuple[PlannedSensor, ...]  # the sensors, each after those that it reads
 
 
 def in_order(sensors: Sequence[PlannedSensor]) -> tuple[PlannedSensor, ...]:

@@ -39,8 +39,7 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "last_action": ("actuator",),
 }
 """Shape of each tensor of a `SceneState`, after the leading `env`."""
-CHOICES = ("variant", "object_material")
-"""Fields that say which of several things an object is: integers."""
+CHOICES = ("variant", "object_material")  # fields that say which of several things an object is: integers
 
 
 @dataclass

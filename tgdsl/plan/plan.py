@@ -29,8 +29,7 @@ from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.known import QUANTITIES
 from tgdsl.quantities.pairs import PairedObject, PairTable
 
-FORMAT = 17
-"""Version of the Plan; a reader refuses any other."""
+FORMAT = 17  # version of the Plan; a reader refuses any other
 
 
 @dataclass(frozen=True)

@@ -19,19 +19,12 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class PlannedAxis:
-    """What the rows of a reading are, for users.
+    """What the rows of a reading are, for users."""
 
-    Attributes:
-        name: What one is called: "taxel", "body", "voxel", …
-        size: How many there are.
-        texts: Columns of a table with a row for each, by name: texts.
-        numbers: Columns of numbers, (row, …).
-    """
-
-    name: str
-    size: int
-    texts: Mapping[str, tuple[str, ...]]
-    numbers: Mapping[str, np.ndarray]
+    name: str  # what one is called: "taxel", "body", "voxel", …
+    size: int  # how many there are
+    texts: Mapping[str, tuple[str, ...]]  # columns of a table with a row for each, by name: texts
+    numbers: Mapping[str, np.ndarray]  # columns of numbers, (row, …)
 
 
 @dataclass(frozen=True)
@@ -65,16 +58,11 @@ class PlannedMemory:
 
 @dataclass(frozen=True, eq=False)
 class PlannedNoise(Generic[Array]):
-    """The imperfections of a sensor.
+    """The imperfections of a sensor."""
 
-    Attributes:
-        terms: The stages there are, in their order, see `sensors.noise.pipeline`.
-        constants: Values that they read, ([end,] channel, row), see `sensors.noise.pipeline`.
-        streams: What random numbers are drawn for, see `sensors.noise.random`.
-    """
-
-    terms: tuple[str, ...]
-    streams: tuple[int, ...]
+    terms: tuple[str, ...]  # the stages there are, in their order, see `sensors.noise.pipeline`
+    streams: tuple[int, ...]  # what random numbers are drawn for, see `sensors.noise.random`
+    # values that they read, ([end,] channel, row), see `sensors.noise.pipeline`
     constants: Mapping[str, Array] = field(metadata=INLINE)
 
 
@@ -92,56 +80,32 @@ class PlannedSensor(Generic[Array]):
     """One way to read a sensor: what is computed for it alone.
 
     A sensor that is read both clean and measured is computed once where noise comes after its equation, else twice.
-
-    Attributes:
-        name: Its name, `touch`, or `touch/clean` where another one is the measured sensor.
-        sensor: The sensor's name in the document.
-        kind: Its kind.
-        links: The links that carry it.
-        taxels: Its taxels, rows of the layout.
-        uses: What it asked for: by quantity the number of the use.
-        joined: The sensors that are computed as one, in the order of the uses' rows; empty if it is alone.
-        rows: Which of the uses' rows are its own: the first, and one beyond the last.
-        constants: What its kind folded.
-        state: What it carries from one call to the next: the kind's own, `noise/…` and `sample/…`.
-        signal: Channels of the signal that noise and sampling act on.
-        readings: Its readings: first its own, measured if it has noise; then the clean one, if that is read too; then reports.
-        axes: What their rows are, one for each.
-        noise: Its imperfections.
-        period: Time between its samples [s]; 0: it takes one at every call.
-        history: What is read of the last calls.
-        notes: What an account of it says of its parameters, line by line.
-        is_timed: Whether its kind wants to know when it is called: see `sensors.base.Context`.
-        substeps: Physics steps of a call that it is advanced at; 0: once per call.
-        upstream: Sensors whose planes it reads, see `sensors.upstream`: they are evaluated before it.
-        provides: Planes that it has for others.
-        is_random: Whether its kind draws random numbers of its own.
-        timestep: Time between the calls of its kind that its constants are made for [s]; 0: any will do.
     """
 
-    name: str
-    sensor: str
-    kind: str
-    links: tuple[Link, ...]
-    taxels: Array
-    uses: Mapping[str, int]
-    joined: tuple[str, ...]
-    rows: tuple[int, int]
-    state: Mapping[str, PlannedMemory]
-    signal: tuple[str, ...]
+    name: str  # its name, `touch`, or `touch/clean` where another one is the measured sensor
+    sensor: str  # the sensor's name in the document
+    kind: str  # its kind
+    links: tuple[Link, ...]  # the links that carry it
+    taxels: Array  # its taxels, rows of the layout
+    uses: Mapping[str, int]  # what it asked for: by quantity the number of the use
+    joined: tuple[str, ...]  # the sensors that are computed as one, in the order of the uses' rows; empty if it is alone
+    rows: tuple[int, int]  # which of the uses' rows are its own: the first, and one beyond the last
+    state: Mapping[str, PlannedMemory]  # what it carries from one call to the next: the kind's own, `noise/…` and `sample/…`
+    signal: tuple[str, ...]  # channels of the signal that noise and sampling act on
+    # its readings: first its own, measured if it has noise; then the clean one, if that is read too; then reports
     readings: tuple[PlannedReading, ...]
-    axes: tuple[PlannedAxis, ...]
-    constants: Mapping[str, Array] = field(metadata=INLINE)
-    noise: PlannedNoise[Array] | None
-    period: float
-    history: PlannedHistory | None
-    notes: tuple[str, ...]
-    is_timed: bool
-    substeps: int
-    upstream: tuple[str, ...]
-    provides: tuple[str, ...]
-    is_random: bool
-    timestep: float
+    axes: tuple[PlannedAxis, ...]  # what their rows are, one for each
+    constants: Mapping[str, Array] = field(metadata=INLINE)  # what its kind folded
+    noise: PlannedNoise[Array] | None  # its imperfections
+    period: float  # time between its samples [s]; 0: it takes one at every call
+    history: PlannedHistory | None  # what is read of the last calls
+    notes: tuple[str, ...]  # what an account of it says of its parameters, line by line
+    is_timed: bool  # whether its kind wants to know when it is called: see `sensors.base.Context`
+    substeps: int  # physics steps of a call that it is advanced at; 0: once per call
+    upstream: tuple[str, ...]  # sensors whose planes it reads, see `sensors.upstream`: they are evaluated before it
+    provides: tuple[str, ...]  # planes that it has for others
+    is_random: bool  # whether its kind draws random numbers of its own
+    timestep: float  # time between the calls of its kind that its constants are made for [s]; 0: any will do
 
     @property
     def wants_clock(self) -> bool:
@@ -166,27 +130,17 @@ class PlannedSensor(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class PlannedObservation(Generic[Array]):
-    """One term of an observation group.
+    """One term of an observation group."""
 
-    Attributes:
-        group: The group.
-        index: Which of its terms.
-        type: Its type.
-        reading: The reading that is observed; None if it is of none.
-        channels: Channels of the reading.
-        constants: What was folded for it; `rows` of joints or actuators that are observed, if not all.
-        num_features: How many features it gives.
-        axes: Order of the link-frame axes of an aggregate force; else empty.
-    """
-
-    group: str
-    index: int
-    type: str
-    reading: str | None
-    channels: tuple[int, ...]
-    num_features: int
+    group: str  # the group
+    index: int  # which of its terms
+    type: str  # its type
+    reading: str | None  # the reading that is observed; None if it is of none
+    channels: tuple[int, ...]  # channels of the reading
+    num_features: int  # how many features it gives
+    # what was folded for it; `rows` of joints or actuators that are observed, if not all
     constants: Mapping[str, Array] = field(metadata=INLINE)
-    axes: Literal["", "xyz", "zyx"] = ""
+    axes: Literal["", "xyz", "zyx"] = ""  # order of the link-frame axes of an aggregate force; else empty
 
     @property
     def key(self) -> str:

@@ -13,10 +13,8 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 import numpy as np
 
-LEAF = "array"
-"""Key of what stands for an array in JSON: its name."""
-INLINE = {"inline": True}
-"""Metadata of a dataclass's field for a mapping whose keys follow on the path of what holds it."""
+LEAF = "array"  # key of what stands for an array in JSON: its name
+INLINE = {"inline": True}  # metadata of a dataclass's field for a mapping whose keys follow on the path of what holds it
 
 
 def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:

@@ -43,7 +43,6 @@ def conditional(schema: Any, definitions: Mapping[str, Schema]) -> Any:
 
 
 def _branches(schema: Schema) -> list[Schema]:
-    """Return the alternatives of a schema, and those of alternatives that are nothing but alternatives themselves."""
     own = schema.get("anyOf") or schema.get("oneOf") or []
     inner = [(_branches(part) if not part.keys() - {"anyOf", "oneOf", "discriminator"} else []) or [part] for part in own]
     return [part for parts in inner for part in parts]

@@ -291,5 +291,4 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> Path | None:
 
 
 def _display_name(path: Path, loaded: Loaded, wanted: str | None) -> str:
-    """Return the name a layout file has in messages: as the user would type it from where the document's name counts."""
     return str(path) if wanted is None else str(Path(loaded.source.file).parent / wanted)

@@ -12,25 +12,17 @@ from tgdsl.schema.document import Spec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.schema.yaml import Path, Source
 
-GIVEN = "<scene>"
-"""The robot's model of a document that names none, where a scene is given."""
+GIVEN = "<scene>"  # the robot's model of a document that names none, where a scene is given
 
 
 @dataclass(kw_only=True)
 class Section:
-    """A document, or its layout, as found, and its mistakes so far.
+    """A document, or its layout, as found, and its mistakes so far."""
 
-    Attributes:
-        source: Its text's values and places.
-        folder: Folder that file names in it are relative to.
-        problems: Mistakes found so far, of the document and its layout; later stages add theirs.
-        prefix: Where its paths start in the source: of a layout in line, where that stands in its document.
-    """
-
-    source: Source
-    folder: FilePath
-    problems: list[Problem]
-    prefix: Path = ()
+    source: Source  # its text's values and places
+    folder: FilePath  # folder that file names in it are relative to
+    problems: list[Problem]  # mistakes found so far, of the document and its layout; later stages add theirs
+    prefix: Path = ()  # where its paths start in the source: of a layout in line, where that stands in its document
 
     def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
         """Return a mistake at a path."""
@@ -56,15 +48,10 @@ class LoadedLayout(Section):
 
 @dataclass(kw_only=True)
 class Loaded(Section):
-    """A document, as found and as read. With `problems`, faulty entries are left out of `spec`.
+    """A document, as found and as read. With `problems`, faulty entries are left out of `spec`."""
 
-    Attributes:
-        spec: The document.
-        layout: Its layout; None if that could not be read, or if it `is_without_layout`.
-    """
-
-    spec: Spec
-    layout: LoadedLayout | None = None
+    spec: Spec  # the document
+    layout: LoadedLayout | None = None  # its layout; None if that could not be read, or if it `is_without_layout`
 
     @property
     def robot_file(self) -> FilePath | None:

@@ -22,7 +22,6 @@ def reference_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]
 
 
 def _names(loaded: Loaded, key: str) -> list[str] | None:
-    """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
     result = loaded.source.value.get(key, {})
     return list(result) if isinstance(result, dict) else None
 

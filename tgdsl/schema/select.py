@@ -79,7 +79,6 @@ def _chosen(
 def _group(
     name: str, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], inside: tuple[str, ...]
 ) -> set[int]:
-    """Return what a group takes; nothing if it is being looked up already: that mistake is reported where it is defined."""
     return set() if name in inside else _chosen(groups[name], candidates, groups, (*inside, name))
 
 

@@ -56,7 +56,6 @@ def _rest(value: dict, model: type[BaseModel], entries: set[Path], required: tup
 
 
 def _is_follow_up(error: ErrorDetails) -> bool:
-    """Return whether an error only repeats another: of a value that is no YAML, or of items that have errors themselves."""
     result, context = error["input"], error.get("ctx", {})
     return result is yaml.Unreadable or (error["type"] == "too_short" and len(result) >= context["min_length"])
 
@@ -152,7 +151,6 @@ def _problem(
 
 
 def _wanted(kind: str) -> str:
-    """Return what pydantic's errors about Python types mean in a document, or nothing."""
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         return "a mapping"
     return {"tuple_type": "a list", "string_type": "a string"}.get(kind, "")

@@ -17,14 +17,10 @@ from tgdsl.errors import Problem, did_you_mean
 
 Path = tuple[str | int, ...]
 
-MAX_DEPTH = 50
-"""Values that are nested more deeply are refused, before Python's own limit is reached in some odd place."""
-MAX_BYTES = 2 * 2**20
-"""Size of the largest file that is read, comments included."""
-MAX_NODES = 100_000
-"""Most names and values of a document, each alias counted as what it stands for: some 7,000 points in line."""
-MAX_TEXT = 10_000
-"""Characters of the longest name or value."""
+MAX_DEPTH = 50  # values that are nested more deeply are refused, before Python's own limit is reached in some odd place
+MAX_BYTES = 2 * 2**20  # size of the largest file that is read, comments included
+MAX_NODES = 100_000  # most names and values of a document, each alias counted as what it stands for: some 7,000 points in line
+MAX_TEXT = 10_000  # characters of the longest name or value
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 _TOO_MANY = f"more than {MAX_NODES} names and values, aliases counted as what they stand for"
 _HINT = "long lists of points go into a CSV file beside the layout"
@@ -44,21 +40,13 @@ class Mark(NamedTuple):
 
 @dataclass
 class Source:
-    """A document as found: its plain value, where each part of it stands, and what is wrong with it as YAML.
+    """A document as found: its plain value, where each part of it stands, and what is wrong with it as YAML."""
 
-    Attributes:
-        file: Name of the file.
-        value: Mappings, lists and scalars.
-        keys: Place of the key of each mapping entry, by its path.
-        values: Place of each value, by its path.
-        problems: Mistakes found while reading.
-    """
-
-    file: str
-    value: Any = None
-    keys: dict[Path, Mark] = field(default_factory=dict)
-    values: dict[Path, Mark] = field(default_factory=dict)
-    problems: list[Problem] = field(default_factory=list)
+    file: str  # name of the file
+    value: Any = None  # mappings, lists and scalars
+    keys: dict[Path, Mark] = field(default_factory=dict)  # place of the key of each mapping entry, by its path
+    values: dict[Path, Mark] = field(default_factory=dict)  # place of each value, by its path
+    problems: list[Problem] = field(default_factory=list)  # mistakes found while reading
 
     def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
         """Return a mistake at a path, placed at the nearest part of it that the document holds."""
@@ -204,7 +192,6 @@ def from_mapping(value: Mapping[str, Any], file: str) -> Source:
 
 
 def _refuse(source: Source, error: _TooManyError) -> None:
-    """Leave a document without a value, and only what ended its reading for a mistake."""
     source.value = None
     source.problems = [Problem(source.file, error.line, error.column, path_text(error.path), _TOO_MANY, _HINT)]
 

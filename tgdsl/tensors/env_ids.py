@@ -12,10 +12,8 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, TgdslError, listed
 from tgdsl.tensors.torch_internals import is_followed
 
-EnvIds = Tensor | np.ndarray | Sequence[int]
-"""Environments: indices, or a boolean mask over all of them."""
-FEW = 0.5
-"""With more of the environments than this share, something is done for all of them."""
+EnvIds = Tensor | np.ndarray | Sequence[int]  # environments: indices, or a boolean mask over all of them
+FEW = 0.5  # with more of the environments than this share, something is done for all of them
 
 
 def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] = SimulationError) -> Int[np.ndarray, " n"]:

@@ -14,8 +14,7 @@ Tensors = dict[str, Tensor]
 Function = Callable[[Tensors, Tensors], Tensors]
 Replay = Callable[[], Any]
 
-WARM_CALLS = 2
-"""Calls before the one that is captured: they compile and load kernels."""
+WARM_CALLS = 2  # calls before the one that is captured: they compile and load kernels
 
 
 def captured(call: Callable[[], Tensors]) -> tuple[Replay, Tensors]:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from tgdsl.tensors.operations import Operation
 
-LARGEST = 256
-"""Most taxels of a link for which the kernel is used: a library multiplies larger matrices faster."""
+LARGEST = 256  # most taxels of a link for which the kernel is used: a library multiplies larger matrices faster
 Matrices = Sequence[Float[Tensor, "_from plane _to"]]
 
 

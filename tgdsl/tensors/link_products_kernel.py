@@ -67,7 +67,6 @@ def link_products(lines: Tensor, matrices: Sequence[Tensor]) -> Tensor:
 
 
 def _padded(size: int) -> int:
-    """Return along how many numbers a product of blocks goes."""
     return max(triton.next_power_of_2(size), MIN_BLOCK)  # pyright: ignore[reportReturnType]
 
 
@@ -93,11 +92,7 @@ def _tiles(sizes: Sequence[int], num_planes: int, tile: int) -> list[int]:
 
 @torch.library.custom_op("tgdsl::joined", mutates_args=(), schema="(Tensor[] matrices, int tile) -> (Tensor, Tensor)")
 def _joined(matrices: Sequence[Tensor], tile: int) -> tuple[Tensor, Tensor]:
-    """Return all matrices one after the other, and the table of tiles.
-
-    A compiler would make a kernel of each part. These are three in all, and no copy from the host, which a CUDA graph could
-    not hold.
-    """
+    """Return all matrices one after the other, and the table of tiles."""
     numbers = _tiles([len(matrix) for matrix in matrices], matrices[0].shape[1], tile)
     tiles = matrices[0].new_zeros(len(numbers), dtype=torch.int32)
     add_each(tiles.unbind(), numbers)

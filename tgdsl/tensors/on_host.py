@@ -11,8 +11,7 @@ from torch import Tensor
 
 from tgdsl.tensors.env_ids import is_cheap_to_read
 
-MOST = 2**15
-"""Of more numbers torch shares an operation out among its threads."""
+MOST = 2**15  # of more numbers torch shares an operation out among its threads
 
 
 def on_host(work: Callable[..., Iterable[Any]], *given: Tensor) -> list[Tensor]:

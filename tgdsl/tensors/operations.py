@@ -19,28 +19,20 @@ from tgdsl.tensors.torch_internals import is_exporting
 P = ParamSpec("P")
 R = TypeVar("R")
 
-HAS_TRITON = find_spec("triton") is not None
-"""Whether Triton is installed, as it is with every build of torch for a GPU."""
+HAS_TRITON = find_spec("triton") is not None  # whether Triton is installed, as it is with every build of torch for a GPU
 
 
 @dataclass(frozen=True)
 class Operation(Generic[P, R]):
-    """A function of tensors: torch's operations define it, a Triton kernel stands in for them where it can.
+    """A function of tensors: torch's operations define it, a Triton kernel stands in for them where it can."""
 
-    Attributes:
-        name: Name of the custom operator that launches the kernel, in the namespace "tgdsl".
-        definition: What it is, in torch's operations; differentiable, for any device and dtype.
-        kernel: The same by the kernel. It imports the kernel's file in its body: Triton is neither installed everywhere nor
-            imported in an instant, and torch.compile traces an import statement, but no `importlib.import_module`.
-        inputs: The tensors that have to be float32, on a GPU and without derivatives.
-        condition: What the arguments have to meet besides; None: nothing.
-    """
-
-    name: str
-    definition: Callable[P, R]
+    name: str  # name of the custom operator that launches the kernel, in the namespace "tgdsl"
+    definition: Callable[P, R]  # what it is, in torch's operations; differentiable, for any device and dtype
+    # the same by the kernel. It imports the kernel's file in its body: Triton is neither installed everywhere nor imported in
+    # an instant, and torch.compile traces an import statement, but no `importlib.import_module`.
     kernel: Callable[P, R]
-    inputs: Callable[P, Iterable[Tensor]]
-    condition: Callable[P, bool] | None = None
+    inputs: Callable[P, Iterable[Tensor]]  # the tensors that have to be float32, on a GPU and without derivatives
+    condition: Callable[P, bool] | None = None  # what the arguments have to meet besides; None: nothing
 
     def takes_kernel(self, *args: P.args, **kwargs: P.kwargs) -> bool:
         """Return whether a call with these arguments launches the kernel."""

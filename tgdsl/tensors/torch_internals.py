@@ -152,8 +152,7 @@ def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:
     return MethodType(copy, method.__self__)
 
 
-MOST_FUSED = 1024
-"""Operations of a kernel that is to be as large as can be."""
+MOST_FUSED = 1024  # operations of a kernel that is to be as large as can be
 
 
 def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> dict[str, Any]:
@@ -186,8 +185,7 @@ def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:
     return size
 
 
-ASSERT_DTYPE = "aten._assert_tensor_metadata.default"
-"""The operation that `assert_dtype` makes."""
+ASSERT_DTYPE = "aten._assert_tensor_metadata.default"  # the operation that `assert_dtype` makes
 
 
 def assert_dtype(tensor: Tensor, dtype: torch.dtype) -> None:
@@ -205,11 +203,7 @@ def write_package(program: torch.export.ExportedProgram, path: Path, options: Ma
 
 @contextmanager
 def _checked() -> Iterator[None]:
-    """Have AOTInductor's packages refuse inputs of a wrong dtype, shape, stride or device, or of unlike numbers of rows.
-
-    Inductor writes such checks, but for the last, and has them done only where AOTI_RUNTIME_CHECK_INPUTS is set; else wrong
-    tensors are read as if they were right. Here they are always done, and 1 is a size like any other.
-    """
+    """Have AOTInductor's packages refuse inputs of a wrong dtype, shape, stride or device, or of unlike numbers of rows."""
     from torch._inductor import config
     from torch._inductor.codegen.cpp_wrapper_cpu import CppWrapperCpu
     from torch._inductor.virtualized import V

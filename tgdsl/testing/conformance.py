@@ -38,10 +38,8 @@ from tgdsl.testing.reference import assert_agrees
 
 FLOAT32_TOLERANCE = 1e-5
 """Largest error of a float32 module over the largest magnitude of the channel: some 80 roundings of 2⁻²⁴."""
-FLOAT64_TOLERANCE = 1e-12
-"""The same for float64: room for the 1e-15 of its rounding, times the conditioning of a thin depth."""
-FAR_TOLERANCE = 1e-9
-"""The same at 1 km from the origin, where a float64 position is known to 1e-13 m."""
+FLOAT64_TOLERANCE = 1e-12  # the same for float64: room for the 1e-15 of its rounding, times the conditioning of a thin depth
+FAR_TOLERANCE = 1e-9  # the same at 1 km from the origin, where a float64 position is known to 1e-13 m
 
 SCENE = """
 <mujoco model="conformance">
@@ -88,7 +86,6 @@ def conformance_document(scene: Path, sensor: Mapping[str, Any], palm: list[Any]
 
 @functools.lru_cache(maxsize=8)
 def _plan_of(document: str, kinds: tuple[Kind, ...]) -> Plan:
-    """Return the plan of a document, which is given as JSON; its poses are made up, so objects are inside links too."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnfeltWarning)
         return compile_document(json.loads(document), kinds=kinds).plan

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 Readings = Float[np.ndarray, "step env row channel"]
-RESAMPLES, TAILS = 400, (2.5, 97.5)
-"""Bootstrap samples, and the percentiles that an interval reaches from and to."""
+RESAMPLES, TAILS = 400, (2.5, 97.5)  # bootstrap samples, and the percentiles that an interval reaches from and to
 
 
 class Interval(NamedTuple):
@@ -29,17 +28,13 @@ class Interval(NamedTuple):
 
 
 class Magnitude(NamedTuple):
-    """What errors of a reading are relative to.
+    """What errors of a reading are relative to."""
 
-    Attributes:
-        rest: Median of each channel.
-        scale: Largest difference of a channel from its median, or of one of the same quantity (`force` of `force_x`); 1 where
-            nothing ever changes.
-        active: Where the exact reading is not at its median: elsewhere nothing is felt, as a rule.
-    """
-
-    rest: Float[np.ndarray, " channel"]
+    rest: Float[np.ndarray, " channel"]  # median of each channel
+    # largest difference of a channel from its median, or of one of the same quantity (`force` of `force_x`); 1 where nothing
+    # ever changes
     scale: Float[np.ndarray, " channel"]
+    # where the exact reading is not at its median: elsewhere nothing is felt, as a rule
     active: Bool[np.ndarray, "step env row channel"]
 
     def of(self, envs: slice, channels: Sequence[int]) -> Magnitude:
@@ -48,19 +43,12 @@ class Magnitude(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Errors of a reading.
+    """Errors of a reading."""
 
-    Attributes:
-        rms: Root of the sum of squared errors over the number of active readings.
-        largest: The largest.
-        p99: What 99 of 100 active readings' errors do not exceed; errors of the others count too.
-        is_finite: Whether all readings are finite numbers.
-    """
-
-    rms: Interval
-    largest: Interval
-    p99: float
-    is_finite: bool
+    rms: Interval  # root of the sum of squared errors over the number of active readings
+    largest: Interval  # the largest
+    p99: float  # what 99 of 100 active readings' errors do not exceed; errors of the others count too
+    is_finite: bool  # whether all readings are finite numbers
 
 
 def halves(num_envs: int) -> tuple[slice, slice]:

@@ -22,8 +22,7 @@ from tgdsl.sensors.noise.reference import words
 from tgdsl.sensors.upstream import Upstream
 
 Planes = Mapping[str, np.ndarray]
-Memory = dict[int, dict[str, np.ndarray]]
-"""What a sensor remembers, by environment and name."""
+Memory = dict[int, dict[str, np.ndarray]]  # what a sensor remembers, by environment and name
 
 
 class ReferenceModule:

@@ -45,8 +45,7 @@ def only(state: SceneState, envs: Any) -> SceneState:
     return SceneState(**selected, substeps=tuple(only(part, envs) for part in state.substeps))
 
 
-TOGETHER = 1e-6
-"""Distances [m] that differ by less count as equal where a row is looked for by its place."""
+TOGETHER = 1e-6  # distances [m] that differ by less count as equal where a row is looked for by its place
 
 
 def narrowed(state: SceneState, have: Mapping[str, Sequence[str]], inputs: Inputs) -> SceneState:
@@ -90,16 +89,11 @@ def readings_of(touch: TactileModule, states: Sequence[SceneState], name: str) -
 
 
 class Common(NamedTuple):
-    """What two modules' readings of a sensor have in common: readings at the same places, samples at the same times.
+    """What two modules' readings of a sensor have in common: readings at the same places, samples at the same times."""
 
-    Attributes:
-        here: Rows of the one's reading that the other has too; None: all.
-        there: Rows of the other's whose mean is at each of these; None: the same.
-        channels: Which channel of the other's each of the one's is; -1: it has none, which counts as 0; None: the same.
-    """
-
-    here: Int[np.ndarray, " row"] | None
-    there: Sequence[Int[np.ndarray, " row"]] | None
+    here: Int[np.ndarray, " row"] | None  # rows of the one's reading that the other has too; None: all
+    there: Sequence[Int[np.ndarray, " row"]] | None  # rows of the other's whose mean is at each of these; None: the same
+    # which channel of the other's each of the one's is; -1: it has none, which counts as 0; None: the same
     channels: Int[np.ndarray, " channel"] | None
 
     def of_one(self, readings: Shaped[np.ndarray, "step env row channel"]) -> np.ndarray:

@@ -16,21 +16,14 @@ BARE: Mapping[str, Any] = {"readout": "clean", "rate": None, "history": None, "a
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A way to compute a sensor.
+    """A way to compute a sensor."""
 
-    Attributes:
-        label: What to call it.
-        changes: What is other than in the document, by dotted path: `sensors.skin.operator`.
-        is_own: Whether it is what the document says.
-        is_free: Whether it may be chosen: it changes nothing that somebody wrote, nor what is read.
-        is_exact: Whether it is exact but for rounding.
-    """
-
-    label: str
+    label: str  # what to call it
+    # what is other than in the document, by dotted path: `sensors.skin.operator`
     changes: Mapping[str, Any] = field(default_factory=dict)
-    is_own: bool = False
-    is_free: bool = True
-    is_exact: bool = False
+    is_own: bool = False  # whether it is what the document says
+    is_free: bool = True  # whether it may be chosen: it changes nothing that somebody wrote, nor what is read
+    is_exact: bool = False  # whether it is exact but for rounding
 
     def joined(self, other: Variant) -> Variant:
         """Return the variant that has the changes of both."""
@@ -40,17 +33,11 @@ class Variant:
 
 @dataclass(frozen=True)
 class Variants:
-    """The variants of a sensor, from coarse to fine; each changes one thing of the document.
+    """The variants of a sensor, from coarse to fine; each changes one thing of the document."""
 
-    Attributes:
-        own: What the document says.
-        fields: Other choices of the sensor's fields.
-        queries: Other ways to find distances to the meshes that it feels.
-    """
-
-    own: Variant
-    fields: tuple[Variant, ...]
-    queries: tuple[Variant, ...]
+    own: Variant  # what the document says
+    fields: tuple[Variant, ...]  # other choices of the sensor's fields
+    queries: tuple[Variant, ...]  # other ways to find distances to the meshes that it feels
 
 
 def bare(name: str) -> dict[str, Any]:

@@ -29,25 +29,16 @@ ON_HOST = {
 
 
 class Step(NamedTuple):
-    """What is exported of a module.
+    """What is exported of a module."""
 
-    Attributes:
-        plan: Its plan.
-        module: Holds its constants.
-        pure_step: `TactileModule.pure_step`.
-        observe: `observing.observe` of this plan.
-        tensors: Fields of a state of `EXAMPLE_ENVS` environments.
-        memory: Memory of as many.
-        dt: Time between steps [s], if fields have it.
-    """
-
-    plan: Plan
-    module: nn.Module
+    plan: Plan  # its plan
+    module: nn.Module  # holds its constants
+    # `TactileModule.pure_step`
     pure_step: Callable[[Tensors, Tensors, Tensor | None], tuple[dict[str, Tensor], dict[str, Tensor]]]
-    observe: Callable[[Tensors], dict[str, Tensor]]
-    tensors: dict[str, Tensor]
-    memory: dict[str, Tensor]
-    dt: float | None
+    observe: Callable[[Tensors], dict[str, Tensor]]  # `observing.observe` of this plan
+    tensors: dict[str, Tensor]  # fields of a state of `EXAMPLE_ENVS` environments
+    memory: dict[str, Tensor]  # memory of as many
+    dt: float | None  # time between steps [s], if fields have it
 
 
 class FlatStep(nn.Module):

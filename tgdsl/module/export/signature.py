@@ -20,45 +20,28 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Port:
-    """A tensor that goes in or comes out.
+    """A tensor that goes in or comes out."""
 
-    Attributes:
-        name: A field of `SceneState`, `substep/<i>/<field>`, `reset`, `memory/<name>`; `reading/<name>`,
-            `observation/<group>`, `next/<name>`.
-        shape: Its shape after `env`.
-        dtype: Its dtype, such as "float32".
-        rest: What all its numbers are before the first call, if it is memory.
-    """
-
+    # a field of `SceneState`, `substep/<i>/<field>`, `reset`, `memory/<name>`; `reading/<name>`, `observation/<group>`,
+    # `next/<name>`
     name: str
-    shape: tuple[int, ...]
-    dtype: str
-    rest: float | None = None
+    shape: tuple[int, ...]  # its shape after `env`
+    dtype: str  # its dtype, such as "float32"
+    rest: float | None = None  # what all its numbers are before the first call, if it is memory
 
 
 @dataclass(frozen=True)
 class Signature:
-    """All inputs and outputs of a step; each `next/<name>` goes in as `memory/<name>` at the next one.
+    """All inputs and outputs of a step; each `next/<name>` goes in as `memory/<name>` at the next one."""
 
-    Attributes:
-        inputs: What goes in, in order.
-        outputs: What comes out, in order.
-        dt: Time between steps that the program is made for [s]; None if nothing depends on it.
-        taxels_id: See `TactileModule.taxels_id`.
-        source: Document or artefact that it was exported from; empty if it was a module in memory.
-        overrides: What was overridden of the document.
-        version: Of tgdsl.
-        format: Of this text.
-    """
-
-    inputs: tuple[Port, ...]
-    outputs: tuple[Port, ...]
-    dt: float | None
-    taxels_id: str
-    source: str
-    overrides: tuple[str, ...]
-    version: str
-    format: int = FORMAT
+    inputs: tuple[Port, ...]  # what goes in, in order
+    outputs: tuple[Port, ...]  # what comes out, in order
+    dt: float | None  # time between steps that the program is made for [s]; None if nothing depends on it
+    taxels_id: str  # see `TactileModule.taxels_id`
+    source: str  # document or artefact that it was exported from; empty if it was a module in memory
+    overrides: tuple[str, ...]  # what was overridden of the document
+    version: str  # of tgdsl
+    format: int = FORMAT  # of this text
 
     def to_json(self) -> str:
         """Return the text."""

@@ -24,23 +24,17 @@ from tgdsl.module.export.signature import Signature, read_signature
 from tgdsl.module.module import TactileModule
 
 BATCHES, NUM_CALLS, RESET_EVERY = (1, 7, 64), 100, 9
-TOLERANCE = 1e-5
-"""Largest difference over the largest magnitude of a channel, as for the kinds' own float32."""
-SPREAD = 0.015
-"""Standard deviation of bodies' positions [m]: many taxels touch."""
+TOLERANCE = 1e-5  # largest difference over the largest magnitude of a channel, as for the kinds' own float32
+SPREAD = 0.015  # standard deviation of bodies' positions [m]: many taxels touch
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How far an exported file is from the module.
+    """How far an exported file is from the module."""
 
-    Attributes:
-        differences: By batch size and output, the largest difference over the largest magnitude of its channel.
-        refuses_other_dtypes: Whether tensors of a wrong dtype are refused.
-    """
-
+    # by batch size and output, the largest difference over the largest magnitude of its channel
     differences: Mapping[int, Mapping[str, float]]
-    refuses_other_dtypes: bool
+    refuses_other_dtypes: bool  # whether tensors of a wrong dtype are refused
 
     @property
     def worst(self) -> float:

@@ -21,10 +21,8 @@ from tgdsl.tensors.torch_internals import HookedModule, held_buffers
 
 ENV = "clock/env"
 """Numbers of the environments that are read, counted from this module's first; only given where these are some of them."""
-SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")
-"""What all environments have in common."""
-_INT64 = 2**63
-"""First number beyond an int64."""
+SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")  # what all environments have in common
+_INT64 = 2**63  # first number beyond an int64
 
 
 class Clock(HookedModule):
@@ -209,7 +207,6 @@ class Clock(HookedModule):
 
 
 def _env(memory: Mapping[str, Tensor]) -> Tensor:
-    """Return the numbers of the environments that are read, (env,), counted over all processes."""
     age = memory["clock/age"]
     return (memory[ENV] if ENV in memory else torch.arange(age.shape[0], device=age.device)) + memory["clock/first_env"]
 

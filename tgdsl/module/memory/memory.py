@@ -25,8 +25,7 @@ from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.on_host import HostCopy
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 
-EVERY = 16
-"""On a GPU one call in so many is looked at: a small kernel takes as long to launch as a module's own."""
+EVERY = 16  # on a GPU one call in so many is looked at: a small kernel takes as long to launch as a module's own
 
 
 class StateWatch:
@@ -306,13 +305,11 @@ def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mas
 
 
 def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
-    """Return the places of this call's entries in a ring: environment, and which of its calls."""
     place = materialised(memory["clock/step"] % memory[name].shape[1])
     return torch.arange(place.shape[0], device=place.device), place
 
 
 def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:
-    """Return how many calls before the present one a ring holds; nothing if it is none."""
     if planned.past == 0 or dt is None:
         return ()
     return (max(math.ceil(planned.past / dt - 1e-6), 1),)

@@ -32,8 +32,7 @@ class HasPlan(Protocol):
         ...
 
 
-Taxels = HasPlan | Mapping[str, Any] | str | PathLike[str]
-"""Taxels that are expected, see `check_taxels`."""
+Taxels = HasPlan | Mapping[str, Any] | str | PathLike[str]  # taxels that are expected, see `check_taxels`
 
 
 def check_taxels(touch: HasPlan, expected: Taxels, what: str = "this module") -> None:
@@ -120,11 +119,7 @@ def _check_id(plan: Plan, expected: str, what: str) -> None:
 
 
 def _tables(expected: Taxels) -> Mapping[str, Columns]:
-    """Return tables by sensor.
-
-    Raises:
-        TgdslError: If there are none.
-    """
+    """Return tables by sensor."""
     if isinstance(expected, Mapping):
         return {str(name): _columns(table, f'taxels["{name}"]') for name, table in expected.items()}
     if isinstance(plan := getattr(expected, "plan", None), Plan):
