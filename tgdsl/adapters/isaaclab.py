@@ -25,12 +25,9 @@ class TactileSensor(SensorBase):
 
     Sensors advance when they are first asked for after a step; with an `update_period`, when that has passed. An environment
     that is reset is read again, alone, and has no contacts until the next step.
-
-    Attributes:
-        tactile: The sensor of Newton's that is read; `tactile.touch` is the module.
     """
 
-    tactile: SensorTactile
+    tactile: SensorTactile  # the sensor of Newton's that is read; `tactile.touch` is the module
 
     @property
     def data(self) -> dict[str, Tensor]:
@@ -74,15 +71,9 @@ class TactileSensor(SensorBase):
 
 @configclass
 class TactileSensorCfg(SensorBaseCfg):
-    """A document's sensors in a scene.
-
-    Attributes:
-        document: The document, or an artefact (`.safetensors`).
-        prefix: Stands before all names among Newton's labels; needed only where several labels end alike.
-        names: Labels by the names in the document, where they differ otherwise.
-    """
+    """A document's sensors in a scene."""
 
     class_type: type = TactileSensor
-    document: Any = MISSING
-    prefix: str = ""
-    names: dict[str, str] = field(default_factory=dict)
+    document: Any = MISSING  # the document, or an artefact (`.safetensors`)
+    prefix: str = ""  # stands before all names among Newton's labels; needed only where several labels end alike
+    names: dict[str, str] = field(default_factory=dict)  # labels by the names in the document, where they differ otherwise

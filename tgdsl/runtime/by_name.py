@@ -104,16 +104,11 @@ def _body_index(bodies: tuple[str, ...], names: tuple[str, ...], device: torch.d
 
 
 class Geoms(NamedTuple):
-    """The geoms (shapes, colliders) of an environment, by name.
+    """The geoms (shapes, colliders) of an environment, by name."""
 
-    Attributes:
-        bodies: Name of the body of each geom.
-        names: Name of each geom; needed only for modules with objects that share a body.
-        parents: Name of each body's parent; needed only for modules whose objects or links have child bodies without joints.
-    """
-
-    bodies: tuple[str, ...]
-    names: tuple[str, ...] = ()
+    bodies: tuple[str, ...]  # name of the body of each geom
+    names: tuple[str, ...] = ()  # name of each geom; needed only for modules with objects that share a body
+    # name of each body's parent; needed only for modules whose objects or links have child bodies without joints
     parents: tuple[tuple[str, str], ...] = ()
 
     def of_part(self, part: ContactPart) -> Int[np.ndarray, " geom"]:
@@ -140,17 +135,12 @@ class PairRows(NamedTuple):
     """Which pairs the contacts of two geoms belong to.
 
     A row is a link and an object's geoms: pairs of one link whose objects have the same geoms share it.
-
-    Attributes:
-        row_of_pair: The row of each pair.
-        num_rows: Number of rows.
-        link_of_geom: Index of each geom's link; of none, the number of links.
-        row_of_geoms: The rows of contacts of an object's geom and a link; −1 where there are no more, and of no link.
     """
 
-    row_of_pair: Int[np.ndarray, " pair"]
-    num_rows: int
-    link_of_geom: Int[np.ndarray, " geom"]
+    row_of_pair: Int[np.ndarray, " pair"]  # the row of each pair
+    num_rows: int  # number of rows
+    link_of_geom: Int[np.ndarray, " geom"]  # index of each geom's link; of none, the number of links
+    # the rows of contacts of an object's geom and a link; −1 where there are no more, and of no link
     row_of_geoms: Int[np.ndarray, "layer geom link"]
 
 
@@ -268,7 +258,6 @@ def _on_device(table: np.ndarray, device: torch.device) -> Tensor:
 
 
 def _ranks(key: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
-    """Return how many equal numbers stand before each."""
     ordered, order = key.sort(stable=True)
     rank = torch.arange(len(key), device=key.device) - torch.searchsorted(ordered, ordered)
     return torch.empty_like(rank).index_copy_(0, order, rank)

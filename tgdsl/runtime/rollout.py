@@ -26,10 +26,8 @@ from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.simulation import Simulation
 
-PLACES = ("link", "body", "pos", "normal", "area")
-"""Columns of `taxels.taxel_table` that a recording holds."""
-MISSED = 0.9
-"""Share of a load that no taxel feels above which a run reports it."""
+PLACES = ("link", "body", "pos", "normal", "area")  # columns of `taxels.taxel_table` that a recording holds
+MISSED = 0.9  # share of a load that no taxel feels above which a run reports it
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
 

@@ -23,17 +23,12 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True)
 class Script:
-    """How a scene is run.
+    """How a scene is run."""
 
-    Attributes:
-        keyframes: Keyframes whose controls are held and moved between, in turn; None: the start is held.
-        closing: How the hand closes on an object, where there are no keyframes.
-        note: What a user should know of it; may be empty.
-    """
-
+    # keyframes whose controls are held and moved between, in turn; None: the start is held
     keyframes: tuple[str, ...] | None = None
-    closing: Closing | None = None
-    note: str = ""
+    closing: Closing | None = None  # how the hand closes on an object, where there are no keyframes
+    note: str = ""  # what a user should know of it; may be empty
 
     def begin(self, touch: TactileModule, num_envs: int, substeps: int, seconds: float, options: Options | None = None) -> Run:
         """Start the scene; each hold and each move takes some seconds."""

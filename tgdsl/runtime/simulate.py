@@ -14,8 +14,7 @@ from tgdsl.runtime.simulators.machine import checked_device
 from tgdsl.runtime.simulators.simulation import SimOptions
 from tgdsl.runtime.warp import WarpSimulation
 
-MUJOCO = "mujoco"
-"""What users call the kind "simulation" where they name a simulator."""
+MUJOCO = "mujoco"  # what users call the kind "simulation" where they name a simulator
 
 
 @overload

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from tgdsl.tensors.env_ids import EnvIds
 
-Control = Tensor | np.ndarray | None
-"""Controls of a step, (actuator,) or (env, actuator); None: as they were."""
+Control = Tensor | np.ndarray | None  # controls of a step, (actuator,) or (env, actuator); None: as they were
 
 
 @runtime_checkable

@@ -161,12 +161,10 @@ def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
     return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
 
 
-CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")
-"""Fields of a state that are read of contact sensors."""
+CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")  # fields of a state that are read of contact sensors
 _WIDTH = {"found": 1, "force": 3, "torque": 3, "dist": 1, "pos": 3, "normal": 3, "tangent": 3}
 """How many numbers each quantity has that a contact sensor may show, in MuJoCo's order."""
-_OF_SLOTS = ("force", "torque", "pos", "normal", "tangent")
-"""The vectors of a contact in a slot, three numbers each."""
+_OF_SLOTS = ("force", "torque", "pos", "normal", "tangent")  # the vectors of a contact in a slot, three numbers each
 _ADVICE = "add them with tgdsl.instrument(spec, touch.inputs) before compiling"
 
 
@@ -301,12 +299,10 @@ def _geoms(model: mujoco.MjModel, kind: int, index: int) -> Int[np.ndarray, " ge
 
 
 def _rows(array: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """Return rows of an array (env, row, …), laid out in that order, which `array[:, ids]` does not do."""
-    return np.take(array, ids, axis=1)
+    return np.take(array, ids, axis=1)  # `array[:, ids]` has another memory layout
 
 
-def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return `np.cross` of vectors along the last axis, in a fifth of its time for few of them."""
+def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:  # a fifth of the time of `np.cross` for few vectors
     (a, b, c), (x, y, z) = ([vector[..., i] for i in range(3)] for vector in (one, other))
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
 

@@ -37,18 +37,13 @@ class Movement:
     """How the hand of a scene moves.
 
     Shapes: joints and bodies are MuJoCo's indices.
-
-    Attributes:
-        model: The scene.
-        trees: Topmost bodies of the kinematic trees that carry taxels.
-        ends: Open and closed end of each joint that closes the hand and follows no other such, be it by way of others
-            [rad, of slides m].
-        follows: By joint, those that an equality has follow another: that one, and the polynomial's coefficients.
     """
 
-    model: mujoco.MjModel
-    trees: frozenset[int]
+    model: mujoco.MjModel  # the scene
+    trees: frozenset[int]  # topmost bodies of the kinematic trees that carry taxels
+    # open and closed end of each joint that closes the hand and follows no other such joint [rad, of slides m]
     ends: Mapping[int, tuple[float, float]]
+    # by joint, those that an equality has follow another: that one, and the polynomial's coefficients
     follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]]]
 
     @cached_property
@@ -155,32 +150,21 @@ def movement(scene: Model, bodies: frozenset[str]) -> Movement:
     return Movement(model, trees, driven, follows)
 
 
-SHARES = np.linspace(0.0, 1.0, 9)
-"""How far the hand is closed: where its tips are tried, and where touch is looked for."""
-TOWARD_PALM = (0.0, 0.2, 0.4, 0.6, -0.25, -0.5)
-"""How far from the tips' middle to the palm a place is tried."""
-OPPOSED = -0.3
-"""Two links that touch an object oppose each other if the cosine between their directions is less than this."""
-OVERLAP = 0.1
-"""How deep an object may lie in the open hand where it is left, as a share of its radius."""
+SHARES = np.linspace(0.0, 1.0, 9)  # how far the hand is closed: where its tips are tried, and where touch is looked for
+TOWARD_PALM = (0.0, 0.2, 0.4, 0.6, -0.25, -0.5)  # how far from the tips' middle to the palm a place is tried
+OPPOSED = -0.3  # two links that touch an object oppose each other if the cosine between their directions is less than this
+OVERLAP = 0.1  # how deep an object may lie in the open hand where it is left, as a share of its radius
 _UNBOUNDED = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
 @dataclass(frozen=True)
 class Grip:
-    """What a hand that closes meets of an object, at the first share at which each link does.
+    """What a hand that closes meets of an object, at the first share at which each link does."""
 
-    Attributes:
-        overlap: How deep the object lies in the open hand [m]; negative: how far it is from it.
-        links: Bodies that meet it.
-        is_opposed: Whether two of these do so from opposite sides.
-        imbalance: Length of the mean of the directions from which they do.
-    """
-
-    overlap: float
-    links: frozenset[int]
-    is_opposed: bool
-    imbalance: float
+    overlap: float  # how deep the object lies in the open hand [m]; negative: how far it is from it
+    links: frozenset[int]  # bodies that meet it
+    is_opposed: bool  # whether two of these do so from opposite sides
+    imbalance: float  # length of the mean of the directions from which they do
 
     @property
     def holds(self) -> bool:
@@ -283,47 +267,29 @@ class Sweep:
         return [geom for geom in geoms if self.model.geom_contype[geom] or self.model.geom_conaffinity[geom]] or geoms
 
 
-START = "tgdsl/open"
-"""The keyframe with the hand open."""
-GRIP, MOST = 1.0, 10.0
-"""Force at the fingertips: so many times the object's weight, but at most so much [N]."""
-FIXED_GRIP = 1.0
-"""The same where the object is fixed [N]."""
-LAG = 0.2
-"""By how much a hinge lags its target when its servo gives all it can [rad]; a slide by this times the hand's reach."""
-TIP_MASS = 0.05
-"""Least inertia of a fingertip as a joint moves it [kg]."""
-SPEED = 0.2
-"""How fast one finger pushes the object away [m/s]."""
-STEPS = 0.3
-"""Most that a servo's natural frequency turns in one physics step [rad]."""
-NUM_GROUPS = 31
-"""Groups of actuators that MuJoCo can disable, from 0; those in the next one always act."""
+START = "tgdsl/open"  # the keyframe with the hand open
+GRIP, MOST = 1.0, 10.0  # force at the fingertips: so many times the object's weight, but at most so much [N]
+FIXED_GRIP = 1.0  # the same where the object is fixed [N]
+LAG = 0.2  # by how much a hinge lags its target when its servo gives all it can [rad]; a slide by this times the hand's reach
+TIP_MASS = 0.05  # least inertia of a fingertip as a joint moves it [kg]
+SPEED = 0.2  # how fast one finger pushes the object away [m/s]
+STEPS = 0.3  # most that a servo's natural frequency turns in one physics step [rad]
+NUM_GROUPS = 31  # groups of actuators that MuJoCo can disable, from 0; those in the next one always act
 _EARTH = 9.81
 _TORQUE_SCALE = 10
 
 
 @dataclass(frozen=True)
 class Servo:
-    """A servo on a joint that closes.
+    """A servo on a joint that closes."""
 
-    Attributes:
-        joint: The joint's name.
-        opened: Its open end [rad, of a slide m].
-        closed: Its closed end.
-        limit: Most force of the servo [N m, of a slide N].
-        stiffness: Its stiffness [N m/rad, of a slide N/m].
-        damping: The joint's damping [N m s/rad, of a slide N s/m].
-        armature: The joint's rotor inertia [kg m², of a slide kg].
-    """
-
-    joint: str
-    opened: float
-    closed: float
-    limit: float
-    stiffness: float
-    damping: float
-    armature: float
+    joint: str  # the joint's name
+    opened: float  # its open end [rad, of a slide m]
+    closed: float  # its closed end
+    limit: float  # most force of the servo [N m, of a slide N]
+    stiffness: float  # its stiffness [N m/rad, of a slide N/m]
+    damping: float  # the joint's damping [N m s/rad, of a slide N s/m]
+    armature: float  # the joint's rotor inertia [kg m², of a slide kg]
 
 
 class Closing:
@@ -487,11 +453,9 @@ def _num_beyond(moving: Movement, joint: int) -> int:
 
 
 def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of the robot's bodies that could collide.
-
-    Fingers that meet before they meet the object would hold each other off it; and MuJoCo collides a link with its parent
-    where that is fixed to the world, although both overlap at the joint by design.
-    """
+    """Return the pairs of the robot's bodies that could collide."""
+    # Fingers that meet before they meet the object would hold each other off it; and MuJoCo collides a link with its parent
+    # where that is fixed to the world, although both overlap at the joint by design.
     model = moving.model
     excluded = {int(signature) for signature in model.exclude_signature}
     bodies = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees and model.body_geomnum[b]]

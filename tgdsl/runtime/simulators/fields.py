@@ -24,8 +24,7 @@ STATE_ARRAYS = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
 """Arrays of MuJoCo that poses, velocities and contacts of a state are read from."""
 MOVED = {"joint_pos": "qpos", "joint_vel": "qvel", "last_action": "ctrl"}
 """Fields of a state that a physics step, or its caller, moves on, and the arrays that they are read from."""
-FORCES = {"joint_effort": "qfrc_actuator"}
-"""Fields of a state that MuJoCo leaves at the instant of the poses."""
+FORCES = {"joint_effort": "qfrc_actuator"}  # fields of a state that MuJoCo leaves at the instant of the poses
 
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -79,15 +78,10 @@ class BodyFields:
 
 @dataclass(frozen=True, eq=False)
 class JointColumns:
-    """Where joints and actuators stand in a model's arrays.
+    """Where joints and actuators stand in a model's arrays."""
 
-    Attributes:
-        by_array: Columns of `qpos`, `qvel`, `qfrc_actuator` and `ctrl` that are wanted.
-        fields: The fields that a module wants, and the array of each.
-    """
-
-    by_array: dict[str, Int[np.ndarray, " column"]]
-    fields: dict[str, str]
+    by_array: dict[str, Int[np.ndarray, " column"]]  # columns of `qpos`, `qvel`, `qfrc_actuator` and `ctrl` that are wanted
+    fields: dict[str, str]  # the fields that a module wants, and the array of each
 
     @classmethod
     def of(cls, inputs: Inputs, model: mujoco.MjModel) -> JointColumns:

@@ -64,15 +64,11 @@ def geoms_of(model: mujoco.MjModel, body: int, with_below: bool) -> Int[np.ndarr
 
 @dataclass(frozen=True)
 class Joint:
-    """Where one joint stands.
+    """Where one joint stands."""
 
-    Attributes:
-        qpos: Its part of `qpos`: of a free joint 7 numbers, position [m] and quaternion w, x, y, z; of a ball 4, else 1.
-        qvel: Its part of `qvel`: of a free joint 6 numbers, velocity [m/s] in the world and angular velocity [rad/s] in the
-            body's frame; of a ball 3, else 1.
-    """
-
-    qpos: slice
+    qpos: slice  # its part of `qpos`: of a free joint 7 numbers, position [m] and quaternion w, x, y, z; of a ball 4, else 1
+    # its part of `qvel`: of a free joint 6 numbers, velocity [m/s] in the world and angular velocity [rad/s] in the body's
+    # frame; of a ball 3, else 1
     qvel: slice
 
 

@@ -36,8 +36,7 @@ from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, env_mask
 
 T = TypeVar("T")
-SomeRows = Int[np.ndarray, " n"] | None
-"""Rows of environments to read; None: all."""
+SomeRows = Int[np.ndarray, " n"] | None  # rows of environments to read; None: all
 
 
 class SimOptions(TypedDict, total=False):
@@ -150,14 +149,6 @@ class Simulation(ABC):
 
     An engine implements `_open_device`, `_start`, `_make_reader`, `_refresh`, `_advance`, `_begin_episodes`, `_put`,
     `_evaluate` and `_use_objects`.
-
-    Attributes:
-        model: The compiled scene; where objects differ between environments, that of the first.
-        substeps: Physics steps per control step.
-        properties: Masses and frictions of objects, which may differ between environments.
-        heat: Temperatures and materials of objects that hold heat, in live tensors.
-        drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: an
-            actuator model that MuJoCo lacks. It is captured with the step on a GPU, so it must not wait for it there.
     """
 
     OPTIONS: ClassVar[tuple[str, ...]]
@@ -165,10 +156,12 @@ class Simulation(ABC):
     DEVICE: ClassVar[str] = "cpu"
     """The default device."""
 
-    model: mujoco.MjModel
-    substeps: int
-    properties: ObjectProperties
-    heat: EnvHeat
+    model: mujoco.MjModel  # the compiled scene; where objects differ between environments, that of the first
+    substeps: int  # physics steps per control step
+    properties: ObjectProperties  # masses and frictions of objects, which may differ between environments
+    heat: EnvHeat  # temperatures and materials of objects that hold heat, in live tensors
+    # is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: an actuator
+    # model that MuJoCo lacks. It is captured with the step on a GPU, so it must not wait for it there.
     drive: Callable[[], None] | None = None
     _device: torch.device
     _arrays: Mapping[str, Tensor]

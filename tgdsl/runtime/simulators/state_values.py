@@ -21,8 +21,7 @@ from tgdsl.module.state import SceneState, shape_of
 from tgdsl.plan.inputs import Inputs
 from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, is_env_mask
 
-Numbers = Tensor | np.ndarray | Sequence[Any] | float
-"""Numbers of any dtype, on any device."""
+Numbers = Tensor | np.ndarray | Sequence[Any] | float  # numbers of any dtype, on any device
 INTEGRATED = (
     *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
     *("mocap_pos", "mocap_quat", "userdata"),
@@ -52,14 +51,10 @@ class StateValues(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Rows:
-    """Values to set, in the dtype and on the device of the state.
+    """Values to set, in the dtype and on the device of the state."""
 
-    Attributes:
-        values: By name, (env, …); rows of environments that are not chosen mean nothing.
-        is_bad: Environments whose values cannot be used and were not refused, as that would wait for a GPU.
-    """
-
-    values: dict[str, Tensor]
+    values: dict[str, Tensor]  # by name, (env, …); rows of environments that are not chosen mean nothing
+    # environments whose values cannot be used and were not refused, as that would wait for a GPU
     is_bad: Bool[Tensor, " env"] | None = None
 
 

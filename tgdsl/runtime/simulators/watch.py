@@ -26,20 +26,13 @@ _JOINT_FIELDS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
 
 @dataclass(frozen=True)
 class Watch:
-    """Names of elements whose motion and forces are read: see `SimOptions`.
+    """Names of elements whose motion and forces are read: see `SimOptions`."""
 
-    Attributes:
-        bodies: Bodies, for their poses and velocities.
-        sites: Sites, for their poses.
-        joints: Hinges and slides, for positions, velocities and efforts.
-        actuators: Actuators, for the controls that acted.
-        pairs: Pairs (link, object) whose whole force is read; a sensor of the module has to read it too.
-    """
-
-    bodies: tuple[str, ...] = ()
-    sites: tuple[str, ...] = ()
-    joints: tuple[str, ...] = ()
-    actuators: tuple[str, ...] = ()
+    bodies: tuple[str, ...] = ()  # bodies, for their poses and velocities
+    sites: tuple[str, ...] = ()  # sites, for their poses
+    joints: tuple[str, ...] = ()  # hinges and slides, for positions, velocities and efforts
+    actuators: tuple[str, ...] = ()  # actuators, for the controls that acted
+    # pairs (link, object) whose whole force is read; a sensor of the module has to read it too
     pairs: tuple[tuple[str, str], ...] = ()
 
 
@@ -54,35 +47,20 @@ class BodyMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """What was looked at, of one instant, in world axes.
+    """What was looked at, of one instant, in world axes."""
 
-    Attributes:
-        watch: The names, in the order of the tensors.
-        body_pos: Position of each body's frame [m].
-        body_quat: Orientation of each body, w, x, y, z.
-        body_linvel: Velocity of each body frame's origin [m/s].
-        body_angvel: Angular velocity of each body [rad/s].
-        site_pos: Position of each site [m].
-        site_quat: Orientation of each site, w, x, y, z.
-        joint_pos: Position of each joint [rad; slides: m].
-        joint_vel: Velocity of each joint [rad/s; slides: m/s].
-        joint_effort: What the actuators exert on each joint [N·m; slides: N].
-        last_action: Control of each actuator that acted, in its own unit.
-        pair_force: Whole force of each pair's object on its link [N].
-    """
-
-    watch: Watch
-    body_pos: Float[Tensor, "env body 3"]
-    body_quat: Float[Tensor, "env body 4"]
-    body_linvel: Float[Tensor, "env body 3"]
-    body_angvel: Float[Tensor, "env body 3"]
-    site_pos: Float[Tensor, "env site 3"]
-    site_quat: Float[Tensor, "env site 4"]
-    joint_pos: Float[Tensor, "env joint"]
-    joint_vel: Float[Tensor, "env joint"]
-    joint_effort: Float[Tensor, "env joint"]
-    last_action: Float[Tensor, "env actuator"]
-    pair_force: Float[Tensor, "env pair 3"]
+    watch: Watch  # the names, in the order of the tensors
+    body_pos: Float[Tensor, "env body 3"]  # position of each body's frame [m]
+    body_quat: Float[Tensor, "env body 4"]  # orientation of each body, w, x, y, z
+    body_linvel: Float[Tensor, "env body 3"]  # velocity of each body frame's origin [m/s]
+    body_angvel: Float[Tensor, "env body 3"]  # angular velocity of each body [rad/s]
+    site_pos: Float[Tensor, "env site 3"]  # position of each site [m]
+    site_quat: Float[Tensor, "env site 4"]  # orientation of each site, w, x, y, z
+    joint_pos: Float[Tensor, "env joint"]  # position of each joint [rad; slides: m]
+    joint_vel: Float[Tensor, "env joint"]  # velocity of each joint [rad/s; slides: m/s]
+    joint_effort: Float[Tensor, "env joint"]  # what the actuators exert on each joint [N·m; slides: N]
+    last_action: Float[Tensor, "env actuator"]  # control of each actuator that acted, in its own unit
+    pair_force: Float[Tensor, "env pair 3"]  # whole force of each pair's object on its link [N]
 
     def body(self, name: str) -> BodyMotion:
         """Return the motion of a body by name.

@@ -28,8 +28,7 @@ from tgdsl.runtime.by_name import pair_rows
 from tgdsl.runtime.simulators.model_ids import model_geoms
 from tgdsl.runtime.warp.stream import libraries
 
-TRIED = ("3.11.0", "3.17.0")
-"""Versions of MuJoCo Warp that have these parts as they are used here."""
+TRIED = ("3.11.0", "3.17.0")  # versions of MuJoCo Warp that have these parts as they are used here
 
 
 def contact_force_function(mjw: Any) -> Any:
@@ -71,12 +70,10 @@ class PairContacts:
     Pairs of the same link whose objects have the same geoms share one search. Contacts fill slots in no certain order; if there
     are more than slots, which are kept is not certain either, but the net force is that of all. Contacts that a `gap` adds
     beyond the margin carry no force, and are none.
-
-    Attributes:
-        arrays: Live tensors (env, row, …) of the fields of a state, float32; a row is a link and an object's geoms. Where slots
-            are wanted, `contact_found` is among them.
     """
 
+    # live tensors (env, row, …) of the fields of a state, float32; a row is a link and an object's geoms. Where slots are
+    # wanted, `contact_found` is among them.
     arrays: dict[str, Float[Tensor, "env ..."]]
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, num_envs: int, device: torch.device):
@@ -135,12 +132,10 @@ def foreign_sensors(model: mujoco.MjModel, inputs: Inputs) -> Int[np.ndarray, " 
 @functools.cache
 @no_type_check
 def _kernel(wp: Any, mjw: Any) -> Any:
-    """Return the kernel: one thread per contact. Arrays that are None are not wanted.
-
-    The normal points from the first geom's body to the second's. MuJoCo's sensor takes it as it is where the first one is the
-    object. Else it turns the normal and the tangent, but not their cross product, and of force and torque in this frame
-    the part along that: in the world both are turned, as the normal is.
-    """
+    """Return the kernel: one thread per contact. Arrays that are None are not wanted."""
+    # The normal points from the first geom's body to the second's. MuJoCo's sensor takes it as it is where the first one is
+    # the object. Else it turns the normal and the tangent, but not their cross product, and of force and torque in this frame
+    # the part along that: in the world both are turned, as the normal is.
     wrench_of = contact_force_function(mjw)
     has_adhesion = "contact_adhesion_in" in wrench_of.input_types
     constraint = wp.constant(constraint_contact_bit(mjw))

@@ -50,8 +50,7 @@ goes on."""
 _MASK = sum(1 << bit for bit in POOLS)
 _HORIZON = 1 << 8
 """Bit of a search that ran out of room: of a size that nobody can choose, and a matter of its environment alone."""
-_LARGEST = 1e10
-"""Positions and velocities above it have diverged: MuJoCo's own limit, `mjMAXVAL`."""
+_LARGEST = 1e10  # positions and velocities above it have diverged: MuJoCo's own limit, `mjMAXVAL`
 
 
 class Faults(EnvFaults):
@@ -117,8 +116,7 @@ _VELOCITIES = ("cvel", "cdof_dot")
 """What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
 _DERIVED = tuple(dict.fromkeys((*STATE_ARRAYS, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
-DEFAULT_NCONMAX = 48
-"""Default capacity for contacts per environment."""
+DEFAULT_NCONMAX = 48  # default capacity for contacts per environment
 
 
 class StateReader:
@@ -380,11 +378,9 @@ class WarpSimulation(Simulation):
             self._faults.warn_once(totals)
 
     def _physics(self, num_steps: int) -> None:
-        """Advance all environments by some physics steps, and restart those that shall not wait: for a `GraphedCall`.
-
-        Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
-        some of them remember earlier steps.
-        """
+        """Advance all environments by some physics steps, and restart those that shall not wait: for a `GraphedCall`."""
+        # Poses and contacts are then those at the start of the last step. Only there are sensors evaluated, unless some of
+        # them remember earlier steps.
         whole = self.warp_model.opt.disableflags
         idle = whole if self.warp_model.nhistory else whole | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         try:
@@ -417,10 +413,7 @@ class WarpSimulation(Simulation):
             self._note_stale()
 
     def _begin_episodes(self, mask: Bool[Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
-        """Restart some environments, with values.
-
-        Their poses and contacts are evaluated when they are next asked for; without a look for contacts, their poses at once.
-        """
+        """Restart some environments, with values."""
         self._is_reset.copy_(mask)
         self._restarting()
         self._put(mask, rows)
@@ -442,7 +435,6 @@ class WarpSimulation(Simulation):
                     put_rows(array, is_put, values)
 
     def _evaluate(self, mask: Bool[Tensor, " env"]) -> None:
-        """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
         self._is_stale |= mask
         self._note_stale()
 
@@ -456,11 +448,9 @@ class WarpSimulation(Simulation):
         self._has_stale = self._stream.is_capturing
 
     def _note_stale(self) -> None:
-        """Note, on the host, that environments are to be evaluated.
-
-        A user's graph is replayed without the host. Environments put elsewhere inside it are therefore evaluated in it; and
-        once there is one, all others are evaluated at once, as the graph may read them.
-        """
+        """Note, on the host, that environments are to be evaluated."""
+        # A user's graph is replayed without the host. Environments put elsewhere inside it are therefore evaluated in it; and
+        # once there is one, all others are evaluated at once, as the graph may read them.
         if self._stream.is_capturing:
             self._is_in_graphs = True
             self._evaluation()
@@ -470,10 +460,7 @@ class WarpSimulation(Simulation):
             self._refresh()
 
     def _evaluate_stale(self) -> None:
-        """Evaluate all environments where they are now, then give those that are not stale back their earlier instant.
-
-        It is for a `GraphedCall`.
-        """
+        """Evaluate all environments where they are now, then give those that are not stale back their earlier instant."""
         arrays = {name: self._arrays[name] for name in (*_DERIVED, "history")} | self._contacts.arrays
         arrays = {name: array for name, array in arrays.items() if array.numel()}
         earlier = _copied(arrays)
@@ -484,10 +471,7 @@ class WarpSimulation(Simulation):
         self._is_stale.zero_()
 
     def _evaluate_poses(self) -> None:
-        """Evaluate poses and velocities of the environments that were just reset: for a `GraphedCall`.
-
-        Those of all are evaluated, which costs little, and the others are given back their earlier instant.
-        """
+        """Evaluate poses and velocities of the environments that were just reset: for a `GraphedCall`."""
         arrays = {name: self._arrays[name] for name in _DERIVED if self._arrays[name].numel()}
         earlier = _copied(arrays)
         for evaluate in (self._mjw.kinematics, self._mjw.com_pos, self._mjw.com_vel):

@@ -13,8 +13,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.runtime.simulators.machine import checked_device
 
 T = TypeVar("T")
-_EAGER_CALLS = 2
-"""Calls before the one that is captured: they load kernels and make what lasts."""
+_EAGER_CALLS = 2  # calls before the one that is captured: they load kernels and make what lasts
 
 
 def libraries() -> tuple[Any, Any]:

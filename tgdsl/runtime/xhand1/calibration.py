@@ -26,8 +26,7 @@ from tgdsl.schema.load import parse_spec, read_spec
 
 Sign = Literal[-1, 1]
 Row = tuple[Number, Number, Number]
-_ORTHOGONAL = 1e-4
-"""Largest error of a rotation's product with its transpose: five written digits."""
+_ORTHOGONAL = 1e-4  # largest error of a rotation's product with its transpose: five written digits
 
 
 class FingerSpec(SpecModel):
@@ -104,25 +103,15 @@ _REQUIRED = ("tgdsl", "fingers")
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What one hand's counts mean.
+    """What one hand's counts mean."""
 
-    Attributes:
-        units: Unit of what `apply` returns.
-        scale: Unit per count, along the sensor's axes.
-        rotation: From the sensor's axes to the link's.
-        bias: Offset of the force [units].
-        tare: What the sensors read unloaded [counts].
-        hand: Which hand it is for, or empty.
-        contact_threshold: Force above which a fingertip is in contact [units]; None if that was not said.
-    """
-
-    units: Literal["counts", "N"]
-    scale: Float[np.ndarray, "finger 3"]
-    rotation: Float[np.ndarray, "finger 3 3"]
-    bias: Float[np.ndarray, "finger 3"]
-    tare: Float[np.ndarray, "finger 3"]
-    hand: str = ""
-    contact_threshold: float | None = None
+    units: Literal["counts", "N"]  # unit of what `apply` returns
+    scale: Float[np.ndarray, "finger 3"]  # unit per count, along the sensor's axes
+    rotation: Float[np.ndarray, "finger 3 3"]  # from the sensor's axes to the link's
+    bias: Float[np.ndarray, "finger 3"]  # offset of the force [units]
+    tare: Float[np.ndarray, "finger 3"]  # what the sensors read unloaded [counts]
+    hand: str = ""  # which hand it is for, or empty
+    contact_threshold: float | None = None  # force above which a fingertip is in contact [units]; None if that was not said
 
     @classmethod
     def none(cls) -> Calibration:

@@ -41,19 +41,12 @@ _LAST_TRIES = 6
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One state of the hand.
+    """One state of the hand."""
 
-    Attributes:
-        sequence: Number of the exchange that brought it; each is larger than the one before.
-        requested_at: When it was asked for, on the clock of `time.monotonic` [s]: what it says is not older than this.
-        received_at: When it was here [s].
-        state: What the hand said.
-    """
-
-    sequence: int
-    requested_at: float
-    received_at: float
-    state: HandState
+    sequence: int  # number of the exchange that brought it; each is larger than the one before
+    requested_at: float  # when it was asked for, on the clock of `time.monotonic` [s]: what it says is not older than this
+    received_at: float  # when it was here [s]
+    state: HandState  # what the hand said
 
     def age_s(self, now: float | None = None) -> float:
         """Return how old it can be at most [s], now or at a time of `time.monotonic`."""
@@ -183,27 +176,19 @@ def _plausible(state: HandState) -> HandState:
     return state
 
 
-MAX_AGE_S = 0.1
-"""Largest age of a reading that is returned [s], unless replies may take longer."""
-READ_TIMEOUT_S = 0.08
-"""How long a call waits for a new reading [s], unless replies may take longer."""
+MAX_AGE_S = 0.1  # largest age of a reading that is returned [s], unless replies may take longer
+READ_TIMEOUT_S = 0.08  # how long a call waits for a new reading [s], unless replies may take longer
 _PATIENCE_S = 1.0
 _CLOSE_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Tare:
-    """What the fingertips read while nothing touches them.
+    """What the fingertips read while nothing touches them."""
 
-    Attributes:
-        mean: Mean of the frames [counts].
-        spread: Largest less least of the frames [counts].
-        num_frames: How many frames.
-    """
-
-    mean: Float[np.ndarray, "finger 3"]
-    spread: Float[np.ndarray, "finger 3"]
-    num_frames: int
+    mean: Float[np.ndarray, "finger 3"]  # mean of the frames [counts]
+    spread: Float[np.ndarray, "finger 3"]  # largest less least of the frames [counts]
+    num_frames: int  # how many frames
 
 
 class XHand1:

@@ -16,35 +16,22 @@ from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogErr
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS, NUM_JOINTS, PASSIVE, JointCommand, Mode
 
 JointArray = Float[np.ndarray, " joint"]
-ROUNDING = 1e-6
-"""How far a target may lie beyond its range to count as its end [rad]: float32 angles are rounded by less."""
-_LONGEST_STEP_S = 0.05
-"""Set-points move no further in one exchange than in this time, however long it took [s]."""
+ROUNDING = 1e-6  # how far a target may lie beyond its range to count as its end [rad]: float32 angles are rounded by less
+_LONGEST_STEP_S = 0.05  # set-points move no further in one exchange than in this time, however long it took [s]
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Leave to move, and how far it goes. One value per joint, in the order of their ids.
+    """Leave to move, and how far it goes. One value per joint, in the order of their ids."""
 
-    Attributes:
-        lower: Least set-point [rad].
-        upper: Largest set-point [rad].
-        speed: How fast a set-point may move [rad/s].
-        current_limit: Largest motor current [mA]; what torque it makes is not published.
-        kp: Proportional gain [hand's unit].
-        ki: Integral gain [hand's unit].
-        kd: Derivative gain [hand's unit].
-        watchdog_s: The hand is made passive if no command comes for this long [s].
-    """
-
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
-    speed: tuple[float, ...]
-    current_limit: tuple[int, ...]
-    kp: int
-    ki: int = 0
-    kd: int = 0
-    watchdog_s: float = 0.1
+    lower: tuple[float, ...]  # least set-point [rad]
+    upper: tuple[float, ...]  # largest set-point [rad]
+    speed: tuple[float, ...]  # how fast a set-point may move [rad/s]
+    current_limit: tuple[int, ...]  # largest motor current [mA]; what torque it makes is not published
+    kp: int  # proportional gain [hand's unit]
+    ki: int = 0  # integral gain [hand's unit]
+    kd: int = 0  # derivative gain [hand's unit]
+    watchdog_s: float = 0.1  # the hand is made passive if no command comes for this long [s]
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing.
@@ -113,15 +100,10 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
 
 @dataclass(frozen=True, eq=False)
 class JointControls:
-    """Controls of a model that are the hand's joint angles.
+    """Controls of a model that are the hand's joint angles."""
 
-    Attributes:
-        actuator_id: Actuator of each joint.
-        qpos_id: Place of each joint in the model's `qpos`.
-    """
-
-    actuator_id: Int[np.ndarray, " joint"]
-    qpos_id: Int[np.ndarray, " joint"]
+    actuator_id: Int[np.ndarray, " joint"]  # actuator of each joint
+    qpos_id: Int[np.ndarray, " joint"]  # place of each joint in the model's `qpos`
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel) -> JointControls:

@@ -49,23 +49,14 @@ _KEPT = ("stack", "last")
 
 @dataclass(frozen=True)
 class HandTerm:
-    """One observation that a hand can give.
+    """One observation that a hand can give."""
 
-    Attributes:
-        planned: The observation.
-        fingers: Fingertips that it is of, in the order of the sensor's links.
-        axes: Axes of an aggregate force, in order.
-        steps: How many control steps are stacked, the oldest first.
-        period: Time between samples [s]; 0: one at every control step.
-        joints: Joints that it is of, by the hand's ids; of a `last_action`, those whose actuators it is of.
-    """
-
-    planned: PlannedObservation
-    fingers: tuple[int, ...] = ()
-    axes: tuple[int, ...] = ()
-    steps: int = 1
-    period: float = 0.0
-    joints: tuple[int, ...] = ()
+    planned: PlannedObservation  # the observation
+    fingers: tuple[int, ...] = ()  # fingertips that it is of, in the order of the sensor's links
+    axes: tuple[int, ...] = ()  # axes of an aggregate force, in order
+    steps: int = 1  # how many control steps are stacked, the oldest first
+    period: float = 0.0  # time between samples [s]; 0: one at every control step
+    joints: tuple[int, ...] = ()  # joints that it is of, by the hand's ids; of a `last_action`, those whose actuators it is of
 
     @property
     def label(self) -> str:
@@ -250,7 +241,6 @@ class _Past:
         return torch.cat(self._last, dim=1)
 
     def reset(self) -> None:
-        """Forget them."""
         self._last: Sequence[Tensor] = []
         self._phase = torch.zeros_like(self._dt)
 

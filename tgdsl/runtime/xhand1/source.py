@@ -65,33 +65,21 @@ class VelocityFilter:
 
 @dataclass(frozen=True, eq=False)
 class HandSample:
-    """What the hand said at one control step.
+    """What the hand said at one control step."""
 
-    Attributes:
-        joint_pos: Joint angles, by joint id [rad].
-        joint_vel: Their speeds, by `VelocityFilter` [rad/s].
-        tip_force: Force on each fingertip, along its link's axes [`units`].
-        is_tip_saturated: Whether a component of a fingertip's counts is at the end of its range: the force may be larger.
-        taxel_counts: Each taxel's force as the hand gives it [counts]; where the taxels sit and their axes are unverified.
-        is_taxel_saturated: The same for each taxel.
-        joint_temperature: Temperature of each drive [°C].
-        tip_temperature: Temperature of each fingertip [°C].
-        joint_error: Error codes of each joint's three boards; 0 is none.
-        units: Unit of `tip_force`.
-        reading: The reading that all this comes from; it knows its age.
-    """
-
-    joint_pos: Float[Tensor, "env joint"]
-    joint_vel: Float[Tensor, "env joint"]
-    tip_force: Float[Tensor, "env finger 3"]
+    joint_pos: Float[Tensor, "env joint"]  # joint angles, by joint id [rad]
+    joint_vel: Float[Tensor, "env joint"]  # their speeds, by `VelocityFilter` [rad/s]
+    tip_force: Float[Tensor, "env finger 3"]  # force on each fingertip, along its link's axes [`units`]
+    # whether a component of a fingertip's counts is at the end of its range: the force may be larger
     is_tip_saturated: Bool[Tensor, "env finger"]
+    # each taxel's force as the hand gives it [counts]; where the taxels sit and their axes are unverified
     taxel_counts: Int[Tensor, "env finger taxel 3"]
-    is_taxel_saturated: Bool[Tensor, "env finger taxel"]
-    joint_temperature: Int[Tensor, "env joint"]
-    tip_temperature: Int[Tensor, "env finger"]
-    joint_error: Int[Tensor, "env joint 3"]
-    units: Literal["counts", "N"]
-    reading: Reading
+    is_taxel_saturated: Bool[Tensor, "env finger taxel"]  # the same for each taxel
+    joint_temperature: Int[Tensor, "env joint"]  # temperature of each drive [°C]
+    tip_temperature: Int[Tensor, "env finger"]  # temperature of each fingertip [°C]
+    joint_error: Int[Tensor, "env joint 3"]  # error codes of each joint's three boards; 0 is none
+    units: Literal["counts", "N"]  # unit of `tip_force`
+    reading: Reading  # the reading that all this comes from; it knows its age
 
     @classmethod
     def of(cls, reading: Reading, calibration: Calibration, velocity: VelocityFilter, time_s: float) -> HandSample:

@@ -22,10 +22,8 @@ from tgdsl.scene.contact_bits import free_bit
 from tgdsl.scene.scene import Choice, SceneModels, with_choices
 from tgdsl.schema.objects import NUM_SIZES
 
-Values = int | float | Sequence[Any] | np.ndarray
-"""Numbers, one per environment or one for all."""
-SPARE_BODY = "tgdsl/spare"
-"""The body that holds one geom per mesh: it belongs to the world, touches nothing and is not seen."""
+Values = int | float | Sequence[Any] | np.ndarray  # numbers, one per environment or one for all
+SPARE_BODY = "tgdsl/spare"  # the body that holds one geom per mesh: it belongs to the world, touches nothing and is not seen
 
 
 class SharedMeshModels(SceneModels):
@@ -136,8 +134,7 @@ def checked_numbers(what: str, value: Values, count: int, num: int) -> Int[np.nd
     return np.broadcast_to(result, count).astype(np.int64)
 
 
-COLDEST = ZEROS["K"]
-"""Absolute zero [°C]."""
+COLDEST = ZEROS["K"]  # absolute zero [°C]
 
 
 class EnvHeat:

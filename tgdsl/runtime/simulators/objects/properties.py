@@ -30,23 +30,15 @@ PER_ENV: Mapping[str, tuple[str, ...]] = {"mass": MASS_FIELDS, "friction": ("geo
 
 @dataclass(frozen=True, eq=False)
 class RigidObject:
-    """An object: a body, and those below it that are welded to it.
+    """An object: a body, and those below it that are welded to it."""
 
-    Attributes:
-        name: Its body.
-        bodies: Indices of its bodies.
-        geoms: Indices of their geoms.
-        dofs: Degrees of freedom of its body's joints.
-        above: The bodies that carry it, the world among them.
-        is_tree: Whether it is a kinematic tree by itself whose joints have no armature: then what MuJoCo derives of its mass
-            grows or shrinks with that alone.
-    """
-
-    name: str
-    bodies: Int[np.ndarray, " body"]
-    geoms: Int[np.ndarray, " geom"]
-    dofs: Int[np.ndarray, " dof"]
-    above: Int[np.ndarray, " ancestor"]
+    name: str  # its body
+    bodies: Int[np.ndarray, " body"]  # indices of its bodies
+    geoms: Int[np.ndarray, " geom"]  # indices of their geoms
+    dofs: Int[np.ndarray, " dof"]  # degrees of freedom of its body's joints
+    above: Int[np.ndarray, " ancestor"]  # the bodies that carry it, the world among them
+    # whether it is a kinematic tree by itself whose joints have no armature: then what MuJoCo derives of its mass grows or
+    # shrinks with that alone
     is_tree: bool
 
 

@@ -47,15 +47,10 @@ _COUNTS_PER_TURN = 4096
 
 @dataclass(frozen=True, eq=False)
 class TipForces:
-    """What the fingertips feel [counts]; rounded and cut to a byte, as a sensor would.
+    """What the fingertips feel [counts]; rounded and cut to a byte, as a sensor would."""
 
-    Attributes:
-        total: Force of each fingertip.
-        taxel: Force of each taxel.
-    """
-
-    total: Float[np.ndarray, "finger 3"]
-    taxel: Float[np.ndarray, "finger taxel 3"]
+    total: Float[np.ndarray, "finger 3"]  # force of each fingertip
+    taxel: Float[np.ndarray, "finger taxel 3"]  # force of each taxel
 
     @classmethod
     def zero(cls) -> TipForces:
@@ -162,8 +157,7 @@ def _counts(force: Float[np.ndarray, "*batch 3"]) -> np.ndarray:
 
 _IDLE_S = 0.05
 _KEPT_REQUESTS = 20_000
-_CHUNK = 124
-"""Bytes that come out of the line at a time: 0.4 ms at 3 Mbaud."""
+_CHUNK = 124  # bytes that come out of the line at a time: 0.4 ms at 3 Mbaud
 
 
 class EmulatedLine:

@@ -42,8 +42,7 @@ from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NU
 PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 """For an emulator on a busy machine, where bytes are late but not lost: pseudo-terminals then take up to half a second."""
 _POLL_S = 0.001
-_LATE_S = 0.2
-"""Physics that is later than this is not made up for [s]."""
+_LATE_S = 0.2  # physics that is later than this is not made up for [s]
 
 
 @dataclass(frozen=True)
@@ -286,7 +285,6 @@ class EmulatedSource(XHand1Source):
         return self.body.time if self._is_lockstep else super()._time_of(reading)
 
     def _check_threads(self) -> None:
-        """Raise the error that ended a thread, not what follows from it."""
         if self.body.failure is not None:
             raise SimulationError(f"the emulated hand's simulation ended: {self.body.failure}") from self.body.failure
         self.emulator.check()

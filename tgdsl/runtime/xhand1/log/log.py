@@ -53,8 +53,7 @@ RECORD = np.dtype(
     + [(name, getattr(_ZERO, name).dtype, getattr(_ZERO, name).shape) for name in STATE]
 )
 """One reading: the arrays of a log, row by row."""
-CHUNK = 256
-"""Readings that are in memory at a time: 1 MB of them."""
+CHUNK = 256  # readings that are in memory at a time: 1 MB of them
 _DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zlib.error, zipfile.BadZipFile, struct.error)
 """Errors that a damaged archive raises."""
 
@@ -65,17 +64,11 @@ class LogError(TgdslError):
 
 @dataclass(frozen=True)
 class Fault:
-    """A failure: when no reading came, and why.
+    """A failure: when no reading came, and why."""
 
-    Attributes:
-        time: When it was noticed, on the clock of the readings [s].
-        kind: Name of the error's class.
-        message: What it said.
-    """
-
-    time: float
-    kind: str
-    message: str
+    time: float  # when it was noticed, on the clock of the readings [s]
+    kind: str  # name of the error's class
+    message: str  # what it said
 
     @classmethod
     def of(cls, error: HandError, time: float) -> Fault:
@@ -92,29 +85,17 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class HandLog:
-    """A log that was checked from end to end. Times and failures are in memory; readings are read from the file on demand.
+    """A log that was checked from end to end. Times and failures are in memory; readings are read from the file on demand."""
 
-    Attributes:
-        path: The file.
-        identity: The hand; None if it was not asked.
-        calibration: What its counts meant when it was recorded; None if nothing was known.
-        started_at: Time of day at the start [s since 1970], for people.
-        sequence: Number of the exchange of each reading.
-        requested_at: When each was asked for [s].
-        received_at: When each was here [s].
-        faults: The failures, in order.
-        fault_reading: How many readings had come before each.
-    """
-
-    path: Path
-    identity: HandIdentity | None
-    calibration: Calibration | None
-    started_at: float
-    sequence: Int[np.ndarray, " reading"]
-    requested_at: Float[np.ndarray, " reading"]
-    received_at: Float[np.ndarray, " reading"]
-    faults: tuple[Fault, ...] = field(repr=False)
-    fault_reading: Int[np.ndarray, " fault"]
+    path: Path  # the file
+    identity: HandIdentity | None  # the hand; None if it was not asked
+    calibration: Calibration | None  # what its counts meant when it was recorded; None if nothing was known
+    started_at: float  # time of day at the start [s since 1970], for people
+    sequence: Int[np.ndarray, " reading"]  # number of the exchange of each reading
+    requested_at: Float[np.ndarray, " reading"]  # when each was asked for [s]
+    received_at: Float[np.ndarray, " reading"]  # when each was here [s]
+    faults: tuple[Fault, ...] = field(repr=False)  # the failures, in order
+    fault_reading: Int[np.ndarray, " fault"]  # how many readings had come before each
 
     @property
     def num_readings(self) -> int:

@@ -203,7 +203,6 @@ class ReplaySource(HandSource):
         raise fault.error()
 
     def _log_time(self) -> float:
-        """Return what the log's clock shows: it runs with that on the wall, unless the replay is as fast as possible."""
         if math.isinf(self._speed):
             return self._now
         return self._start + (self._clock() - self._began_at) * self._speed

@@ -23,8 +23,7 @@ from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
 from tgdsl.runtime.xhand1.wire.protocol import HOST_ADDRESS, OVERHEAD, Command, Frame, FrameParser, encode_frame, hand_address
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD, Port
 
-_CLOCK_TOLERANCE = 0.97
-"""Part of the nominal time that a UART with a fast clock may take for a frame."""
+_CLOCK_TOLERANCE = 0.97  # part of the nominal time that a UART with a fast clock may take for a frame
 
 _VERSION_TRIES = 3
 _BABBLE = "the line does not fall silent: something else is sending on it"
@@ -32,23 +31,16 @@ _BABBLE = "the line does not fall silent: something else is sending on it"
 
 @dataclass(frozen=True)
 class SerialTiming:
-    """Times of the line.
+    """Times of the line."""
 
-    Attributes:
-        baud: Bits per second; 10 bits carry one byte.
-        reply_timeout_s: How long a reply may take to be complete [s].
-        silence_s: Silence after which a reply that has begun will not go on [s]. FTDI adapters pause for up to 16 ms.
-        settle_s: Silence that is asked for after a failure [s]: if the hand tells its version, since the last byte.
-        quiet_s: Silence that ends a good reply [s].
-        checks_wire_time: Whether a reply that is complete sooner than the baud rate allows is refused as that of an earlier
-            request. Turn it off for a line that is faster than it says.
-    """
-
-    baud: int = BAUD
-    reply_timeout_s: float = 0.03
+    baud: int = BAUD  # bits per second; 10 bits carry one byte
+    reply_timeout_s: float = 0.03  # how long a reply may take to be complete [s]
+    # silence after which a reply that has begun will not go on [s]. FTDI adapters pause for up to 16 ms.
     silence_s: float = 0.018
-    settle_s: float = 0.018
-    quiet_s: float = 0.0005
+    settle_s: float = 0.018  # silence that is asked for after a failure [s]: if the hand tells its version, since the last byte
+    quiet_s: float = 0.0005  # silence that ends a good reply [s]
+    # whether a reply that is complete sooner than the baud rate allows is refused as that of an earlier request. Turn it off
+    # for a line that is faster than it says.
     checks_wire_time: bool = True
 
     @property
@@ -59,40 +51,24 @@ class SerialTiming:
 
 @dataclass
 class SerialCounters:
-    """What happened on the line so far.
+    """What happened on the line so far."""
 
-    Attributes:
-        num_requests: Requests sent.
-        num_replies: Requests that were answered.
-        num_timeouts: Requests without an answer.
-        num_damaged: Requests with a damaged answer.
-        num_foreign: Frames from or to other addresses.
-        num_unexpected: Replies that were not asked for: repeated, early, or to another command.
-        num_discarded_bytes: Bytes that belonged to no frame, or that came when nothing was asked.
-    """
-
-    num_requests: int = 0
-    num_replies: int = 0
-    num_timeouts: int = 0
-    num_damaged: int = 0
-    num_foreign: int = 0
-    num_unexpected: int = 0
-    num_discarded_bytes: int = 0
+    num_requests: int = 0  # requests sent
+    num_replies: int = 0  # requests that were answered
+    num_timeouts: int = 0  # requests without an answer
+    num_damaged: int = 0  # requests with a damaged answer
+    num_foreign: int = 0  # frames from or to other addresses
+    num_unexpected: int = 0  # replies that were not asked for: repeated, early, or to another command
+    num_discarded_bytes: int = 0  # bytes that belonged to no frame, or that came when nothing was asked
 
 
 @dataclass(frozen=True)
 class Addresses:
-    """Where requests go, and from and to where replies come. What a real hand puts into its replies is unverified.
+    """Where requests go, and from and to where replies come. What a real hand puts into its replies is unverified."""
 
-    Attributes:
-        hand_id: The hand's id.
-        reply_source: Source of its replies; default: the hand's address.
-        reply_destination: Destination of its replies; default: the host's address.
-    """
-
-    hand_id: int = 0
-    reply_source: int | None = None
-    reply_destination: int | None = None
+    hand_id: int = 0  # the hand's id
+    reply_source: int | None = None  # source of its replies; default: the hand's address
+    reply_destination: int | None = None  # destination of its replies; default: the host's address
 
     @property
     def reply(self) -> tuple[int, int]:
@@ -103,21 +79,13 @@ class Addresses:
 
 @dataclass(frozen=True)
 class Reply:
-    """A reply.
+    """A reply."""
 
-    Attributes:
-        payload: Its bytes.
-        requested_at: When the request went out, on the client's clock [s]: the reply is not older than this.
-        received_at: When the reply was complete [s].
-        source: Address that it came from.
-        destination: Address that it was for.
-    """
-
-    payload: bytes
-    requested_at: float
-    received_at: float
-    source: int
-    destination: int
+    payload: bytes  # its bytes
+    requested_at: float  # when the request went out, on the client's clock [s]: the reply is not older than this
+    received_at: float  # when the reply was complete [s]
+    source: int  # address that it came from
+    destination: int  # address that it was for
 
 
 class _Waiting:

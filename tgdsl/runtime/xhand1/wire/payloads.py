@@ -49,29 +49,19 @@ class Mode(IntEnum):
 
 @dataclass(frozen=True)
 class JointCommand:
-    """What one joint's drive shall do.
+    """What one joint's drive shall do."""
 
-    Attributes:
-        position: Set-point [rad].
-        kp: Proportional gain [hand's unit].
-        ki: Integral gain [hand's unit].
-        kd: Derivative gain [hand's unit].
-        current_limit: Largest motor current [mA].
-        mode: What the drive does.
-    """
-
-    position: float = 0.0
-    kp: int = 0
-    ki: int = 0
-    kd: int = 0
-    current_limit: int = 0
-    mode: int = Mode.PASSIVE
+    position: float = 0.0  # set-point [rad]
+    kp: int = 0  # proportional gain [hand's unit]
+    ki: int = 0  # integral gain [hand's unit]
+    kd: int = 0  # derivative gain [hand's unit]
+    current_limit: int = 0  # largest motor current [mA]
+    mode: int = Mode.PASSIVE  # what the drive does
 
 
 _JOINT_COMMAND = struct.Struct("<Hhhhf6H")
 COMMAND_SIZE = NUM_JOINTS * _JOINT_COMMAND.size
-PASSIVE = (JointCommand(),) * NUM_JOINTS
-"""Mode 0, no gain, no current: the request that reads, and asks no joint to move."""
+PASSIVE = (JointCommand(),) * NUM_JOINTS  # mode 0, no gain, no current: the request that reads, and asks no joint to move
 
 
 def encode_command(joints: Sequence[JointCommand]) -> bytes:
@@ -141,41 +131,26 @@ _PLACES = {
 _FORCES = ("total_force", "taxel_force")
 
 FORCE_MIN = np.array([-128, -128, 0])
-FORCE_MAX = np.array([127, 127, 255])
-"""What a force component can hold [counts]."""
+FORCE_MAX = np.array([127, 127, 255])  # what a force component can hold [counts]
 
 
 @dataclass(frozen=True, eq=False)
 class HandState:
-    """The reply to an exchange: what the hand says of itself. Forces are in the sensor's counts; no unit of them is published.
+    """The reply to an exchange: what the hand says of itself. Forces are in counts, whose unit is not published."""
 
-    Attributes:
-        joint_id: Id that each joint gives itself.
-        sensor_id: Meaning not published.
-        position: Joint angles [rad].
-        current: Motor current [mA].
-        raw_position: Encoder counts.
-        joint_temperature: Its low byte is in °C; the high byte's meaning is not published.
-        joint_error: Error codes of the communication board, the joint board and the fingertip board; 0 is none.
-        reserved: Three words without published meaning.
-        total_force: Fingertip force as the hand itself sums it up [counts].
-        taxel_force: Force of each taxel [counts].
-        taxel_temperature: 20 thermometers of each fingertip [°C].
-        total_temperature: The fingertip's own temperature [°C].
-    """
-
-    joint_id: UInt8[np.ndarray, " joint"]
-    sensor_id: UInt8[np.ndarray, " joint"]
-    position: Float[np.ndarray, " joint"]
-    current: UInt16[np.ndarray, " joint"]
-    raw_position: UInt16[np.ndarray, " joint"]
-    joint_temperature: UInt16[np.ndarray, " joint"]
+    joint_id: UInt8[np.ndarray, " joint"]  # id that each joint gives itself
+    sensor_id: UInt8[np.ndarray, " joint"]  # meaning not published
+    position: Float[np.ndarray, " joint"]  # joint angles [rad]
+    current: UInt16[np.ndarray, " joint"]  # motor current [mA]
+    raw_position: UInt16[np.ndarray, " joint"]  # encoder counts
+    joint_temperature: UInt16[np.ndarray, " joint"]  # its low byte is in °C; the high byte's meaning is not published
+    # error codes of the communication board, the joint board and the fingertip board; 0 is none
     joint_error: UInt16[np.ndarray, "joint 3"]
-    reserved: UInt16[np.ndarray, "joint 3"]
-    total_force: Int[np.ndarray, "finger 3"]
-    taxel_force: Int[np.ndarray, "finger taxel 3"]
-    taxel_temperature: UInt8[np.ndarray, "finger 20"]
-    total_temperature: UInt8[np.ndarray, " finger"]
+    reserved: UInt16[np.ndarray, "joint 3"]  # three words without published meaning
+    total_force: Int[np.ndarray, "finger 3"]  # fingertip force as the hand itself sums it up [counts]
+    taxel_force: Int[np.ndarray, "finger taxel 3"]  # force of each taxel [counts]
+    taxel_temperature: UInt8[np.ndarray, "finger 20"]  # 20 thermometers of each fingertip [°C]
+    total_temperature: UInt8[np.ndarray, " finger"]  # the fingertip's own temperature [°C]
 
     @property
     def is_total_saturated(self) -> Bool[np.ndarray, "finger 3"]:

@@ -23,17 +23,11 @@ _MORE_PATIENT = SerialTiming(reply_timeout_s=0.4)
 
 @dataclass(frozen=True)
 class FoundHand:
-    """A hand that answered.
+    """A hand that answered."""
 
-    Attributes:
-        device: Its serial port.
-        addresses: Its id, and the addresses that its reply had.
-        version: What the reply held, as it came.
-    """
-
-    device: str
-    addresses: Addresses
-    version: bytes
+    device: str  # its serial port
+    addresses: Addresses  # its id, and the addresses that its reply had
+    version: bytes  # what the reply held, as it came
 
 
 def find_hands(
@@ -72,17 +66,11 @@ def find_hands(
 
 @dataclass(frozen=True)
 class AskedPort:
-    """A serial port that was asked for hands.
+    """A serial port that was asked for hands."""
 
-    Attributes:
-        port: The port.
-        hands: The hands that answered.
-        trouble: Why it could not be asked, or empty.
-    """
-
-    port: PortInfo
-    hands: tuple[FoundHand, ...]
-    trouble: str = ""
+    port: PortInfo  # the port
+    hands: tuple[FoundHand, ...]  # the hands that answered
+    trouble: str = ""  # why it could not be asked, or empty
 
     def __str__(self) -> str:
         name = f"{self.port.device} ({self.port.description})" if self.port.description else self.port.device
@@ -149,23 +137,14 @@ _BYTES = ("version", "side", "serial_number", "name")
 
 @dataclass(frozen=True)
 class HandIdentity:
-    """What a hand says about itself; bytes as they came, for the layout of these replies is unverified.
+    """What a hand says about itself; bytes as they came, for the layout of these replies is unverified."""
 
-    Attributes:
-        device: The serial port that it answers on.
-        hand_id: Its id.
-        version: Its version; empty if it was not asked.
-        side: Register 20, which hand it is; None if it does not tell.
-        serial_number: Register 21; None if it does not tell.
-        name: Register 54; None if it does not tell.
-    """
-
-    device: str
-    hand_id: int
-    version: bytes = b""
-    side: bytes | None = None
-    serial_number: bytes | None = None
-    name: bytes | None = None
+    device: str  # the serial port that it answers on
+    hand_id: int  # its id
+    version: bytes = b""  # its version; empty if it was not asked
+    side: bytes | None = None  # register 20, which hand it is; None if it does not tell
+    serial_number: bytes | None = None  # register 21; None if it does not tell
+    name: bytes | None = None  # register 54; None if it does not tell
 
     def as_json(self) -> dict[str, Any]:
         """Return it for a log, bytes as hexadecimal text."""

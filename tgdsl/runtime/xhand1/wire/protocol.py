@@ -17,14 +17,12 @@ from tgdsl.runtime.xhand1.wire.errors import ProtocolError
 
 HEADER = b"\x55\xaa"
 HOST_ADDRESS = 0xFE
-HAND_ADDRESS = 0x80
-"""A hand's address is this with its id in the low seven bits."""
+HAND_ADDRESS = 0x80  # a hand's address is this with its id in the low seven bits
 HEAD_SIZE = 7
 OVERHEAD = HEAD_SIZE + 2
 MAX_PAYLOAD = 8224
 
-FIRMWARE_COMMANDS = frozenset({0xA1, 0xA2, 0xA3, 0xA4, 0xB0})
-"""Commands that write firmware: they are never sent."""
+FIRMWARE_COMMANDS = frozenset({0xA1, 0xA2, 0xA3, 0xA4, 0xB0})  # commands that write firmware: they are never sent
 
 
 class Command(IntEnum):
@@ -59,19 +57,12 @@ class Register(IntEnum):
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame, without header, length and checksum.
+    """One frame, without header, length and checksum."""
 
-    Attributes:
-        source: Address of who sent it.
-        destination: Address of whom it is for.
-        command: What it asks or answers: a `Command`, or a number that has no name here.
-        payload: Its bytes, at most `MAX_PAYLOAD`.
-    """
-
-    source: int
-    destination: int
-    command: int
-    payload: bytes = b""
+    source: int  # address of who sent it
+    destination: int  # address of whom it is for
+    command: int  # what it asks or answers: a `Command`, or a number that has no name here
+    payload: bytes = b""  # its bytes, at most `MAX_PAYLOAD`
 
 
 def hand_address(hand_id: int) -> int:

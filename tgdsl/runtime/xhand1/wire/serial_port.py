@@ -9,8 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError
 
 BAUD = 3_000_000
-POLL_S = 0.0005
-"""How long a read waits for the first byte [s]."""
+POLL_S = 0.0005  # how long a read waits for the first byte [s]
 _WRITE_TIMEOUT_S = 0.5
 _LARGEST_READ = 4096
 
@@ -38,17 +37,11 @@ class Port(Protocol):
 
 @dataclass(frozen=True)
 class PortInfo:
-    """A serial port of this computer.
+    """A serial port of this computer."""
 
-    Attributes:
-        device: Name to open it by, such as `/dev/ttyUSB0`.
-        description: What the adapter calls itself.
-        serial_number: The adapter's serial number, or empty.
-    """
-
-    device: str
-    description: str
-    serial_number: str
+    device: str  # name to open it by, such as `/dev/ttyUSB0`
+    description: str  # what the adapter calls itself
+    serial_number: str  # the adapter's serial number, or empty
 
 
 def list_ports() -> tuple[PortInfo, ...]:
