@@ -23,36 +23,23 @@ HoldOut = Literal["none", "taxel", "blocks", "time", "recording"]
 Intervals = Literal["profile", "bootstrap", "none"]
 LEVEL = 0.95
 CORRELATED = 0.95
-UNKNOWN = 0.9
-"""Part of its range from which a parameter's interval says nothing."""
-WORSE = 1.2
-"""Held-out error over the error in-sample from which a fit is warned of."""
+UNKNOWN = 0.9  # part of its range from which a parameter's interval says nothing
+WORSE = 1.2  # held-out error over the error in-sample from which a fit is warned of
 RESAMPLES = 100
 
 
 @dataclass(frozen=True)
 class TargetErrors:
-    """Relative RMSE of a target: the RMS of the residuals over that of the target.
+    """Relative RMSE of a target: the RMS of the residuals over that of the target."""
 
-    Attributes:
-        recording: Name of the recording.
-        reading: The reading.
-        error: In-sample.
-        held_out: On numbers that were held out; None: none were.
-        floor: Of the target's noise; None: unknown.
-        alone: Of the reading's own map without any sensor.
-        rms: RMS of the target, in its unit.
-        unit: Unit of the reading.
-    """
-
-    recording: str
-    reading: str
-    error: float
-    held_out: float | None
-    floor: float | None
-    alone: float
-    rms: float
-    unit: str
+    recording: str  # name of the recording
+    reading: str  # the reading
+    error: float  # in-sample
+    held_out: float | None  # on numbers that were held out; None: none were
+    floor: float | None  # of the target's noise; None: unknown
+    alone: float  # of the reading's own map without any sensor
+    rms: float  # RMS of the target, in its unit
+    unit: str  # unit of the reading
 
     def texts(self, digits: int) -> tuple[str, ...]:
         """Return `error`, `held_out`, `floor` and `alone` with so many decimals; empty where None."""
@@ -63,19 +50,12 @@ class TargetErrors:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How well the unknowns are known, from the derivatives at the optimum.
+    """How well the unknowns are known, from the derivatives at the optimum."""
 
-    Attributes:
-        sigma: Standard deviation of each unknown in x; infinite where nothing depends on it.
-        correlation: Correlations of the unknowns.
-        noise: Standard deviation of the weighted residuals.
-        degrees: Degrees of freedom.
-    """
-
-    sigma: Float[np.ndarray, " unknown"]
-    correlation: Float[np.ndarray, "unknown unknown"]
-    noise: float
-    degrees: int
+    sigma: Float[np.ndarray, " unknown"]  # standard deviation of each unknown in x; infinite where nothing depends on it
+    correlation: Float[np.ndarray, "unknown unknown"]  # correlations of the unknowns
+    noise: float  # standard deviation of the weighted residuals
+    degrees: int  # degrees of freedom
 
 
 def uncertainty(problem: Problem, solution: Solution) -> Uncertainty:

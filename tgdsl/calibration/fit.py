@@ -26,12 +26,9 @@ from tgdsl.console.tables import text_table
 from tgdsl.errors import TgdslError
 from tgdsl.sensors import Kind
 
-CONTINUED = 3
-"""Starts that are followed to their minimum."""
-HUBER = 1.345
-"""Residual over its scale from which a row counts less (95 % efficiency for normal noise)."""
-ROUNDS = 4
-"""Most times that weights of rows and noise of targets are estimated again."""
+CONTINUED = 3  # starts that are followed to their minimum
+HUBER = 1.345  # residual over its scale from which a row counts less (95 % efficiency for normal noise)
+ROUNDS = 4  # most times that weights of rows and noise of targets are estimated again
 
 
 @dataclass(frozen=True)
@@ -52,23 +49,15 @@ class FittedParameter:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Parameters that fit recordings, and how well. `print(fit)` shows all of it.
+    """Parameters that fit recordings, and how well. `print(fit)` shows all of it."""
 
-    Attributes:
-        parameters: What was fitted, by path.
-        nuisances: Offsets of poses [m] and clocks [s], gains and coefficients of the reading's own maps, by name.
-        errors: Errors, one for each target.
-        warnings: What the data cannot tell, and what speaks against the model.
-        problem: The problem that was solved.
-        solution: Its solution.
-    """
-
-    parameters: Mapping[str, FittedParameter]
+    parameters: Mapping[str, FittedParameter]  # what was fitted, by path
+    # offsets of poses [m] and clocks [s], gains and coefficients of the reading's own maps, by name
     nuisances: Mapping[str, float]
-    errors: tuple[TargetErrors, ...]
-    warnings: tuple[str, ...]
-    problem: Problem
-    solution: Solution
+    errors: tuple[TargetErrors, ...]  # errors, one for each target
+    warnings: tuple[str, ...]  # what the data cannot tell, and what speaks against the model
+    problem: Problem  # the problem that was solved
+    solution: Solution  # its solution
 
     def __str__(self) -> str:
         parts = []

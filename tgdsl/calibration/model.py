@@ -30,10 +30,8 @@ from tgdsl.quantities.base import Request
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 
-DECADES = 1.0
-"""How far a positive parameter without bounds is searched from where it starts, either way."""
-LOGARITHMIC = 20.0
-"""Ratio of bounds from which a positive parameter is searched by its logarithm."""
+DECADES = 1.0  # how far a positive parameter without bounds is searched from where it starts, either way
+LOGARITHMIC = 20.0  # ratio of bounds from which a positive parameter is searched by its logarithm
 
 
 class InfeasibleError(TgdslError):
@@ -42,23 +40,14 @@ class InfeasibleError(TgdslError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a sensor that is fitted.
+    """A number of a sensor that is fitted."""
 
-    Attributes:
-        path: Sensor and field: `skin.thickness`.
-        start: Its value in the document.
-        low: Least value, in the unit of the field.
-        high: Largest value.
-        unit: Unit of the field; empty if it has none.
-        is_log: Whether its logarithm is searched.
-    """
-
-    path: str
-    start: float
-    low: float
-    high: float
-    unit: str
-    is_log: bool
+    path: str  # sensor and field: `skin.thickness`
+    start: float  # its value in the document
+    low: float  # least value, in the unit of the field
+    high: float  # largest value
+    unit: str  # unit of the field; empty if it has none
+    is_log: bool  # whether its logarithm is searched
 
     def value(self, u: float) -> float:
         """Return the value at a place of the search, 0 at `low` and 1 at `high`."""
@@ -200,11 +189,7 @@ class Model:
         return result
 
     def _spec(self, name: str, values: Mapping[str, float]) -> Any:
-        """Return a sensor's spec with other values.
-
-        Raises:
-            InfeasibleError: If it cannot have them.
-        """
+        """Return a sensor's spec with other values."""
         raw = self._loaded.source.get(("sensors", name))
         for path, value in values.items():
             raw = _with(raw, path.split(".")[1:], value)
@@ -277,14 +262,12 @@ def _mark(annotation: Any, metadata: Sequence[object]) -> Quantity | None:
 
 
 def _with(raw: Any, path: Sequence[str], value: float) -> Any:
-    """Return a mapping with another value at a path."""
     if not path:
         return value
     return {**(raw or {}), path[0]: _with((raw or {}).get(path[0]), path[1:], value)}
 
 
 def _are_alike(one: Sequence[LoweredSensor], two: Sequence[LoweredSensor], kind: Kind) -> bool:
-    """Return whether sensors differ in nothing but the values of their constants."""
     if kind.fit is not None or len(one) != len(two):
         return False
     return all(_shape(first) == _shape(second) for first, second in zip(one, two, strict=True))

@@ -23,12 +23,9 @@ from tgdsl.calibration.recordings import Recording, Target
 from tgdsl.errors import TgdslError
 
 ReadingMap = Literal["none", "offset", "scale", "affine"]
-STEP = 3e-4
-"""Step of finite differences in x: small to a range and to a prior's width, large to the error of a tabulated field."""
-WIDTHS = 6.0
-"""Largest nuisance, in standard deviations."""
-LINEAR = 1e-7
-"""Relative deviation from a straight line up to which a reading is linear in a parameter."""
+STEP = 3e-4  # step of finite differences in x: small to a range and to a prior's width, large to the error of a tabulated field
+WIDTHS = 6.0  # largest nuisance, in standard deviations
+LINEAR = 1e-7  # relative deviation from a straight line up to which a reading is linear in a parameter
 Weights = Sequence[Float[np.ndarray, " number"]]
 
 
@@ -43,39 +40,25 @@ class Nuisance(NamedTuple):
 
 
 class Part(NamedTuple):
-    """One target of one recording, flat.
+    """One target of one recording, flat."""
 
-    Attributes:
-        recording: Which recording it is of.
-        target: The target.
-        value: Its numbers.
-        weight: Their weights.
-        columns: What the reading's own map adds per unit of its coefficients, (number, coefficient).
-        names: Names of the coefficients.
-    """
-
-    recording: int
-    target: Target
-    value: Float[np.ndarray, " number"]
-    weight: Float[np.ndarray, " number"]
+    recording: int  # which recording it is of
+    target: Target  # the target
+    value: Float[np.ndarray, " number"]  # its numbers
+    weight: Float[np.ndarray, " number"]  # their weights
+    # what the reading's own map adds per unit of its coefficients, (number, coefficient)
     columns: Float[np.ndarray, "number coefficient"]
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # names of the coefficients
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What some x gives.
+    """What some x gives."""
 
-    Attributes:
-        x: The unknowns, with the linear parameters as solved for.
-        residual: Weighted residuals, then the nuisances.
-        predicted: Readings of each part, by all of the model.
-        coefficients: Coefficients of each part's own map, the gain last if there is one.
-    """
-
-    x: Float[np.ndarray, " unknown"]
-    residual: Float[np.ndarray, " residual"]
-    predicted: tuple[Float[np.ndarray, " number"], ...]
+    x: Float[np.ndarray, " unknown"]  # the unknowns, with the linear parameters as solved for
+    residual: Float[np.ndarray, " residual"]  # weighted residuals, then the nuisances
+    predicted: tuple[Float[np.ndarray, " number"], ...]  # readings of each part, by all of the model
+    # coefficients of each part's own map, the gain last if there is one
     coefficients: tuple[Float[np.ndarray, " coefficient"], ...]
 
     @property
@@ -251,7 +234,6 @@ class Problem:
         return Solution(x, residual, tuple(predicted), tuple(coefficients))
 
     def _projected(self, i: int, value: np.ndarray, root: np.ndarray) -> np.ndarray:
-        """Return weighted numbers less what a part's own map can explain of them."""
         columns, value = self.parts[i].columns * root[:, None], value * root
         return value - columns @ np.linalg.lstsq(columns, value, rcond=None)[0]
 
@@ -349,17 +331,12 @@ def _clock(target: Target) -> str:
 
 
 def _places(model: Model, reading: str) -> np.ndarray | None:
-    """Return where a reading's rows are in their link's frame (row, 3) [m]; None if they have no place."""
     table = model.module.rows.get(reading)
     return np.asarray(table["pos"]) if table is not None and "pos" in (table.dtype.names or ()) else None
 
 
 def _part(i: int, target: Target, reading: ReadingMap, places: np.ndarray | None, model: Model) -> Part:
-    """Return a target with the columns of its own map.
-
-    Raises:
-        TgdslError: If its rows have no places, and the map depends on them.
-    """
+    """Return a target with the columns of its own map."""
     output = next(output for output in model.module.outputs if output.name == target.reading)
     channels = [output.channels[channel] for channel in target.channels]
     samples, rows, num = target.value.shape

@@ -41,57 +41,35 @@ from tgdsl.plan.inputs import Inputs
 NAMES_OF = {axis: f"{axis}s" for axis in ("pair", "object", "joint", "actuator")} | {"body": "bodies", "heated": "heated"}
 """Key of the names along each axis of the state."""
 OF_TARGET = ("target", "unit", "clock", "clock_width", "channels", "weight", "floor", "zero")
-ROUNDING = 0.01
-"""Largest error of a quaternion's length: recordings are rounded."""
-DERIVED = {"body_linvel": "body_pos", "body_angvel": "body_quat"}
-"""Velocities that follow from other fields."""
+ROUNDING = 0.01  # largest error of a quaternion's length: recordings are rounded
+DERIVED = {"body_linvel": "body_pos", "body_angvel": "body_quat"}  # velocities that follow from other fields
 Arrays = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a sensor read.
+    """What a sensor read."""
 
-    Attributes:
-        reading: Name of the reading.
-        value: In the unit of the reading; 0 where the weight is.
-        weight: Weight of each number.
-        channels: Places of its channels among the reading's.
-        time: Its clock [s].
-        clock_width: Standard deviation of the clock's offset [s].
-        floor: RMS noise, in the unit of the reading; 0: unknown.
-        unit: Unit of the reading.
-        zero: Time at which the reading was set to zero [s]; None: never.
-    """
-
-    reading: str
-    value: Float[np.ndarray, "sample row channel"]
-    weight: Float[np.ndarray, "sample row channel"]
-    channels: tuple[int, ...]
-    time: Float[np.ndarray, " sample"]
-    clock_width: float
-    floor: float
-    unit: str
-    zero: float | None
+    reading: str  # name of the reading
+    value: Float[np.ndarray, "sample row channel"]  # in the unit of the reading; 0 where the weight is
+    weight: Float[np.ndarray, "sample row channel"]  # weight of each number
+    channels: tuple[int, ...]  # places of its channels among the reading's
+    time: Float[np.ndarray, " sample"]  # its clock [s]
+    clock_width: float  # standard deviation of the clock's offset [s]
+    floor: float  # RMS noise, in the unit of the reading; 0: unknown
+    unit: str  # unit of the reading
+    zero: float | None  # time at which the reading was set to zero [s]; None: never
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """States of a scene and what sensors read.
+    """States of a scene and what sensors read."""
 
-    Attributes:
-        name: Name of its file.
-        time: Clock of the states [s].
-        fields: Fields of `SceneState` (step, …), in the order of the module's inputs.
-        widths: Standard deviations of the fields' offsets, (1, …) or (step, …).
-        targets: What sensors read.
-    """
-
-    name: str
-    time: Float[np.ndarray, " step"]
-    fields: Arrays
-    widths: Arrays
-    targets: tuple[Target, ...]
+    name: str  # name of its file
+    time: Float[np.ndarray, " step"]  # clock of the states [s]
+    fields: Arrays  # fields of `SceneState` (step, …), in the order of the module's inputs
+    widths: Arrays  # standard deviations of the fields' offsets, (1, …) or (step, …)
+    targets: tuple[Target, ...]  # what sensors read
 
     def state_at(self, time: Float[np.ndarray, " sample"], fields: Arrays) -> dict[str, np.ndarray]:
         """Return fields at other times, linear in between; choices and contacts as at the step before."""

@@ -26,8 +26,7 @@ Level = Literal["fault", "slower", "missing", "note"]
 """`fault`: what is installed computes wrongly, or refuses to work; `slower`: the same readings, later; `missing`: tgdsl can do
 something that is not to be had; `note`: nothing is to be done."""
 
-DEVELOPMENT = ("dev", "docs")
-"""The extras that only tgdsl's own development needs."""
+DEVELOPMENT = ("dev", "docs")  # the extras that only tgdsl's own development needs
 
 WITHOUT: Mapping[str, tuple[Level, str]] = {
     "gymnasium": ("missing", "no vector environments of gymnasium: TouchEnv and rsl_rl's adapter remain"),
@@ -59,19 +58,12 @@ _DRAW = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/
 
 @dataclass(frozen=True)
 class Package:
-    """A package that tgdsl uses.
+    """A package that tgdsl uses."""
 
-    Attributes:
-        name: Its name.
-        installed: The version that is installed; None: it is not.
-        wanted: The versions that tgdsl works with, as pip writes them.
-        extra: The extra that brings it, as in `pip install "tgdsl[gpu]"`; empty: it always comes.
-    """
-
-    name: str
-    installed: str | None
-    wanted: str
-    extra: str
+    name: str  # its name
+    installed: str | None  # the version that is installed; None: it is not
+    wanted: str  # the versions that tgdsl works with, as pip writes them
+    extra: str  # the extra that brings it, as in `pip install "tgdsl[gpu]"`; empty: it always comes
 
     @property
     def fits(self) -> bool:
@@ -81,40 +73,25 @@ class Package:
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a user should know.
+    """Something that a user should know."""
 
-    Attributes:
-        level: How bad it is.
-        what: The result, in words.
-        then: What follows, or what to do.
-    """
-
-    level: Level
-    what: str
-    then: str
+    level: Level  # how bad it is
+    what: str  # the result, in words
+    then: str  # what follows, or what to do
 
 
 @dataclass(frozen=True)
 class Installation:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        system: Python, operating system, processor, by name.
-        packages: The packages that tgdsl uses.
-        devices: Where a module can be, and what of it torch says.
-        compilers: What compiles kernels, by name: its place or version; None: there is none.
-        opengl: Which values of `MUJOCO_GL` draw.
-        caches: Folders of what was compiled or computed before, and their sizes [bytes]; None: there is no such folder.
-        findings: What a user should know, the worst first.
-    """
-
-    system: Mapping[str, str]
-    packages: tuple[Package, ...]
-    devices: Mapping[str, str]
-    compilers: Mapping[str, str | None]
-    opengl: Mapping[str, bool]
+    system: Mapping[str, str]  # python, operating system, processor, by name
+    packages: tuple[Package, ...]  # the packages that tgdsl uses
+    devices: Mapping[str, str]  # where a module can be, and what of it torch says
+    compilers: Mapping[str, str | None]  # what compiles kernels, by name: its place or version; None: there is none
+    opengl: Mapping[str, bool]  # which values of `MUJOCO_GL` draw
+    # folders of what was compiled or computed before, and their sizes [bytes]; None: there is no such folder
     caches: Mapping[str, int | None]
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...]  # what a user should know, the worst first
 
     @property
     def is_sound(self) -> bool:

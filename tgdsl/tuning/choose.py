@@ -34,17 +34,11 @@ from tgdsl.tuning.trials import Sensor
 
 
 class Shared(NamedTuple):
-    """How sensors share objects.
+    """How sensors share objects."""
 
-    Attributes:
-        places: Index of the way in which distances to each object are computed.
-        alone: The same as each sensor would have it by itself.
-        floors: Of objects that sensors without an accuracy feel too, what they have.
-    """
-
-    places: Places
-    alone: Mapping[str, Places]
-    floors: Places
+    places: Places  # index of the way in which distances to each object are computed
+    alone: Mapping[str, Places]  # the same as each sensor would have it by itself
+    floors: Places  # of objects that sensors without an accuracy feel too, what they have
 
 
 def account(trial: Trial, own: Outcome, shared: Shared) -> tuple[str, ...]:
@@ -82,8 +76,7 @@ def _cost(outcome: Outcome) -> tuple[int, int]:
     return outcome.cost.operations or 0, outcome.cost.constants
 
 
-FORMAT = 2
-"""Version of the choosing."""
+FORMAT = 2  # version of the choosing
 ENVS, STEPS = 16, 90
 """Environments of the run, half of which choose and half verify (more where objects have more variants), and control steps."""
 
@@ -141,10 +134,7 @@ def _is_asked(document: Document, overrides: Mapping[str, Any] | None) -> bool:
 
 
 def _names_accuracy(value: object, depth: int = 3) -> bool:
-    """Return whether text holds the word, or a mapping the key: no deeper than `sensors`, their names and their keys.
-
-    Lists hold no sensors, and a list of lists of the same lists takes for ever to go through.
-    """
+    """Return whether text holds the word, or a mapping the key: no deeper than `sensors`, their names and their keys."""
     if isinstance(value, str):
         return "accuracy" in value
     if not isinstance(value, Mapping) or depth == 0:
@@ -209,11 +199,7 @@ class Found(NamedTuple):
 
 
 def _chosen(task: Task) -> Choice:
-    """Measure and choose: for each sensor by itself, then with objects as fine as the strictest sensor needs.
-
-    Raises:
-        SpecError: If there is a sensor whose accuracy nothing holds, or that cannot be measured.
-    """
+    """Measure and choose: for each sensor by itself, then with objects as fine as the strictest sensor needs."""
     recording, floors = _states(task), _floors(task.loaded, task.wanted)
 
     def by_itself(name: str) -> Found:
@@ -243,11 +229,7 @@ def _chosen(task: Task) -> Choice:
 
 
 def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dict[str, Found]:
-    """Return what work returns of each sensor.
-
-    Raises:
-        SpecError: All that it refuses, where `accuracy` stands.
-    """
+    """Return what work returns of each sensor."""
     result, problems = {}, []
     for name in names:
         try:
@@ -271,11 +253,7 @@ def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
 
 
 def _states(task: Task) -> Recording:
-    """Return states of a run of the scene, with all that the sensors read without imperfections.
-
-    Raises:
-        SpecError: If the scene cannot be run.
-    """
+    """Return states of a run of the scene, with all that the sensors read without imperfections."""
     changes = {key: value for name in task.wanted for key, value in bare(name).items()}
     plan = compile_document(task.document, {**task.overrides, **changes}, task.kinds, task.progress, list(task.wanted)).plan
     inputs = plan.inputs

@@ -27,27 +27,19 @@ from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.scripted import Script, script_of, substeps_of
 from tgdsl.scene.scene import scene_model
 
-LEAST_ENVS = 2
-"""Half of the environments choose, the others verify."""
+LEAST_ENVS = 2  # half of the environments choose, the others verify
 SWAY, PERIODS = 0.03, (0.05, 0.4)
 """Amplitude of the motion added to the controls, as a fraction of their range, and its periods, as fractions of a run."""
-REACH = (0.5, 1.1)
-"""How far each environment's controls go from their start, of the script's own."""
+REACH = (0.5, 1.1)  # how far each environment's controls go from their start, of the script's own
 
 
 @dataclass(frozen=True)
 class Recording:
-    """States of a scene, one after the other.
+    """States of a scene, one after the other."""
 
-    Attributes:
-        states: The states.
-        names: What stands at each place of the axes of their fields.
-        source: Where they are from.
-    """
-
-    states: tuple[SceneState, ...]
-    names: Mapping[str, Sequence[str]]
-    source: str
+    states: tuple[SceneState, ...]  # the states
+    names: Mapping[str, Sequence[str]]  # what stands at each place of the axes of their fields
+    source: str  # where they are from
 
     @property
     def num_envs(self) -> int:

@@ -18,8 +18,7 @@ from tgdsl.schema.objects import query_alternatives
 from tgdsl.tuning.recording import Recording
 from tgdsl.tuning.trials import Cost, Exact, Sensor, cost_of, exact_of, finest_of
 
-Places = Mapping[str, int]
-"""Of objects, which of `query_alternatives` they have."""
+Places = Mapping[str, int]  # of objects, which of `query_alternatives` they have
 
 
 class Level(NamedTuple):
@@ -31,23 +30,14 @@ class Level(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """A variant, measured.
+    """A variant, measured."""
 
-    Attributes:
-        variant: It.
-        cost: What it takes, counted.
-        chosen: Errors of each quantity in the environments that variants are compared in.
-        verified: The same in the others, which take no part.
-        excess: Largest upper end of an interval of `chosen` over its bound: at most 1 if the accuracy is held.
-        verified_excess: Largest error of `verified` over its bound.
-    """
-
-    variant: Variant
-    cost: Cost
-    chosen: Mapping[str, Errors]
-    verified: Mapping[str, Errors]
-    excess: float
-    verified_excess: float
+    variant: Variant  # it
+    cost: Cost  # what it takes, counted
+    chosen: Mapping[str, Errors]  # errors of each quantity in the environments that variants are compared in
+    verified: Mapping[str, Errors]  # the same in the others, which take no part
+    excess: float  # largest upper end of an interval of `chosen` over its bound: at most 1 if the accuracy is held
+    verified_excess: float  # largest error of `verified` over its bound
 
     @property
     def is_held(self) -> bool:

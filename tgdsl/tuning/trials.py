@@ -32,50 +32,30 @@ from tgdsl.tuning.recording import Recording
 
 
 class Cost(NamedTuple):
-    """What a module takes, counted.
+    """What a module takes, counted."""
 
-    Attributes:
-        operations: Elementary operations of one environment's call; None: not counted.
-        constants: Of all environments together [bytes].
-        state: What each environment carries from call to call [bytes].
-        output: What each environment's call returns [bytes].
-    """
-
-    operations: int | None
-    constants: int
-    state: int
-    output: int
+    operations: int | None  # elementary operations of one environment's call; None: not counted
+    constants: int  # of all environments together [bytes]
+    state: int  # what each environment carries from call to call [bytes]
+    output: int  # what each environment's call returns [bytes]
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A sensor of a document, without imperfections, and how its variants are compiled.
+    """A sensor of a document, without imperfections, and how its variants are compiled."""
 
-    Attributes:
-        document: The document.
-        overrides: Changes to it, imperfections left out.
-        name: The sensor's name.
-        kind: Its kind.
-        spec: Its fields.
-        others: Kind and fields of all sensors of its Plan: itself and the sensors it reads.
-        queried: Of the objects with meshes that it feels, their fields.
-        own: The Plan of the document's own variant.
-        variants: The variants.
-        kinds: Kinds in addition to tgdsl's and those of installed packages.
-        plans: Plans so far, by their changes.
-    """
-
-    document: Document
-    overrides: Mapping[str, Any]
-    name: str
-    kind: Kind
-    spec: AnySensorSpec
+    document: Document  # the document
+    overrides: Mapping[str, Any]  # changes to it, imperfections left out
+    name: str  # the sensor's name
+    kind: Kind  # its kind
+    spec: AnySensorSpec  # its fields
+    # kind and fields of all sensors of its Plan: itself and the sensors it reads
     others: Mapping[str, tuple[Kind, AnySensorSpec]]
-    queried: Mapping[str, ObjectSpec]
-    own: Plan
-    variants: Variants
-    kinds: Sequence[Kind] = ()
-    plans: dict[str, Plan] = field(default_factory=dict)
+    queried: Mapping[str, ObjectSpec]  # of the objects with meshes that it feels, their fields
+    own: Plan  # the Plan of the document's own variant
+    variants: Variants  # the variants
+    kinds: Sequence[Kind] = ()  # kinds in addition to tgdsl's and those of installed packages
+    plans: dict[str, Plan] = field(default_factory=dict)  # plans so far, by their changes
 
     @staticmethod
     def of(document: Document, overrides: Mapping[str, Any], name: str, kinds: Sequence[Kind] = ()) -> Sensor:
@@ -128,23 +108,14 @@ def quiet_plan(document: Document, overrides: Mapping[str, Any], name: str, kind
 
 
 class Exact(NamedTuple):
-    """What errors of a sensor are measured against.
+    """What errors of a sensor are measured against."""
 
-    Attributes:
-        variant: The finest available variant.
-        module: The document's own variant in float64, whose rows readings are compared at.
-        readings: The finest variant's, in float64, at those rows.
-        magnitude: What errors are relative to.
-        quantities: What each channel is a component of.
-        units: The unit of each channel.
-    """
-
-    variant: Variant
-    module: TactileModule
-    readings: Float[np.ndarray, "step env row channel"]
-    magnitude: Magnitude
-    quantities: tuple[str, ...]
-    units: tuple[str, ...]
+    variant: Variant  # the finest available variant
+    module: TactileModule  # the document's own variant in float64, whose rows readings are compared at
+    readings: Float[np.ndarray, "step env row channel"]  # the finest variant's, in float64, at those rows
+    magnitude: Magnitude  # what errors are relative to
+    quantities: tuple[str, ...]  # what each channel is a component of
+    units: tuple[str, ...]  # the unit of each channel
 
 
 def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Progress = silent) -> Exact:

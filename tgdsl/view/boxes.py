@@ -27,31 +27,20 @@ from tgdsl.view.style import WARMTH
 from tgdsl.view.taxels import Pose, in_world
 
 Array = np.ndarray
-FLAT = 0.5
-"""Half of the range of the colours where all that is read is the same [the reading's unit]."""
+FLAT = 0.5  # half of the range of the colours where all that is read is the same [the reading's unit]
 
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """The boxes of one reading in one environment, and what they read.
+    """The boxes of one reading in one environment, and what they read."""
 
-    Attributes:
-        layout: Those at the surface of their link, as taxels: centre, mean normal and area of what is exposed.
-        chosen: Which boxes these are: the others are hidden inside.
-        size: Their sides, along the axes of their body [m].
-        value: What each reads, hidden ones too.
-        label: Quantity and unit.
-        unit: Unit, as it is printed.
-        ends: Lowest and highest of the colours; None: those of the values.
-    """
-
-    layout: Layout
-    chosen: Int[Array, " shown"]
-    size: Float[Array, "shown 3"]
-    value: Float[Array, " box"]
-    label: str
-    unit: str
-    ends: tuple[float, float] | None = None
+    layout: Layout  # those at the surface of their link, as taxels: centre, mean normal and area of what is exposed
+    chosen: Int[Array, " shown"]  # which boxes these are: the others are hidden inside
+    size: Float[Array, "shown 3"]  # their sides, along the axes of their body [m]
+    value: Float[Array, " box"]  # what each reads, hidden ones too
+    label: str  # quantity and unit
+    unit: str  # unit, as it is printed
+    ends: tuple[float, float] | None = None  # lowest and highest of the colours; None: those of the values
 
     @property
     def norm(self) -> Normalize:

@@ -33,8 +33,7 @@ OPPOSED = 0.2
 """Length of the mean unit normal below which taxels have no common side, but look at each other, as a gripper's pads do."""
 _PAST_NEAR_PAD = np.radians(35.0)  # how far a camera turns from beside opposed pads towards the face of one
 _AROUND, _RISES = range(0, 360, 45), (-30, 16, 50)
-_LOOK = 200
-"""Columns and rows of the pictures by which views are compared."""
+_LOOK = 200  # columns and rows of the pictures by which views are compared
 
 
 class ViewError(TgdslError):

@@ -32,8 +32,7 @@ from tgdsl.view.hand_table import StreamCounter
 from tgdsl.view.stages import Stage, kinematic_poses
 
 Array = np.ndarray
-LIVE_STEP = 0.02
-"""Time between readings of a live hand that are shown [s]."""
+LIVE_STEP = 0.02  # time between readings of a live hand that are shown [s]
 _DOCUMENT = {
     "tgdsl": 1,
     "robot": {"model": "xhand1"},
@@ -70,7 +69,6 @@ class HandStage(Stage):
         return kinematic_poses(self.model, self._data)
 
     def _take(self, position: Float[Array, " joint"], counts: Num[Array, "finger 3"]) -> None:
-        """Take joint angles [rad] and the fingertips' counts along the sensors' axes."""
         self._data.qpos[self._qpos_id] = position
         force = self.calibration.apply(counts)[self._fingers]
         self.readings = {"tips": torch.from_numpy(force).float().unsqueeze(0)}

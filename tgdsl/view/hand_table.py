@@ -15,25 +15,18 @@ from tgdsl.runtime.xhand1.driver import Reading
 from tgdsl.runtime.xhand1.log.log import Fault
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, JOINTS
 
-BAR = 32
-"""Width of a full bar [characters]."""
+BAR = 32  # width of a full bar [characters]
 _PARTS = " ▏▎▍▌▋▊▉"
 _RATE_OVER_S = 1.0
 
 
 @dataclass(frozen=True)
 class StreamStats:
-    """How the readings come.
+    """How the readings come."""
 
-    Attributes:
-        rate: Readings per second, over the last second; NaN before the second reading.
-        num_faults: Failures so far.
-        fault: The failure since the last reading; None if there was none.
-    """
-
-    rate: float
-    num_faults: int
-    fault: Fault | None
+    rate: float  # readings per second, over the last second; NaN before the second reading
+    num_faults: int  # failures so far
+    fault: Fault | None  # the failure since the last reading; None if there was none
 
 
 class StreamCounter:

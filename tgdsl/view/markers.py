@@ -27,25 +27,15 @@ THRESHOLDS = {"N": 1e-3, "N·m": 1e-6, "m": 1e-6, "Pa": 1.0}
 
 @dataclass(frozen=True, eq=False)
 class Markers(Taxels):
-    """The rows of one reading in one environment: taxels, or bodies, and what they read.
+    """The rows of one reading in one environment: taxels, or bodies, and what they read."""
 
-    Attributes:
-        value: Magnitude of the reading, in `unit`; 0 where it does not exceed `threshold`.
-        quantity: What is read, such as `|force|`.
-        unit: Its unit, with the prefix that suits the values; empty for plain numbers.
-        vector: The reading itself in the world, in SI units, if it is a vector.
-        scale: What a number in SI units is multiplied with to be in `unit`.
-        would_read: Which of them would read anything without noise; None: those that do.
-        threshold: See `THRESHOLDS` [SI]; 0: whatever is read counts.
-    """
-
-    value: Float[Array, " taxel"]
-    quantity: str
-    unit: str
-    vector: Float[Array, "taxel 3"] | None = None
-    scale: float = 1.0
-    would_read: Bool[Array, " taxel"] | None = None
-    threshold: float = 0.0
+    value: Float[Array, " taxel"]  # magnitude of the reading, in `unit`; 0 where it does not exceed `threshold`
+    quantity: str  # what is read, such as `|force|`
+    unit: str  # its unit, with the prefix that suits the values; empty for plain numbers
+    vector: Float[Array, "taxel 3"] | None = None  # the reading itself in the world, in SI units, if it is a vector
+    scale: float = 1.0  # what a number in SI units is multiplied with to be in `unit`
+    would_read: Bool[Array, " taxel"] | None = None  # which of them would read anything without noise; None: those that do
+    threshold: float = 0.0  # see `THRESHOLDS` [SI]; 0: whatever is read counts
 
     @property
     def is_read(self) -> Bool[Array, " taxel"]:

@@ -77,7 +77,6 @@ def body_triangles(
 
 
 def _names(model: mujoco.MjModel, geom: int) -> set[str]:
-    """Return the names of links that a geom's may be: see `Link`."""
     mesh = model.mesh(model.geom_dataid[geom]).name if model.geom_dataid[geom] >= 0 else ""
     return {model.geom(geom).name, mesh, f"{model.body(model.geom_bodyid[geom]).name}/{mesh}"} - {""}
 

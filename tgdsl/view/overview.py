@@ -26,12 +26,9 @@ from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING
 from tgdsl.view.table import outputs_on_taxels
 from tgdsl.view.taxels import Pose
 
-PANEL = (3.9, 3.7)
-"""Width and height of a panel [inch]."""
-ALONE = 1.6
-"""How much larger a panel is that stands alone."""
-ARROW = 0.09
-"""Length of the longest arrow, as a part of the panel's width."""
+PANEL = (3.9, 3.7)  # width and height of a panel [inch]
+ALONE = 1.6  # how much larger a panel is that stands alone
+ARROW = 0.09  # length of the longest arrow, as a part of the panel's width
 
 
 def drawn_outputs(touch: TactileModule) -> list[Output]:

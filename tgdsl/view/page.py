@@ -45,20 +45,14 @@ from tgdsl.view.taxels import Pose
 Array = np.ndarray
 LOCAL = "127.0.0.1"
 PORT = 8080
-FRAME = 1 / 30
-"""Least time between two frames [s]."""
-PLOT_SECONDS = 10.0
-"""How much of the past the plot shows [s]."""
-SAVED_FRAMES = 1800
-"""Number of frames that the page can save: the last minute at 30 per second."""
-MAX_STEPS = 5
-"""Most control steps per frame: a scene slower than that runs behind real time."""
+FRAME = 1 / 30  # least time between two frames [s]
+PLOT_SECONDS = 10.0  # how much of the past the plot shows [s]
+SAVED_FRAMES = 1800  # number of frames that the page can save: the last minute at 30 per second
+MAX_STEPS = 5  # most control steps per frame: a scene slower than that runs behind real time
 _CARRIER, _ROBOT, _OBJECT, _REST = (176, 181, 190), (128, 134, 145), (60, 112, 186), (62, 72, 88)
 _DISC_RADIUS = (0.0006, 0.0022)
-_LIFT = 2e-4
-"""How far discs and arrows begin above the surface [m]."""
-_ARROW = 0.03
-"""Length of the arrow of the largest vector [m]."""
+_LIFT = 2e-4  # how far discs and arrows begin above the surface [m]
+_ARROW = 0.03  # length of the arrow of the largest vector [m]
 _HEAT = HEAT.with_extremes(under="#{:02x}{:02x}{:02x}".format(*_REST))
 _SIGNED = matplotlib.colormaps["coolwarm"]
 MAGNITUDE = "magnitude"
@@ -451,7 +445,6 @@ class Page:
         self.stage.advance()
 
     def _save(self, client: Any) -> None:
-        """Send the saved frames to the browser that asked for them."""
         if self._frames_seen:
             client.send_file_download("seen.npz", self.saved_frames(), save_immediately=True)
 
@@ -462,7 +455,6 @@ class Page:
             self._set_sliders(self.stage.control)
 
     def _pick(self, row: int) -> None:
-        """Show one taxel's name and reading; a second click on it shows all again."""
         self._picked = None if self._picked == row else row
         self._history.clear()
 
@@ -512,7 +504,6 @@ def _viser() -> Any:
 
 
 def _joined(corners: Float[Array, "face 3 3"], normals: Float[Array, "face 3 3"]) -> tuple[Array, Array]:
-    """Return vertices and faces; corners are one vertex where place and normal agree, so that edges stay sharp."""
     both = np.concatenate([corners.reshape(-1, 3) * 1e6, normals.reshape(-1, 3) * 1e3], axis=1).round().astype(np.int64)
     _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
     return corners.reshape(-1, 3)[first].astype(np.float32), inverse.reshape(-1, 3).astype(np.uint32)

@@ -27,8 +27,7 @@ from tgdsl.view.scene import draw_colour_bar, draw_markers, render_scene
 from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING
 
 Array = np.ndarray
-SIZE = (16.0, 9.0)
-"""Width and height of the picture [inch]."""
+SIZE = (16.0, 9.0)  # width and height of the picture [inch]
 VIEW = (0.0125, 0.06, 0.55, 0.82)  # the 3-D view in the figure: left, bottom, width, height
 MAX_MAPS = 12
 _NAME_SPACING = 0.028  # least distance of the names of links, as a part of the 3-D view's height

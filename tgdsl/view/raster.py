@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 Array = np.ndarray
-_FRAGMENTS = 100_000
-"""Fragments drawn at a time, to bound memory."""
+_FRAGMENTS = 100_000  # fragments drawn at a time, to bound memory
 
 
 class Camera(NamedTuple):
@@ -29,21 +28,13 @@ class Camera(NamedTuple):
 
 
 class Viewport(NamedTuple):
-    """The pixels that a part of a camera's image fills.
+    """The pixels that a part of a camera's image fills."""
 
-    Attributes:
-        camera: The camera.
-        corner: The lower left pixel on the camera's image [m].
-        scale: Pixels per metre.
-        width: Number of columns.
-        height: Number of rows.
-    """
-
-    camera: Camera
-    corner: Float[Array, " 2"]
-    scale: float
-    width: int
-    height: int
+    camera: Camera  # the camera
+    corner: Float[Array, " 2"]  # the lower left pixel on the camera's image [m]
+    scale: float  # pixels per metre
+    width: int  # number of columns
+    height: int  # number of rows
 
     def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """Return column [pixel], row [pixel] and nearness to the camera [m]."""

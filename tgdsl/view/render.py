@@ -35,10 +35,8 @@ from tgdsl.view.taxels import Taxels, is_visible, taxels_of
 
 Array = np.ndarray
 COLOURS = ("#0f7fb8", "#e8871e", "#c2315b", "#3a9d5d", "#7a55b0", "#8c6d46", "#d4b106", "#4f5d75")
-HEIGHT = 750
-"""Rows of the file if no size is asked for."""
-MIN_SIZE = 200
-"""Columns and rows that a file has at least."""
+HEIGHT = 750  # rows of the file if no size is asked for
+MIN_SIZE = 200  # columns and rows that a file has at least
 _INCHES = 6.0  # the figure's height, whatever its pixels: text scales with it
 _HEAD, _FOOT, _GAP = 0.085, 0.085, 0.03  # parts of the figure's height
 _SUPERSAMPLING = 3  # pixels rendered per pixel of the file, along each axis
@@ -144,7 +142,6 @@ def _box(points: Float[Array, "point 2"]) -> Float[Array, "2 2"]:
 
 
 def _natural_size(box: Float[Array, "2 2"], panels: int) -> tuple[int, int]:
-    """Return the size of a file whose panels are just as wide as what they show, but no strip."""
     across, up = box[1] - box[0]
     columns = HEIGHT * (1 - _HEAD - _FOOT) * np.clip(across / up, 0.75, 3.0)
     return round(panels * columns + (panels + 1) * _GAP * HEIGHT), HEIGHT
@@ -170,10 +167,7 @@ def _image(hand: Mesh, fragments: Fragments, viewport: Viewport) -> Float[Array,
 def _draw_taxels(
     axes: Axes, layout: Layout, taxels: Taxels, viewport: Viewport, fragments: Fragments, crossed: Int[Array, " unfelt"]
 ) -> None:
-    """Draw those in view as discs with a tick along the normal, far ones first; those that are hidden as faint rings.
-
-    Those that cannot feel are crossed out, faintly where they are hidden.
-    """
+    """Draw those in view as discs with a tick along the normal, far ones first; those that are hidden as faint rings."""
     at = viewport.project(taxels.pos)
     seen, active = is_visible(taxels, at, fragments, viewport.camera), taxels.size > 0
     radius = radii(layout, taxels.pos)

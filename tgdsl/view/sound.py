@@ -20,27 +20,18 @@ from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.sensors.upstream import SAMPLES
 
-PEAK = 0.7
-"""Largest sample of a file that is normalised, of full scale."""
-RANGE = 80.0
-"""Levels that a spectrogram tells apart [dB]."""
+PEAK = 0.7  # largest sample of a file that is normalised, of full scale
+RANGE = 80.0  # levels that a spectrogram tells apart [dB]
 
 
 @dataclass(frozen=True, eq=False)
 class Sound:
-    """The samples of a sensor over a run.
+    """The samples of a sensor over a run."""
 
-    Attributes:
-        name: The sensor's name.
-        unit: Unit of the samples.
-        rate: Samples per second [Hz].
-        samples: The sum over its rows.
-    """
-
-    name: str
-    unit: str
-    rate: float
-    samples: Float[np.ndarray, " sample"]
+    name: str  # the sensor's name
+    unit: str  # unit of the samples
+    rate: float  # samples per second [Hz]
+    samples: Float[np.ndarray, " sample"]  # the sum over its rows
 
 
 def sounding(plan: Plan) -> tuple[PlannedSensor, ...]:
@@ -84,16 +75,11 @@ def check_soundfile() -> None:
 
 @dataclass(frozen=True, eq=False)
 class Spectrogram:
-    """How strong each frequency is at each time.
+    """How strong each frequency is at each time."""
 
-    Attributes:
-        time: Middles of the windows [s].
-        frequency: [Hz].
-        level: Power over the loudest one's of the sound, (frequency, time) [dB]; −inf where there is none.
-    """
-
-    time: Float[np.ndarray, " time"]
-    frequency: Float[np.ndarray, " frequency"]
+    time: Float[np.ndarray, " time"]  # middles of the windows [s]
+    frequency: Float[np.ndarray, " frequency"]  # [Hz]
+    # power over the loudest one's of the sound, (frequency, time) [dB]; −inf where there is none
     level: Float[np.ndarray, "frequency time"]
 
 

@@ -30,27 +30,17 @@ Array = np.ndarray
 
 
 class Stage(ABC):
-    """A scene at one instant.
+    """A scene at one instant."""
 
-    Attributes:
-        touch: The module whose taxels are shown.
-        model: The compiled scene.
-        num_envs: Number of environments.
-        control_step: Duration of one step [s].
-        time: The instant [s].
-        readings: What the taxels read then.
-        control: Values that a user may set, one per actuator; None where something else acts.
-        num_steps: Number of instants of a recorded run; None: the scene goes on without end.
-    """
-
-    touch: TactileModule
-    model: mujoco.MjModel
-    num_envs: int
-    control_step: float
-    time: float
-    readings: Mapping[str, Tensor]
+    touch: TactileModule  # the module whose taxels are shown
+    model: mujoco.MjModel  # the compiled scene
+    num_envs: int  # number of environments
+    control_step: float  # duration of one step [s]
+    time: float  # the instant [s]
+    readings: Mapping[str, Tensor]  # what the taxels read then
+    # values that a user may set, one per actuator; None where something else acts
     control: Float[Array, " actuator"] | None = None
-    num_steps: int | None = None
+    num_steps: int | None = None  # number of instants of a recorded run; None: the scene goes on without end
 
     @abstractmethod
     def advance(self) -> None:

@@ -40,10 +40,7 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
 
 
 def _own_rows(table: TaxelTable, output: Output, readings: Mapping[str, Tensor], env: int) -> list[str]:
-    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample.
-
-    Rows that share that column, such as the cells of a link, are one line: how many they are, the lowest and the highest.
-    """
+    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample."""
     first, *_ = table.dtype.names or ("row",)
     values = last_step(readings[output.name])[env].detach().cpu().double().numpy()
     channels = [f"{name} [{unit}]" for name, unit in zip(output.channels, output.units, strict=True)]

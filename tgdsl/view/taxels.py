@@ -29,13 +29,9 @@ class Pose(NamedTuple):
 
 @runtime_checkable
 class Posed(Protocol):
-    """A model whose bodies are somewhere: a simulator's, or a recorded run's.
+    """A model whose bodies are somewhere: a simulator's, or a recorded run's."""
 
-    Attributes:
-        model: The compiled scene.
-    """
-
-    model: mujoco.MjModel
+    model: mujoco.MjModel  # the compiled scene
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         """Return origins [m] and quaternions w, x, y, z of all bodies in one environment, in the world."""
@@ -44,17 +40,11 @@ class Posed(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Taxels:
-    """Taxels in the world.
+    """Taxels in the world."""
 
-    Attributes:
-        pos: Position in the world [m].
-        normal: Outward unit normal in the world.
-        size: Width of the patch that the taxel stands for [m]; 0 marks an inactive filler.
-    """
-
-    pos: Float[Array, "taxel 3"]
-    normal: Float[Array, "taxel 3"]
-    size: Float[Array, " taxel"]
+    pos: Float[Array, "taxel 3"]  # position in the world [m]
+    normal: Float[Array, "taxel 3"]  # outward unit normal in the world
+    size: Float[Array, " taxel"]  # width of the patch that the taxel stands for [m]; 0 marks an inactive filler
 
 
 def taxels_of(model: mujoco.MjModel, pose: Pose, layout: Layout) -> Taxels:

@@ -35,21 +35,13 @@ class FitError(TgdslError):
 
 @dataclass(frozen=True, eq=False)
 class FingerFit:
-    """What a fingertip's counts mean, and how well they say what the force was.
+    """What a fingertip's counts mean, and how well they say what the force was."""
 
-    Attributes:
-        scale: N per count along the sensor's axes.
-        rotation: From the sensor's axes to the link's; it may mirror.
-        tare: Counts without force.
-        force: The forces that were known, along the link's axes [N].
-        error: What the fit says, less that [N].
-    """
-
-    scale: Float[np.ndarray, " axis"]
-    rotation: Float[np.ndarray, "axis axis"]
-    tare: Float[np.ndarray, " axis"]
-    force: Forces
-    error: Forces
+    scale: Float[np.ndarray, " axis"]  # N per count along the sensor's axes
+    rotation: Float[np.ndarray, "axis axis"]  # from the sensor's axes to the link's; it may mirror
+    tare: Float[np.ndarray, " axis"]  # counts without force
+    force: Forces  # the forces that were known, along the link's axes [N]
+    error: Forces  # what the fit says, less that [N]
 
     @property
     def rms(self) -> Float[np.ndarray, " axis"]:
@@ -193,7 +185,6 @@ def _expect_response(counts: Forces) -> None:
 
 
 def _spread(vectors: Forces) -> tuple[np.ndarray, np.ndarray]:
-    """Return root mean squares along the principal directions, and these, as rows."""
     _, values, directions = np.linalg.svd(vectors, full_matrices=False)
     return values / np.sqrt(len(vectors)), directions
 

@@ -66,19 +66,12 @@ class LoadsSpec(SpecModel):
 
 @dataclass(frozen=True, eq=False)
 class TipRecord:
-    """What a log's fingertips read.
+    """What a log's fingertips read."""
 
-    Attributes:
-        time: When each reading was asked for, after the first was here [s].
-        counts: Their forces [counts].
-        is_saturated: Whether a component of the force is at the end of its range.
-        is_taxel_saturated: The same of each taxel.
-    """
-
-    time: Float[np.ndarray, " reading"]
-    counts: Float[np.ndarray, "reading finger 3"]
-    is_saturated: Bool[np.ndarray, "reading finger"]
-    is_taxel_saturated: Bool[np.ndarray, "reading finger taxel"]
+    time: Float[np.ndarray, " reading"]  # when each reading was asked for, after the first was here [s]
+    counts: Float[np.ndarray, "reading finger 3"]  # their forces [counts]
+    is_saturated: Bool[np.ndarray, "reading finger"]  # whether a component of the force is at the end of its range
+    is_taxel_saturated: Bool[np.ndarray, "reading finger taxel"]  # the same of each taxel
 
     @classmethod
     def of(cls, log: HandLog, ignored_taxels: Sequence[int] = ()) -> TipRecord:
@@ -107,19 +100,12 @@ class TipRecord:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples of one fingertip with known forces.
+    """Samples of one fingertip with known forces."""
 
-    Attributes:
-        counts: What it read [counts].
-        force: The force on it, along its link's axes [N].
-        num_left_out: Samples left out because the sum or a taxel was at the end of its range.
-        saturated_taxels: Numbers of the taxels that were.
-    """
-
-    counts: Forces
-    force: Forces
-    num_left_out: int
-    saturated_taxels: tuple[int, ...]
+    counts: Forces  # what it read [counts]
+    force: Forces  # the force on it, along its link's axes [N]
+    num_left_out: int  # samples left out because the sum or a taxel was at the end of its range
+    saturated_taxels: tuple[int, ...]  # numbers of the taxels that were
 
 
 def load_loads(path: Path) -> tuple[Load, ...]:

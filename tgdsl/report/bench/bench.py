@@ -24,35 +24,22 @@ from tgdsl.tuning.choose import choose
 from tgdsl.tuning.recording import Recording, load_recording, record, save_recording
 from tgdsl.tuning.trials import Sensor
 
-PHYSICS = "physics"
-"""What the physics is called among the sensors."""
+PHYSICS = "physics"  # what the physics is called among the sensors
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        document: A YAML file, or the same as a mapping.
-        overrides: By dotted path YAML text, or a plain value.
-        sensors: Sensors, and `physics`, that are measured; empty: all.
-        states: File of states; None: a scripted run.
-        save_states: File that the states of the run are written to; None: none.
-        state_envs: Environments of the scripted run; half of them verify.
-        steps: Its control steps, about.
-        substeps: Physics steps of each.
-        options: How sensors are measured.
-    """
-
-    document: Document
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-    sensors: tuple[str, ...] = ()
-    states: Path | None = None
-    save_states: Path | None = None
-    state_envs: int = 16
-    steps: int = 90
-    substeps: int = 5
-    options: Options = field(default_factory=Options)
+    document: Document  # a YAML file, or the same as a mapping
+    overrides: Mapping[str, Any] = field(default_factory=dict)  # by dotted path YAML text, or a plain value
+    sensors: tuple[str, ...] = ()  # sensors, and `physics`, that are measured; empty: all
+    states: Path | None = None  # file of states; None: a scripted run
+    save_states: Path | None = None  # file that the states of the run are written to; None: none
+    state_envs: int = 16  # environments of the scripted run; half of them verify
+    steps: int = 90  # its control steps, about
+    substeps: int = 5  # physics steps of each
+    options: Options = field(default_factory=Options)  # how sensors are measured
 
 
 def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], None] | None = None) -> Report:
@@ -119,11 +106,7 @@ def _check(options: Options) -> None:
 
 
 def _wanted(sensors: Collection[str], names: Sequence[str]) -> list[str]:
-    """Return what is measured, in the document's order.
-
-    Raises:
-        TgdslError: If there is no such sensor.
-    """
+    """Return what is measured, in the document's order."""
     known = [*names, *([] if PHYSICS in names else [PHYSICS])]
     for name in sensors:
         if name not in known:

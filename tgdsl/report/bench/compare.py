@@ -23,21 +23,13 @@ OF_TIME = ("seconds_", "times_own", "is_on_front", "is_own")
 
 
 class Comparison(NamedTuple):
-    """What two benches differ in.
+    """What two benches differ in."""
 
-    Attributes:
-        only_before: Variants that the earlier one alone has.
-        only_now: Variants that the later one alone has.
-        changed: Variants whose errors or counts differ, with each number before and now.
-        turned: Pairs of variants of which the first was faster, and is slower now.
-        tied: Variants that are on one front alone, and are as fast as what takes their place.
-    """
-
-    only_before: tuple[str, ...]
-    only_now: tuple[str, ...]
-    changed: Mapping[str, tuple[str, ...]]
-    turned: tuple[tuple[str, str], ...]
-    tied: tuple[str, ...]
+    only_before: tuple[str, ...]  # variants that the earlier one alone has
+    only_now: tuple[str, ...]  # variants that the later one alone has
+    changed: Mapping[str, tuple[str, ...]]  # variants whose errors or counts differ, with each number before and now
+    turned: tuple[tuple[str, str], ...]  # pairs of variants of which the first was faster, and is slower now
+    tied: tuple[str, ...]  # variants that are on one front alone, and are as fast as what takes their place
 
     def lines(self) -> list[str]:
         """Return what is said of it."""
@@ -100,7 +92,6 @@ def _by_name(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 def _changes(now: Row, before: Row) -> tuple[str, ...]:
-    """Return the numbers that should be the same in each run, and are not."""
     names = [name for name in now if not name.startswith(OF_TIME) and name in before]
     return tuple(f"{name} {_brief(before[name])} → {_brief(now[name])}" for name in names if now[name] != before[name])
 

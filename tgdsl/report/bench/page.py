@@ -17,8 +17,7 @@ from tgdsl.report.bench.results import Measured, Report, Subject, rows_of
 from tgdsl.report.files import page_of, svg_of, table_of, write_report_files
 from tgdsl.view.style import FAINT, INK
 
-FLOOR = 1e-9
-"""Errors below this are drawn here: an axis of powers of ten has no zero."""
+FLOOR = 1e-9  # errors below this are drawn here: an axis of powers of ten has no zero
 OWN, FRONT = "#c0392b", "#1f6f8b"
 
 

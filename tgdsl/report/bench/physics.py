@@ -26,10 +26,8 @@ from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.recording import varied
 from tgdsl.tuning.trials import Cost
 
-FINE = 4
-"""How many times smaller the time step of the fine run is."""
-ITERATIONS, TOLERANCE = 400, 1e-12
-"""Of the solver in the fine run."""
+FINE = 4  # how many times smaller the time step of the fine run is
+ITERATIONS, TOLERANCE = 400, 1e-12  # of the solver in the fine run
 
 
 class Setting(NamedTuple):

@@ -13,26 +13,16 @@ from tgdsl.tuning.trials import Cost
 
 @dataclass(frozen=True)
 class Measured:
-    """A variant, measured.
+    """A variant, measured."""
 
-    Attributes:
-        label: What to call it.
-        precision: Of what is computed and returned.
-        is_own: Whether it is what the compiler takes now.
-        chosen: Errors on the environments that the front is drawn from, relative to the reading's magnitude.
-        verified: The same on the others.
-        times: Median time of a call [s], by the number of environments.
-        cost: What it takes, counted.
-        is_on_front: Whether no other is better in time or error, and worse in neither; where intervals overlap two are equal.
-    """
-
-    label: str
-    precision: str
-    is_own: bool
-    chosen: Errors
-    verified: Errors
-    times: Mapping[int, Interval]
-    cost: Cost
+    label: str  # what to call it
+    precision: str  # of what is computed and returned
+    is_own: bool  # whether it is what the compiler takes now
+    chosen: Errors  # errors on the environments that the front is drawn from, relative to the reading's magnitude
+    verified: Errors  # the same on the others
+    times: Mapping[int, Interval]  # median time of a call [s], by the number of environments
+    cost: Cost  # what it takes, counted
+    # whether no other is better in time or error, and worse in neither; where intervals overlap two are equal
     is_on_front: bool = False
 
     @property
@@ -43,27 +33,16 @@ class Measured:
 
 @dataclass(frozen=True)
 class Subject:
-    """A sensor, or the physics, in all variants.
+    """A sensor, or the physics, in all variants."""
 
-    Attributes:
-        name: Its name.
-        kind: Its kind.
-        reference: What errors are measured against.
-        check: How far that is from the kind's float64 definition; empty: not compared.
-        magnitudes: What each quantity's errors are relative to, with its unit.
-        points: The variants.
-        left_out: Variants that cannot be had, and why.
-        chosen: What `accuracy` chose and why, line by line; empty: there is none.
-    """
-
-    name: str
-    kind: str
-    reference: str
-    check: str
-    magnitudes: Mapping[str, str]
-    points: tuple[Measured, ...]
-    left_out: tuple[tuple[str, str], ...]
-    chosen: tuple[str, ...] = ()
+    name: str  # its name
+    kind: str  # its kind
+    reference: str  # what errors are measured against
+    check: str  # how far that is from the kind's float64 definition; empty: not compared
+    magnitudes: Mapping[str, str]  # what each quantity's errors are relative to, with its unit
+    points: tuple[Measured, ...]  # the variants
+    left_out: tuple[tuple[str, str], ...]  # variants that cannot be had, and why
+    chosen: tuple[str, ...] = ()  # what `accuracy` chose and why, line by line; empty: there is none
 
     @property
     def own(self) -> Measured:
@@ -73,19 +52,12 @@ class Subject:
 
 @dataclass(frozen=True)
 class Report:
-    """A bench.
+    """A bench."""
 
-    Attributes:
-        document: The document.
-        machine: Where times were measured.
-        states: Where the states are from.
-        subjects: Sensors, and physics.
-    """
-
-    document: str
-    machine: str
-    states: str
-    subjects: tuple[Subject, ...]
+    document: str  # the document
+    machine: str  # where times were measured
+    states: str  # where the states are from
+    subjects: tuple[Subject, ...]  # sensors, and physics
 
 
 def with_front(points: Sequence[Measured]) -> tuple[Measured, ...]:

@@ -37,21 +37,13 @@ CHECKED_STEPS, CHECKED_ENVS = 6, 2
 
 @dataclass(frozen=True)
 class Options:
-    """How sensors are measured.
+    """How sensors are measured."""
 
-    Attributes:
-        device: Where.
-        num_envs: Environments of timed calls.
-        repeats: Timed calls of each variant.
-        compiled: Whether modules are compiled by torch before they are timed.
-        seed: Of bootstraps, and of which states are timed.
-    """
-
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    num_envs: tuple[int, ...] = (256,)
-    repeats: int = 11
-    compiled: bool = False
-    seed: int = 0
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))  # where
+    num_envs: tuple[int, ...] = (256,)  # environments of timed calls
+    repeats: int = 11  # timed calls of each variant
+    compiled: bool = False  # whether modules are compiled by torch before they are timed
+    seed: int = 0  # of bootstraps, and of which states are timed
 
 
 class Way(NamedTuple):

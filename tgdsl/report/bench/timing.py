@@ -16,8 +16,7 @@ from scipy.stats import binom
 
 from tgdsl.module.accuracy.errors import Interval
 
-WARM_UP = 2
-"""Calls of each before the first one that is timed."""
+WARM_UP = 2  # calls of each before the first one that is timed
 
 
 def median_of(times: Float[np.ndarray, " call"]) -> Interval:
