@@ -12,35 +12,24 @@ from pydantic_core import CoreSchema, core_schema
 from tgdsl.fields import units
 from tgdsl.fields.models import PATTERN
 
-DIMENSIONS = ("length", "force", "torque", "pressure", "temperature")
-"""Dimensions of what sensors read."""
+DIMENSIONS = ("length", "force", "torque", "pressure", "temperature")  # dimensions of what sensors read
 EXPECTED = 'a fraction such as "1 %", or an amount such as "0.02 mm"'
 _PERCENT = re.compile(r"\s*+([0-9]++\.?[0-9]*+|\.[0-9]++)([eE][-+]?[0-9]++)?\s*+%\s*+\Z")
 
 
 class Bound(NamedTuple):
-    """What an error may amount to.
+    """What an error may amount to."""
 
-    Attributes:
-        value: It, in the unit.
-        unit: The unit of the channels that it is of, `N·m`; empty: a fraction of the largest change.
-        text: As a document has it.
-    """
-
-    value: float
-    unit: str
-    text: str
+    value: float  # it, in the unit
+    unit: str  # the unit of the channels that it is of, `N·m`; empty: a fraction of the largest change
+    text: str  # as a document has it
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Bounds of a reading's errors.
+    """Bounds of a reading's errors."""
 
-    Attributes:
-        bounds: The bound of each quantity, `force` of `force_x`; under the empty name that of all.
-    """
-
-    bounds: tuple[tuple[str, Bound], ...]
+    bounds: tuple[tuple[str, Bound], ...]  # the bound of each quantity, `force` of `force_x`; under the empty name that of all
 
     def of(self, quantity: str) -> Bound | None:
         """Return the bound of a quantity."""

@@ -36,31 +36,20 @@ from tgdsl.fields.models import TEXT_OR_OTHER, Pressure, Quantity, SpecModel, Us
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of.
+    """What a body is made of."""
 
-    Attributes:
-        name: Its name; of one that a document gives by numbers, what that is based on.
-        conductivity: Thermal conductivity k [W/(m·K)].
-        density: ρ [kg/m³].
-        specific_heat: Specific heat capacity c [J/(kg·K)].
-        emissivity: Hemispherical emissivity ε of its surface, from 0 to 1.
-        youngs_modulus: Young's modulus E [Pa]; None where it means little, as of a liquid.
-        poissons_ratio: Poisson's ratio ν; None where it means little.
-        source: Where the numbers are from.
-        mass_damping: Rayleigh's α [1/s]: a mode of angular frequency ω decays as e^(−dt), d = (α + β ω²)/2. None if unknown.
-        stiffness_damping: Rayleigh's β [s]; None if unknown.
-    """
-
-    name: str
-    conductivity: Annotated[float, Usual("conductivity", low=0.01, high=2500.0)]
-    density: Annotated[float, Usual("mass_density", low=5.0, high=25000.0)]
-    specific_heat: Annotated[float, Usual("specific_heat", low=100.0, high=10000.0)]
-    emissivity: float
+    name: str  # its name; of one that a document gives by numbers, what that is based on
+    conductivity: Annotated[float, Usual("conductivity", low=0.01, high=2500.0)]  # thermal conductivity k [W/(m·K)]
+    density: Annotated[float, Usual("mass_density", low=5.0, high=25000.0)]  # ρ [kg/m³]
+    specific_heat: Annotated[float, Usual("specific_heat", low=100.0, high=10000.0)]  # specific heat capacity c [J/(kg·K)]
+    emissivity: float  # hemispherical emissivity ε of its surface, from 0 to 1
+    # Young's modulus E [Pa]; None where it means little, as of a liquid
     youngs_modulus: Annotated[float | None, Usual("pressure", low=1e3, high=1.2e12)]
-    poissons_ratio: float | None
-    source: str
+    poissons_ratio: float | None  # Poisson's ratio ν; None where it means little
+    source: str  # where the numbers are from
+    # Rayleigh's α [1/s]: a mode of angular frequency ω decays as e^(−dt), d = (α + β ω²)/2. None if unknown.
     mass_damping: float | None = None
-    stiffness_damping: float | None = None
+    stiffness_damping: float | None = None  # Rayleigh's β [s]; None if unknown
 
     def damped(self, mass_damping: float, stiffness_damping: float, source: str) -> Material:
         """Return the material with Rayleigh's damping α [1/s] and β [s], and where these are from."""
@@ -119,8 +108,7 @@ MATERIALS: Mapping[str, Material] = MappingProxyType(
 """The materials that a document can name."""
 
 
-THERMAL = ("conductivity", "density", "specific_heat", "emissivity")
-"""What must be known of a material for heat."""
+THERMAL = ("conductivity", "density", "specific_heat", "emissivity")  # what must be known of a material for heat
 
 
 def known_material(name: str) -> Material:
@@ -186,7 +174,6 @@ class _AsWritten:
     """Marks a material that is written as a name, or as an `OwnMaterial`."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
-        """Read either, and look names up."""
         return core_schema.no_info_after_validator_function(_material, handler.generate_schema(_Written))
 
 

@@ -35,7 +35,6 @@ class SpecModel(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _note_model(cls, value: object, info: Any) -> object:
-        """Note which model a mapping was read as, so that an error can name the keys that it knows."""
         if isinstance(info.context, dict):
             info.context[id(value)] = cls
         return value
@@ -57,19 +56,12 @@ PATTERN = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*(%s)?\s*$"
 
 @dataclass(frozen=True)
 class Quantity:
-    """Marks a float that may also be written with a unit, bounded in SI units.
+    """Marks a float that may also be written with a unit, bounded in SI units."""
 
-    Attributes:
-        dimension: A key of `units.UNITS`, or a `units.Dimension` of one's own.
-        ge: Least value.
-        gt: Bound that the value must exceed.
-        le: Largest value.
-    """
-
-    dimension: str | units.Dimension
-    ge: float | None = None
-    gt: float | None = None
-    le: float | None = None
+    dimension: str | units.Dimension  # a key of `units.UNITS`, or a `units.Dimension` of one's own
+    ge: float | None = None  # least value
+    gt: float | None = None  # bound that the value must exceed
+    le: float | None = None  # largest value
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
         """Read a number or a string, then look at the bounds."""
@@ -98,8 +90,7 @@ class Quantity:
         return value
 
 
-Range = tuple[float, float]
-"""Lowest and highest value; the same for a plain number."""
+Range = tuple[float, float]  # lowest and highest value; the same for a plain number
 
 
 class RangeOf(Quantity):
@@ -122,17 +113,11 @@ class RangeOf(Quantity):
 
 @dataclass(frozen=True)
 class Usual:
-    """Marks a field whose value was most likely meant in another unit beyond these bounds: a warning then says so.
+    """Marks a field whose value was most likely meant in another unit beyond these bounds: a warning then says so."""
 
-    Attributes:
-        dimension: A key of `units.UNITS`, or a `units.Dimension` of one's own.
-        low: Least usual magnitude, in SI units; 0 is usual too.
-        high: Largest usual magnitude.
-    """
-
-    dimension: str | units.Dimension
-    low: float = 0.0
-    high: float = math.inf
+    dimension: str | units.Dimension  # a key of `units.UNITS`, or a `units.Dimension` of one's own
+    low: float = 0.0  # least usual magnitude, in SI units; 0 is usual too
+    high: float = math.inf  # largest usual magnitude
 
     def doubt(self, value: float) -> tuple[str, str] | None:
         """Return what is unusual about a value, and a hint; None if nothing is."""
@@ -150,8 +135,7 @@ Area = Annotated[float, Quantity("area", gt=0.0)]
 Angle = Annotated[float, Quantity("angle", gt=0.0)]
 Frequency = Annotated[float, Quantity("frequency", gt=0.0)]
 Pressure = Annotated[float, Quantity("pressure", gt=0.0)]
-Temperature = Annotated[float, Quantity("temperature", ge=units.ZEROS["K"])]
-"""[°C], from absolute zero on."""
+Temperature = Annotated[float, Quantity("temperature", ge=units.ZEROS["K"])]  # [°C], from absolute zero on
 Number = Annotated[float, Quantity("number")]
 NonNegative = Annotated[float, Quantity("number", ge=0.0)]
 Positive = Annotated[float, Quantity("number", gt=0.0)]

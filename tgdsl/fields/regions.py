@@ -69,7 +69,7 @@ _REGIONS: dict[str, type[SpecModel]] = {"facing": Facing, "box": InBox, "sphere"
 
 
 def _region_tag(value: object) -> str | None:
-    """Return the region's key with an article, because a tag in an error's location must not look like a key."""
+    # An article, because a tag in an error's location must not look like a key.
     if isinstance(value, dict):
         return next((f"a {key}" for key in _REGIONS if key in value), None)
     return next((f"a {key}" for key, model in _REGIONS.items() if isinstance(value, model)), None)

@@ -35,15 +35,10 @@ ZEROS: dict[str, float] = {"K": -273.15}
 
 @dataclass(frozen=True, eq=False)
 class Dimension:
-    """A dimension that `UNITS` lacks, for kinds of sensors and tasks of one's own.
+    """A dimension that `UNITS` lacks, for kinds of sensors and tasks of one's own."""
 
-    Attributes:
-        name: What it is called in messages.
-        units: Factor to SI of each of its units; the first is the one inside tgdsl, with a factor of 1.
-    """
-
-    name: str
-    units: Mapping[str, float]
+    name: str  # what it is called in messages
+    units: Mapping[str, float]  # factor to SI of each of its units; the first is the one inside tgdsl, with a factor of 1
 
     def __post_init__(self) -> None:
         """Raise `ValueError` if the first unit is not the one inside, or a unit cannot be written behind a number."""

@@ -33,8 +33,7 @@ from torch import Tensor
 from tgdsl.errors import TgdslError
 from tgdsl.geometry.planes import Vec, split
 
-ON_SURFACE = 1e-7
-"""Points nearer than this fraction of the mesh's size are on the surface: their gradient is the face's normal."""
+ON_SURFACE = 1e-7  # points nearer than this fraction of the mesh's size are on the surface: their gradient is the face's normal
 SIGN_OFFSET = 2e-6
 """The winding number is evaluated at least this fraction of the mesh's size off the surface, well clear of rounding."""
 SEARCH_ERROR = 2e-6
@@ -176,10 +175,8 @@ mesh_distance.register_autograd(_backward, setup_context=_save)
 
 
 def _thin(corners: Float[np.ndarray, "f 3 3"], tolerance: float) -> Int[np.ndarray, " t"]:
-    """Return the faces on which float32 may misplace the nearest point by more than a tolerance [m].
-
-    With longest edge L and height h, Warp's point is off along the face by (L/h)² L of float32's precision, at most by L.
-    """
+    """Return the faces on which float32 may misplace the nearest point by more than a tolerance [m]."""
+    # With longest edge L and height h, Warp's point is off along the face by (L/h)² L of float32's precision, at most by L.
     edges = np.roll(corners, -1, axis=1) - corners
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     aspect = longest**2 / np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)

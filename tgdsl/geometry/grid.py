@@ -29,20 +29,13 @@ class Grid(NamedTuple):
     """Signed distance at the nodes of a grid, negative inside; or of several, of which each point asks one.
 
     Counts that are the same for all points may be Python's: a compiler then makes them part of the code.
-
-    Attributes:
-        values: Signed distance at the nodes [m], grid after grid, z running fastest.
-        first: Index of a point's grid's node (0, 0, 0).
-        num: Number of its nodes along each axis.
-        origin: Place of its node (0, 0, 0) in the geom's frame [m].
-        cell: Spacing of its nodes [m], alike along all axes.
     """
 
-    values: Float[Tensor, " node"]
-    first: Count
-    num: tuple[Count, Count, Count]
-    origin: Vec
-    cell: Float[Tensor, "*point"]
+    values: Float[Tensor, " node"]  # signed distance at the nodes [m], grid after grid, z running fastest
+    first: Count  # index of a point's grid's node (0, 0, 0)
+    num: tuple[Count, Count, Count]  # number of its nodes along each axis
+    origin: Vec  # place of its node (0, 0, 0) in the geom's frame [m]
+    cell: Float[Tensor, "*point"]  # spacing of its nodes [m], alike along all axes
 
 
 def one_grid(values: Float[Tensor, "x y z"], origin: Float[Tensor, " 3"], cell: Float[Tensor, ""]) -> Grid:
@@ -70,8 +63,7 @@ def tricubic(point: Vec, grid: Grid) -> tuple[Tensor, Vec]:
     return _interpolate(point, grid, _cubic_weights, first=-1)
 
 
-METHODS = {"trilinear": trilinear, "tricubic": tricubic}
-"""How a grid is interpolated, by the name that a Plan gives it."""
+METHODS = {"trilinear": trilinear, "tricubic": tricubic}  # how a grid is interpolated, by the name that a Plan gives it
 
 
 def _linear_weights(t: Tensor) -> Nodes:

@@ -157,7 +157,6 @@ def length_and_inverse(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _safe_roots(squared: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the root of a squared length and one over it; 0 and 1 where the length vanishes."""
     is_null = squared <= tiny()
     inverse = torch.rsqrt(torch.where(is_null, 1.0, squared))
     return torch.where(is_null, 0.0, squared * inverse), inverse

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from tgdsl.geometry.planes import tie
 
 Array = np.ndarray
-TIE = tie()
-"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins."""
+TIE = tie()  # lengths [m] that differ by no more than this count as equal, and the first among equals wins
 
 
 def signed_distance(shape: str, size: Float[Array, " 3"], point: Float[Array, " 3"]) -> tuple[float, Float[Array, " 3"]]:
@@ -64,11 +63,7 @@ def _cylinder(size: Array, point: Array) -> tuple[Array, bool, Array]:
 
 
 def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
-    """Nearest point by bracketing u = t + e², t the Lagrange multiplier: X_i = e_i² p_i / (u + e_i² − e²), ‖X/e‖ = 1.
-
-    If no u above the pole 0 of the least semi-axis e solves it, the point is on that axis' plane of symmetry and the nearest
-    points are a mirrored pair, of which the positive is taken.
-    """
+    """Nearest point by bracketing u = t + e², t the Lagrange multiplier: X_i = e_i² p_i / (u + e_i² − e²), ‖X/e‖ = 1."""
     square = size**2
     least = int(np.argmin(size))
     sign = np.where(point < -TIE, -1.0, 1.0)
@@ -79,6 +74,7 @@ def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
     def excess(u: float) -> float:
         return sum((part / (u + rest)) ** 2 for part, rest in terms) - 1.0
 
+    # If no u above the pole 0 solves it, the nearest points are a mirrored pair, of which the positive is taken.
     flat = square > square[least]
     at_pole = np.sum((size[flat] * y[flat] / gap[flat]) ** 2)
     if not np.any(y[square == square[least]] > 0) and at_pole <= 1.0:

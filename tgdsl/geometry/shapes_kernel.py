@@ -53,7 +53,6 @@ def gradient_of(shape, size, point):
 
 @triton.jit
 def _to_walls(x, y, z):
-    """Return the signed distance from those to two or three walls at right angles."""
     inside = tl.maximum(tl.maximum(x, y, propagate_nan=tl.PropagateNan.ALL), z, propagate_nan=tl.PropagateNan.ALL)
     return length(_positive(x), _positive(y), _positive(z)) + tl.minimum(inside, 0.0, propagate_nan=tl.PropagateNan.ALL)
 

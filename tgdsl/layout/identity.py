@@ -23,12 +23,9 @@ from jaxtyping import Bool, Shaped
 from tgdsl.errors import TaxelError
 from tgdsl.layout.layout import Layout
 
-POSITION = 1e-6
-"""Largest distance of two positions that are the same place, and of two radii [m]."""
-DIRECTION = 1e-4
-"""Largest distance of two unit vectors that are the same direction: an angle [rad]."""
-AREA = 0.05
-"""Largest difference of two areas that are the same, relative to the larger: sampled ones are counted in points."""
+POSITION = 1e-6  # largest distance of two positions that are the same place, and of two radii [m]
+DIRECTION = 1e-4  # largest distance of two unit vectors that are the same direction: an angle [rad]
+AREA = 0.05  # largest difference of two areas that are the same, relative to the larger: sampled ones are counted in points
 _LENGTH_CELL, _DIRECTION_CELL = 1e-3, 0.1
 _SHIFTS = (0.5 * np.sqrt(0.3), 0.5 * np.sqrt(0.3) + 0.5)
 """Where the grids of ids begin, in cells: numbers that people draw, such as halves of a millimetre, are on no line."""

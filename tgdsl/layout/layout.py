@@ -14,42 +14,25 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Link:
-    """A part of the robot that carries taxels.
+    """A part of the robot that carries taxels."""
 
-    Attributes:
-        name: Name that the layout gave it: a body's, a geom's or a mesh's.
-        body: The body whose frame the taxels are in.
-    """
-
-    name: str
-    body: str
+    name: str  # name that the layout gave it: a body's, a geom's or a mesh's
+    body: str  # the body whose frame the taxels are in
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Taxels of all links.
+    """Taxels of all links."""
 
-    Attributes:
-        links: The links, in the robot's body order.
-        groups: Names of the links in each link group.
-        link_id: Index into `links` of each taxel; ascending.
-        pos: Position in the body frame [m].
-        normal: Outward unit normal in the body frame.
-        tangent: Unit tangent in the body frame, perpendicular to the normal.
-        radius: Sensing radius [m]; 0 marks an inactive filler.
-        area: Surface that the taxel stands for [m²].
-        cell: Row and column in the link's grid; −1 where it has none.
-    """
-
-    links: tuple[Link, ...]
-    groups: Mapping[str, tuple[str, ...]]
-    link_id: Int[np.ndarray, " taxel"]
-    pos: Float[np.ndarray, "taxel 3"]
-    normal: Float[np.ndarray, "taxel 3"]
-    tangent: Float[np.ndarray, "taxel 3"]
-    radius: Float[np.ndarray, " taxel"]
-    area: Float[np.ndarray, " taxel"]
-    cell: Int[np.ndarray, "taxel 2"]
+    links: tuple[Link, ...]  # the links, in the robot's body order
+    groups: Mapping[str, tuple[str, ...]]  # names of the links in each link group
+    link_id: Int[np.ndarray, " taxel"]  # index into `links` of each taxel; ascending
+    pos: Float[np.ndarray, "taxel 3"]  # position in the body frame [m]
+    normal: Float[np.ndarray, "taxel 3"]  # outward unit normal in the body frame
+    tangent: Float[np.ndarray, "taxel 3"]  # unit tangent in the body frame, perpendicular to the normal
+    radius: Float[np.ndarray, " taxel"]  # sensing radius [m]; 0 marks an inactive filler
+    area: Float[np.ndarray, " taxel"]  # surface that the taxel stands for [m²]
+    cell: Int[np.ndarray, "taxel 2"]  # row and column in the link's grid; −1 where it has none
 
     @staticmethod
     def of_links(links: tuple[Link, ...], groups: Mapping[str, tuple[str, ...]]) -> Layout:

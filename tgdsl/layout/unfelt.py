@@ -14,21 +14,13 @@ REASONS = NOT_COLLIDED, BURIED, COVERED = "not collided", "buried", "covered at 
 
 @dataclass(frozen=True, eq=False)
 class Unfelt:
-    """Taxels of a link that cannot feel, all for one reason.
+    """Taxels of a link that cannot feel, all for one reason."""
 
-    Attributes:
-        link: The link.
-        reason: One of the reasons above.
-        why: What the reason is here.
-        taxels: The taxels, by their indices in the layout, ascending.
-        of: Number of taxels of the link.
-    """
-
-    link: str
-    reason: str
-    why: str
-    taxels: Int[np.ndarray, " unfelt"]
-    of: int
+    link: str  # the link
+    reason: str  # one of the reasons above
+    why: str  # what the reason is here
+    taxels: Int[np.ndarray, " unfelt"]  # the taxels, by their indices in the layout, ascending
+    of: int  # number of taxels of the link
 
     def __str__(self) -> str:
         return f"{self.link}: {len(self.taxels)} of {self.of} taxels {self.why}"

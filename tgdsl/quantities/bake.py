@@ -27,10 +27,8 @@ CHOICE_POINTS, REPORT_POINTS = 4096, 16384
 HEADROOM, CHOICE_PERCENTILE = 0.95, 99.3
 """The choice holds the tolerance with something to spare, nearly two standard deviations of a percentile of so few points, so
 that as a rule the 99th percentile of the held-back points holds it too."""
-EDGE_FACTOR = 5.0
-"""How many times the tolerance the 99th percentile of the error near sharp edges may be."""
-COARSEST = 16
-"""Cells along the longest side of the first grid that is tried."""
+EDGE_FACTOR = 5.0  # how many times the tolerance the 99th percentile of the error near sharp edges may be
+COARSEST = 16  # cells along the longest side of the first grid that is tried
 
 
 @dataclass(frozen=True)
@@ -38,47 +36,28 @@ class Errors:
     """Errors at random points of the band, which took no part in the choice of the grid.
 
     Points nearer to a sharp edge than one cell are counted apart: there no grid does better than O(cell).
-
-    Attributes:
-        count: Points away from sharp edges; the tolerance holds for their `p99`.
-        p99: 99th percentile of the distance error [m].
-        max: Largest distance error [m].
-        rms: Root mean square of the distance error [m].
-        angle_p99: 99th percentile of the angle between the gradient and the true one [rad].
-        edge_count: Points near sharp edges.
-        edge_p99: 99th percentile of their distance error [m]; 0 if there are none, as the next.
-        edge_max: Largest distance error among them [m].
     """
 
-    count: int
-    p99: float
-    max: float
-    rms: float
-    angle_p99: float
-    edge_count: int
-    edge_p99: float
-    edge_max: float
+    count: int  # points away from sharp edges; the tolerance holds for their `p99`
+    p99: float  # 99th percentile of the distance error [m]
+    max: float  # largest distance error [m]
+    rms: float  # root mean square of the distance error [m]
+    angle_p99: float  # 99th percentile of the angle between the gradient and the true one [rad]
+    edge_count: int  # points near sharp edges
+    edge_p99: float  # 99th percentile of their distance error [m]; 0 if there are none, as the next
+    edge_max: float  # largest distance error among them [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """A grid of signed distances in the surface's frame.
+    """A grid of signed distances in the surface's frame."""
 
-    Attributes:
-        values: Signed distance at the nodes [m], negative inside.
-        origin: Place of node (0, 0, 0) [m].
-        cell: Spacing of the nodes [m].
-        method: Name of the function of `tgdsl.geometry.grid` that interpolates: trilinear or tricubic.
-        errors: What the grid costs in accuracy.
-        flaws: What of the surface its user should know: see `Outer`.
-    """
-
-    values: Float[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, " 3"]
-    cell: float
-    method: str
-    errors: Errors
-    flaws: tuple[str, ...]
+    values: Float[np.ndarray, "x y z"]  # signed distance at the nodes [m], negative inside
+    origin: Float[np.ndarray, " 3"]  # place of node (0, 0, 0) [m]
+    cell: float  # spacing of the nodes [m]
+    method: str  # name of the function of `tgdsl.geometry.grid` that interpolates: trilinear or tricubic
+    errors: Errors  # what the grid costs in accuracy
+    flaws: tuple[str, ...]  # what of the surface its user should know: see `Outer`
 
 
 def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int = 64 * 2**20) -> Baked:
@@ -213,25 +192,17 @@ def _percentile(values: np.ndarray, percentile: float) -> float:
 
 
 OUTER_FORMAT = b"tgdsl outer surface 1"
-HULL_POINTS = 2000
-"""Points of a convex hull whose distance to the mesh is looked at."""
+HULL_POINTS = 2000  # points of a convex hull whose distance to the mesh is looked at
 
 
 @dataclass(frozen=True, eq=False)
 class GeomDistance:
-    """How the distance to a geom is computed.
+    """How the distance to a geom is computed."""
 
-    Attributes:
-        geom: The geom.
-        shape: What computes it: a primitive's type, an interpolation of a grid, or `raycast`.
-        arrays: Further arrays that the method needs, by name.
-        accuracy: Errors of a grid, by name; empty for exact distances.
-    """
-
-    geom: SurfaceGeom
-    shape: str
-    arrays: Mapping[str, np.ndarray]
-    accuracy: Mapping[str, float]
+    geom: SurfaceGeom  # the geom
+    shape: str  # what computes it: a primitive's type, an interpolation of a grid, or `raycast`
+    arrays: Mapping[str, np.ndarray]  # further arrays that the method needs, by name
+    accuracy: Mapping[str, float]  # errors of a grid, by name; empty for exact distances
 
 
 def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, name: str) -> GeomDistance:

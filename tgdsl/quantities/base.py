@@ -34,15 +34,10 @@ Report = Callable[[tuple[str | int, ...], str, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Request(Generic[Value]):
-    """What a kind asks of a scene; `Value` is what its `forward` gets.
+    """What a kind asks of a scene; `Value` is what its `forward` gets."""
 
-    Attributes:
-        objects: Objects that it concerns; empty where a request has nothing to do with objects.
-        is_gated: Whether an object counts only while the simulator has it in contact with the link.
-    """
-
-    objects: tuple[str, ...] = ()
-    is_gated: bool = False
+    objects: tuple[str, ...] = ()  #: objects that it concerns; empty where a request has nothing to do with objects
+    is_gated: bool = False  #: whether an object counts only while the simulator has it in contact with the link
     wants_contacts: ClassVar[bool] = False
     """Whether the contacts of each link with the objects are read from the state."""
     is_within_radii: ClassVar[bool] = False
@@ -77,25 +72,16 @@ class Request(Generic[Value]):
 
 @dataclass(frozen=True, eq=False)
 class Use:
-    """A request and its taxels, shared by all sensors with equal requests.
+    """A request and its taxels, shared by all sensors with equal requests."""
 
-    Attributes:
-        request: The request.
-        sensors: The sensors, by their names in the document.
-        links: The links that carry them.
-        taxels: Their taxels, rows of the layout.
-        pos: Where these are, (3, taxel) in the links' bodies' frames [m]; one array for all uses of the same taxels.
-        radius_noise: Name of the sensor whose noise disturbs the taxels' radii, if any.
-        largest_shift: By how much, at most [m].
-    """
-
-    request: Request
-    sensors: tuple[str, ...]
-    links: tuple[Link, ...]
-    taxels: Int[np.ndarray, " taxel"]
+    request: Request  #: the request
+    sensors: tuple[str, ...]  #: the sensors, by their names in the document
+    links: tuple[Link, ...]  #: the links that carry them
+    taxels: Int[np.ndarray, " taxel"]  #: their taxels, rows of the layout
+    #: where these are, (3, taxel) in the links' bodies' frames [m]; one array for all uses of the same taxels
     pos: Float[np.ndarray, "3 taxel"]
-    radius_noise: str = ""
-    largest_shift: float = 0.0
+    radius_noise: str = ""  #: name of the sensor whose noise disturbs the taxels' radii, if any
+    largest_shift: float = 0.0  #: by how much, at most [m]
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -105,32 +91,20 @@ class Use:
 
 @dataclass(frozen=True, eq=False)
 class Planning:
-    """What a quantity plans from.
+    """What a quantity plans from."""
 
-    Attributes:
-        layout: The taxels of all sensors.
-        sensed: What there is of each object that some sensor senses.
-        pairs: The pairs that may meet, sorted by object and link.
-        contact_pairs: The pairs whose contacts are read, in the order of the state.
-        objects: The objects that have pairs, in the Plan's order.
-        bodies: The bodies whose poses are read, in the order of the state.
-        geoms_of: Returns the geoms that a link's taxels sit on, by its name: meshes as they are, not their convex hulls.
-        report: Notes a mistake.
-        progress: Called with a line of text for each long job.
-        joints: The joints that are read, in the order of the state.
-        anchors: Where the anchor of each is in the frame of the body that it moves, by its name [m].
-    """
-
-    layout: Layout
-    sensed: Mapping[str, SensedObject]
-    pairs: tuple[Pair, ...]
-    contact_pairs: tuple[Pair, ...]
-    objects: tuple[PairedObject, ...]
-    bodies: tuple[str, ...]
+    layout: Layout  #: the taxels of all sensors
+    sensed: Mapping[str, SensedObject]  #: what there is of each object that some sensor senses
+    pairs: tuple[Pair, ...]  #: the pairs that may meet, sorted by object and link
+    contact_pairs: tuple[Pair, ...]  #: the pairs whose contacts are read, in the order of the state
+    objects: tuple[PairedObject, ...]  #: the objects that have pairs, in the Plan's order
+    bodies: tuple[str, ...]  #: the bodies whose poses are read, in the order of the state
+    #: returns the geoms that a link's taxels sit on, by its name: meshes as they are, not their convex hulls
     geoms_of: Callable[[str], tuple[SurfaceGeom, ...]]
-    report: Report
-    progress: Progress
-    joints: tuple[str, ...] = ()
+    report: Report  #: notes a mistake
+    progress: Progress  #: called with a line of text for each long job
+    joints: tuple[str, ...] = ()  #: the joints that are read, in the order of the state
+    #: where the anchor of each is in the frame of the body that it moves, by its name [m]
     anchors: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)
 
     def bodies_of(self, taxels: Int[np.ndarray, " taxel"]) -> list[str]:
@@ -183,21 +157,13 @@ class Planning:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What quantities are gathered from, at one instant.
+    """What quantities are gathered from, at one instant."""
 
-    Attributes:
-        tensors: Fields of `SceneState`, by name.
-        objects: The Plan's objects.
-        pairs: Relative poses of all pairs, in the order of the Plan; None if there are none.
-        radius_shifts: By how much the radii of sensors with such noise are off, by sensor: (env, taxel) [m].
-        dtype: Dtype of the gathered values.
-    """
-
-    tensors: Mapping[str, Tensor]
-    objects: tuple[PairedObject, ...]
-    pairs: Pairs | None
-    radius_shifts: Mapping[str, Tensor]
-    dtype: torch.dtype
+    tensors: Mapping[str, Tensor]  #: fields of `SceneState`, by name
+    objects: tuple[PairedObject, ...]  #: the Plan's objects
+    pairs: Pairs | None  #: relative poses of all pairs, in the order of the Plan; None if there are none
+    radius_shifts: Mapping[str, Tensor]  #: errors of radii by sensor, where noise disturbs them: (env, taxel) [m]
+    dtype: torch.dtype  #: dtype of the gathered values
 
 
 def heated_objects(objects: Sequence[PairedObject], sensed: Mapping[str, SensedObject]) -> tuple[str, ...]:
@@ -217,21 +183,15 @@ def variant_of(scene: Scene, target: PairedObject) -> Int[Tensor, " env"] | None
 
 
 class Quantity(ABC):
-    """A quantity: how it is planned, gathered and explained. One instance of each is registered.
+    """A quantity: how it is planned, gathered and explained. One instance of each is registered."""
 
-    Attributes:
-        name: Its name, also of its part of the Plan.
-        request: The type of its requests.
-        part: The type of its part of the Plan: a frozen dataclass, generic in its arrays (NumPy's in the Plan, torch's at run
-            time).
-        has_rows: Whether memory may have a row for each row of its value, as `Memory(rows=…)` asks: see `num_rows`.
-        is_fused: Whether kernels on a CPU are to be as large as can be: all that is computed is alike, and would be read again.
-    """
-
-    name: ClassVar[str]
-    request: ClassVar[type[Request]]
+    name: ClassVar[str]  #: its name, also of its part of the Plan
+    request: ClassVar[type[Request]]  #: the type of its requests
+    #: the type of its part of the Plan: a frozen dataclass, generic in its arrays (NumPy's in the Plan, torch's at run time)
     part: ClassVar[type]
+    #: whether memory may have a row for each row of its value, as `Memory(rows=…)` asks: see `num_rows`
     has_rows: ClassVar[bool] = False
+    #: whether kernels on a CPU are to be as large as can be: all that is computed is alike, and would be read again
     is_fused: ClassVar[bool] = False
 
     @abstractmethod

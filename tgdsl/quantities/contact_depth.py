@@ -47,81 +47,49 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class SearchPart(Generic[Array]):
-    """What a GPU's search for the deepest geom is given that is the same at all calls: see `search.Tables`.
+    """What a GPU's search for the deepest geom is given that is the same at all calls: see `search.Tables`."""
 
-    Attributes:
-        pair: Index of each probe's pair with each object among all pairs, (object, taxel).
-        spheres: Bounds of the objects, (1, object, 2); None where they differ between environments.
-        geoms: Their geoms, (1, geom, row); None in the same case.
-    """
-
-    pair: Array
-    spheres: Array | None
-    geoms: Array | None
+    pair: Array  # index of each probe's pair with each object among all pairs, (object, taxel)
+    spheres: Array | None  # bounds of the objects, (1, object, 2); None where they differ between environments
+    geoms: Array | None  # their geoms, (1, geom, row); None in the same case
 
 
 @dataclass(frozen=True, eq=False)
 class ProbeQuery(Generic[Array]):
-    """Probes whose distances are computed once, however many uses share them.
+    """Probes whose distances are computed once, however many uses share them."""
 
-    Attributes:
-        objects: The objects that they are measured against: indices into the Plan's.
-        pos: Where the probes are in their links' bodies' frames [m], (3, taxel).
-        pair: Index of each probe's pair with each object among that object's pairs, (object, taxel).
-    """
-
-    objects: tuple[int, ...]
-    pos: Array
-    pair: Array
+    objects: tuple[int, ...]  # the objects that they are measured against: indices into the Plan's
+    pos: Array  # where the probes are in their links' bodies' frames [m], (3, taxel)
+    pair: Array  # index of each probe's pair with each object among that object's pairs, (object, taxel)
 
 
 @dataclass(frozen=True, eq=False)
 class DepthUse(Generic[Array]):
-    """One request: the objects of a query that count, and how.
+    """One request: the objects of a query that count, and how."""
 
-    Attributes:
-        query: Number of its query.
-        objects: Which of that one's objects.
-        is_gated: Whether they count only in contact.
-        wants: Further results: "distance", "frame", "motion", "normal".
-        radius_noise: The sensor whose noise disturbs the radii, if any.
-        reach: How far each probe feels each object [m], (object, taxel); −∞ where it does not.
-        search: What a search by a kernel is given; None where it is of no use.
-    """
-
-    query: int
-    objects: tuple[int, ...]
-    is_gated: bool
-    wants: tuple[str, ...]
-    radius_noise: str
-    reach: Array
-    search: SearchPart[Array] | None
+    query: int  # number of its query
+    objects: tuple[int, ...]  # which of that one's objects
+    is_gated: bool  # whether they count only in contact
+    wants: tuple[str, ...]  # further results: "distance", "frame", "motion", "normal"
+    radius_noise: str  # the sensor whose noise disturbs the radii, if any
+    reach: Array  # how far each probe feels each object [m], (object, taxel); −∞ where it does not
+    search: SearchPart[Array] | None  # what a search by a kernel is given; None where it is of no use
 
 
 @dataclass(frozen=True, eq=False)
 class ContactDepthPart(Generic[Array]):
-    """All of it.
+    """All of it."""
 
-    Attributes:
-        geoms: Geoms of the Plan's objects; None of one that nothing is measured against.
-        queries: The queries.
-        uses: The uses.
-    """
-
-    geoms: tuple[GeomTable[Array] | None, ...]
-    queries: tuple[ProbeQuery[Array], ...]
-    uses: tuple[DepthUse[Array], ...]
+    geoms: tuple[GeomTable[Array] | None, ...]  # geoms of the Plan's objects; None of one that nothing is measured against
+    queries: tuple[ProbeQuery[Array], ...]  # the queries
+    uses: tuple[DepthUse[Array], ...]  # the uses
 
 
-FAR = 1e6
-"""Numbers of poses up to this [m] have distances that are numbers, in float32 too."""
+FAR = 1e6  # numbers of poses up to this [m] have distances that are numbers, in float32 too
 
 
 def _are_closed(scene: Scene) -> bool:
-    """Return whether no pair is in contact, and nothing is so far away or no number that a closed gate would not hide it.
-
-    False where the values are not to be looked at: on a GPU, in code that is traced, and where derivatives are wanted.
-    """
+    """Return whether no pair is in contact, and nothing is so far away or no number that a closed gate would not hide it."""
     pairs = scene.pairs
     if pairs is None or pairs.gate is None or not is_cheap_to_read(pairs.gate) or not bool((pairs.gate == -torch.inf).all()):
         return False
@@ -172,8 +140,7 @@ def _reference_penetration(
 ) -> ReferencePenetration:
     """Query the probes of one link against the objects that it may feel; None stands for one that it may not.
 
-    The paper's equations word for word: q = p_L + R_L x, d = max(0, max_g (R − φ_g(q))), m = ∇φ at the deepest geom,
-    v = R_Lᵀ (v_C(q) − v_L(q)). A probe whose radius is −∞ is inactive.
+    The paper's: q = p_L + R_L x, d = max(0, max_g (R − φ_g(q))), m = ∇φ at the deepest geom, v = R_Lᵀ (v_C(q) − v_L(q)).
     """
     normal, velocity, angular = np.zeros((3, len(pos), 3))
     distance, outward = np.full((len(pos), len(objects)), np.inf), np.zeros((len(pos), len(objects), 3))

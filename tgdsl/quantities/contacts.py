@@ -31,31 +31,20 @@ class ContactPoints(NamedTuple):
     at the centre of the contacts shown, weighted by their forces: each takes r |f_c| / Σ_c |f_c| on itself, or equal shares
     where none has a force. The forces then sum to the whole; the moment of r about that centre is not known, nor are torques
     beyond the slots. Where no contact is shown there is nowhere to act, and `net` alone has r.
-
-    Attributes:
-        pos: Contact points [m].
-        force: Force on the body at each [N].
-        torque: Torque on the body at each [N·m].
-        normal: Unit normal out of the object at each; NaN where the state has a force without one.
-        net: Whole force on the body from the objects felt [N], contacts beyond the slots included.
     """
 
-    pos: Vec
-    force: Vec
-    torque: Vec
-    normal: Vec
-    net: Vec
+    pos: Vec  # contact points [m]
+    force: Vec  # force on the body at each [N]
+    torque: Vec  # torque on the body at each [N·m]
+    normal: Vec  # unit normal out of the object at each; NaN where the state has a force without one
+    net: Vec  # whole force on the body from the objects felt [N], contacts beyond the slots included
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts(Request[ContactPoints]):
-    """Asks for the solver's contacts.
+    """Asks for the solver's contacts."""
 
-    Attributes:
-        slots: Contacts per body and object that are wanted; 0: the net force alone.
-    """
-
-    slots: int = 0
+    slots: int = 0  # contacts per body and object that are wanted; 0: the net force alone
     wants_contacts: ClassVar[bool] = True
 
     @property
@@ -81,28 +70,18 @@ SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal
 
 @dataclass(frozen=True, eq=False)
 class ContactsUse(Generic[Array]):
-    """One request.
+    """One request."""
 
-    Attributes:
-        bodies: Indices of the sensors' bodies in the state, (body,).
-        pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
-    """
-
-    bodies: Array
-    pairs: Array
+    bodies: Array  # indices of the sensors' bodies in the state, (body,)
+    pairs: Array  # whose contacts: indices into `inputs.pairs`, or their number for none, (body, object)
 
 
 @dataclass(frozen=True, eq=False)
 class ContactsPart(Generic[Array]):
-    """All of it.
+    """All of it."""
 
-    Attributes:
-        slots: Contacts per pair that are read; 0: the net force alone.
-        uses: The uses.
-    """
-
-    slots: int
-    uses: tuple[ContactsUse[Array], ...]
+    slots: int  # contacts per pair that are read; 0: the net force alone
+    uses: tuple[ContactsUse[Array], ...]  # the uses
 
 
 def _use(planning: Planning, use: Use) -> ContactsUse[np.ndarray]:
@@ -154,21 +133,13 @@ def _in_frame(quat: Plane, vector: Plane) -> list[Plane]:
 
 
 class PairContacts(NamedTuple):
-    """The contacts of each body and object, in world axes; planes (env, body, object, slot).
+    """The contacts of each body and object, in world axes; planes (env, body, object, slot)."""
 
-    Attributes:
-        pos: Contact points [m].
-        force: Force on the body at each [N], what the slots lack of each pair's whole force shared out.
-        torque: Torque on the body at each [N·m]; None if it was not asked for.
-        normal: Unit normal out of the object; NaN where the state has a force without one.
-        is_used: Which slots are contacts.
-    """
-
-    pos: Vec
-    force: Vec
-    torque: Vec | None
-    normal: Vec
-    is_used: Bool[Tensor, "env body object slot"]
+    pos: Vec  # contact points [m]
+    force: Vec  # force on the body at each [N], what the slots lack of each pair's whole force shared out
+    torque: Vec | None  # torque on the body at each [N·m]; None if it was not asked for
+    normal: Vec  # unit normal out of the object; NaN where the state has a force without one
+    is_used: Bool[Tensor, "env body object slot"]  # which slots are contacts
 
 
 def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"], has_torque: bool = False) -> PairContacts:
@@ -208,23 +179,14 @@ def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceContacts:
-    """The solver's contacts, each in the frame of its body: `request.ContactPoints` as a list.
+    """The solver's contacts, each in the frame of its body: `request.ContactPoints` as a list."""
 
-    Attributes:
-        body: Which body each is on.
-        pos: Contact points [m].
-        force: Force on the body [N].
-        torque: Torque on the body [N·m].
-        normal: Unit normal out of the object.
-        net: Whole force on each body [N].
-    """
-
-    body: Int[np.ndarray, " contact"]
-    pos: Float[np.ndarray, "contact 3"]
-    force: Float[np.ndarray, "contact 3"]
-    torque: Float[np.ndarray, "contact 3"]
-    normal: Float[np.ndarray, "contact 3"]
-    net: Float[np.ndarray, "body 3"]
+    body: Int[np.ndarray, " contact"]  # which body each is on
+    pos: Float[np.ndarray, "contact 3"]  # contact points [m]
+    force: Float[np.ndarray, "contact 3"]  # force on the body [N]
+    torque: Float[np.ndarray, "contact 3"]  # torque on the body [N·m]
+    normal: Float[np.ndarray, "contact 3"]  # unit normal out of the object
+    net: Float[np.ndarray, "body 3"]  # whole force on each body [N]
 
 
 def reference_contacts(scene: ReferenceScene, pair: int | np.integer) -> list[list[np.ndarray]]:

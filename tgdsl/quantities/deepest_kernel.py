@@ -28,8 +28,7 @@ from tgdsl.quantities.search_tables import Deepest, Tables
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 
-BLOCK = 64
-"""Probes of a program, which is one warp: two for each of its lanes."""
+BLOCK = 64  # probes of a program, which is one warp: two for each of its lanes
 POS, ROTATION, BOUND = (tl.constexpr(column) for column in (search_tables.POS, search_tables.ROTATION, search_tables.BOUND))
 KIND, ROW = tl.constexpr(search_tables.KIND), tl.constexpr(search_tables.ROW)
 
@@ -51,18 +50,7 @@ def find(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object *e
 def _deepest(
     pose: list[Tensor], pos: list[Tensor], pair: Tensor, reach: Tensor, gate: Tensor | None, spheres: Tensor, geoms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return depth (env, taxel), normal (3, env, taxel) and pair (env, taxel) of `Deepest`.
-
-    Args:
-        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
-            (env, pair) that lie in memory alike.
-        pos: Positions of the probes in their links' frames, (taxel,) [m].
-        pair: Index of each probe's pair among all, (object, taxel).
-        reach: As `find` has it.
-        gate: 0 where a pair counts, −∞ where it does not, (env, pair).
-        spheres: See `Tables`.
-        geoms: See `Tables`.
-    """
+    """Return depth (env, taxel), normal (3, env, taxel) and pair (env, taxel) of `Deepest`."""
     num_envs, (num_objects, num_taxels) = pose[0].shape[0], pair.shape
     depth = pose[0].new_empty((num_envs, num_taxels))
     normal = pose[0].new_empty((3, num_envs, num_taxels))
@@ -184,10 +172,7 @@ def deepest_kernel(
 
 @triton.jit
 def _begun(pair, radii, gates, gate_row, gate_pair, pose, row, pose_pair, IS_GATED: tl.constexpr):
-    """Return the radii, the link's origin in the object's frame, and 0 where the pose is finite.
-
-    If an orientation is not a number, no part of the rotation is, and its object is never passed over.
-    """
+    """Return the radii, the link's origin in the object's frame, and 0 where the pose is finite."""
     at = row + pair * pose_pair
     radius = tl.load(radii)
     if IS_GATED:
@@ -197,13 +182,11 @@ def _begun(pair, radii, gates, gate_row, gate_pair, pose, row, pose_pair, IS_GAT
 
 @triton.jit
 def _is_any_within(squared, limit):
-    """Return whether any squared distance is within its limit's, or not a number; nothing is within a negative limit."""
     return is_any((squared > limit * tl.abs(limit)) == 0)
 
 
 @triton.jit
 def _from(point, at):
-    """Return a point less the one that is in memory there."""
     return point[0] - tl.load(at), point[1] - tl.load(at + 1), point[2] - tl.load(at + 2)
 
 

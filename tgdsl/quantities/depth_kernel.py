@@ -27,8 +27,7 @@ from tgdsl.quantities.pairs import Pairs
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 
-BLOCK = 32
-"""Points that are looked up together, by a program of one warp; two for each lane do not fit into its registers."""
+BLOCK = 32  # points that are looked up together, by a program of one warp; two for each lane do not fit into its registers
 GEOM, ORIGIN, CELL, FRAME = tl.constexpr(3), tl.constexpr(12), tl.constexpr(15), tl.constexpr(16)
 """Columns of the frames' table, which begins with the geom's place, and their number."""
 
@@ -72,19 +71,7 @@ def _meet(
     values: Tensor,
     is_cubic: bool,
 ) -> Tensor:
-    """Return places, distance and gradient, (7, env, link, point).
-
-    Args:
-        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: nine planes
-            (env, pair) that lie in memory alike, and three.
-        gate: Negative where a pair does not count, (env, pair).
-        pair: Index of each link's pair.
-        points: Places in the object's frame, (3, case, point) [m].
-        frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes, (link, 16) [m].
-        counts: Index of each grid's first node, and the number of its nodes along each axis, (link, 4).
-        values: `Grid.values`, (node,).
-        is_cubic: Whether it is interpolated by cubes.
-    """
+    """Return places, distance and gradient, (7, env, link, point)."""
     num_envs, num_links, num_points = pose[0].shape[0], pair.shape[0], points.shape[2]
     result = pose[0].new_empty((7, num_envs, num_links, num_points))
     points, gates = points.contiguous(), pose[0] if gate is None else gate
@@ -208,7 +195,6 @@ def measured(grid, here, is_point, IS_CUBIC: tl.constexpr):
 
 @triton.jit
 def _is_beyond(place, num):
-    """Return whether places along an axis are outside a grid; NaN is not."""
     return (place < 0) | (place > num - 1)
 
 
@@ -222,16 +208,12 @@ def nearest(grid, at, is_in):
 
 @triton.jit
 def _rounded(place, num):
-    """Return the number of the node next to a place along an axis; an arbitrary one where it is no number."""
     return tl.minimum(tl.maximum((place + 0.5).to(tl.int32), 0), num - 1)
 
 
 @triton.jit
 def _interpolated(nodes, place, num, slack, is_wanted, IS_CUBIC: tl.constexpr):
-    """Return the distance at places within one grid [m], and its slope along the axes [m per cell]; as `grid` has them.
-
-    Nodes along the last axis, which lie side by side, are a block's second axis: lanes that read them share sectors of memory.
-    """
+    """Return the distance at places within one grid [m], and its slope along the axes [m per cell]; as `grid` has them."""
     NUM: tl.constexpr = 4 if IS_CUBIC else 2
     x, y, z = _lower(place[0], num[0], slack), _lower(place[1], num[1], slack), _lower(place[2], num[2], slack)
     t_x, t_y, t_z = (place[0] - x)[:, None], (place[1] - y)[:, None], (place[2] - z)[:, None]
@@ -263,13 +245,11 @@ def _interpolated(nodes, place, num, slack, is_wanted, IS_CUBIC: tl.constexpr):
 
 @triton.jit
 def _lower(place, num, slack):
-    """Return the number of the node below a place along an axis; an arbitrary one where it is no number."""
     return tl.minimum(tl.maximum(tl.floor(place + slack).to(tl.int32), 0), num - 2)
 
 
 @triton.jit
 def _node(lower, k: tl.constexpr, num, IS_CUBIC: tl.constexpr):
-    """Return the number of a weight's node along an axis; beyond the border the outermost ones repeat."""
     return tl.minimum(tl.maximum(lower + (k - 1), 0), num - 1) if IS_CUBIC else lower + k
 
 

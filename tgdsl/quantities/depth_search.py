@@ -39,46 +39,28 @@ class Distance(NamedTuple):
 
 
 class Penetration(NamedTuple):
-    """What probes meet, at the geom that each is deepest in; planes of shape (env, taxel), in the link's frame.
+    """What probes meet, at the geom that each is deepest in; planes of shape (env, taxel), in the link's frame."""
 
-    Attributes:
-        pos: Where the probes are [m], planes (taxel,).
-        depth: Penetration depth max(0, radius − distance) [m].
-        normal: Unit normal out of the object; zero where the depth is zero. None if not asked for.
-        velocity: Velocity of the object's material at the probe relative to the probe [m/s]; None if not asked for.
-        angular: Angular velocity of the object relative to the link [rad/s]; None if not asked for.
-        distances: Distance to each object, by its name; empty if not asked for.
-        frames: How each object sees the link, by its name; empty if not asked for.
-    """
-
-    pos: Vec
-    depth: Tensor
-    normal: Vec | None
-    velocity: Vec | None
-    angular: Vec | None
-    distances: dict[str, Distance]
-    frames: dict[str, Frame]
+    pos: Vec  # where the probes are [m], planes (taxel,)
+    depth: Tensor  # penetration depth max(0, radius − distance) [m]
+    normal: Vec | None  # unit normal out of the object; zero where the depth is zero. None if not asked for.
+    velocity: Vec | None  # velocity of the object's material at the probe relative to the probe [m/s]; None if not asked for
+    angular: Vec | None  # angular velocity of the object relative to the link [rad/s]; None if not asked for
+    distances: dict[str, Distance]  # distance to each object, by its name; empty if not asked for
+    frames: dict[str, Frame]  # how each object sees the link, by its name; empty if not asked for
 
 
 @dataclass(frozen=True, eq=False)
 class ContactDepth(Request[Penetration]):
-    """Asks how deep probes are in objects: the deepest object wins, the first among equals.
+    """Asks how deep probes are in objects: the deepest object wins, the first among equals."""
 
-    Attributes:
-        radius: Radius of each probe [m], (taxel,); None: the taxels'. Inactive probes have depth 0.
-        range: Distance from an object's surface up to which it is needed [m], if more than the radius.
-        normal: Whether the normal is asked for.
-        motion: Whether the velocities are.
-        distance: Whether the distances to all objects are.
-        frame: Whether the frames are.
-    """
-
+    # radius of each probe [m], (taxel,); None: the taxels'. Inactive probes have depth 0.
     radius: Float[np.ndarray, " taxel"] | None = None
-    range: float = 0.0
-    normal: bool = False
-    motion: bool = False
-    distance: bool = False
-    frame: bool = False
+    range: float = 0.0  # distance from an object's surface up to which it is needed [m], if more than the radius
+    normal: bool = False  # whether the normal is asked for
+    motion: bool = False  # whether the velocities are
+    distance: bool = False  # whether the distances to all objects are
+    frame: bool = False  # whether the frames are
     is_within_radii: ClassVar[bool] = True
 
     @property
@@ -117,15 +99,10 @@ class ContactDepth(Request[Penetration]):
 
 
 class Probes(NamedTuple):
-    """Probes of one query; the positions are in the frame of each probe's link.
+    """Probes of one query; the positions are in the frame of each probe's link."""
 
-    Attributes:
-        pos: Positions [m], planes of shape (taxel,).
-        pair: For each object, index of each probe's pair among the pairs of that object.
-    """
-
-    pos: Vec
-    pair: Int[Tensor, "object taxel"]
+    pos: Vec  # positions [m], planes of shape (taxel,)
+    pair: Int[Tensor, "object taxel"]  # for each object, index of each probe's pair among the pairs of that object
 
 
 class Target(NamedTuple):
@@ -136,21 +113,13 @@ class Target(NamedTuple):
 
 
 class ObjectDistance(NamedTuple):
-    """How far each probe is from one object's surface.
+    """How far each probe is from one object's surface."""
 
-    Attributes:
-        name: The object's name.
-        pairs: Its pairs among all of the plan.
-        pair: Index of each probe's pair among them.
-        distance: Signed distance [m], a plane (env, taxel).
-        gradient: Its unit gradient in the link's frame.
-    """
-
-    name: str
-    pairs: slice
-    pair: Int[Tensor, " taxel"]
-    distance: Tensor
-    gradient: Vec
+    name: str  # the object's name
+    pairs: slice  # its pairs among all of the plan
+    pair: Int[Tensor, " taxel"]  # index of each probe's pair among them
+    distance: Tensor  # signed distance [m], a plane (env, taxel)
+    gradient: Vec  # its unit gradient in the link's frame
 
 
 def measure(pairs: Pairs, probes: Probes, targets: Sequence[Target]) -> tuple[ObjectDistance, ...]:

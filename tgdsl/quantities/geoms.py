@@ -35,39 +35,23 @@ class RaycastSurface(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """How an object sees points: a point, rotated and shifted, is in the object's frame; planes that broadcast with points.
+    """How an object sees points: a point, rotated and shifted, is in the object's frame; planes that broadcast with points."""
 
-    Attributes:
-        rotation: Rotates the points' vectors into the object's frame.
-        offset: The points' origin in the object's frame [m].
-    """
-
-    rotation: Rot
-    offset: Vec
+    rotation: Rot  # rotates the points' vectors into the object's frame
+    offset: Vec  # the points' origin in the object's frame [m]
 
 
 class Geoms(NamedTuple):
-    """An object's geoms in its body's frame, as each environment has it.
+    """An object's geoms in its body's frame, as each environment has it."""
 
-    Attributes:
-        shapes: Method of the distance to each geom: see `GeomTable`.
-        is_centred: Whether each geom's frame is the body's.
-        size: Size of each geom as MuJoCo defines it [m].
-        pos: Origin of each geom in the body frame [m].
-        rotation: Rotates geom vectors into the body frame, row by row.
-        is_absent: Which geoms a case lacks; None if none does.
-        variant: Which variant each environment has; None if all are alike.
-        surfaces: Grid or triangles of each geom that is no primitive.
-    """
-
-    shapes: tuple[str, ...]
-    is_centred: tuple[bool, ...]
-    size: Float[Tensor, "case geom 3"]
-    pos: Float[Tensor, "case geom 3"]
-    rotation: Float[Tensor, "case geom 9"]
-    is_absent: Bool[Tensor, "case geom"] | None
-    variant: Int[Tensor, " env"] | None
-    surfaces: tuple[Grid | RaycastSurface | None, ...]
+    shapes: tuple[str, ...]  # method of the distance to each geom: see `GeomTable`
+    is_centred: tuple[bool, ...]  # whether each geom's frame is the body's
+    size: Float[Tensor, "case geom 3"]  # size of each geom as MuJoCo defines it [m]
+    pos: Float[Tensor, "case geom 3"]  # origin of each geom in the body frame [m]
+    rotation: Float[Tensor, "case geom 9"]  # rotates geom vectors into the body frame, row by row
+    is_absent: Bool[Tensor, "case geom"] | None  # which geoms a case lacks; None if none does
+    variant: Int[Tensor, " env"] | None  # which variant each environment has; None if all are alike
+    surfaces: tuple[Grid | RaycastSurface | None, ...]  # grid or triangles of each geom that is no primitive
 
 
 def body_distance(point: Vec, geoms: Geoms) -> tuple[Tensor, Vec]:
@@ -128,39 +112,24 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class GridTable(Generic[Array]):
-    """The grids of one column, one after the other.
+    """The grids of one column, one after the other."""
 
-    Attributes:
-        values: Signed distance at the nodes [m], float32, (node,).
-        first: Index of each case's node (0, 0, 0), (case,).
-        num: Number of its nodes along each axis, (case, 3).
-        origin: Place of its node (0, 0, 0) in the geom's frame [m], (case, 3).
-        cell: Spacing of its nodes [m], (case,).
-        counts: Nodes of the first case's grid: numbers that become part of compiled code.
-    """
-
-    values: Array
-    first: Array
-    num: Array
-    origin: Array
-    cell: Array
-    counts: tuple[int, int, int]
+    values: Array  # signed distance at the nodes [m], float32, (node,)
+    first: Array  # index of each case's node (0, 0, 0), (case,)
+    num: Array  # number of its nodes along each axis, (case, 3)
+    origin: Array  # place of its node (0, 0, 0) in the geom's frame [m], (case, 3)
+    cell: Array  # spacing of its nodes [m], (case,)
+    counts: tuple[int, int, int]  # nodes of the first case's grid: numbers that become part of compiled code
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleTable:
-    """The triangles of one column, which are queried at run time; they stay on the host.
-
-    Attributes:
-        vertices: Of each case [m], (vertex, 3).
-        faces: Of each case, (face, 3).
-        max_distance: How far a query looks [m].
-    """
+    """The triangles of one column, which are queried at run time; they stay on the host."""
 
     stays_on_host: ClassVar[bool] = True
-    vertices: tuple[np.ndarray, ...]
-    faces: tuple[np.ndarray, ...]
-    max_distance: float
+    vertices: tuple[np.ndarray, ...]  # of each case [m], (vertex, 3)
+    faces: tuple[np.ndarray, ...]  # of each case, (face, 3)
+    max_distance: float  # how far a query looks [m]
 
     @cached_property
     def prepared(self) -> RaycastSurface:
@@ -180,25 +149,17 @@ class GeomTable(Generic[Array]):
     """The geoms of an object.
 
     A column stands for the geoms of one type that the cases have in its place; a case may lack it.
-
-    Attributes:
-        shapes: Method of the distance to each column: a primitive's type, an interpolation of a grid, or `raycast`.
-        is_centred: Which of them share the body's frame in all cases.
-        size: Size of each as MuJoCo defines it [m], (case, geom, 3).
-        pos: Its origin in the body's frame [m], (case, geom, 3).
-        rotation: Rotates its vectors into the body's frame, row by row, (case, geom, 9).
-        is_absent: 1 where a case lacks it, (case, geom); None if there is one case.
-        surfaces: Grids or triangles of each that is no primitive.
-        accuracy: Measured errors of each case's geoms, see `bake.Errors`; empty where distances are exact.
     """
 
+    # method of the distance to each column: a primitive's type, an interpolation of a grid, or `raycast`
     shapes: tuple[str, ...]
-    is_centred: tuple[bool, ...]
-    size: Array
-    pos: Array
-    rotation: Array
-    is_absent: Array | None
-    surfaces: tuple[GridTable[Array] | TriangleTable | None, ...]
+    is_centred: tuple[bool, ...]  # which of them share the body's frame in all cases
+    size: Array  # size of each as MuJoCo defines it [m], (case, geom, 3)
+    pos: Array  # its origin in the body's frame [m], (case, geom, 3)
+    rotation: Array  # rotates its vectors into the body's frame, row by row, (case, geom, 9)
+    is_absent: Array | None  # 1 where a case lacks it, (case, geom); None if there is one case
+    surfaces: tuple[GridTable[Array] | TriangleTable | None, ...]  # grids or triangles of each that is no primitive
+    # measured errors of each case's geoms, see `bake.Errors`; empty where distances are exact
     accuracy: tuple[tuple[Mapping[str, float], ...], ...]
 
 

@@ -26,19 +26,12 @@ Array = TypeVar("Array")
 
 
 class BodyMotion(NamedTuple):
-    """Poses and velocities of the bodies of a sensor's links, in order; planes (env, body).
+    """Poses and velocities of the bodies of a sensor's links, in order; planes (env, body)."""
 
-    Attributes:
-        rotation: Rotates body vectors into the world.
-        pos: Position of each body's frame [m].
-        linvel: Velocity of the frame's origin, in world axes [m/s].
-        angvel: Angular velocity, in world axes [rad/s].
-    """
-
-    rotation: Rot
-    pos: Vec
-    linvel: Vec
-    angvel: Vec
+    rotation: Rot  # rotates body vectors into the world
+    pos: Vec  # position of each body's frame [m]
+    linvel: Vec  # velocity of the frame's origin, in world axes [m/s]
+    angvel: Vec  # angular velocity, in world axes [rad/s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +80,10 @@ class Places(Request[Vec]):
     """Asks where points on bodies are: planes (env, point) in the world [m], in the dtype of the state.
 
     With `objects` it asks where the frames of these objects' bodies are, and of no other points.
-
-    Attributes:
-        bodies: The body of each point.
-        offset: Where each is in its body's frame [m].
     """
 
-    bodies: tuple[str, ...] = ()
+    bodies: tuple[str, ...] = ()  # the body of each point
+    # where each is in its body's frame [m]
     offset: Float[np.ndarray, "point 3"] = field(default_factory=lambda: np.zeros((0, 3)))
 
 
@@ -147,16 +137,11 @@ class JointDrive(NamedTuple):
     """How a sensor's joints move and are driven, in the order of its layout's links; planes (env, joint).
 
     The reference's are arrays (joint,), its places (joint, 3).
-
-    Attributes:
-        velocity: Velocity ω [rad/s; slides: m/s].
-        effort: What the actuators exert τ [N·m; slides: N].
-        place: Where the joint's anchor is in the world [m], in the dtype of the state.
     """
 
-    velocity: Any
-    effort: Any
-    place: Any
+    velocity: Any  # velocity ω [rad/s; slides: m/s]
+    effort: Any  # what the actuators exert τ [N·m; slides: N]
+    place: Any  # where the joint's anchor is in the world [m], in the dtype of the state
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     *(LOADS, JOINTS, PLACES),
 )
 """The quantities that come with tgdsl, in the order in which they are planned and gathered."""
-GROUP = "tgdsl.quantities"
-"""Group of the entry points by which packages bring quantities."""
+GROUP = "tgdsl.quantities"  # group of the entry points by which packages bring quantities
 
 
 def known_quantities(given: Sequence[Quantity] = ()) -> tuple[Quantity, ...]:

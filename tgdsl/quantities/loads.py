@@ -33,34 +33,26 @@ class PairLoads(NamedTuple):
     with the force f_c on the body and the unit normal n_c out of the object at each contact c, and the velocity v_c of the
     object's material there relative to the body's. What contacts beyond the slots carry is shared out over those shown, as
     `quantities.contacts` has it.
-
-    Attributes:
-        force: Sum of the contacts' normal forces, F [N].
-        sliding: Normal force times sliding speed, W [W]; times a coefficient of friction it is the power of friction.
-        center: Centre of the contacts weighted by F, in the frame of the body or object that was asked for [m]; zero where they
-            do not touch. None if it was not asked for.
-        along: Mean of the contacts' normals weighted by F, in that frame, into this body or object; zero where they do not
-            touch. None if the centre was not asked for.
     """
 
-    force: Any
-    sliding: Any
+    force: Any  # sum of the contacts' normal forces, F [N]
+    sliding: Any  # normal force times sliding speed, W [W]; times a coefficient of friction it is the power of friction
+    # centre of the contacts weighted by F, in the frame of the body or object that was asked for [m]; zero where they do not
+    # touch. None if it was not asked for.
     center: Any
+    # mean of the contacts' normals weighted by F, in that frame, into this body or object; zero where they do not touch. None
+    # if the centre was not asked for.
     along: Any = None
 
 
 @dataclass(frozen=True, eq=False)
 class Loads(Request[PairLoads]):
-    """Asks how hard each body is pressed by each object, and how fast they slide on one another.
+    """Asks how hard each body is pressed by each object, and how fast they slide on one another."""
 
-    Attributes:
-        slots: Contacts per body and object that are read.
-        of: Whose loads they are to be summed up for: geoms that two objects share load a link once, but both objects.
-        has_center: Whether the centre and the mean normal of the contacts are wanted, in the frame of what they are of.
-    """
-
-    slots: int = 4
+    slots: int = 4  # contacts per body and object that are read
+    # whose loads they are to be summed up for: geoms that two objects share load a link once, but both objects
     of: Literal["link", "object"] = "link"
+    # whether the centre and the mean normal of the contacts are wanted, in the frame of what they are of
     has_center: bool = False
     wants_contacts: ClassVar[bool] = True
 
@@ -84,19 +76,12 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class LoadsUse(Generic[Array]):
-    """One request.
+    """One request."""
 
-    Attributes:
-        bodies: Indices of the sensors' bodies in the state, (body,).
-        objects: Indices of the objects' bodies in the state, (object,).
-        pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
-        center: The frame of the centre of contacts; empty: no centre is computed.
-    """
-
-    bodies: Array
-    objects: Array
-    pairs: Array
-    center: Literal["", "link", "object"]
+    bodies: Array  # indices of the sensors' bodies in the state, (body,)
+    objects: Array  # indices of the objects' bodies in the state, (object,)
+    pairs: Array  # whose contacts: indices into `inputs.pairs`, or their number for none, (body, object)
+    center: Literal["", "link", "object"]  # the frame of the centre of contacts; empty: no centre is computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +133,6 @@ def _of_object(plane: Tensor) -> Tensor:
 def _velocity(
     state: Mapping[str, Tensor], bodies: Int[Tensor, " own"], found: PairContacts, spread: Callable[[Tensor], Tensor]
 ) -> Vec:
-    """Return the velocity of the bodies' material at each contact [m/s], (env, body, object, slot)."""
     names = ("body_pos", "body_linvel", "body_angvel")
     pos, linvel, angvel = (planes.vec(map(spread, planes.split(state[name].index_select(1, bodies)))) for name in names)
     return planes.add(linvel, planes.cross(angvel, _away(found, pos)))
@@ -174,7 +158,6 @@ def _middle(
 
 
 def _away(found: PairContacts, pos: Vec) -> Vec:
-    """Return from a point to each contact [m]; zero where there is none."""
     return planes.vec(torch.where(found.is_used, part, 0.0) for part in planes.sub(found.pos, pos))
 
 

@@ -30,14 +30,10 @@ from tgdsl.surfaces.quadrature import Pieces, Quadrature, extent, outer_surface
 
 FORMAT = b"tgdsl moments 2"
 CHOICE_POINTS, REPORT_POINTS = 1024, 2048
-HEADROOM = 0.95
-"""The choice holds the tolerance with something to spare, so that as a rule the held-back points hold it too."""
-FINER = 2.0
-"""How many times finer than the field's the quadrature is that it is measured against."""
-GRADIENT_FINENESS = 24
-"""Pieces along a radius where gradients have a tolerance; fewer where it is more than one over this."""
-BRICK = 6
-"""Nodes along the side of a brick that is computed at once."""
+HEADROOM = 0.95  # the choice holds the tolerance with something to spare, so that as a rule the held-back points hold it too
+FINER = 2.0  # how many times finer than the field's the quadrature is that it is measured against
+GRADIENT_FINENESS = 24  # pieces along a radius where gradients have a tolerance; fewer where it is more than one over this
+BRICK = 6  # nodes along the side of a brick that is computed at once
 SPACING, PIECES = 1e-3, 200.0
 """Longest side of the pieces that an area is summed from and points are drawn from [m]; but no more along a large object."""
 
@@ -47,42 +43,27 @@ class FieldErrors:
     """Errors at random points within the radius of the surface, which took no part in the choice of the lattice.
 
     All are fractions of full scale, the largest magnitude at these points.
-
-    Attributes:
-        mass_rms: Root mean square of the error of S0.
-        mass_max: Its largest.
-        first_rms: Root mean square of the length of the error of S1.
-        first_max: Its largest.
-        gradient_p999: 99.9th percentile of the error of S0's gradient by place, over the largest gradient; None: not measured,
-            as the next two.
-        gradient_max: Its largest.
-        first_gradient_p999: The same of S1, by Frobenius' norm.
     """
 
-    mass_rms: float
-    mass_max: float
-    first_rms: float
-    first_max: float
+    mass_rms: float  # root mean square of the error of S0
+    mass_max: float  # its largest
+    first_rms: float  # root mean square of the length of the error of S1
+    first_max: float  # its largest
+    # 99.9th percentile of the error of S0's gradient by place, over the largest gradient; None: not measured, as the next two
     gradient_p999: float | None = None
-    gradient_max: float | None = None
-    first_gradient_p999: float | None = None
+    gradient_max: float | None = None  # its largest
+    first_gradient_p999: float | None = None  # the same of S1, by Frobenius' norm
 
 
 @dataclass(frozen=True, eq=False)
 class BakedField:
-    """Moments at the nodes of a lattice in the body's frame.
+    """Moments at the nodes of a lattice in the body's frame."""
 
-    Attributes:
-        values: S0 [m³], S1 [m⁴], and their derivatives with respect to R if asked for, or their splines' factors; float32.
-        origin: Place of node (0, 0, 0) [m].
-        cell: Spacing of the nodes [m].
-        errors: What the lattice costs in accuracy.
-    """
-
+    # S0 [m³], S1 [m⁴], and their derivatives with respect to R if asked for, or their splines' factors; float32
     values: Float[np.ndarray, "x y z channel"]
-    origin: Float[np.ndarray, " 3"]
-    cell: float
-    errors: FieldErrors
+    origin: Float[np.ndarray, " 3"]  # place of node (0, 0, 0) [m]
+    cell: float  # spacing of the nodes [m]
+    errors: FieldErrors  # what the lattice costs in accuracy
 
 
 def spacing_of(geoms: Sequence[SurfaceGeom]) -> float:
@@ -250,7 +231,6 @@ def _around(pieces: Pieces, radius: float, count: int, seed: int) -> Float[np.nd
 
 
 def _lattice(pos: Float[np.ndarray, "m 3"], radius: float, cell: float) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """Return origin and numbers of nodes: two layers more than reach the surface, so that the outermost fit is zero too."""
     low, high = pos.min(axis=0) - radius, pos.max(axis=0) + radius
     x, y, z = (int(num) + 5 for num in np.ceil((high - low) / cell))
     return (low + high) / 2 - cell * np.array([x - 1, y - 1, z - 1]) / 2, (x, y, z)
@@ -356,29 +336,19 @@ def _halves(*both: np.ndarray) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray
     return tuple(part[:, :1] for part in both), tuple(part[:, 1:4] for part in both)
 
 
-SLACK = 1e-6
-"""By how much lists reach farther than the radius, for the rounding of a float32 [m]."""
+SLACK = 1e-6  # by how much lists reach farther than the radius, for the rounding of a float32 [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points of a surface, and for each cube of a lattice those within reach; index `n` of a list stands for none.
+    """Points of a surface, and for each cube of a lattice those within reach; index `n` of a list stands for none."""
 
-    Attributes:
-        points: Places in the body's frame [m].
-        weight: Surface that each stands for [m²].
-        lists: Indices of points.
-        num: Number of cubes along each axis.
-        origin: Lower corner of the lattice [m].
-        cell: Side of a cube [m].
-    """
-
-    points: Float[np.ndarray, "n 3"]
-    weight: float
-    lists: Int[np.ndarray, "bin slot"]
-    num: tuple[int, int, int]
-    origin: Float[np.ndarray, " 3"]
-    cell: float
+    points: Float[np.ndarray, "n 3"]  # places in the body's frame [m]
+    weight: float  # surface that each stands for [m²]
+    lists: Int[np.ndarray, "bin slot"]  # indices of points
+    num: tuple[int, int, int]  # number of cubes along each axis
+    origin: Float[np.ndarray, " 3"]  # lower corner of the lattice [m]
+    cell: float  # side of a cube [m]
 
 
 def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.ndarray, "n 3"], float]:

@@ -25,20 +25,14 @@ from tgdsl.geometry.grid import Count, within
 from tgdsl.geometry.planes import Vec, vec
 
 Pair = tuple[Tensor, Tensor]
-BLOCK = 16
-"""Candidates of each point that are summed at once where nothing fuses the sum, so that memory stays bounded."""
+BLOCK = 16  # candidates of each point that are summed at once where nothing fuses the sum, so that memory stays bounded
 
 
 class Moments(NamedTuple):
-    """Moments of the sensing ball's weight over a surface.
+    """Moments of the sensing ball's weight over a surface."""
 
-    Attributes:
-        mass: S0 [m³].
-        first: S1, about the point [m⁴].
-    """
-
-    mass: Tensor
-    first: Vec
+    mass: Tensor  # S0 [m³]
+    first: Vec  # S1, about the point [m⁴]
 
 
 class MomentField(NamedTuple):
@@ -46,22 +40,16 @@ class MomentField(NamedTuple):
 
     They vanish on the outermost nodes, so points outside read zero. Counts that are the same for all points may be Python's: a
     compiler then makes them part of the code.
-
-    Attributes:
-        values: S0 and S1 [m³, m⁴], and their derivatives with respect to R if there are 8 channels; z running fastest.
-        first: Index of a point's lattice's node (0, 0, 0).
-        num: Number of its nodes along each axis.
-        origin: Place of its node (0, 0, 0) in the object's frame [m].
-        cell: Spacing of its nodes [m], alike along all axes.
-        is_smooth: Whether the values are factors of quadratic B-splines about the nodes rather than the moments there: the
-            gradient then has no jumps.
     """
 
+    # S0 and S1 [m³, m⁴], and their derivatives with respect to R if there are 8 channels; z running fastest
     values: Float[Tensor, "node channel"]
-    first: Count
-    num: tuple[Count, Count, Count]
-    origin: Vec
-    cell: Float[Tensor, "*point"]
+    first: Count  # index of a point's lattice's node (0, 0, 0)
+    num: tuple[Count, Count, Count]  # number of its nodes along each axis
+    origin: Vec  # place of its node (0, 0, 0) in the object's frame [m]
+    cell: Float[Tensor, "*point"]  # spacing of its nodes [m], alike along all axes
+    # whether the values are factors of quadratic B-splines about the nodes rather than the moments there: the gradient then has
+    # no jumps
     is_smooth: bool = False
 
 
@@ -69,24 +57,15 @@ class PointCloud(NamedTuple):
     """Points sampled on a surface, and for each cube of a lattice the list of those within reach of any place in it.
 
     Of several clouds each point asks one. The last row is a point that is out of reach of everything: it fills the lists.
-
-    Attributes:
-        points: Coordinates in the object's frame [m].
-        weight: Surface that each point of the cloud stands for [m²].
-        lists: Rows of `points`.
-        first: Index of a cloud's first cube.
-        num: Number of its cubes along each axis.
-        origin: Lower corner of its lattice in the object's frame [m].
-        cell: Side of a cube [m].
     """
 
-    points: tuple[Float[Tensor, " row"], Float[Tensor, " row"], Float[Tensor, " row"]]
-    weight: Float[Tensor, "*point"]
-    lists: Int[Tensor, "bin slot"]
-    first: Count
-    num: tuple[Count, Count, Count]
-    origin: Vec
-    cell: Float[Tensor, "*point"]
+    points: tuple[Float[Tensor, " row"], Float[Tensor, " row"], Float[Tensor, " row"]]  # coordinates in the object's frame [m]
+    weight: Float[Tensor, "*point"]  # surface that each point of the cloud stands for [m²]
+    lists: Int[Tensor, "bin slot"]  # rows of `points`
+    first: Count  # index of a cloud's first cube
+    num: tuple[Count, Count, Count]  # number of its cubes along each axis
+    origin: Vec  # lower corner of its lattice in the object's frame [m]
+    cell: Float[Tensor, "*point"]  # side of a cube [m]
 
 
 def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = None) -> Moments:
@@ -114,10 +93,7 @@ def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = 
 
 
 def _spline_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Vec, Vec, Vec]]:
-    """Return the index of the lowest of the nodes around points, and the weights of three along each axis.
-
-    A quadratic B-spline reaches over the nodes next to the nearest one, so the lattice ends half a cell before its last node.
-    """
+    """Return the index of the lowest of the nodes around points, and the weights of three along each axis."""
     axes = zip(point, field.origin, field.num, strict=True)
     nodes = [within((part - start) / field.cell - 0.5, count - 2) for part, start, count in axes]
     lower = [within(part.floor().long(), count - 3) for part, count in zip(nodes, field.num, strict=True)]
@@ -173,10 +149,7 @@ def cloud_moments(point: Vec, cloud: PointCloud, radius: Tensor) -> Moments:
 
 
 def _cell_of(point: Vec, origin: Vec, cell: Tensor, num: tuple[Count, Count, Count], last: int) -> tuple[Tensor, Vec]:
-    """Return the index of each point's cell in its lattice, and the place in it, from 0 to 1 within the lattice.
-
-    Of a lattice's nodes (`last` = 2) points outside count as at the border; of its cubes (`last` = 1) they do not.
-    """
+    """Return the index of each point's cell in its lattice, and the place in it, from 0 to 1 within the lattice."""
     place = [(part - start) / cell for part, start in zip(point, origin, strict=True)]
     if last == 2:
         place = [within(part, count - 1) for part, count in zip(place, num, strict=True)]

@@ -26,11 +26,9 @@ from tgdsl.quantities.reference import ReferenceScene
 from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.sensed import SensedObject
 
-FAR = 1e6
-"""Coordinates of the point that fills lists [m]: out of reach of everything, its square still a float32."""
+FAR = 1e6  # coordinates of the point that fills lists [m]: out of reach of everything, its square still a float32
 Solid = Sequence[tuple[SurfaceGeom, ...]]
-Number = dict[tuple[Any, ...], int]
-"""Number of a table, by method and object."""
+Number = dict[tuple[Any, ...], int]  # number of a table, by method and object
 
 
 Array = TypeVar("Array")
@@ -38,96 +36,56 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class FieldTable(Generic[Array]):
-    """Fields of moments, one after the other: see `moments.MomentField`.
+    """Fields of moments, one after the other: see `moments.MomentField`."""
 
-    Attributes:
-        values: At the nodes, float32, (node, channel).
-        first: Index of each field's node (0, 0, 0), (table,).
-        num: Number of its nodes along each axis, (table, 3).
-        origin: Place of its node (0, 0, 0) [m], (table, 3).
-        cell: Spacing of its nodes [m], (table,).
-        counts: Nodes of the first field: numbers that become part of compiled code.
-        is_smooth: Whether fields are sums of quadratic B-splines.
-    """
-
-    values: Array
-    first: Array
-    num: Array
-    origin: Array
-    cell: Array
-    counts: tuple[int, int, int]
-    is_smooth: bool
+    values: Array  # at the nodes, float32, (node, channel)
+    first: Array  # index of each field's node (0, 0, 0), (table,)
+    num: Array  # number of its nodes along each axis, (table, 3)
+    origin: Array  # place of its node (0, 0, 0) [m], (table, 3)
+    cell: Array  # spacing of its nodes [m], (table,)
+    counts: tuple[int, int, int]  # nodes of the first field: numbers that become part of compiled code
+    is_smooth: bool  # whether fields are sums of quadratic B-splines
 
 
 @dataclass(frozen=True, eq=False)
 class CloudTable(Generic[Array]):
-    """Points and lists of those within reach, one cloud after the other: see `moments.PointCloud`.
+    """Points and lists of those within reach, one cloud after the other: see `moments.PointCloud`."""
 
-    Attributes:
-        points: Places [m], (3, row); the last one is out of reach of everything.
-        weight: Surface that each point stands for [m²], (variant,).
-        lists: Rows of `points`, (bin, slot).
-        first: Index of each cloud's first cube, (variant,).
-        num: Number of its cubes along each axis, (variant, 3).
-        origin: Lower corner of its lattice [m], (variant, 3).
-        cell: Side of a cube [m], (variant,).
-        counts: Cubes of the first cloud: numbers that become part of compiled code.
-    """
-
-    points: Array
-    weight: Array
-    lists: Array
-    first: Array
-    num: Array
-    origin: Array
-    cell: Array
-    counts: tuple[int, int, int]
+    points: Array  # places [m], (3, row); the last one is out of reach of everything
+    weight: Array  # surface that each point stands for [m²], (variant,)
+    lists: Array  # rows of `points`, (bin, slot)
+    first: Array  # index of each cloud's first cube, (variant,)
+    num: Array  # number of its cubes along each axis, (variant, 3)
+    origin: Array  # lower corner of its lattice [m], (variant, 3)
+    cell: Array  # side of a cube [m], (variant,)
+    counts: tuple[int, int, int]  # cubes of the first cloud: numbers that become part of compiled code
 
 
 @dataclass(frozen=True, eq=False)
 class MomentTable(Generic[Array]):
-    """The moments of one object, found in one way.
+    """The moments of one object, found in one way."""
 
-    Attributes:
-        object: The object: its place in the Plan.
-        radii: Radii that there are fields of [m].
-        area: Area of its outer surface, planes left out [m²], (variant,).
-        plane_pos: Places of its planes in its body's frame [m], (plane, 3).
-        plane_rotation: Rotates their vectors into it, (plane, 9).
-        surface: The rest of its surface; None if there is no more to it.
-        accuracy: Measured errors of each field, variant after variant, radius by radius: see `FieldErrors`.
-    """
-
-    object: int
-    radii: tuple[float, ...]
-    area: Array
-    plane_pos: Array
-    plane_rotation: Array
-    surface: FieldTable[Array] | CloudTable[Array] | None
+    object: int  # the object: its place in the Plan
+    radii: tuple[float, ...]  # radii that there are fields of [m]
+    area: Array  # area of its outer surface, planes left out [m²], (variant,)
+    plane_pos: Array  # places of its planes in its body's frame [m], (plane, 3)
+    plane_rotation: Array  # rotates their vectors into it, (plane, 9)
+    surface: FieldTable[Array] | CloudTable[Array] | None  # the rest of its surface; None if there is no more to it
+    # measured errors of each field, variant after variant, radius by radius: see `FieldErrors`
     accuracy: tuple[Mapping[str, float], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class MomentUse(Generic[Array]):
-    """One request.
+    """One request."""
 
-    Attributes:
-        tables: Number of the table of each of its objects.
-        pos: Where the probes are in their links' bodies' frames [m], (3, taxel).
-        pair: Index of each probe's pair with each object among that object's pairs, (object, taxel).
-        reach: Sensing radius of each probe towards each object [m], (object, taxel); 0 where it has none.
-        radius_id: Which of the table's radii that is, (object, taxel).
-        radius_noise: The sensor whose noise disturbs the radii, if any.
-        motion: Whether the objects' motions are asked for.
-    """
-
-    tables: tuple[int, ...]
-    pos: Array
-    pair: Array
-    reach: Array
-    radius_id: Array
-    radius_noise: str
-    motion: bool
+    tables: tuple[int, ...]  # number of the table of each of its objects
+    pos: Array  # where the probes are in their links' bodies' frames [m], (3, taxel)
+    pair: Array  # index of each probe's pair with each object among that object's pairs, (object, taxel)
+    reach: Array  # sensing radius of each probe towards each object [m], (object, taxel); 0 where it has none
+    radius_id: Array  # which of the table's radii that is, (object, taxel)
+    radius_noise: str  # the sensor whose noise disturbs the radii, if any
+    motion: bool  # whether the objects' motions are asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,23 +142,14 @@ def _surface(table: MomentTable[Tensor], variant: Tensor | None, radius_id: Tens
 
 @dataclass(frozen=True, eq=False)
 class ReferenceMoments:
-    """Moments of objects' surfaces and the objects' motion, in the links' frames: `request.SurfaceMoments` as arrays.
+    """Moments of objects' surfaces and the objects' motion, in the links' frames: `request.SurfaceMoments` as arrays."""
 
-    Attributes:
-        mass: S0 [m³].
-        first: S1 about the probe [m⁴].
-        velocity: Velocity of each object's material at the probe relative to the probe [m/s].
-        angular: Angular velocity of each object relative to the link [rad/s].
-        turn: The link's own angular velocity [rad/s].
-        area: Area of each object's outer surface, planes left out [m²].
-    """
-
-    mass: Float[np.ndarray, "taxel object"]
-    first: Float[np.ndarray, "taxel object 3"]
-    velocity: Float[np.ndarray, "taxel object 3"]
-    angular: Float[np.ndarray, "taxel object 3"]
-    turn: Float[np.ndarray, "taxel 3"]
-    area: Float[np.ndarray, " object"]
+    mass: Float[np.ndarray, "taxel object"]  # S0 [m³]
+    first: Float[np.ndarray, "taxel object 3"]  # S1 about the probe [m⁴]
+    velocity: Float[np.ndarray, "taxel object 3"]  # velocity of each object's material at the probe relative to the probe [m/s]
+    angular: Float[np.ndarray, "taxel object 3"]  # angular velocity of each object relative to the link [rad/s]
+    turn: Float[np.ndarray, "taxel 3"]  # the link's own angular velocity [rad/s]
+    area: Float[np.ndarray, " object"]  # area of each object's outer surface, planes left out [m²]
 
 
 def _splines(factors: np.ndarray, place: np.ndarray) -> float:

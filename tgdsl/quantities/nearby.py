@@ -22,46 +22,29 @@ from tgdsl.tensors.operations import Operation
 
 
 class SurfaceMoments(NamedTuple):
-    """Moments of surfaces near each probe, in its link's frame; planes (env, taxel).
+    """Moments of surfaces near each probe, in its link's frame; planes (env, taxel)."""
 
-    Attributes:
-        pos: Where the probes are [m], planes (taxel,).
-        none: Zero at each probe.
-        moments: Moments of each object's surface about each probe, by the object's name.
-        motions: Motion of each object relative to the link; empty if not asked for.
-        area: Area of each object's outer surface, planes left out [m²], (case, 1).
-    """
-
-    pos: Vec
-    none: Tensor
-    moments: dict[str, Moments]
-    motions: dict[str, Motion]
-    area: dict[str, Tensor]
+    pos: Vec  # where the probes are [m], planes (taxel,)
+    none: Tensor  # zero at each probe
+    moments: dict[str, Moments]  # moments of each object's surface about each probe, by the object's name
+    motions: dict[str, Motion]  # motion of each object relative to the link; empty if not asked for
+    area: dict[str, Tensor]  # area of each object's outer surface, planes left out [m²], (case, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class MomentsRequest(Request[SurfaceMoments]):
-    """Asks for moments of objects' surfaces around probes. They are never gated.
+    """Asks for moments of objects' surfaces around probes. They are never gated."""
 
-    Attributes:
-        radius: Sensing radius of all active probes [m]; None: that of each in the layout.
-        backend: "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
-        num_points: Points of each object.
-        tolerance: Root mean square error of a field as a fraction of full scale.
-        gradient_tolerance: Error that 99.9 % of S0's gradients by place may have, as a fraction of the largest; None: any.
-        max_bytes: Largest size of all fields of an object, or of its lists of points [bytes].
-        with_area: Whether the area of the felt objects is wanted, so that there must be one.
-        motion: Whether the objects' motions are asked for.
-    """
-
-    radius: float | None = None
+    radius: float | None = None  # sensing radius of all active probes [m]; None: that of each in the layout
+    # "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
     backend: Literal["field", "points"] = "field"
-    num_points: int = 5000
-    tolerance: float = 0.005
+    num_points: int = 5000  # points of each object
+    tolerance: float = 0.005  # root mean square error of a field as a fraction of full scale
+    # error that 99.9 % of S0's gradients by place may have, as a fraction of the largest; None: any
     gradient_tolerance: float | None = None
-    max_bytes: int = 64 * 2**20
-    with_area: bool = False
-    motion: bool = False
+    max_bytes: int = 64 * 2**20  # largest size of all fields of an object, or of its lists of points [bytes]
+    with_area: bool = False  # whether the area of the felt objects is wanted, so that there must be one
+    motion: bool = False  # whether the objects' motions are asked for
     is_within_radii: ClassVar[bool] = True
 
     def merged(self, other: Request) -> MomentsRequest:
@@ -77,26 +60,18 @@ class Plane(NamedTuple):
 
 
 class MomentSource(NamedTuple):
-    """One object, and the source of its moments.
+    """One object, and the source of its moments."""
 
-    Attributes:
-        target: The object.
-        pair: Index of each probe's pair among its own.
-        radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on
-            the object itself.
-        shift: By how much that is more than the radius that a field is of [m], (env, taxel); None: nothing.
-        surface: Its outer surface without planes; None if it has planes alone.
-        planes: Its planes.
-        area: Area of its outer surface, planes left out [m²].
-    """
-
-    target: PairedObject
-    pair: Int[Tensor, " taxel"]
+    target: PairedObject  # the object
+    pair: Int[Tensor, " taxel"]  # index of each probe's pair among its own
+    # sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on the object
+    # itself
     radius: Float[Tensor, "*env taxel"]
+    # by how much that is more than the radius that a field is of [m], (env, taxel); None: nothing
     shift: Float[Tensor, "env taxel"] | None
-    surface: MomentField | PointCloud | None
-    planes: tuple[Plane, ...]
-    area: Float[Tensor, "case 1"]
+    surface: MomentField | PointCloud | None  # its outer surface without planes; None if it has planes alone
+    planes: tuple[Plane, ...]  # its planes
+    area: Float[Tensor, "case 1"]  # area of its outer surface, planes left out [m²]
 
 
 def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> SurfaceMoments:

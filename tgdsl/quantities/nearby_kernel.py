@@ -24,8 +24,7 @@ from tgdsl.quantities.pairs import Pairs
 # pyright: reportGeneralTypeIssues=false
 
 
-BLOCK = 128
-"""Probes of a program, which has four warps: so each thread loads whole nodes, and none is sent to another one."""
+BLOCK = 128  # probes of a program, which has four warps: so each thread loads whole nodes, and none is sent to another one
 
 
 def felt_moments(
@@ -72,21 +71,7 @@ def _felt_moments(
     table: Tensor | None,
     numbers: list[int],
 ) -> Tensor:
-    """Return S0 and S1, (4, env, taxel) [m³, m⁴], in the frame of each probe's link.
-
-    Args:
-        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
-            (env, pair) that lie in memory alike.
-        pos: Positions of the probes in their links' frames, (taxel,) [m].
-        pair: Index of each probe's pair, (taxel,).
-        radius: See `felt_moments`.
-        shift: See `felt_moments`.
-        values: `MomentField.values`.
-        lattice: Origin and spacing of the field's nodes, (*point, 4) [m].
-        table: Index of the field's node (0, 0, 0), and the number of its nodes along each axis, (*point, 4); None: as `numbers`
-            has them.
-        numbers: The same where all points ask one field.
-    """
+    """Return S0 and S1, (4, env, taxel) [m³, m⁴], in the frame of each probe's link."""
     num_envs, num_taxels = pose[0].shape[0], pair.shape[0]
     moments = pose[0].new_empty((4, num_envs, num_taxels))
     num_points = num_envs * num_taxels
@@ -101,14 +86,12 @@ def _felt_moments(
 
 
 def _steps(rows: Tensor) -> tuple[int, int]:
-    """Return how many numbers apart the rows of neighbours are, along `env` and along `taxel`; 0 where all have the same."""
     *_, num_envs, num_taxels, width = (1, 1, *rows.shape)
     return num_taxels * width if num_envs > 1 else 0, width if num_taxels > 1 else 0
 
 
 @triton.jit
 def _along(place, num):
-    """Return cell, place in it and whether that is inside, along an axis of `num` nodes; as `field_moments` has them."""
     inner = tl.clamp(place, 0.0, tl.cast(num - 1, tl.float32), propagate_nan=tl.PropagateNan.ALL)
     lower = tl.minimum(tl.floor(inner), tl.cast(num - 2, tl.float32))
     return lower.to(tl.int32), inner - lower, (inner > 0) & (inner < num - 1)

@@ -30,25 +30,15 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairedObject:
-    """An object that some link may meet.
+    """An object that some link may meet."""
 
-    Attributes:
-        name: Its name.
-        body: Its body.
-        first_pair: Index of its first pair.
-        num_pairs: Number of its pairs.
-        num_variants: Number of its variants; 1 if it is the same in all environments.
-        is_sized: Whether its size is part of the state.
-        varied: Its index in `inputs.objects`, the objects that differ between environments; −1 if it does not differ.
-    """
-
-    name: str
-    body: str
-    first_pair: int
-    num_pairs: int
-    num_variants: int
-    is_sized: bool
-    varied: int
+    name: str  # its name
+    body: str  # its body
+    first_pair: int  # index of its first pair
+    num_pairs: int  # number of its pairs
+    num_variants: int  # number of its variants; 1 if it is the same in all environments
+    is_sized: bool  # whether its size is part of the state
+    varied: int  # its index in `inputs.objects`, the objects that differ between environments; −1 if it does not differ
 
     @property
     def pairs(self) -> slice:
@@ -58,47 +48,28 @@ class PairedObject:
 
 @dataclass(frozen=True, eq=False)
 class PairTable(Generic[Array]):
-    """The Plan's pairs, sorted by object.
+    """The Plan's pairs, sorted by object."""
 
-    Attributes:
-        link: Index of each pair's link among the bodies of the state, (pair,).
-        object: Index of its object's body.
-        gate: Its place among `inputs.pairs`, whose contacts are read; 0 where no request wants to know.
-    """
-
-    link: Array
-    object: Array
-    gate: Array
+    link: Array  # index of each pair's link among the bodies of the state, (pair,)
+    object: Array  # index of its object's body
+    gate: Array  # its place among `inputs.pairs`, whose contacts are read; 0 where no request wants to know
 
 
 class Motion(NamedTuple):
-    """Motion of an object relative to a link, in the link's frame, as a velocity field v(x) = linear + angular × x.
+    """Motion of an object relative to a link, in the link's frame, as a velocity field v(x) = linear + angular × x."""
 
-    Attributes:
-        linear: Velocity of the object's material at the link's origin, less the link's own [m/s].
-        angular: Relative angular velocity [rad/s].
-        turn: The link's own angular velocity [rad/s].
-    """
-
-    linear: Vec
-    angular: Vec
-    turn: Vec
+    linear: Vec  # velocity of the object's material at the link's origin, less the link's own [m/s]
+    angular: Vec  # relative angular velocity [rad/s]
+    turn: Vec  # the link's own angular velocity [rad/s]
 
 
 class Pairs(NamedTuple):
-    """What relates each link to each object: planes of shape (env, pair), sorted by object.
+    """What relates each link to each object: planes of shape (env, pair), sorted by object."""
 
-    Attributes:
-        rotation: Rotates link vectors into the object's frame.
-        offset: The link's origin in the object's frame [m].
-        motion: Relative motion, if some sensor wants it.
-        gate: 0 where the pair counts, −∞ where it does not; None if nothing is gated.
-    """
-
-    rotation: Rot
-    offset: Vec
-    motion: Motion | None
-    gate: Tensor | None
+    rotation: Rot  # rotates link vectors into the object's frame
+    offset: Vec  # the link's origin in the object's frame [m]
+    motion: Motion | None  # relative motion, if some sensor wants it
+    gate: Tensor | None  # 0 where the pair counts, −∞ where it does not; None if nothing is gated
 
 
 def relate(
@@ -138,12 +109,7 @@ def relate(
 
 
 def _related(*fields: Plane) -> list[Plane]:
-    """Return the planes of `relate` without the gate: rotation, offset and, if there are velocities, motion.
-
-    Args:
-        *fields: Quaternion, position and, if motion is wanted, velocity and angular velocity, of each pair's link, (env, pair,
-            …); and the same of its object.
-    """
+    """Return the planes of `relate` without the gate: rotation, offset and, if there are velocities, motion."""
     half = len(fields) // 2
     (link_quat, link_pos, *link_motion), (quat, pos, *motion) = fields[:half], fields[half:]
     link_rotation, rotation = planes.rotation(link_quat), planes.rotation(quat)

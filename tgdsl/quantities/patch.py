@@ -26,55 +26,32 @@ def cancelled() -> float:
 
 
 class Contacts(NamedTuple):
-    """What the solver says of contacts, and where bodies are: fields of `SceneState`.
+    """What the solver says of contacts, and where bodies are: fields of `SceneState`."""
 
-    Attributes:
-        force: Of each contact (env, pair, slot, 3) [N].
-        torque: The same [N·m].
-        normal: The same.
-        pos: The same [m].
-        whole: Force of all contacts of a pair (env, pair, 3) [N].
-        body_pos: Origins of bodies (env, body, 3) [m].
-        body_quat: Their orientations (env, body, 4).
-    """
-
-    force: Tensor
-    torque: Tensor
-    normal: Tensor
-    pos: Tensor
-    whole: Tensor
-    body_pos: Tensor
-    body_quat: Tensor
+    force: Tensor  # of each contact (env, pair, slot, 3) [N]
+    torque: Tensor  # the same [N·m]
+    normal: Tensor  # the same
+    pos: Tensor  # the same [m]
+    whole: Tensor  # force of all contacts of a pair (env, pair, 3) [N]
+    body_pos: Tensor  # origins of bodies (env, body, 3) [m]
+    body_quat: Tensor  # their orientations (env, body, 4)
 
 
 class Sides(NamedTuple):
-    """Which contacts make a patch.
+    """Which contacts make a patch."""
 
-    Attributes:
-        bodies: Indices of the sensor's bodies (body,).
-        pairs: The pair of each body's contacts with each object (body, object); the number of pairs for none.
-        are_all: Whether each body may meet each object.
-        is_star: Whether the area is the paper's polygon: see `patch_area`.
-    """
-
-    bodies: Tensor
-    pairs: Tensor
-    are_all: bool
-    is_star: bool = False
+    bodies: Tensor  # indices of the sensor's bodies (body,)
+    pairs: Tensor  # the pair of each body's contacts with each object (body, object); the number of pairs for none
+    are_all: bool  # whether each body may meet each object
+    is_star: bool = False  # whether the area is the paper's polygon: see `patch_area`
 
 
 class Slot(NamedTuple):
-    """One contact of each body and object, planes (env, body, object); zero where there is none.
+    """One contact of each body and object, planes (env, body, object); zero where there is none."""
 
-    Attributes:
-        force: Normal force, at least 0 [N].
-        pos: Where it is from the body's origin, along the world's axes [m].
-        normal: Out of the object, along the world's axes.
-    """
-
-    force: Tensor
-    pos: Vec
-    normal: Vec
+    force: Tensor  # normal force, at least 0 [N]
+    pos: Vec  # where it is from the body's origin, along the world's axes [m]
+    normal: Vec  # out of the object, along the world's axes
 
 
 class Touch(NamedTuple):
@@ -138,10 +115,8 @@ def _of_pairs(field: Tensor, sides: Sides) -> Tensor:
     return torch.where(is_pair, field[:, index.clamp(max=num_pairs - 1)], 0.0)
 
 
-MOST_SWAPPED = 8
-"""Points up to which they are sorted by swapping neighbours, which compiles to one kernel."""
-Point = tuple[Tensor, Tensor, Tensor]
-"""Angle, as a number that grows with it, and two coordinates [m]."""
+MOST_SWAPPED = 8  # points up to which they are sorted by swapping neighbours, which compiles to one kernel
+Point = tuple[Tensor, Tensor, Tensor]  # angle, as a number that grows with it, and two coordinates [m]
 
 
 def patch_area(away: Sequence[Vec], normal: Vec, is_used: Sequence[Tensor], is_star: bool) -> Float[Tensor, "env body object"]:
@@ -224,8 +199,7 @@ def _tangents(normal: Vec) -> tuple[Vec, Vec]:
     return (1.0 + sign * nx * nx * a, sign * b, -sign * nx), (b, sign + ny * ny * a, -ny)
 
 
-MOST_SLOTS = 8
-"""Contacts of a pair that the kernel takes: it compares each with each."""
+MOST_SLOTS = 8  # contacts of a pair that the kernel takes: it compares each with each
 
 
 class Patch(NamedTuple):

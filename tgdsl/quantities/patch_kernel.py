@@ -19,10 +19,8 @@ from tgdsl.geometry.shapes_kernel import dot
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 
-BLOCK = 16
-"""Pairs of a program."""
-WARPS = 1
-"""Warps of a program."""
+BLOCK = 16  # pairs of a program
+WARPS = 1  # warps of a program
 
 
 @triton_op("tgdsl::contact_patch", mutates_args={})
@@ -112,25 +110,21 @@ def patch_kernel(
 
 @triton.jit
 def _at(plane, at, is_there):
-    """Load numbers; 0 where there are none."""
     return tl.load(plane + at, is_there, 0.0)
 
 
 @triton.jit
 def _vector(field, at, is_there):
-    """Load vectors; zero where there are none."""
     return _at(field, at, is_there), _at(field, at + 1, is_there), _at(field, at + 2, is_there)
 
 
 @triton.jit
 def _is_any(vector):
-    """Return which vectors are not zero."""
     return (vector[0] != 0) | (vector[1] != 0) | (vector[2] != 0)
 
 
 @triton.jit
 def _sum(weight, vectors):
-    """Return the sum of vectors (P, S), each times its weight, over the slots."""
     x, y, z = tl.sum(weight * vectors[0], axis=1), tl.sum(weight * vectors[1], axis=1), tl.sum(weight * vectors[2], axis=1)
     return x, y, z
 
@@ -185,7 +179,6 @@ def _hull(away, centre, axis, counts, slot, SLOTS: tl.constexpr):
 
 @triton.jit
 def _angle(x, y):
-    """Return a number from 0 to 4 that grows with a point's angle."""
     size = tl.abs(x) + tl.abs(y)
     along = x / tl.where(size > 0, size, 1.0)
     return tl.where(y >= 0, 1.0 - along, 3.0 + along)

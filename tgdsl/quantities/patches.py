@@ -28,23 +28,14 @@ from tgdsl.surfaces.sensed import ObjectHeat
 
 @dataclass(frozen=True)
 class Topology:
-    """What is joined.
+    """What is joined."""
 
-    Attributes:
-        num_bodies: Number of bodies.
-        cells: How many cells each object has along each axis; all 1 if it has one temperature.
-        grids: The objects that are rows themselves.
-        lumped: The objects that are nodes.
-        links: For each object the body that it is, if it is a link of the sensor; else −1.
-        met: The (body, object) pairs that may meet.
-    """
-
-    num_bodies: int
-    cells: tuple[tuple[int, int, int], ...]
-    grids: tuple[int, ...]
-    lumped: tuple[int, ...]
-    links: tuple[int, ...]
-    met: tuple[tuple[int, int], ...]
+    num_bodies: int  # number of bodies
+    cells: tuple[tuple[int, int, int], ...]  # how many cells each object has along each axis; all 1 if it has one temperature
+    grids: tuple[int, ...]  # the objects that are rows themselves
+    lumped: tuple[int, ...]  # the objects that are nodes
+    links: tuple[int, ...]  # for each object the body that it is, if it is a link of the sensor; else −1
+    met: tuple[tuple[int, int], ...]  # the (body, object) pairs that may meet
 
     @property
     def num_objects(self) -> int:
@@ -122,33 +113,19 @@ class Topology:
 
 
 class HeatOfObjects(NamedTuple):
-    """Materials of objects, planes (env, object).
+    """Materials of objects, planes (env, object)."""
 
-    Attributes:
-        start: Temperature at which an episode begins [°C]; ignored where the object has none.
-        has_start: 1 where it has.
-        conductivity: k [W/(m·K)].
-        volumetric_heat: ρc [J/(m³·K)].
-        emissivity: ε [1].
-        compliance: (1 − ν²)/E [1/Pa].
-        volume: [m³]; infinite for what keeps its temperature, such as a plane.
-        area: Outer surface [m²].
-        curvature: 1/R of the touched surface [1/m]; 0 where it is flat.
-        size: Sides of the box of one that is divided into cells, planes (object,) each [m].
-        corner: Lowest corner of that box in the object's frame [m].
-    """
-
-    start: Tensor
-    has_start: Tensor
-    conductivity: Tensor
-    volumetric_heat: Tensor
-    emissivity: Tensor
-    compliance: Tensor
-    volume: Tensor
-    area: Tensor
-    curvature: Tensor
-    size: Vec
-    corner: Vec
+    start: Tensor  # temperature at which an episode begins [°C]; ignored where the object has none
+    has_start: Tensor  # 1 where it has
+    conductivity: Tensor  # k [W/(m·K)]
+    volumetric_heat: Tensor  # ρc [J/(m³·K)]
+    emissivity: Tensor  # ε [1]
+    compliance: Tensor  # (1 − ν²)/E [1/Pa]
+    volume: Tensor  # [m³]; infinite for what keeps its temperature, such as a plane
+    area: Tensor  # outer surface [m²]
+    curvature: Tensor  # 1/R of the touched surface [1/m]; 0 where it is flat
+    size: Vec  # sides of the box of one that is divided into cells, planes (object,) each [m]
+    corner: Vec  # lowest corner of that box in the object's frame [m]
 
 
 class ContactPatch(NamedTuple):
@@ -157,50 +134,32 @@ class ContactPatch(NamedTuple):
     Contacts count where their normal force is positive. The centre is that of these contacts, and the normal the direction of
     the sum of their normals, both weighted by normal force; where the normals cancel, as of a link that is pinched from two
     sides, that of the first of them.
-
-    Attributes:
-        force: Sum of the contacts' normal forces [N].
-        area: Area of the contact points' convex hull in the plane across the normal [m²]; 0 for fewer than three.
-        pos: Centre in the link's frame [m].
-        normal: Unit normal out of the object, in the link's frame.
-        object_pos: Centre in the object's frame [m]; None if no object there is divided into cells.
-        object_normal: Normal in the object's frame.
-        objects: Materials of the objects.
-        topology: Which patch joins what.
-        sides: `topology`'s tables.
-        cells: What a step needs of the boxes of objects with cells, see `cells.tables`.
-        boxes: Lowest and highest corner of each body's box, (body, 2, 3) in its frame [m].
     """
 
-    force: Tensor
-    area: Tensor
-    pos: Vec
-    normal: Vec
-    object_pos: Vec | None
-    object_normal: Vec | None
-    objects: HeatOfObjects
-    topology: Topology
-    sides: Mapping[str, Tensor]
-    cells: Mapping[str, Tensor]
-    boxes: Float[Tensor, "body 2 3"]
+    force: Tensor  # sum of the contacts' normal forces [N]
+    area: Tensor  # area of the contact points' convex hull in the plane across the normal [m²]; 0 for fewer than three
+    pos: Vec  # centre in the link's frame [m]
+    normal: Vec  # unit normal out of the object, in the link's frame
+    object_pos: Vec | None  # centre in the object's frame [m]; None if no object there is divided into cells
+    object_normal: Vec | None  # normal in the object's frame
+    objects: HeatOfObjects  # materials of the objects
+    topology: Topology  # which patch joins what
+    sides: Mapping[str, Tensor]  # `topology`'s tables
+    cells: Mapping[str, Tensor]  # what a step needs of the boxes of objects with cells, see `cells.tables`
+    boxes: Float[Tensor, "body 2 3"]  # lowest and highest corner of each body's box, (body, 2, 3) in its frame [m]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactPatches(Request[ContactPatch]):
-    """Asks for the patches.
+    """Asks for the patches."""
 
-    Attributes:
-        slots: Contacts per body and object that make a patch.
-        boxes: Lowest and highest corner of each body's box in its frame, handed on (body, 2, 3) [m].
-        is_star: Whether the area is the paper's polygon, through all points in the order of their angles about the
-            centre, instead of their convex hull.
-        needs_stiffness: Whether each object has to be of a material whose Young's modulus is known.
-    """
-
-    slots: int
+    slots: int  # contacts per body and object that make a patch
+    # lowest and highest corner of each body's box in its frame, handed on (body, 2, 3) [m]
     boxes: Float[np.ndarray, "body 2 3"]
+    # whether the area is the paper's polygon, through all points in the order of their angles about the centre, instead of
+    # their convex hull
     is_star: bool
-    needs_stiffness: bool
+    needs_stiffness: bool  # whether each object has to be of a material whose Young's modulus is known
 
     @property
     def wants_contacts(self) -> bool:  # type: ignore[override]
@@ -222,44 +181,25 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class PatchesUse(Generic[Array]):
-    """One request.
+    """One request."""
 
-    Attributes:
-        topology: Which patch joins what.
-        is_star: See `ContactPatches`.
-        bodies: Indices of the sensor's bodies in the state, (body,); empty without objects.
-        pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
-        relations: The same pair by its number in the Plan, or the number of pairs, (body, object).
-        boxes: Lowest and highest corner of each body's box (body, 2, 3) [m].
-        start: Temperature at which each object begins (object,) [°C], and `has_start` 1 where it has one.
-        has_start: See `start`.
-        materials: Conductivity [W/(m·K)], ρc [J/(m³·K)], emissivity [1] and compliance [1/Pa], (object, choice, 4).
-        shapes: Volume [m³], area [m²] and curvature [1/m], (object, variant, 3).
-        grids: Lowest corner of each object's box and its sides (object, 2, 3) [m].
-        variants: Where each object's variant is in the state's field; −1: all alike.
-        heated: Where each object is in the state's fields of heat; −1: it is not there.
-        has_own_start: Whether the state says at which temperature it begins.
-        num_materials: How many materials it may have.
-        sides: The tables of `topology`.
-        cells: What a step needs of the boxes of objects with cells, see `cells.tables`; empty if there are none.
-    """
-
-    topology: Topology
-    is_star: bool
-    bodies: Array
-    pairs: Array
-    relations: Array
-    boxes: Array
-    start: Array
-    has_start: Array
-    materials: Array
-    shapes: Array
-    grids: Array
-    variants: tuple[int, ...]
-    heated: tuple[int, ...]
-    has_own_start: tuple[bool, ...]
-    num_materials: tuple[int, ...]
-    sides: Mapping[str, Array]
+    topology: Topology  # which patch joins what
+    is_star: bool  # see `ContactPatches`
+    bodies: Array  # indices of the sensor's bodies in the state, (body,); empty without objects
+    pairs: Array  # whose contacts: indices into `inputs.pairs`, or their number for none, (body, object)
+    relations: Array  # the same pair by its number in the Plan, or the number of pairs, (body, object)
+    boxes: Array  # lowest and highest corner of each body's box (body, 2, 3) [m]
+    start: Array  # temperature at which each object begins (object,) [°C], and `has_start` 1 where it has one
+    has_start: Array  # see `start`
+    materials: Array  # conductivity [W/(m·K)], ρc [J/(m³·K)], emissivity [1] and compliance [1/Pa], (object, choice, 4)
+    shapes: Array  # volume [m³], area [m²] and curvature [1/m], (object, variant, 3)
+    grids: Array  # lowest corner of each object's box and its sides (object, 2, 3) [m]
+    variants: tuple[int, ...]  # where each object's variant is in the state's field; −1: all alike
+    heated: tuple[int, ...]  # where each object is in the state's fields of heat; −1: it is not there
+    has_own_start: tuple[bool, ...]  # whether the state says at which temperature it begins
+    num_materials: tuple[int, ...]  # how many materials it may have
+    sides: Mapping[str, Array]  # the tables of `topology`
+    # what a step needs of the boxes of objects with cells, see `cells.tables`; empty if there are none
     cells: Mapping[str, Array]
 
 
@@ -270,8 +210,7 @@ class PatchesPart(Generic[Array]):
     uses: tuple[PatchesUse[Array], ...]
 
 
-FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
-"""Faces of a box, by the axis that they are across, and on which side."""
+FACES = ("-x", "+x", "-y", "+y", "-z", "+z")  # faces of a box, by the axis that they are across, and on which side
 
 
 def tables(

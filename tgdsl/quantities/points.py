@@ -27,55 +27,36 @@ from tgdsl.surfaces.sensed import DistanceOptions, SensedObject
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.operations import Operation
 
-LINKS = DistanceOptions()
-"""How the distance to links' own surfaces is computed."""
+LINKS = DistanceOptions()  # how the distance to links' own surfaces is computed
 
 
-SMALLEST_TILE, LARGEST_TILE = 32, 128
-"""Numbers of taxels of a tile."""
+SMALLEST_TILE, LARGEST_TILE = 32, 128  # numbers of taxels of a tile
 
 
 class PointSource(NamedTuple):
-    """The points of one object, and the links that they may meet.
+    """The points of one object, and the links that they may meet."""
 
-    Attributes:
-        object: The object's name.
-        pair: Index of the pair of each link and the object.
-        taxels: First of each link's taxels, and one beyond the last.
-        tiles: What `point_tiles` returns of them.
-        points: Places in the object's frame [m].
-        area: Surface that each stands for [m²].
-        links: The links' own surfaces, each in the frame of its body: an object whose cases are links.
-    """
-
-    object: str
-    pair: Int[Tensor, " link"]
-    taxels: tuple[tuple[int, int], ...]
-    tiles: Int[Tensor, "tile 3"]
+    object: str  # the object's name
+    pair: Int[Tensor, " link"]  # index of the pair of each link and the object
+    taxels: tuple[tuple[int, int], ...]  # first of each link's taxels, and one beyond the last
+    tiles: Int[Tensor, "tile 3"]  # what `point_tiles` returns of them
+    # places in the object's frame [m]
     points: tuple[Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"]]
-    area: Float[Tensor, "case 1"]
-    links: Geoms
+    area: Float[Tensor, "case 1"]  # surface that each stands for [m²]
+    links: Geoms  # the links' own surfaces, each in the frame of its body: an object whose cases are links
 
 
 class LinkPoints(NamedTuple):
-    """Points sampled on one object, as the links that they may meet see them; planes (env, link, point), in each link's frame.
+    """Points sampled on one object, in the frames of the links that they may meet; planes (env, link, point)."""
 
-    Attributes:
-        taxels: First of each link's taxels, and one beyond the last.
-        tiles: What `points.point_tiles` returns of them.
-        pos: Where they are now [m]; a compiler stores them.
-        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed, and maybe where it is beyond what
-            the sensors asked for.
-        gradient: Its unit gradient.
-        area: Surface of the object that each stands for [m²], (case, 1).
-    """
-
-    taxels: tuple[tuple[int, int], ...]
-    tiles: Int[Tensor, "tile 3"]
-    pos: Vec
+    taxels: tuple[tuple[int, int], ...]  # first of each link's taxels, and one beyond the last
+    tiles: Int[Tensor, "tile 3"]  # what `points.point_tiles` returns of them
+    pos: Vec  # where they are now [m]; a compiler stores them
+    # signed distance to the link's own surface [m]; +∞ where the gate is closed, and maybe where it is beyond what the sensors
+    # asked for
     distance: Tensor
-    gradient: Vec
-    area: Tensor
+    gradient: Vec  # its unit gradient
+    area: Tensor  # surface of the object that each stands for [m²], (case, 1)
 
 
 class ObjectPoints(NamedTuple):
@@ -142,15 +123,10 @@ LINK_POINTS = Operation("meet", link_points, _by_kernel, _inputs, are_grids)
 
 @dataclass(frozen=True, eq=False)
 class Points(Request[dict[str, ObjectPoints]]):
-    """Asks for points of objects. Where a gate is closed they are nowhere: their distance is +∞.
+    """Asks for points of objects. Where a gate is closed they are nowhere: their distance is +∞."""
 
-    Attributes:
-        num_points: Points of each object.
-        range: Distance from a link's surface up to which it is needed [m].
-    """
-
-    num_points: int = 5000
-    range: float = 0.0
+    num_points: int = 5000  # points of each object
+    range: float = 0.0  # distance from a link's surface up to which it is needed [m]
 
 
 Array = TypeVar("Array")
@@ -158,38 +134,23 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class CloudPart(Generic[Array]):
-    """The points of one object.
+    """The points of one object."""
 
-    Attributes:
-        object: The object: its place in the Plan.
-        points: Places in its body's frame [m], (3, variant, point).
-        area: Surface that each stands for [m²], (variant,).
-    """
-
-    object: int
-    points: Array
-    area: Array
+    object: int  # the object: its place in the Plan
+    points: Array  # places in its body's frame [m], (3, variant, point)
+    area: Array  # surface that each stands for [m²], (variant,)
 
 
 @dataclass(frozen=True, eq=False)
 class MetObject(Generic[Array]):
-    """An object of a use, and the links that may meet it.
+    """An object of a use, and the links that may meet it."""
 
-    Attributes:
-        cloud: Number of its cloud.
-        links: The links: indices into `PointsPart.links`.
-        taxels: First of each link's taxels among the use's, and one beyond the last.
-        pair: Index of the pair of each link and the object among all pairs, (link,).
-        link: `links` as an array, (link,).
-        tiles: What `points.point_tiles` returns of the taxels, (tile, 3).
-    """
-
-    cloud: int
-    links: tuple[int, ...]
-    taxels: tuple[tuple[int, int], ...]
-    pair: Array
-    link: Array
-    tiles: Array
+    cloud: int  # number of its cloud
+    links: tuple[int, ...]  # the links: indices into `PointsPart.links`
+    taxels: tuple[tuple[int, int], ...]  # first of each link's taxels among the use's, and one beyond the last
+    pair: Array  # index of the pair of each link and the object among all pairs, (link,)
+    link: Array  # `links` as an array, (link,)
+    tiles: Array  # what `points.point_tiles` returns of the taxels, (tile, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,19 +163,12 @@ class PointsUse(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class PointsPart(Generic[Array]):
-    """All of it.
+    """All of it."""
 
-    Attributes:
-        links: Names of the links whose own surfaces points are measured against.
-        surfaces: Their geoms: a case for each link; None if there is none.
-        clouds: The objects' points.
-        uses: The uses.
-    """
-
-    links: tuple[str, ...]
-    surfaces: GeomTable[Array] | None
-    clouds: tuple[CloudPart[Array], ...]
-    uses: tuple[PointsUse[Array], ...]
+    links: tuple[str, ...]  # names of the links whose own surfaces points are measured against
+    surfaces: GeomTable[Array] | None  # their geoms: a case for each link; None if there is none
+    clouds: tuple[CloudPart[Array], ...]  # the objects' points
+    uses: tuple[PointsUse[Array], ...]  # the uses
 
 
 def _source(part: PointsPart[Tensor], met: MetObject[Tensor], scene: Scene) -> PointSource:
@@ -240,21 +194,13 @@ def _with_lost(pairs: Pairs) -> Pairs:
 
 @dataclass(frozen=True, eq=False)
 class ReferencePoints:
-    """Points sampled on one object, in the frame of one link that they may meet: a row of `points.LinkPoints` as arrays.
+    """Points sampled on one object, in the frame of one link that they may meet: a row of `points.LinkPoints` as arrays."""
 
-    Attributes:
-        taxels: The link's taxels.
-        pos: Where they are [m].
-        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed.
-        gradient: Its unit gradient.
-        area: Surface that each stands for [m²].
-    """
-
-    taxels: Int[np.ndarray, " own"]
-    pos: Float[np.ndarray, "point 3"]
-    distance: Float[np.ndarray, " point"]
-    gradient: Float[np.ndarray, "point 3"]
-    area: float
+    taxels: Int[np.ndarray, " own"]  # the link's taxels
+    pos: Float[np.ndarray, "point 3"]  # where they are [m]
+    distance: Float[np.ndarray, " point"]  # signed distance to the link's own surface [m]; +∞ where the gate is closed
+    gradient: Float[np.ndarray, "point 3"]  # its unit gradient
+    area: float  # surface that each stands for [m²]
 
 
 class _Points(Quantity):

@@ -18,19 +18,12 @@ Array = np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class ReferenceBody:
-    """A body at one instant, in the world frame.
+    """A body at one instant, in the world frame."""
 
-    Attributes:
-        pos: Position of its frame [m].
-        quat: Orientation, w, x, y, z.
-        linvel: Velocity of the frame's origin [m/s].
-        angvel: Angular velocity [rad/s].
-    """
-
-    pos: Float[Array, " 3"]
-    quat: Float[Array, " 4"]
-    linvel: Float[Array, " 3"]
-    angvel: Float[Array, " 3"]
+    pos: Float[Array, " 3"]  # position of its frame [m]
+    quat: Float[Array, " 4"]  # orientation, w, x, y, z
+    linvel: Float[Array, " 3"]  # velocity of the frame's origin [m/s]
+    angvel: Float[Array, " 3"]  # angular velocity [rad/s]
 
     @cached_property
     def rotation(self) -> Float[Array, "3 3"]:
@@ -46,25 +39,15 @@ class ReferenceBody:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceScene:
-    """One environment at one instant.
+    """One environment at one instant."""
 
-    Attributes:
-        layout: The taxels of the sensor, or its links if it has none.
-        rows: Which taxels of a use are the sensor's.
-        objects: The Plan's objects.
-        bodies: Bodies of the state, by name in order.
-        contact_pairs: Pairs of the state.
-        fields: Fields of the state in float64, without `env`.
-        shift: By how much all objects are moved [m].
-    """
-
-    layout: Layout
-    rows: slice
-    objects: tuple[PairedObject, ...]
-    bodies: tuple[str, ...]
-    contact_pairs: tuple[Pair, ...]
-    fields: Mapping[str, Array]
-    shift: Float[Array, " 3"]
+    layout: Layout  # the taxels of the sensor, or its links if it has none
+    rows: slice  # which taxels of a use are the sensor's
+    objects: tuple[PairedObject, ...]  # the Plan's objects
+    bodies: tuple[str, ...]  # bodies of the state, by name in order
+    contact_pairs: tuple[Pair, ...]  # pairs of the state
+    fields: Mapping[str, Array]  # fields of the state in float64, without `env`
+    shift: Float[Array, " 3"]  # by how much all objects are moved [m]
 
     def body(self, name: str) -> ReferenceBody:
         """Return a body where the state has it."""

@@ -26,45 +26,33 @@ SHAPES = ("", "plane", "sphere", "capsule", "cylinder", "box")
 SPHERE = SHAPES.index("sphere")
 
 
-EVERYWHERE = 3e38
-"""Bound of a plane [m]: finite, but not its square, so that no place is beyond it, and −∞ added to it is −∞."""
+EVERYWHERE = 3e38  # bound of a plane [m]: finite, but not its square, so that no place is beyond it, and −∞ added to it is −∞
 
 
 MARGIN = 10 * planes.tie()
 """By how much farther than its reach a geom is passed over [m]: beyond all that counts as equal, in float32."""
 
 
-POS, ROTATION, BOUND, KIND, ROW = 3, 6, 15, 16, 17
-"""Columns of `Tables.geoms`, which begins with the size, and their number."""
+POS, ROTATION, BOUND, KIND, ROW = 3, 6, 15, 16, 17  # columns of `Tables.geoms`, which begins with the size, and their number
 
 
 class Tables(NamedTuple):
-    """The objects of a search.
+    """The objects of a search."""
 
-    Attributes:
-        pair: Index of each probe's pair with each object among all pairs.
-        spheres: Radius of a sphere about each object's origin that holds it [m], −∞ if it is absent, and how many geoms it has.
-        geoms: Each geom's size, place and rotation in its body's frame, row by row, the radius of a sphere about its own origin
-            that holds it [m], and its kind, which is negative if it has a frame.
-    """
-
-    pair: Int[Tensor, "object taxel"]
+    pair: Int[Tensor, "object taxel"]  # index of each probe's pair with each object among all pairs
+    # radius of a sphere about each object's origin that holds it [m], −∞ if it is absent, and how many geoms it has
     spheres: Float[Tensor, "case object 2"]
+    # each geom's size, place and rotation in its body's frame, row by row, the radius of a sphere about its own origin that
+    # holds it [m], and its kind, which is negative if it has a frame
     geoms: Float[Tensor, "case geom row"]
 
 
 class Deepest(NamedTuple):
-    """What each probe is deepest in, the first among equals.
+    """What each probe is deepest in, the first among equals."""
 
-    Attributes:
-        depth: Penetration depth max(0, radius − distance) [m]; not-a-number where a pose is.
-        normal: Unit normal out of the object, in the link's frame, planes (env, taxel); zero where nothing is reached.
-        pair: Index of the winner's pair among all pairs; −1 where nothing is reached.
-    """
-
-    depth: Float[Tensor, "env taxel"]
-    normal: Vec
-    pair: Int[Tensor, "env taxel"]
+    depth: Float[Tensor, "env taxel"]  # penetration depth max(0, radius − distance) [m]; not-a-number where a pose is
+    normal: Vec  # unit normal out of the object, in the link's frame, planes (env, taxel); zero where nothing is reached
+    pair: Int[Tensor, "env taxel"]  # index of the winner's pair among all pairs; −1 where nothing is reached
 
 
 def geom_tables(objects: Sequence[Geoms]) -> tuple[Tensor, Tensor]:
@@ -109,7 +97,6 @@ def _filled(like: Tensor, values: Sequence[float]) -> Float[Tensor, "1 value"]:
 
 @torch.library.custom_op("tgdsl::side_by_side", mutates_args=(), schema="(Tensor[] parts) -> Tensor")
 def _side_by_side(parts: list[Tensor]) -> Tensor:
-    """Return torch.cat(parts, dim=1), by one kernel: a compiler would make one of each part."""
     return torch.cat(parts, dim=1)
 
 

@@ -21,21 +21,14 @@ from tgdsl.surfaces.surface import Surface
 
 @dataclass(frozen=True, eq=False)
 class Bulk:
-    """What geoms are together. Those that overlap count fully: volumes and areas are sums.
+    """What geoms are together. Those that overlap count fully: volumes and areas are sums."""
 
-    Attributes:
-        volume: Volume [m³].
-        area: Area of the surface [m²].
-        low: Lower corner of the bounding box, in the body's frame [m].
-        high: Upper corner.
-        curvature: Mean curvature where something touches it, averaged over the area [1/m]: of a sphere 1/r, along the side of a
-            cylinder or capsule 1/2r, of an ellipsoid that of the sphere of its volume, of flat faces and meshes 0.
-    """
-
-    volume: float
-    area: float
-    low: Float[np.ndarray, " 3"]
-    high: Float[np.ndarray, " 3"]
+    volume: float  # volume [m³]
+    area: float  # area of the surface [m²]
+    low: Float[np.ndarray, " 3"]  # lower corner of the bounding box, in the body's frame [m]
+    high: Float[np.ndarray, " 3"]  # upper corner
+    # mean curvature where something touches it, averaged over the area [1/m]: of a sphere 1/r, along the side of a cylinder or
+    # capsule 1/2r, of an ellipsoid that of the sphere of its volume, of flat faces and meshes 0
     curvature: float
 
     @property
@@ -105,7 +98,6 @@ def _cylinder(r: float, h: float, _c: float, rotation: np.ndarray) -> Measured:
 
 
 def _ellipsoid(a: float, b: float, c: float, rotation: np.ndarray) -> Measured:
-    """By Carlson's symmetric integral R_G: NIST, Digital Library of Mathematical Functions, 19.33.1."""
     volume = 4 / 3 * pi * a * b * c
     area = 3 * volume * float(elliprg(a**-2, b**-2, c**-2))
     return volume, area, (a * b * c) ** (-1 / 3), np.linalg.norm(rotation * [a, b, c], axis=1)
@@ -116,7 +108,6 @@ def _box(x: float, y: float, z: float, rotation: np.ndarray) -> Measured:
 
 
 def _plane(_x: float, _y: float, _z: float, _rotation: np.ndarray) -> Measured:
-    """A half-space; of its surface, most of which is of no interest, nothing counts."""
     return inf, 0.0, 0.0, np.full(3, inf)
 
 

@@ -12,35 +12,23 @@ from jaxtyping import Float
 
 from tgdsl.surfaces.surface import Surface
 
-CELLS = 8
-"""Cells along each axis into which points are sorted, where they and the planes are many."""
-CHUNK = 1 << 21
-"""Distances from half-spaces that are in memory at once."""
-SLACK = 1e-6
-"""Widening of a bounding box [m]: what is just outside is a small distance away, not infinitely far."""
+CELLS = 8  # cells along each axis into which points are sorted, where they and the planes are many
+CHUNK = 1 << 21  # distances from half-spaces that are in memory at once
+SLACK = 1e-6  # widening of a bounding box [m]: what is just outside is a small distance away, not infinitely far
 
 
 @dataclass(frozen=True, eq=False)
 class ConvexSolid:
-    """A primitive or a convex hull, somewhere in a frame.
+    """A primitive or a convex hull, somewhere in a frame."""
 
-    Attributes:
-        shape: The primitive's type, or `mesh`.
-        size: Its size as MuJoCo defines it [m].
-        pos: Its frame's origin [m].
-        rotation: Rotates vectors of its frame into the frame that it is in.
-        planes: Outward unit normals and offsets [m] of a hull's faces, in its own frame; of a primitive none.
-        low: Lower corner of its bounding box, in its own frame [m].
-        high: Upper corner.
-    """
-
-    shape: str
-    size: Float[np.ndarray, " 3"]
-    pos: Float[np.ndarray, " 3"]
-    rotation: Float[np.ndarray, "3 3"]
+    shape: str  # the primitive's type, or `mesh`
+    size: Float[np.ndarray, " 3"]  # its size as MuJoCo defines it [m]
+    pos: Float[np.ndarray, " 3"]  # its frame's origin [m]
+    rotation: Float[np.ndarray, "3 3"]  # rotates vectors of its frame into the frame that it is in
+    # outward unit normals and offsets [m] of a hull's faces, in its own frame; of a primitive none
     planes: Float[np.ndarray, "k 4"]
-    low: Float[np.ndarray, " 3"]
-    high: Float[np.ndarray, " 3"]
+    low: Float[np.ndarray, " 3"]  # lower corner of its bounding box, in its own frame [m]
+    high: Float[np.ndarray, " 3"]  # upper corner
 
     def depth(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Return the distance of points inside to the surface [m].
@@ -55,11 +43,9 @@ class ConvexSolid:
         return depth
 
     def _from_planes(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Return the distance from the nearest face's plane: that is the surface's for points inside.
-
-        Normals are unit vectors: over a cell of points within r of its middle, a plane's distance changes by at most r, so that
-        planes farther from the middle than the nearest one by more than 2r are nearest to none of its points.
-        """
+        """Return the distance from the nearest face's plane: that is the surface's for points inside."""
+        # Over a cell of points within r of its middle, a plane's distance changes by at most r: planes farther from the middle
+        # than the nearest one by more than 2r are nearest to none of its points.
         if len(pos) * len(self.planes) <= CHUNK:
             return (self.planes[:, 3] - pos @ self.planes[:, :3].T).min(axis=1)
         step = np.maximum(np.ptp(pos, axis=0), SLACK) / CELLS

@@ -10,35 +10,23 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-LEAF = 32
-"""Faces whose boxes are compared with all near ones at once."""
-CHUNK = 1 << 18
-"""Pairs that are looked at at once."""
-MAX_PAIRS = 20_000_000
-"""Largest number of pairs of faces whose boxes overlap."""
-MAX_SEGMENTS = 200_000
-"""Largest number of segments along which faces are cut."""
-ROUNDING = 1e-3
-"""Distance at which a cell's corner is on a line, over the tolerance."""
+LEAF = 32  # faces whose boxes are compared with all near ones at once
+CHUNK = 1 << 18  # pairs that are looked at at once
+MAX_PAIRS = 20_000_000  # largest number of pairs of faces whose boxes overlap
+MAX_SEGMENTS = 200_000  # largest number of segments along which faces are cut
+ROUNDING = 1e-3  # distance at which a cell's corner is on a line, over the tolerance
 
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """How the faces of a surface meet elsewhere than along their borders.
+    """How the faces of a surface meet elsewhere than along their borders."""
 
-    Attributes:
-        cut: Faces that others cross or touch.
-        segments: Along what each is cut [m].
-        covered: Faces in a plane with earlier ones, which may cover them and along whose border they are cut.
-        cover: Those earlier ones.
-        is_complete: Whether they were all looked at; if they are too many, none is there.
-    """
-
-    cut: Int[np.ndarray, " s"]
-    segments: Float[np.ndarray, "s 2 3"]
+    cut: Int[np.ndarray, " s"]  # faces that others cross or touch
+    segments: Float[np.ndarray, "s 2 3"]  # along what each is cut [m]
+    # faces in a plane with earlier ones, which may cover them and along whose border they are cut
     covered: Int[np.ndarray, " n"]
-    cover: Int[np.ndarray, " n"]
-    is_complete: bool = True
+    cover: Int[np.ndarray, " n"]  # those earlier ones
+    is_complete: bool = True  # whether they were all looked at; if they are too many, none is there
 
 
 def crossings(corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 3"], tolerance: float) -> Crossings:
@@ -106,7 +94,6 @@ def _near_pairs(low: Float[np.ndarray, "f 3"], high: Float[np.ndarray, "f 3"]) -
 
 
 def _heights(base: np.ndarray, normal: np.ndarray, corners: np.ndarray, tolerance: float) -> Float[np.ndarray, "n 3"]:
-    """Return how high corners are above the planes of other faces [m], 0 where they touch them."""
     height = np.einsum("nki,ni->nk", corners - base[:, :1], normal)
     height[np.abs(height) <= tolerance] = 0.0
     return height
@@ -158,13 +145,7 @@ def cells(
 def _clipped(
     segments: Float[np.ndarray, "s 2 d"], depth: Float[np.ndarray, "s 2 k"], tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which segments pass through the interior of convex cells, and their ends there.
-
-    Args:
-        segments: Their ends, in a plane or in space [m].
-        depth: How far within each line of the cell's border the ends are [m].
-        tolerance: How far within a segment is at least, and how long [m].
-    """
+    """Return which segments pass through the interior of convex cells, and their ends there."""
     slope = depth[:, 1] - depth[:, 0]
     at = np.divide(-depth[:, 0], slope, out=np.zeros_like(slope), where=slope != 0)
     begin = np.where(slope > 0, at, 0.0).max(axis=1).clip(0, 1)

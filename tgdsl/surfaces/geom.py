@@ -12,29 +12,17 @@ from tgdsl.surfaces.surface import Surface
 
 @dataclass(frozen=True, eq=False)
 class Geom:
-    """A compiled geom, in its body's frame.
+    """A compiled geom, in its body's frame."""
 
-    Attributes:
-        id: MuJoCo's index.
-        name: Its name, or empty.
-        mesh: Name of its mesh, or empty.
-        body: Name of its body.
-        shape: MuJoCo's name of its type.
-        size: Its size as MuJoCo defines it [m].
-        pos: Its frame's origin [m].
-        rotation: Rotates geom vectors into the body frame.
-        is_colliding: Whether it can collide at all.
-    """
-
-    id: int
-    name: str
-    mesh: str
-    body: str
-    shape: str
-    size: Float[np.ndarray, " 3"]
-    pos: Float[np.ndarray, " 3"]
-    rotation: Float[np.ndarray, "3 3"]
-    is_colliding: bool
+    id: int  # MuJoCo's index
+    name: str  # its name, or empty
+    mesh: str  # name of its mesh, or empty
+    body: str  # name of its body
+    shape: str  # MuJoCo's name of its type
+    size: Float[np.ndarray, " 3"]  # its size as MuJoCo defines it [m]
+    pos: Float[np.ndarray, " 3"]  # its frame's origin [m]
+    rotation: Float[np.ndarray, "3 3"]  # rotates geom vectors into the body frame
+    is_colliding: bool  # whether it can collide at all
 
     @property
     def is_centred(self) -> bool:
@@ -54,17 +42,11 @@ class Geom:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceGeom:
-    """A geom whose distance, area or points are wanted: a primitive, or triangles.
+    """A geom whose distance, area or points are wanted: a primitive, or triangles."""
 
-    Attributes:
-        geom: The compiled geom.
-        surface: Its triangles in its own frame; None for a primitive.
-        mesh: The mesh whose convex hull the surface is, in the same frame; None if it is none.
-    """
-
-    geom: Geom
-    surface: Surface | None
-    mesh: Surface | None = None
+    geom: Geom  # the compiled geom
+    surface: Surface | None  # its triangles in its own frame; None for a primitive
+    mesh: Surface | None = None  # the mesh whose convex hull the surface is, in the same frame; None if it is none
 
     @property
     def shape(self) -> str:

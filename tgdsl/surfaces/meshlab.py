@@ -34,17 +34,11 @@ ROUNDING = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    """A clean surface whose enclosed components are gone.
+    """A clean surface whose enclosed components are gone."""
 
-    Attributes:
-        surface: Its triangles; solid components are counter-clockwise seen from outside.
-        component: Connected component of each face.
-        is_solid: Which components enclose a volume.
-    """
-
-    surface: Surface
-    component: Int[np.ndarray, " f"]
-    is_solid: Bool[np.ndarray, " component"]
+    surface: Surface  # its triangles; solid components are counter-clockwise seen from outside
+    component: Int[np.ndarray, " f"]  # connected component of each face
+    is_solid: Bool[np.ndarray, " component"]  # which components enclose a volume
 
     @cached_property
     def offset(self) -> float:
@@ -190,7 +184,6 @@ def _solid(surface: Surface, component: Int[np.ndarray, " f"]) -> Bool[np.ndarra
 
 
 def _signed_volumes(surface: Surface, component: Int[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
-    """Return the volume between each face and its component's first corner; negative if the face looks toward it [m³]."""
     _, first = np.unique(component, return_index=True)
     corners = surface.corners - surface.corners[first, :1][component]
     return np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0

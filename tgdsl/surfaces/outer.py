@@ -24,10 +24,8 @@ from tgdsl.surfaces.holes import merged
 from tgdsl.surfaces.parts import outward
 from tgdsl.surfaces.surface import Surface
 
-TOUCH = 1e-6
-"""Distance at which faces touch, over the mesh's size: MuJoCo has its vertices in float32."""
-STEP = 1e-5
-"""Distance in front of and behind a face at which one looks whether it is inside, over the mesh's size."""
+TOUCH = 1e-6  # distance at which faces touch, over the mesh's size: MuJoCo has its vertices in float32
+STEP = 1e-5  # distance in front of and behind a face at which one looks whether it is inside, over the mesh's size
 OPEN = "is not closed; what is inside is decided by its winding number"
 TWISTED = "has parts whose faces cannot be made to agree which side is out; they are as in its file"
 UNCUT = "has more faces that cross than are cut; those that are partly inside count as surface"
@@ -35,19 +33,13 @@ UNCUT = "has more faces that cross than are cut; those that are partly inside co
 
 @dataclass(frozen=True, eq=False)
 class Outer:
-    """The outer surface of a mesh.
+    """The outer surface of a mesh."""
 
-    Attributes:
-        vertices: Positions [m].
-        faces: Vertex indices, counter-clockwise seen from outside; sheets have each face twice, once from either side.
-        uncut: The mesh's faces of which there is something in `faces`, whole; on the same vertices.
-        flaws: What of the mesh its user should know, to be put after its name.
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
+    vertices: Float[np.ndarray, "v 3"]  # positions [m]
+    # vertex indices, counter-clockwise seen from outside; sheets have each face twice, once from either side
     faces: Int[np.ndarray, "f 3"]
-    uncut: Int[np.ndarray, "g 3"]
-    flaws: tuple[str, ...]
+    uncut: Int[np.ndarray, "g 3"]  # the mesh's faces of which there is something in `faces`, whole; on the same vertices
+    flaws: tuple[str, ...]  # what of the mesh its user should know, to be put after its name
 
 
 def outer(surface: Surface) -> Outer:
@@ -104,17 +96,11 @@ def is_inside(
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """What faces are cut into: whole faces first, then the cells of the others.
+    """What faces are cut into: whole faces first, then the cells of the others."""
 
-    Attributes:
-        owner: The face of each.
-        middle: A point in it [m].
-        corners: Of those that are no whole faces, corners [m].
-    """
-
-    owner: Int[np.ndarray, " n"]
-    middle: Float[np.ndarray, "n 3"]
-    corners: list[Float[np.ndarray, "_ 3"]]
+    owner: Int[np.ndarray, " n"]  # the face of each
+    middle: Float[np.ndarray, "n 3"]  # a point in it [m]
+    corners: list[Float[np.ndarray, "_ 3"]]  # of those that are no whole faces, corners [m]
 
 
 def _cells(corners: Float[np.ndarray, "f 3 3"], crossed: Crossings, tolerance: float) -> _Cells:
@@ -184,13 +170,11 @@ def _assembled(
 
 
 def _distinct(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " g"]:
-    """Return the faces that repeat no earlier one in the same sense."""
     turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     return np.sort(np.unique(turned, axis=0, return_index=True)[1])
 
 
 def _has_area(corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
-    """Return which triangles are higher than 1e-9 of their longest side: needles are, slivers of zero area are not."""
     sides = corners - np.roll(corners, 1, axis=1)
     longest = (sides**2).sum(axis=2).max(axis=1, initial=0)
     return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 1e-9 * longest

@@ -19,27 +19,18 @@ from scipy.sparse.csgraph import connected_components
 
 from tgdsl.surfaces.holes import hole_caps
 
-FLAT = 1e-9
-"""Volume below which a part encloses none, over the cube of its size."""
-ENCLOSED = 0.9
-"""Winding number of a part from which a point is within it: on its surface it is 1/2, at a notch of it more."""
+FLAT = 1e-9  # volume below which a part encloses none, over the cube of its size
+ENCLOSED = 0.9  # winding number of a part from which a point is within it: on its surface it is 1/2, at a notch of it more
 
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """A surface whose parts are wound outwards and share no vertices.
+    """A surface whose parts are wound outwards and share no vertices."""
 
-    Attributes:
-        vertices: Positions [m].
-        faces: Vertex indices, counter-clockwise seen from outside.
-        caps: Triangles that close the parts' holes, wound like the faces.
-        is_orientable: Whether all neighbours could be made to agree. A part whose neighbours cannot is left as it was.
-    """
-
-    vertices: Float[np.ndarray, "w 3"]
-    faces: Int[np.ndarray, "f 3"]
-    caps: Int[np.ndarray, "g 3"]
-    is_orientable: bool
+    vertices: Float[np.ndarray, "w 3"]  # positions [m]
+    faces: Int[np.ndarray, "f 3"]  # vertex indices, counter-clockwise seen from outside
+    caps: Int[np.ndarray, "g 3"]  # triangles that close the parts' holes, wound like the faces
+    is_orientable: bool  # whether all neighbours could be made to agree. A part whose neighbours cannot is left as it was.
 
 
 def outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], written: Int[np.ndarray, "f 3"]) -> Parts:
@@ -109,7 +100,6 @@ def _neighbours(
 
 
 def _sides(faces: np.ndarray) -> Int[np.ndarray, "n 2"]:
-    """Return the first sides of all faces, then the second, then the third."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 

@@ -25,27 +25,19 @@ from tgdsl.geometry.shapes import SHAPES
 from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.solid import Solid
 
-SECTIONS = 128
-"""Least number of sides of what stands for a circle before its points are moved onto the true surface."""
-CUT = 16.0
-"""How many times finer than the spacing triangles are where another geom's surface cuts them."""
-STEP = 1e-7
-"""How far a point is moved out or in to see what is there [m]."""
+SECTIONS = 128  # least number of sides of what stands for a circle before its points are moved onto the true surface
+CUT = 16.0  # how many times finer than the spacing triangles are where another geom's surface cuts them
+STEP = 1e-7  # how far a point is moved out or in to see what is there [m]
 
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
 class Quadrature:
-    """Points that stand for a surface.
+    """Points that stand for a surface."""
 
-    Attributes:
-        pos: Places in the body's frame [m].
-        area: Surface that each stands for [m²].
-    """
-
-    pos: Float[np.ndarray, "n 3"]
-    area: Float[np.ndarray, " n"]
+    pos: Float[np.ndarray, "n 3"]  # places in the body's frame [m]
+    area: Float[np.ndarray, " n"]  # surface that each stands for [m²]
 
     @cached_property
     def tree(self) -> KDTree:
@@ -55,19 +47,12 @@ class Quadrature:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Small triangles of an outer surface.
+    """Small triangles of an outer surface."""
 
-    Attributes:
-        corners: Their corners in the body's frame [m]; those of a primitive are chords of it.
-        pos: The point of the true surface at the middle of each [m].
-        normal: Unit normal out of the object there.
-        area: Surface that each stands for [m²].
-    """
-
-    corners: Float[np.ndarray, "f 3 3"]
-    pos: Float[np.ndarray, "f 3"]
-    normal: Float[np.ndarray, "f 3"]
-    area: Float[np.ndarray, " f"]
+    corners: Float[np.ndarray, "f 3 3"]  # their corners in the body's frame [m]; those of a primitive are chords of it
+    pos: Float[np.ndarray, "f 3"]  # the point of the true surface at the middle of each [m]
+    normal: Float[np.ndarray, "f 3"]  # unit normal out of the object there
+    area: Float[np.ndarray, " f"]  # surface that each stands for [m²]
 
     def quadrature(self, spacing: float) -> Quadrature:
         """Return one point per piece, or one for all those that share a cube of half the spacing [m]."""

@@ -24,34 +24,25 @@ from tgdsl.surfaces.surface import Surface
 
 NEAR_PARALLEL = 0.7
 """An axis with a larger |cosine| to a direction is not used to orient what is perpendicular to that direction."""
-EDGE_ON = 1e-6
-"""Faces with a smaller |cosine| between normal and rays are left out: their neighbours cover the same rays."""
+EDGE_ON = 1e-6  # faces with a smaller |cosine| between normal and rays are left out: their neighbours cover the same rays
 ROUNDING = 1e-9
 """Widening of faces, relative to the largest coordinate, so that no ray slips between two faces that share an edge."""
-RASTER = 256
-"""Rays along the longer side of the raster that looks for the visible part of a region."""
+RASTER = 256  # rays along the longer side of the raster that looks for the visible part of a region
 _PAIRS = 1_000_000  # (face, ray) pairs tested at a time, to bound memory
 
 
 @dataclass(frozen=True, eq=False)
 class OrthographicView:
-    """A surface in orthographic projection along a direction.
+    """A surface in orthographic projection along a direction."""
 
-    Attributes:
-        axes: Rows are the unit vectors of u, v and t in the body frame, right-handed; rays travel along +t.
-        face_id: Index of each face into the surface's faces.
-        corners: (u, v, t) of each face's corners, counter-clockwise in (u, v) [m].
-        normals: Unit face normals against the rays, body frame: the side that a ray comes from is outside.
-        geom: Index of each face's geom.
-        rounding: Lengths below this are rounding noise [m].
-    """
-
+    # rows are the unit vectors of u, v and t in the body frame, right-handed; rays travel along +t
     axes: Float[np.ndarray, "3 3"]
-    face_id: Int[np.ndarray, " f"]
-    corners: Float[np.ndarray, "f 3 3"]
+    face_id: Int[np.ndarray, " f"]  # index of each face into the surface's faces
+    corners: Float[np.ndarray, "f 3 3"]  # (u, v, t) of each face's corners, counter-clockwise in (u, v) [m]
+    # unit face normals against the rays, body frame: the side that a ray comes from is outside
     normals: Float[np.ndarray, "f 3"]
-    geom: Int[np.ndarray, " f"]
-    rounding: float
+    geom: Int[np.ndarray, " f"]  # index of each face's geom
+    rounding: float  # lengths below this are rounding noise [m]
 
     @staticmethod
     def of(
@@ -105,15 +96,10 @@ def frame(direction: Float[np.ndarray, " 3"], columns: Float[np.ndarray, " 3"] |
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """First hits of some rays.
+    """First hits of some rays."""
 
-    Attributes:
-        face: Index into the view's faces; −1 where a ray misses.
-        depth: t of the hit [m]; infinite where a ray misses.
-    """
-
-    face: Int[np.ndarray, " ray"]
-    depth: Float[np.ndarray, " ray"]
+    face: Int[np.ndarray, " ray"]  # index into the view's faces; −1 where a ray misses
+    depth: Float[np.ndarray, " ray"]  # t of the hit [m]; infinite where a ray misses
 
 
 def first_hits(view: OrthographicView, uv: Float[np.ndarray, "ray 2"]) -> Hits:

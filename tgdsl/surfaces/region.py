@@ -17,31 +17,22 @@ from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import Facing, InBox, InSphere, OnGeoms, RegionPart
 from tgdsl.surfaces.surface import Surface
 
-LENGTH_TOLERANCE = 1e-6
-"""Points this close to a region's border belong to it [m]: float32 mesh files round by about as much."""
+LENGTH_TOLERANCE = 1e-6  # points this close to a region's border belong to it [m]: float32 mesh files round by about as much
 ANGLE_TOLERANCE = 1e-4
 """The same for the normals of faces a millimetre wide [rad]: a chamfer of 45° is within 45°, however its corners round."""
-Covered = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
-"""Returns which points of the body frame [m] are covered."""
+Covered = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]  # returns which points of the body frame [m] are covered
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Part of a surface: the intersection of parts, all in the body frame.
+    """Part of a surface: the intersection of parts, all in the body frame."""
 
-    Attributes:
-        is_geom: Which of the surface's geoms belong to it; None: all.
-        facings: Unit direction and largest angle [rad] between it and the outward normal.
-        boxes: Lower and upper corner [m].
-        spheres: Centre and radius [m].
-        is_covered: Returns which points are no part of it, as other solids cover them; None: none are.
-    """
-
-    is_geom: Bool[np.ndarray, " geom"] | None
+    is_geom: Bool[np.ndarray, " geom"] | None  # which of the surface's geoms belong to it; None: all
+    # unit direction and largest angle [rad] between it and the outward normal
     facings: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
-    boxes: tuple[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]], ...]
-    spheres: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
-    is_covered: Covered | None = None
+    boxes: tuple[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]], ...]  # lower and upper corner [m]
+    spheres: tuple[tuple[Float[np.ndarray, " 3"], float], ...]  # centre and radius [m]
+    is_covered: Covered | None = None  # returns which points are no part of it, as other solids cover them; None: none are
 
     @staticmethod
     def of(surface: Surface, parts: Sequence[RegionPart], is_covered: Covered | None = None) -> Region:

@@ -18,10 +18,8 @@ from scipy.ndimage import label
 from tgdsl.surfaces.outer import is_inside, outer
 from tgdsl.surfaces.surface import Surface
 
-SHARP = np.deg2rad(30.0)
-"""Angle between the normals of two faces from which their edge is sharp [rad]."""
-CHUNK = 1 << 18
-"""Points that are asked for at once."""
+SHARP = np.deg2rad(30.0)  # angle between the normals of two faces from which their edge is sharp [rad]
+CHUNK = 1 << 18  # points that are asked for at once
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,19 +15,12 @@ from jaxtyping import Bool, Float, Int
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of one or several geoms of a body.
+    """Triangles of one or several geoms of a body."""
 
-    Attributes:
-        vertices: Positions in the body frame [m].
-        faces: Vertex indices, counter-clockwise seen from outside.
-        face_geom: Index into `geoms` of the geom that each face belongs to.
-        geoms: Names of the geoms: their own name and, if any, their mesh's.
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    face_geom: Int[np.ndarray, " f"]
-    geoms: tuple[tuple[str, ...], ...]
+    vertices: Float[np.ndarray, "v 3"]  # positions in the body frame [m]
+    faces: Int[np.ndarray, "f 3"]  # vertex indices, counter-clockwise seen from outside
+    face_geom: Int[np.ndarray, " f"]  # index into `geoms` of the geom that each face belongs to
+    geoms: tuple[tuple[str, ...], ...]  # names of the geoms: their own name and, if any, their mesh's
 
     @cached_property
     def corners(self) -> Float[np.ndarray, "f 3 3"]:
