@@ -14,16 +14,14 @@ from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.batch.simulation import ArrayReader
 from tgdsl.runtime.by_name import Geoms, contacts_by_pair
-from tgdsl.runtime.simulators.fields import FORCES, MOVED, STATE_ARRAYS
+from tgdsl.runtime.simulators.fields import StateReader
 from tgdsl.runtime.simulators.model_ids import model_geoms
 from tgdsl.runtime.warp.contacts import PairContacts
-from tgdsl.runtime.warp.simulation import StateReader, view
-from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries, view
 
+_CPU = torch.device("cpu")
 _CONTACT_ARRAYS = ("geom", "pos", "dist", "includemargin", "efc_address")
-_WARP_ARRAYS = ("time", *(name for name in STATE_ARRAYS if name != "sensordata"), *MOVED.values(), *FORCES.values())
 
 
 def read_mujoco(
@@ -52,12 +50,10 @@ def read_mujoco(
         SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one.
     """
     own = inputs or touch.inputs
-    reader, geoms = _reader(touch, own, (model,), lambda: (ArrayReader(own, model), model_geoms(model)))
+    reader, geoms = _reader(touch, own, (model,), lambda: (StateReader(own, model, _CPU), model_geoms(model)))
     envs: list[mujoco.MjData] = list(data) if isinstance(data, Sequence) else [data]
-    contacts = {name: value.numpy() for name, value in _contacts(own, model, geoms, envs).items()}
-    fields: dict[str, Any] = reader.read(
-        {name: np.stack([getattr(env, name) for env in envs]) for name in reader.names}, contacts
-    )
+    arrays = {name: torch.from_numpy(np.stack([getattr(env, name) for env in envs])) for name in reader.arrays}
+    fields: dict[str, Any] = reader.read(arrays) | _contacts(own, model, geoms, envs)
     time = torch.tensor([env.time for env in envs], dtype=torch.float64)
     return SceneState(**fields, time=time).to(touch.device)
 
@@ -125,13 +121,13 @@ def _warp_reader(
         raise SimulationError(f"the module is on {touch.device}, physics on {device}; touch.to({str(device)!r}) moves it there")
     stream = WarpStream(str(device), graph=False)
     with stream.scope():
-        arrays = {name: view(wp, getattr(data, name), device) for name in _WARP_ARRAYS}
+        reader = StateReader(inputs, mj_model, device)
+        arrays = {name: view(wp, getattr(data, name), device) for name in ("time", *reader.arrays)}
         contacts = PairContacts(inputs, mj_model, data.nworld, device)
-        reader = StateReader(inputs, mj_model, arrays, {}, contacts)
 
     def state() -> SceneState:
         contacts.update(model, data)
-        fields: dict[str, Any] = reader.read()
+        fields: dict[str, Any] = reader.read(arrays) | contacts.read()
         return SceneState(**fields, time=arrays["time"].clone())
 
     return GraphedCall(stream, state)

@@ -21,10 +21,10 @@ from tgdsl.errors import SimulationError
 from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.simulators.state_values import control_tensor
 
 PLACES = ("link", "body", "pos", "normal", "area")  # columns of `taxels.taxel_table` that a recording holds
 MISSED = 0.9  # share of a load that no taxel feels above which a run reports it

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
-from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.simulators.state_values import control_tensor
 from tgdsl.runtime.source import Control
 from tgdsl.tensors.env_ids import EnvIds
 

@@ -11,7 +11,7 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, BAD_VALUES, EnvFaults
-from tgdsl.runtime.simulators.state_values import Rows
+from tgdsl.runtime.simulators.state_values import NewValues
 
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 CONTROLS = np.random.default_rng(3).normal(size=(6, 2))
@@ -282,8 +282,8 @@ def test_values_that_a_gpu_finds_bad_are_left_out(tmp_path):
     qpos = torch.from_numpy(np.tile(sim.model.qpos0, (4, 1)))
     qpos[0, 3:7], qpos[1, 0], qpos[3, 0] = 0.0, torch.nan, torch.nan
     table, mask, before = sim._table, torch.tensor([True, True, True, False]), sim.qpos.clone()
-    values, bad = table._judged("qpos", qpos)
-    sim._put(mask, Rows({"qpos": values.float()}, bad.any(dim=0)))
+    values, unfinite, unturned = table._normalised("qpos", qpos)
+    sim._put(mask, NewValues({"qpos": values.float()}, unfinite | unturned))
     assert torch.equal(sim.qpos[[0, 1, 3]], before[[0, 1, 3]])
     np.testing.assert_allclose(sim.qpos[2], sim.model.qpos0, atol=1e-7)
     assert sim.faults.tolist() == [True, True, False, False]

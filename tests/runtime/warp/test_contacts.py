@@ -186,7 +186,7 @@ def test_nothing_is_found_that_is_not_wanted(tmp_path, fields, found):
     for sim in sims:
         sim.step()
     state, other = (sim.state() for sim in sims)
-    assert sims[0]._contacts.arrays.keys() == found
+    assert sims[0]._pairs.arrays.keys() == found
     for name in CONTACTS:
         assert (getattr(state, name) is None) == (name not in fields)
         if name in fields:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import copy
 import importlib
 import itertools
+import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -26,13 +27,12 @@ from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
-from tgdsl.runtime.simulators.fields import STATE_ARRAYS, BodyFields, JointColumns
-from tgdsl.runtime.simulators.machine import bytes_per_env, checked_device, refuse_beyond_memory
+from tgdsl.runtime.simulators.fields import Rows, StateReader
+from tgdsl.runtime.simulators.machine import checked_device, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id, geoms_of
-from tgdsl.runtime.simulators.objects.choices import EnvObjects
-from tgdsl.runtime.simulators.objects.properties import PER_ENV, ObjectProperties, RigidObject, refuse_other_fields
-from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
-from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
+from tgdsl.runtime.simulators.objects import PER_ENV, EnvObjects, ObjectProperties, RigidObject, refuse_other_fields
+from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, refuse_two_instants
+from tgdsl.runtime.simulators.state_values import INTEGRATED, NewValues, StateTable
 from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
 from tgdsl.tensors.env_ids import EnvIds, env_mask
 
@@ -60,13 +60,12 @@ class BatchProperties(ObjectProperties):
         is_open: bool,
     ):
         super().__init__(model, bodies_of, batch.nsim, torch.device("cpu"))
-        self._batch = batch
+        self._batch, self._is_derived = batch, False
         self._fields: dict[str, Array] = {}
         self._chosen = [model] * batch.nsim
         differ = {name for other in variants for name in _differing(model, other)}
         is_apart = is_open or bool(differ - set(mujoco.batch.MODEL_FIELDS))  # in what cannot be expanded
         self._models = list(self._chosen) if is_apart else None
-        self._is_derived = False
 
     def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
         """Give environments other models; those that keep theirs keep their masses and frictions too."""
@@ -88,12 +87,10 @@ class BatchProperties(ObjectProperties):
             self._batch.set_const(np.array(changed))
 
     def fields(self) -> dict[str, Tensor]:
-        names = list(self._fields) if self._models is None else list(_DERIVED_FROM)
-        return {name: self._values(name) for name in names}
+        return {name: self._values(name) for name in (self._fields if self._models is None else _DERIVED_FROM)}
 
     def set_fields(self, fields: Mapping[str, Tensor]) -> None:
-        names = [name for name in fields if name in mujoco.batch.MODEL_FIELDS]
-        refuse_other_fields(fields, {name: self._values(name) for name in names})
+        refuse_other_fields(fields, {name: self._values(name) for name in fields if name in mujoco.batch.MODEL_FIELDS})
         changed = set()
         for name, value in fields.items():
             now = self._arrays_of(name)
@@ -161,7 +158,6 @@ def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
     return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
 
 
-CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")  # fields of a state that are read of contact sensors
 _WIDTH = {"found": 1, "force": 3, "torque": 3, "dist": 1, "pos": 3, "normal": 3, "tangent": 3}
 """How many numbers each quantity has that a contact sensor may show, in MuJoCo's order."""
 _OF_SLOTS = ("force", "torque", "pos", "normal", "tangent")  # the vectors of a contact in a slot, three numbers each
@@ -179,43 +175,37 @@ class ContactSensors:
         if inputs.pairs and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
             problem = "the scene has sensors disabled, and contacts are read of sensors: they would read 0"
             raise SimulationError(f'{problem}; take <flag sensor="disable"/> out of its <option>')
-        self._fields = [name for name in CONTACT_FIELDS if name in inputs.fields]
-        self._shapes = {name: shape_of(name, inputs) for name in self._fields}
+        names = [name for name in ("contact_found", *SLOT_FIELDS, "contact_netforce") if name in inputs.fields]
+        self._shapes = {name: shape_of(name, inputs) for name in names}
         self._num_slots = inputs.slots
-        names = [[contact_sensor_names(pair, i) for i in range(len(inputs.touching(pair)))] for pair in inputs.pairs]
-        self._points = [[_PointSensor(model, point, inputs.slots) for point, _ in parts] for parts in names]
-        self._nets: list[list[range]] = []
-        if "contact_netforce" in self._fields:
-            self._nets = [[_place(model, net) for _, net in parts] for parts in names]
+        sensors = [[contact_sensor_names(pair, i) for i in range(len(inputs.touching(pair)))] for pair in inputs.pairs]
+        self._points = [[_PointSensor(model, point, inputs.slots) for point, _ in parts] for parts in sensors]
+        self._nets = [[_columns(model, net)[1:4] for _, net in parts] for parts in sensors if "contact_netforce" in names]
 
-    def read(self, data: Float[np.ndarray, "env number"]) -> dict[str, Float[np.ndarray, "env pair *rest"]]:
-        """Return the fields that the module wants; `data` is MuJoCo's `sensordata`."""
+    def read(self, sensordata: Float[Tensor, "env number"]) -> dict[str, Float[Tensor, "env pair ..."]]:
+        """Return the fields that the module wants from MuJoCo's `sensordata`."""
+        data, fields = sensordata.numpy(), dict[str, Array]()
         if not self._points:
-            return {name: np.zeros((len(data), *shape)) for name, shape in self._shapes.items()}
-        fields: dict[str, np.ndarray] = {}
+            fields = {name: np.zeros((len(data), *shape)) for name, shape in self._shapes.items()}
+            return {name: torch.from_numpy(values) for name, values in fields.items()}
         if self._nets:
-            nets = [sum(data[:, place.start + 1 : place.start + 4] for place in parts) for parts in self._nets]
+            nets = [sum(data[:, columns.start : columns.stop] for columns in parts) for parts in self._nets]
             fields["contact_netforce"] = np.stack(nets, axis=1)
         fields["contact_found"] = np.stack([sum(sensor.count(data) for sensor in parts) for parts in self._points], axis=1)
         if self._num_slots:
             shown = [[sensor.read(data) for sensor in parts] for parts in self._points]
-            slots = np.stack([_first_contacts(parts, self._num_slots) for parts in shown], axis=1)
-            fields |= _in_world(slots)
-        return {name: fields[name] for name in self._fields}
+            fields |= _in_world(np.stack([_first_contacts(parts, self._num_slots) for parts in shown], axis=1))
+        return {name: torch.from_numpy(np.ascontiguousarray(fields[name])) for name in self._shapes}
 
 
-class _Shown(NamedTuple):
-    """What one sensor shows: which of those shown are contacts, and numbers of each."""
-
-    is_contact: Bool[np.ndarray, "env shown"]
-    values: Float[np.ndarray, "env shown value"]
+_Shown = tuple[Bool[Array, "env shown"], Float[Array, "env shown value"]]  # which rows are contacts, and numbers of each
 
 
 class _PointSensor:
     """A sensor of single contacts."""
 
     def __init__(self, model: mujoco.MjModel, name: str, num_slots: int):
-        self._place = _place(model, name)
+        self._place = _columns(model, name)
         sensor = element_id(model, "sensor", name)
         bits, _, self._num = model.sensor_intprm[sensor, :3].tolist()
         columns: dict[str, list[int]] = {}
@@ -224,43 +214,42 @@ class _PointSensor:
             if bits >> int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{quantity.upper()}")) & 1:
                 columns[quantity] = list(itertools.islice(end, width))
         self._margin = _least_margin(model, sensor)
-        required = [*(_OF_SLOTS if num_slots else ()), *(() if self._margin is None else ("dist", "force"))]
-        if missing := [quantity for quantity in ("found", *required) if quantity not in columns]:
+        required = ("found", *(_OF_SLOTS if num_slots else ()), *(() if self._margin is None else ("dist", "force")))
+        if missing := [quantity for quantity in required if quantity not in columns]:
             raise SimulationError(f'the contact sensor "{name}" does not show {listed(missing)}; {_ADVICE}')
         if self._num < num_slots:
             raise SimulationError(f'the contact sensor "{name}" shows {self._num} contacts, expected {num_slots}; {_ADVICE}')
         self._columns = columns
         self._values = [column for quantity in _OF_SLOTS for column in columns[quantity]] if num_slots else []
 
-    def count(self, data: Float[np.ndarray, "env number"]) -> Float[np.ndarray, " env"]:
+    def count(self, data: Float[Array, "env number"]) -> Float[Array, " env"]:
         """Return how many contacts there are."""
         count = data[:, self._place.start]
         if self._margin is None:
             return count
-        num = self.read(data).is_contact.sum(axis=1)
+        num = self.read(data)[0].sum(axis=1)
         return np.where(num < self._num, num, count)  # if all that are shown are contacts, others may be
 
-    def read(self, data: Float[np.ndarray, "env number"]) -> _Shown:
-        """Return what it shows."""
+    def read(self, data: Float[Array, "env number"]) -> _Shown:
         shown = data[:, self._place.start : self._place.stop].reshape(len(data), self._num, -1)
         is_contact = shown[:, :, 0] > 0
         if self._margin is not None:
             distance, force = shown[:, :, self._columns["dist"][0]], shown[:, :, self._columns["force"]]
             is_contact = is_contact & ((distance < self._margin) | (force != 0).any(axis=-1))
-        return _Shown(is_contact, shown[:, :, self._values])
+        return is_contact, shown[:, :, self._values]
 
 
-def _first_contacts(parts: Sequence[_Shown], num_slots: int) -> Float[np.ndarray, "env slot value"]:
+def _first_contacts(parts: Sequence[_Shown], num_slots: int) -> Float[Array, "env slot value"]:
     """Return the first contacts of a pair, of all parts of its object and link; slots that are left are zero."""
-    is_contact = np.concatenate([part.is_contact for part in parts], axis=1)
-    values = np.concatenate([part.values for part in parts], axis=1) * is_contact[..., None]
+    is_contact = np.concatenate([rows for rows, _ in parts], axis=1)
+    values = np.concatenate([values for _, values in parts], axis=1) * is_contact[..., None]
     if values.shape[1] == num_slots:
         return values
     order = np.argsort(~is_contact, axis=1, kind="stable")[:, :num_slots]
     return np.take_along_axis(values, order[..., None], axis=1)
 
 
-def _in_world(slots: Float[np.ndarray, "env pair slot 15"]) -> dict[str, Float[np.ndarray, "env pair slot 3"]]:
+def _in_world(slots: Float[Array, "env pair slot 15"]) -> dict[str, Float[Array, "env pair slot 3"]]:
     """Rotate force and torque from each contact's frame (normal, tangent, their cross product) to the world."""
     force, torque, pos, normal, tangent = np.split(slots, 5, axis=-1)
     axes = np.stack([normal, tangent, np.cross(normal, tangent)], axis=-2)
@@ -268,7 +257,8 @@ def _in_world(slots: Float[np.ndarray, "env pair slot 15"]) -> dict[str, Float[n
     return {"contact_pos": pos, "contact_force": force, "contact_torque": torque, "contact_normal": normal}
 
 
-def _place(model: mujoco.MjModel, name: str) -> range:
+def _columns(model: mujoco.MjModel, name: str) -> range:
+    """Return the columns of a contact sensor in `sensordata`."""
     try:
         sensor = element_id(model, "sensor", name)
     except SimulationError as error:
@@ -278,89 +268,21 @@ def _place(model: mujoco.MjModel, name: str) -> range:
 
 def _least_margin(model: mujoco.MjModel, sensor: int) -> float | None:
     """Return the least margin of all pairs of geoms that a sensor is of [m]; None if none of them has a gap."""
-    first = _geoms(model, int(model.sensor_objtype[sensor]), int(model.sensor_objid[sensor]))
-    second = _geoms(model, int(model.sensor_reftype[sensor]), int(model.sensor_refid[sensor]))
+
+    def geoms(kind: int, index: int) -> Int[Array, " geom"]:
+        is_geom = kind == mujoco.mjtObj.mjOBJ_GEOM
+        return np.array([index]) if is_geom else geoms_of(model, index, kind == mujoco.mjtObj.mjOBJ_XBODY)
+
+    first = geoms(int(model.sensor_objtype[sensor]), int(model.sensor_objid[sensor]))
+    second = geoms(int(model.sensor_reftype[sensor]), int(model.sensor_refid[sensor]))
     masks = model.geom_contype[first, None] & model.geom_conaffinity[second]
     masks |= model.geom_conaffinity[first, None] & model.geom_contype[second]
-    sums = [values[first, None] + values[second] for values in (model.geom_margin, model.geom_gap)]
-    of_masks = [(margin, gap) for margin, gap, mask in zip(*(part.ravel() for part in (*sums, masks)), strict=True) if mask]
-    of_pairs = [
-        (model.pair_margin[i], model.pair_gap[i])
-        for i, (one, two) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
-        if (one in first and two in second) or (two in first and one in second)
-    ]
-    results = [*of_masks, *of_pairs]
-    return float(min(margin for margin, _ in results)) if any(gap > 0 for _, gap in results) else None
-
-
-def _geoms(model: mujoco.MjModel, kind: int, index: int) -> Int[np.ndarray, " geom"]:
-    is_geom = kind == mujoco.mjtObj.mjOBJ_GEOM
-    return np.array([index]) if is_geom else geoms_of(model, index, kind == mujoco.mjtObj.mjOBJ_XBODY)
-
-
-def _rows(array: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    return np.take(array, ids, axis=1)  # `array[:, ids]` has another memory layout
-
-
-def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:  # a fifth of the time of `np.cross` for few vectors
-    (a, b, c), (x, y, z) = ([vector[..., i] for i in range(3)] for vector in (one, other))
-    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
-
-
-class ArrayReader:
-    """Gathers the fields of a state that are poses, velocities or joints from MuJoCo's arrays (env, …), by name."""
-
-    def __init__(self, inputs: Inputs, model: mujoco.MjModel):
-        self._bodies = BodyFields(inputs, model, index=np.asarray, take=_rows, cross=_cross)
-        self.joints = JointColumns.of(inputs, model)
-        self.names = tuple(dict.fromkeys((*STATE_ARRAYS, *self.joints.fields.values())))
-
-    def read(self, arrays: Mapping[str, Array], others: Mapping[str, Array]) -> dict[str, torch.Tensor]:
-        """Return the fields, each an array of its own; `others`, by field, are taken as they are."""
-        values = self._bodies.read(arrays) | dict(others)
-        now = {name: array for name, array in self.joints.fields.items() if name not in values}
-        values |= {name: self.joint_values(name, arrays[array]) for name, array in now.items()}
-        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in values.items()}
-
-    def joint_values(self, name: str, array: Array) -> Array:
-        """Return a field of joints or actuators from the array that it is read from."""
-        return np.array(array[:, self.joints.by_array[self.joints.fields[name]]], dtype=np.float64)
-
-
-class BatchReader:
-    """Reads a batch.
-
-    A physics step moves joints on, but leaves poses, velocities and contacts as they were at its start, which is a state's
-    instant: so joints are kept from just before it.
-    """
-
-    def __init__(self, inputs: Inputs, model: mujoco.MjModel, batch: mujoco.batch.Batch):
-        self._batch = batch
-        self._reader, self._contacts = ArrayReader(inputs, model), ContactSensors(model, inputs)
-        for name in self._reader.names:
-            batch.bind(name)  # an array is filled only by calls that come after its first use
-        self._kept = {name: self._joints_now(name) for name in self._reader.joints.moved}
-
-    @property
-    def keeps_joints(self) -> bool:
-        """Whether `keep` has anything to do."""
-        return bool(self._kept)
-
-    def keep(self, env_ids: SomeRows = None) -> None:
-        """Keep where some environments' joints are, and their controls: a physics step follows, or poses are new."""
-        for name, kept in self._kept.items():
-            kept[slice(None) if env_ids is None else env_ids] = self._joints_now(name, env_ids)
-
-    def read(self, rows: SomeRows = None) -> dict[str, torch.Tensor]:
-        """Return the fields of some environments (default: all), (env, …), each an array of its own."""
-        envs = slice(None) if rows is None else rows
-        live = {name: getattr(self._batch, name)[envs] for name in self._reader.names}
-        kept = {name: kept[envs].copy() for name, kept in self._kept.items()}
-        return self._reader.read(live, self._contacts.read(live["sensordata"]) | kept)
-
-    def _joints_now(self, name: str, rows: SomeRows = None) -> Array:
-        array = getattr(self._batch, self._reader.joints.fields[name])
-        return self._reader.joint_values(name, array[slice(None) if rows is None else rows])
+    margin, gap = (values[first, None] + values[second] for values in (model.geom_margin, model.geom_gap))
+    one, two = model.pair_geom1, model.pair_geom2
+    of_pairs = (np.isin(one, first) & np.isin(two, second)) | (np.isin(two, first) & np.isin(one, second))
+    margins = np.concatenate([margin[masks != 0], model.pair_margin[of_pairs]])
+    gaps = np.concatenate([gap[masks != 0], model.pair_gap[of_pairs]])
+    return float(margins.min()) if (gaps > 0).any() else None
 
 
 _FORWARD, _VELOCITIES = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -371,13 +293,15 @@ _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in
 class BatchSimulation(Simulation):
     """Environments in MuJoCo's `Batch` on CPU threads, in float64. `qpos`, `qvel` and `ctrl` share MuJoCo's memory.
 
+    A physics step moves joints on, but leaves poses, velocities and contacts as they were at its start, which is a state's
+    instant: so joints are kept from just before it.
+
     Attributes:
         batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).
     """
 
     OPTIONS = ("substeps", "threads", "keyframe", "model", "options", "watch", "per_env", "on_fault", "prepare")
     properties: BatchProperties
-    _reader: BatchReader
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         return self.batch.xpos[env], self.batch.xquat[env]
@@ -385,7 +309,7 @@ class BatchSimulation(Simulation):
     def env_model(self, env: int) -> mujoco.MjModel:
         return self.batch.get_model(env)
 
-    def read(self, env_ids: EnvIds | None = None) -> dict[str, torch.Tensor]:
+    def read(self, env_ids: EnvIds | None = None) -> dict[str, Tensor]:
         """Return the module's readings: see `Simulation.read`. Of few environments only these states are gathered."""
         if env_ids is None or self._touch.inputs.substeps > 1 or self._touch.device.type != "cpu":
             return super().read(env_ids)
@@ -394,7 +318,7 @@ class BatchSimulation(Simulation):
         if rows is None:
             return super().read(mask)
         self._refuse_if_closed()
-        state = self._start_contacts.applied_to(self._state(self.control_step, rows.numpy()), rows=rows)
+        state = self._start_contacts.applied_to(self._state(self.control_step, rows), rows=rows)
         return self._touch.read_few(state, rows, self.num_envs)
 
     def _open_device(self, device: str, options: SimOptions) -> torch.device:
@@ -407,27 +331,37 @@ class BatchSimulation(Simulation):
             raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {hint}')
         return checked_device(device, ("cpu",))
 
-    def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
+    def _start(self, num_envs: int, keyframe: int, options: SimOptions, readers: Sequence[StateReader]) -> None:
+        model, inputs = self.model, self._touch.inputs
         problem = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
-        refuse_two_instants(self.model, f'{problem}; take <flag sleep="enable"/> out of its <option>')
-        refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
-        self.batch = mujoco.batch.Batch(self.model, num_envs, options.get("threads", 0))
+        refuse_two_instants(model, f'{problem}; take <flag sleep="enable"/> out of its <option>')
+        numbers = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION) + 16 * model.nbody + model.nsensordata
+        refuse_beyond_memory(f"{num_envs} environments", 8 * numbers * num_envs)
+        self.batch = mujoco.batch.Batch(model, num_envs, options.get("threads", 0))
         self._keyframe, self._warnings = keyframe, StepWarnings()
-        self._readers: list[BatchReader] = []
+        self._sensors = ContactSensors(model, inputs)
         with torch.inference_mode(False):
+            # An array is filled only by calls that come after its first use.
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
+            self._kept = {name: self._arrays[name].clone() for reader in readers for name in reader.moved}
+            names = {"sensordata", *(name for reader in readers for name in reader.arrays)} - self._arrays.keys()
+            with (
+                warnings.catch_warnings()
+            ):  # that torch could write into arrays that are read-only in NumPy; they are only read
+                warnings.simplefilter("ignore")
+                derived = {name: torch.from_numpy(self.batch.bind(name)) for name in names}
+            self._sources = self._arrays | derived | self._kept
             self._instant = torch.zeros(num_envs, dtype=torch.float64)
-            self._table = StateTable(self.model, self._arrays)
+            self._table = StateTable(model, self._arrays)
             self._faults = EnvFaults(num_envs, self._device, options.get("on_fault", "raise"))
-        objects = self._objects
-        variants, is_open = ([], False) if objects is None else objects.variants()
-        self.properties = BatchProperties(self.batch, self.model, self._touch.inputs.bodies_of, variants, is_open)
-        if objects is not None:
-            self.properties.use_models(objects.models())
+        variants, is_open = ([], False) if self._objects is None else self._objects.variants()
+        self.properties = BatchProperties(self.batch, model, inputs.bodies_of, variants, is_open)
+        if self._objects is not None:
+            self.properties.use_models(self._objects.models())
 
-    def _make_reader(self, inputs: Inputs) -> BatchReader:
-        self._readers.append(BatchReader(inputs, self.model, self.batch))
-        return self._readers[-1]
+    def _contacts(self, rows: Rows) -> dict[str, Tensor]:
+        data = self._sources["sensordata"]
+        return self._sensors.read(data if rows is None else data[rows])
 
     def _refresh(self) -> None: ...
 
@@ -435,19 +369,19 @@ class BatchSimulation(Simulation):
         models = objects.models()
         self._run(lambda: self.properties.use_models(models))
 
-    def _begin_episodes(self, mask: Bool[torch.Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
+    def _begin_episodes(self, mask: Bool[Tensor, " env"], new: NewValues, *, finds_contacts: bool) -> None:
         ids = np.flatnonzero(mask.numpy())
         if len(ids):
             self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe, stage=mujoco.mjtStage.mjSTAGE_NONE.value))
-            self._put(mask, rows)
+            self._put(mask, new)
             self._forward(ids, _FORWARD if finds_contacts else _VELOCITIES)
             self._faults.clear(mask)
 
-    def _put(self, mask: Bool[torch.Tensor, " env"], rows: Rows) -> None:
-        for name, values in rows.values.items():
+    def _put(self, mask: Bool[Tensor, " env"], new: NewValues) -> None:
+        for name, values in new.values.items():
             self._arrays[name][mask] = values[mask]
 
-    def _evaluate(self, mask: Bool[torch.Tensor, " env"]) -> None:
+    def _evaluate(self, mask: Bool[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
         if len(ids):
             self._forward(ids, _FORWARD)
@@ -455,17 +389,17 @@ class BatchSimulation(Simulation):
     def _forward(self, ids: Int[Array, " n"], stage: int) -> None:
         self._run(lambda: self.batch.forward(ids, stage=stage))
         self._instant[ids] = self._arrays["time"][ids]
-        for reader in self._readers:
-            reader.keep(ids)
+        for name, kept in self._kept.items():
+            kept[ids] = self._arrays[name][ids]
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
-        readers = [reader for reader in self._readers if reader.keeps_joints]
-        self._physics_steps(num_steps - 1 if readers else num_steps)
-        if readers:
-            self._drive()
-            for reader in readers:
-                reader.keep()
+        self._physics_steps(num_steps - 1 if self._kept else num_steps)
+        if self._kept:
+            if self.drive is not None:
+                self.drive()
+            for name, kept in self._kept.items():
+                kept.copy_(self._arrays[name])
             self._run(lambda: self.batch.step(nstep=1))
         self._instant.copy_(self._arrays["time"]).sub_(float(self.model.opt.timestep))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
@@ -475,23 +409,20 @@ class BatchSimulation(Simulation):
         if self._faults.on_fault == "raise":
             raise SimulationError("; ".join(self._faults.messages(diverged=", and MuJoCo has restarted them")))
         if self._faults.on_fault == "reset":
-            self._begin_episodes(is_faulty, Rows({}), finds_contacts=True)
+            self._begin_episodes(is_faulty, NewValues({}), finds_contacts=True)
             self._touch.reset(is_faulty)
             self._faults.note_restarted(is_faulty)
         self._faults.warn_once()
 
     def _physics_steps(self, num: int) -> None:
         """Make physics steps: all in one call if nothing drives them."""
-        if self.drive is None and num:
-            self._run(lambda: self.batch.step(nstep=num))
+        if self.drive is None:
+            if num:
+                self._run(lambda: self.batch.step(nstep=num))
             return
         for _ in range(num):
-            self._drive()
-            self._run(lambda: self.batch.step(nstep=1))
-
-    def _drive(self) -> None:
-        if self.drive is not None:
             self.drive()
+            self._run(lambda: self.batch.step(nstep=1))
 
     def _run(self, call: Callable[[], None]) -> None:
         try:

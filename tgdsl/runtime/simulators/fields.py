@@ -1,32 +1,75 @@
-"""Fields of a state from MuJoCo's arrays, NumPy's or torch's: bodies, and where joints and actuators stand.
+"""Fields of a state that are poses, velocities and joints, gathered from MuJoCo's arrays.
 
-Shapes: `env` environments, `body` as the module's `inputs` list them.
+Shapes: `env` environments, `body`, `joint` and `actuator` as the module's `inputs` list them.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from tgdsl.errors import SimulationError, listed
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.model_ids import element_id
 
-T = TypeVar("T", np.ndarray, torch.Tensor)
-STATE_ARRAYS = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
-"""Arrays of MuJoCo that poses, velocities and contacts of a state are read from."""
+Rows = Int[Tensor, " n"] | None  # rows of environments to read; None: all
+POSES = ("xpos", "xquat", "cvel", "subtree_com")  # arrays that poses and velocities of bodies are read from
 MOVED = {"joint_pos": "qpos", "joint_vel": "qvel", "last_action": "ctrl"}
 """Fields of a state that a physics step, or its caller, moves on, and the arrays that they are read from."""
 FORCES = {"joint_effort": "qfrc_actuator"}  # fields of a state that MuJoCo leaves at the instant of the poses
-
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+class StateReader:
+    """Gathers bodies, joints and actuators of a module from arrays (env, …), each field a tensor of its own.
+
+    Attributes:
+        arrays: Names of the arrays that it reads.
+        moved: Those whose values before the last physics step are of the poses' instant.
+    """
+
+    def __init__(self, inputs: Inputs, model: mujoco.MjModel, device: torch.device):
+        def index(ids: np.ndarray) -> Int[Tensor, " n"]:
+            return torch.from_numpy(ids.astype(np.int64)).to(device)
+
+        bodies, actuators = (
+            np.array([element_id(model, kind, name) for name in names], dtype=np.int64)
+            for kind, names in (("body", inputs.bodies), ("actuator", inputs.actuators))
+        )
+        joints = np.array([_scalar_joint(model, name) for name in inputs.joints], dtype=np.int64)
+        dofs = model.jnt_dofadr[joints]
+        columns = {"qpos": model.jnt_qposadr[joints], "qvel": dofs, "qfrc_actuator": dofs, "ctrl": actuators}
+        self._bodies, self._roots, self._fields = index(bodies), index(model.body_rootid[bodies]), inputs.fields
+        self._joints = {n: (array, index(columns[array])) for n, array in (MOVED | FORCES).items() if n in inputs.fields}
+        self.arrays = (*POSES, *(array for array, _ in self._joints.values()))
+        self.moved = tuple(array for name, (array, _) in self._joints.items() if name in MOVED)
+
+    def read(self, arrays: Mapping[str, Tensor], rows: Rows = None) -> dict[str, Float[Tensor, "env item ..."]]:
+        """Return the fields that the module wants, of all or some environments."""
+
+        def take(name: str, ids: Int[Tensor, " n"]) -> Tensor:
+            array = arrays[name] if rows is None else arrays[name][rows]
+            return array.index_select(1, ids)
+
+        fields, values = self._fields, dict[str, Tensor]()
+        if "body_pos" in fields:
+            values["body_pos"] = take("xpos", self._bodies)
+        if "body_quat" in fields:
+            values["body_quat"] = take("xquat", self._bodies)
+        if "body_linvel" in fields or "body_angvel" in fields:
+            angular, linear = take("cvel", self._bodies).split(3, dim=-1)
+            if "body_linvel" in fields:  # MuJoCo gives velocities at the centre of mass of a body's kinematic tree
+                pos = values["body_pos"] if "body_pos" in values else take("xpos", self._bodies)
+                values["body_linvel"] = linear + _cross(angular, pos - take("subtree_com", self._roots))
+            if "body_angvel" in fields:
+                values["body_angvel"] = angular
+        return values | {name: take(array, columns) for name, (array, columns) in self._joints.items()}
 
 
 def warn_of_mocap(inputs: Inputs, model: mujoco.MjModel) -> None:
@@ -39,66 +82,14 @@ def warn_of_mocap(inputs: Inputs, model: mujoco.MjModel) -> None:
         warnings.warn(f"{problem}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=4)
 
 
-class BodyFields:
-    """Gathers the fields of a state that are poses and velocities of bodies."""
-
-    def __init__(
-        self,
-        inputs: Inputs,
-        model: mujoco.MjModel,
-        *,
-        index: Callable[[np.ndarray], Any],
-        take: Callable[[Any, Any], Any],
-        cross: Callable[[Any, Any], Any],
-    ):
-        """Look the bodies up; indices, rows of an array (env, row, …) and cross products are NumPy's or torch's."""
-        ids = np.array([element_id(model, "body", name) for name in inputs.bodies], dtype=np.int64)
-        self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
-        self._fields = inputs.fields
-        self._take, self._cross = take, cross
-
-    def read(self, arrays: Mapping[str, T]) -> dict[str, T]:
-        """Return the fields that the module wants, (env, body, …), each an array of its own."""
-        values: dict[str, T] = {}
-        if "body_pos" in self._fields:
-            values["body_pos"] = self._take(arrays["xpos"], self._bodies)
-        if "body_quat" in self._fields:
-            values["body_quat"] = self._take(arrays["xquat"], self._bodies)
-        if "body_linvel" in self._fields or "body_angvel" in self._fields:
-            spatial = self._take(arrays["cvel"], self._bodies)
-            if "body_linvel" in self._fields:
-                pos = values["body_pos"] if "body_pos" in values else self._take(arrays["xpos"], self._bodies)
-                arm = pos - self._take(arrays["subtree_com"], self._roots)
-                # MuJoCo gives velocities at the centre of mass of a body's kinematic tree.
-                values["body_linvel"] = spatial[..., 3:] + self._cross(spatial[..., :3], arm)
-            if "body_angvel" in self._fields:
-                values["body_angvel"] = spatial[..., :3]
-        return values
+def _cross(one: Float[Tensor, "*batch 3"], other: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    if one.is_cuda:
+        return torch.linalg.cross(one, other)
+    (a, b, c), (x, y, z) = one.unbind(-1), other.unbind(-1)
+    return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x], dim=-1)  # rounds like NumPy's, without fused products
 
 
-@dataclass(frozen=True, eq=False)
-class JointColumns:
-    """Where joints and actuators stand in a model's arrays."""
-
-    by_array: dict[str, Int[np.ndarray, " column"]]  # columns of `qpos`, `qvel`, `qfrc_actuator` and `ctrl` that are wanted
-    fields: dict[str, str]  # the fields that a module wants, and the array of each
-
-    @classmethod
-    def of(cls, inputs: Inputs, model: mujoco.MjModel) -> JointColumns:
-        """Look them up."""
-        joints = np.array([_joint_id(model, name) for name in inputs.joints], dtype=np.intp)
-        actuators = np.array([element_id(model, "actuator", name) for name in inputs.actuators], dtype=np.intp)
-        dofs = model.jnt_dofadr[joints].astype(np.intp)
-        columns = {"qpos": model.jnt_qposadr[joints].astype(np.intp), "qvel": dofs, "qfrc_actuator": dofs, "ctrl": actuators}
-        return cls(columns, {name: array for name, array in (MOVED | FORCES).items() if name in inputs.fields})
-
-    @property
-    def moved(self) -> dict[str, str]:
-        """The fields whose values before the last physics step are needed, and the array of each."""
-        return {name: array for name, array in self.fields.items() if name in MOVED}
-
-
-def _joint_id(model: mujoco.MjModel, name: str) -> int:
+def _scalar_joint(model: mujoco.MjModel, name: str) -> int:
     joint = element_id(model, "joint", name)
     if int(model.jnt_type[joint]) not in _SCALAR:
         raise SimulationError(f'the joint "{name}" is a ball or free joint, expected a hinge or slide')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -62,23 +62,17 @@ def geoms_of(model: mujoco.MjModel, body: int, with_below: bool) -> Int[np.ndarr
     return np.flatnonzero(np.isin(model.geom_bodyid, bodies))
 
 
-@dataclass(frozen=True)
-class Joint:
-    """Where one joint stands."""
+class Joint(NamedTuple):
+    """Where one joint stands.
 
-    qpos: slice  # its part of `qpos`: of a free joint 7 numbers, position [m] and quaternion w, x, y, z; of a ball 4, else 1
-    # its part of `qvel`: of a free joint 6 numbers, velocity [m/s] in the world and angular velocity [rad/s] in the body's
-    # frame; of a ball 3, else 1
+    Attributes:
+        qpos: Its part of `qpos`: of a free joint 7 numbers, position [m] and quaternion w, x, y, z; of a ball 4, else 1.
+        qvel: Its part of `qvel`: of a free joint 6 numbers, velocity [m/s] in the world and angular velocity [rad/s] in the
+            body's frame; of a ball 3, else 1.
+    """
+
+    qpos: slice
     qvel: slice
-
-
-_SIZES = {
-    int(mujoco.mjtJoint.mjJNT_FREE): (7, 6),
-    int(mujoco.mjtJoint.mjJNT_BALL): (4, 3),
-    int(mujoco.mjtJoint.mjJNT_SLIDE): (1, 1),
-    int(mujoco.mjtJoint.mjJNT_HINGE): (1, 1),
-}
-"""Numbers in `qpos` and `qvel` by type of joint."""
 
 
 class Joints(dict[str, Joint]):
@@ -88,13 +82,11 @@ class Joints(dict[str, Joint]):
         super().__init__()
         named = {model.joint(i).name for i in range(model.njnt)}
         for i in range(model.njnt):
-            name, body = model.joint(i).name, model.body(model.jnt_bodyid[i])
-            if not name and int(body.jntnum[0]) == 1 and body.name not in named:
-                name = body.name
-            if name:
-                qpos, qvel = int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])
-                num_qpos, num_qvel = _SIZES[int(model.jnt_type[i])]
-                self[name] = Joint(slice(qpos, qpos + num_qpos), slice(qvel, qvel + num_qvel))
+            joint, body = model.joint(i), model.body(model.jnt_bodyid[i])
+            is_sole = int(body.jntnum[0]) == 1 and body.name not in named
+            if name := joint.name or (body.name if is_sole else ""):
+                qpos, qvel = int(joint.qposadr[0]), int(joint.dofadr[0])
+                self[name] = Joint(slice(qpos, qpos + len(joint.qpos0)), slice(qvel, qvel + len(joint.jntid)))
 
     def __missing__(self, name: str) -> Joint:
         raise SimulationError(f'the scene has no joint "{name}"; {did_you_mean(name, self, "joints")}')

@@ -22,21 +22,26 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.controls import warn_of_range, write_controls
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults, OnFault
-from tgdsl.runtime.simulators.fields import warn_of_mocap
+from tgdsl.runtime.simulators.fields import Rows, StateReader, warn_of_mocap
 from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
-from tgdsl.runtime.simulators.objects.choices import EnvHeat, EnvObjects, SharedMeshModels, Values
-from tgdsl.runtime.simulators.objects.properties import ObjectProperties
-from tgdsl.runtime.simulators.state_values import INTEGRATED, Contacts, Rows, StartContacts, StateTable, StateValues
+from tgdsl.runtime.simulators.objects import EnvHeat, EnvObjects, ObjectProperties, SharedMeshModels, Values
+from tgdsl.runtime.simulators.state_values import (
+    INTEGRATED,
+    Contacts,
+    Control,
+    NewValues,
+    StartContacts,
+    StateTable,
+    StateValues,
+    warn_of_range,
+    write_controls,
+)
 from tgdsl.runtime.simulators.watch import Watch, Watched, WatchReader
-from tgdsl.runtime.source import Control
 from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, env_mask
 
 T = TypeVar("T")
-SomeRows = Int[np.ndarray, " n"] | None  # rows of environments to read; None: all
 
 
 class SimOptions(TypedDict, total=False):
@@ -78,21 +83,15 @@ class SimOptions(TypedDict, total=False):
 class SubstepStates:
     """Copies of the states after each physics step of the last control step but for the last one."""
 
-    def __init__(self, inputs: Inputs):
-        self._wanted = inputs.substeps
+    def __init__(self, wanted: int):
+        self.are_wanted, self._wanted = wanted > 1, wanted
         self._earlier: list[SceneState] = []
         self._restarted: Bool[Tensor, " env"] | None = None
-
-    @property
-    def are_wanted(self) -> bool:
-        """Whether the module has sensors that are advanced at each physics step."""
-        return self._wanted > 1
 
     def begin(self, substeps: int) -> None:
         """Forget the last control step; the next one has so many physics steps."""
         if substeps != self._wanted:
-            steps = f"{self._wanted} physics step{'' if self._wanted == 1 else 's'}"
-            problem = f"this module has sensors that are advanced at {steps} per call"
+            problem = f"this module has sensors that are advanced at {self._wanted} physics steps per call"
             raise SimulationError(
                 f"{problem}, and this simulation makes {substeps} per control step; simulate with substeps={self._wanted}"
             )
@@ -100,9 +99,8 @@ class SubstepStates:
 
     def note(self, state: SceneState) -> None:
         """Keep a copy of the state after a physics step."""
-        values = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-        copies: dict[str, Any] = {name: v.clone() if isinstance(v, Tensor) else v for name, v in values.items()}
-        self._earlier.append(SceneState(**copies))
+        copies: dict[str, Any] = {name: value.clone() for name, value in vars(state).items() if isinstance(value, Tensor)}
+        self._earlier.append(dataclasses.replace(state, **copies))
 
     def restart(self, chosen: Bool[Tensor, " env"]) -> None:
         """Note environments that have begun a new episode since: the earlier states are not of it."""
@@ -118,22 +116,17 @@ class SubstepStates:
         """Return a state with the earlier ones; in environments that have just begun an episode they are as it is."""
         if not self.are_wanted:
             return state
-        if not self._earlier:
-            return dataclasses.replace(state, substeps=(state,) * (self._wanted - 1))
-        restarted = self._restarted
-        earlier = self._earlier if restarted is None else [_mixed(restarted, state, then) for then in self._earlier]
+        earlier = [self._mixed(state, then) for then in self._earlier] or [state] * (self._wanted - 1)
         return dataclasses.replace(state, substeps=tuple(earlier))
 
-
-def _mixed(chosen: Bool[Tensor, " env"], now: SceneState, then: SceneState) -> SceneState:
-    """Return the state of now in some environments, and that of then in the others."""
-    mixed: dict[str, Any] = {}
-    for field in dataclasses.fields(SceneState):
-        new, old = getattr(now, field.name), getattr(then, field.name)
-        if isinstance(new, Tensor):
-            old = torch.where(broadcast_over(chosen.to(new.device), new), new, old)
-        mixed[field.name] = old
-    return SceneState(**mixed)
+    def _mixed(self, now: SceneState, then: SceneState) -> SceneState:
+        if self._restarted is None:
+            return then
+        values: dict[str, Any] = {name: value for name, value in vars(now).items() if isinstance(value, Tensor)}
+        for name, value in values.items():
+            is_new = broadcast_over(self._restarted.to(value.device), value)
+            values[name] = torch.where(is_new, value, getattr(then, name))
+        return dataclasses.replace(then, **values)
 
 
 class Simulation(ABC):
@@ -147,24 +140,29 @@ class Simulation(ABC):
     A module with state remembers each environment's episode: one simulation at a time reads it, from when it is made until it
     is closed or garbage-collected.
 
-    An engine implements `_open_device`, `_start`, `_make_reader`, `_refresh`, `_advance`, `_begin_episodes`, `_put`,
-    `_evaluate` and `_use_objects`.
+    An engine implements the abstract methods; its `_start` sets `_arrays`, `_sources`, `_instant`, `_faults`, `_table`
+    and `properties`.
+
+    Attributes:
+        model: The compiled scene; where objects differ between environments, that of the first.
+        substeps: Physics steps per control step.
+        properties: Masses and frictions of objects, which may differ between environments.
+        heat: Temperatures and materials of objects that hold heat, in live tensors.
+        drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: an
+            actuator model that MuJoCo lacks. It is captured with the step on a GPU, so it must not wait for it there.
     """
 
-    OPTIONS: ClassVar[tuple[str, ...]]
-    """The options of `SimOptions` that this engine knows."""
-    DEVICE: ClassVar[str] = "cpu"
-    """The default device."""
+    OPTIONS: ClassVar[tuple[str, ...]]  # the options of `SimOptions` that this engine knows
+    DEVICE: ClassVar[str] = "cpu"  # the default device
 
-    model: mujoco.MjModel  # the compiled scene; where objects differ between environments, that of the first
-    substeps: int  # physics steps per control step
-    properties: ObjectProperties  # masses and frictions of objects, which may differ between environments
-    heat: EnvHeat  # temperatures and materials of objects that hold heat, in live tensors
-    # is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: an actuator
-    # model that MuJoCo lacks. It is captured with the step on a GPU, so it must not wait for it there.
+    model: mujoco.MjModel
+    substeps: int
+    properties: ObjectProperties
+    heat: EnvHeat
     drive: Callable[[], None] | None = None
     _device: torch.device
-    _arrays: Mapping[str, Tensor]
+    _arrays: Mapping[str, Tensor]  # live, by MuJoCo's names: at least `INTEGRATED`
+    _sources: Mapping[str, Tensor]  # the arrays of the readers, those that a step moves on as they were at the state's instant
     _instant: Float[Tensor, " env"]
     _faults: EnvFaults
     _table: StateTable
@@ -195,35 +193,32 @@ class Simulation(ABC):
         self._touch, self.substeps = touch, options.get("substeps", 1)
         _refuse_unfit(touch, num_envs, options)
         self._device = self._open_device(device or self.DEVICE, options)
-        model, watch = options.get("model"), options.get("watch")
+        inputs, model, watch = touch.inputs, options.get("model"), options.get("watch")
         if model is None:
             scenes = SharedMeshModels(touch.plan.scene, options.get("options"), options.get("prepare"))
             model = scenes.model({})
-            if touch.inputs.objects:
-                self._objects = EnvObjects(scenes, touch.inputs, num_envs)
-        self.model = model
+            if inputs.objects:
+                self._objects = EnvObjects(scenes, inputs, num_envs)
+        self.model, self._reader, readers = model, StateReader(inputs, model, self._device), []
         if watch is not None:
-            self._watch = WatchReader(watch, touch.inputs, model, self._device)
-        self._start(num_envs, keyframe_id(model, options.get("keyframe")), options)
-        self.heat = EnvHeat(touch.inputs, num_envs, self._device, self.qpos.dtype)
+            self._watch = WatchReader(watch, inputs, model, self._device)
+            readers = [self._watch.reader]
+        self._start(num_envs, keyframe_id(model, options.get("keyframe")), options, [self._reader, *readers])
+        self.heat = EnvHeat(inputs, num_envs, self._device, self.qpos.dtype)
         self._object_fields: dict[str, Tensor] = {}
         if self._objects is not None:
             variant, size = self._objects.variant, self._objects.object_size
             with torch.inference_mode(False):
                 self._object_fields["variant"] = torch.from_numpy(variant.copy()).to(self._device)
                 self._object_fields["object_size"] = torch.from_numpy(size.copy()).to(self._device, self.qpos.dtype)
-        warn_of_mocap(touch.inputs, model)
-        self._earlier, self._start_contacts = SubstepStates(touch.inputs), StartContacts(touch.inputs)
-        self._reader = self._make_reader(touch.inputs)
-        if self._watch is not None:
-            self._watch_reader = self._make_reader(self._watch.inputs)
+        warn_of_mocap(inputs, model)
+        self._earlier, self._start_contacts = SubstepStates(inputs.substeps), StartContacts(inputs)
         if touch.has_state:
             _READERS[touch] = weakref.ref(self)
         self.reset()
 
     @property
     def num_envs(self) -> int:
-        """Number of environments."""
         return len(self.qpos)
 
     @property
@@ -356,9 +351,6 @@ class Simulation(ABC):
 
         The others' noise, delays and histories stay where they are, and their rows are as they were returned before: read
         all after a step, and after a reset those that were reset.
-
-        Args:
-            env_ids: Indices, or a boolean mask over environments.
         """
         if env_ids is None:
             return self._touch(self.state())
@@ -374,8 +366,7 @@ class Simulation(ABC):
         if self._watch is None:
             raise SimulationError("nothing is watched: simulate(..., watch=Watch(bodies=(...), joints=(...)))")
         self._refresh()
-        fields: dict[str, Any] = dict(self._watch_reader.read())
-        values = self._start_contacts.applied_to(SceneState(**fields), is_stored=False)
+        values = self._start_contacts.applied_to(self._watch.read(self._sources), is_stored=False)
         return self._watch.watched(values, self.state() if self._watch.has_pairs else None)
 
     def reset(self, env_ids: EnvIds | None = None, *, contacts: Contacts = "evaluate", **values: Unpack[StateValues]) -> None:
@@ -401,12 +392,12 @@ class Simulation(ABC):
                 finite, or MuJoCo reports an environment as failed.
         """
         self._refuse_if_closed()
-        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._device)
+        new, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._device)
         if contacts == "evaluate":
             self._start_contacts.forget(mask)
         else:
             self._start_contacts.place(mask, contacts)
-        self._begin_episodes(mask, rows, finds_contacts=contacts == "evaluate")
+        self._begin_episodes(mask, new, finds_contacts=contacts == "evaluate")
         self._touch.reset(mask)
         self._earlier.restart(mask)
 
@@ -420,8 +411,7 @@ class Simulation(ABC):
             **values: `qpos`, `qvel`, `ctrl`, or another of MuJoCo's arrays that an environment's future follows from (`act`,
                 `mocap_pos`, `mocap_quat`, `time`, `qacc_warmstart`, …); the others stay. Each has one row for all
                 environments alike, or with indices a row for each in their order, or else (env, …), of which the chosen rows
-                are taken. Tensors or arrays of any float dtype, on any device. Quaternions are brought to unit length by
-                MuJoCo's rule (`mju_normalize4`).
+                are taken. Quaternions are brought to unit length by MuJoCo's rule (`mju_normalize4`).
 
         Raises:
             SimulationError: If there are no such environments or arrays, a shape does not fit, or numbers on the host are not
@@ -429,18 +419,15 @@ class Simulation(ABC):
                 and have a fault.
         """
         self._refuse_if_closed()
-        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._device)
+        new, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._device)
         self._start_contacts.forget(mask)
-        self._put(mask, rows)
+        self._put(mask, new)
         self._evaluate(mask)
 
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments (default: all) where they are now, as `mj_forward` does.
 
         It costs about one physics step; forces follow from the present controls.
-
-        Args:
-            env_ids: Indices, or a boolean mask over environments.
 
         Raises:
             SimulationError: If there are no such environments.
@@ -546,12 +533,12 @@ class Simulation(ABC):
         """Load the engine's libraries and return the device."""
 
     @abstractmethod
-    def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
-        """Set `_arrays`, `_instant`, `_faults`, `_table` and `properties`; `model`, `_objects` and `_watch` are there."""
+    def _start(self, num_envs: int, keyframe: int, options: SimOptions, readers: Sequence[StateReader]) -> None:
+        """Make the environments and the live arrays that readers read; `model`, `_objects` and `_watch` are there."""
 
     @abstractmethod
-    def _make_reader(self, inputs: Inputs) -> Any:
-        """Return an object whose `read(rows)` returns poses, velocities, contacts and joints by field of a state."""
+    def _contacts(self, rows: Rows) -> dict[str, Tensor]:
+        """Return the contacts that the module wants by field, of all or some environments."""
 
     @abstractmethod
     def _refresh(self) -> None:
@@ -562,11 +549,11 @@ class Simulation(ABC):
         """Make physics steps, and see to faults."""
 
     @abstractmethod
-    def _begin_episodes(self, mask: Bool[Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
+    def _begin_episodes(self, mask: Bool[Tensor, " env"], new: NewValues, *, finds_contacts: bool) -> None:
         """Restart environments with values, but for the module; without a look for contacts, evaluate poses and velocities."""
 
     @abstractmethod
-    def _put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+    def _put(self, mask: Bool[Tensor, " env"], new: NewValues) -> None:
         """Write values into the state of environments."""
 
     @abstractmethod
@@ -577,17 +564,17 @@ class Simulation(ABC):
     def _use_objects(self, objects: EnvObjects) -> None:
         """Simulate the objects that were chosen."""
 
-    def _state(self, dt: float, rows: SomeRows = None) -> SceneState:
+    def _state(self, dt: float, rows: Rows = None) -> SceneState:
         self._refresh()
         return self._gathered(dt, rows).to(self._touch.device)
 
-    def _gathered(self, dt: float, rows: SomeRows = None) -> SceneState:
+    def _gathered(self, dt: float, rows: Rows = None) -> SceneState:
         """Return the fields that the module wants from the arrays as they are, on the physics' device; `dt` in s."""
-        rest = self.heat.read() | {"time": self._instant.clone()}
-        rest |= {name: field.clone() for name, field in self._object_fields.items()}
+        values: dict[str, Any] = self.heat.read() | {"time": self._instant.clone()}
+        values |= {name: field.clone() for name, field in self._object_fields.items()}
         if rows is not None:
-            rest = {name: value[rows] for name, value in rest.items()}
-        values: dict[str, Any] = self._reader.read(rows) | rest | {"dt": dt}
+            values = {name: value[rows] for name, value in values.items()}
+        values |= self._reader.read(self._sources, rows) | self._contacts(rows) | {"dt": dt}
         return SceneState(**{name: value for name, value in values.items() if name in (*self._touch.inputs.fields, "time")})
 
     def _begin_step(self, control: Control) -> None:
@@ -619,13 +606,13 @@ def _reader_of(touch: TactileModule) -> Simulation | None:
 
 def _refuse_unfit(touch: TactileModule, num_envs: int, options: SimOptions) -> None:
     """Raise an error for what no simulation can do."""
-    substeps = options.get("substeps", 1)
+    substeps, has_model = options.get("substeps", 1), options.get("model") is not None
     if num_envs < 1 or substeps < 1:
         raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
-    if options.get("model") is not None and touch.inputs.objects:
+    if has_model and touch.inputs.objects:
         problem = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
         raise SimulationError(f"{problem}; leave `model` out")
-    if options.get("model") is not None and options.get("options"):
+    if has_model and options.get("options"):
         raise SimulationError("`options` are for the artefact's scene; a model of your own has them in its `opt`")
     if not touch.has_state:
         return

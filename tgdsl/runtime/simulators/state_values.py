@@ -1,4 +1,4 @@
-"""Values of MuJoCo's state as users hand them to a simulator, one row per environment; and contacts that a reset has placed.
+"""Values that users hand to a simulator: MuJoCo's state, controls, and contacts of environments that a reset has placed.
 
 Shapes: `env` environments, `n` environments that are chosen by index, `quat` quaternions in `qpos`.
 """
@@ -6,9 +6,9 @@ Shapes: `env` environments, `n` environments that are chosen by index, `quat` qu
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import mujoco
 import numpy as np
@@ -21,14 +21,16 @@ from tgdsl.module.state import SceneState, shape_of
 from tgdsl.plan.inputs import Inputs
 from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_indices, is_env_mask
 
-Numbers = Tensor | np.ndarray | Sequence[Any] | float  # numbers of any dtype, on any device
+Control = Tensor | np.ndarray | None  # controls of a step, (actuator,) or (env, actuator); None: as they were
+Numbers = Tensor | np.ndarray | Sequence[Any] | float  # of any dtype, on any device
 INTEGRATED = (
     *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
     *("mocap_pos", "mocap_quat", "userdata"),
 )
 """What the future of an environment follows from: MuJoCo's `mjSTATE_INTEGRATION`."""
-_MIN_NORM = 1e-15
-"""MuJoCo's `mjMINVAL`: shorter quaternions have no direction, and those nearer to unit length stay as they are."""
+_MIN_NORM = 1e-15  # MuJoCo's `mjMINVAL`: shorter quaternions have no direction, and those nearer to unit length stay
+FAR_BEYOND = 10.0
+"""How many widths of its range a control must be beyond to be a mistake, such as one of units; less is clipped silently."""
 
 
 class StateValues(TypedDict, total=False):
@@ -49,13 +51,11 @@ class StateValues(TypedDict, total=False):
     userdata: Numbers
 
 
-@dataclass(frozen=True)
-class Rows:
+class NewValues(NamedTuple):
     """Values to set, in the dtype and on the device of the state."""
 
     values: dict[str, Tensor]  # by name, (env, …); rows of environments that are not chosen mean nothing
-    # environments whose values cannot be used and were not refused, as that would wait for a GPU
-    is_bad: Bool[Tensor, " env"] | None = None
+    is_bad: Bool[Tensor, " env"] | None = None  # values that cannot be used: not refused, as that would wait for a GPU
 
 
 class StateTable:
@@ -69,41 +69,31 @@ class StateTable:
         places = np.concatenate([free, balls]).astype(np.int64)[:, None] + np.arange(4)
         self._quats: Int[Tensor, "quat 4"] = torch.from_numpy(places).to(self._device)
 
-    def rows(self, given: Mapping[str, Any], env_ids: EnvIds | None) -> Rows:
-        """Return values as rows per environment.
+    def rows(self, given: Mapping[str, Any], env_ids: EnvIds | None) -> NewValues:
+        """Return values as rows per environment: see `Simulation.set_state`.
 
-        Numbers on the host are looked at here. Those on a GPU, and those whose environments are a mask there, are judged there:
+        Numbers on the host are checked here. Those on a GPU, and those whose environments are a mask there, are checked there:
         nothing waits, and `is_bad` is the result.
-
-        Args:
-            given: By name, one row for all environments alike; or with indices a row for each, in their order; or else
-                (env, …).
-            env_ids: The environments: indices, or a boolean mask; None: all.
-
-        Raises:
-            SimulationError: If there is no such array or environment, a shape does not fit, an environment is named twice, or
-                numbers on the host are not finite or a quaternion of them is zero.
         """
         is_mask = env_ids is None or is_env_mask(env_ids, self._num_envs)
         ids = None if is_mask else env_indices(env_ids, self._num_envs)
-        values: dict[str, Tensor] = {}
-        is_bad: Bool[Tensor, " env"] | None = None
+        result, is_bad = dict[str, Tensor](), None
         for name, value in given.items():
             rows = self._checked(name, value, ids)
-            is_read_here = not (rows.is_cuda or (isinstance(env_ids, Tensor) and env_ids.is_cuda))
+            is_on_host = not (rows.is_cuda or (isinstance(env_ids, Tensor) and env_ids.is_cuda))
             rows = rows.to(self._device, torch.float64)
             ndim = self._arrays[name].ndim - 1
             if ids is not None and rows.ndim > ndim:
                 every = torch.zeros((self._num_envs, *rows.shape[1:]), dtype=rows.dtype, device=self._device)
                 rows = every.index_copy_(0, torch.from_numpy(ids).to(self._device), rows)
-            rows, bad = self._judged(name, rows.expand(self._num_envs, *rows.shape[-ndim:] if ndim else ()))
-            if is_read_here:
-                self._refuse(name, bad, env_ids)
+            rows, unfinite, unturned = self._normalised(name, rows.expand(self._num_envs, *rows.shape[-ndim:] if ndim else ()))
+            if is_on_host:
+                self._refuse(f"{name} is not finite", unfinite, env_ids)
+                self._refuse(f"{name} holds a quaternion of length 0", unturned, env_ids)
             else:
-                any_bad = bad.any(dim=0)
-                is_bad = any_bad if is_bad is None else is_bad | any_bad
-            values[name] = rows.to(self._arrays[name].dtype)
-        return Rows(values, is_bad)
+                is_bad = unfinite | unturned | (False if is_bad is None else is_bad)
+            result[name] = rows.to(self._arrays[name].dtype)
+        return NewValues(result, is_bad)
 
     def _checked(self, name: str, value: Any, ids: Int[np.ndarray, " n"] | None) -> Tensor:
         """Return a value as a tensor without gradients, where it is, of a shape that fits."""
@@ -116,46 +106,77 @@ class StateTable:
         shape = tuple(self._arrays[name].shape[1:])
         num_rows = self._num_envs if ids is None else len(ids)
         if tuple(result.shape) not in ((num_rows, *shape), shape):
-            rows = "a row per environment" if ids is None else "a row for each index"
-            raise SimulationError(
-                f"{name} has shape {tuple(result.shape)}, expected {(num_rows, *shape)}, {rows}, or {shape} for all"
+            expected = (
+                f"{(num_rows, *shape)}, a row {'per environment' if ids is None else 'for each index'}, or {shape} for all"
             )
+            raise SimulationError(f"{name} has shape {tuple(result.shape)}, expected {expected}")
         if ids is not None and result.ndim > len(shape) and len(np.unique(ids)) < len(ids):
-            twice = sorted({str(env) for env in ids.tolist() if (ids == env).sum() > 1})
-            raise SimulationError(
-                f"env_ids: environments {listed(twice)} are named more than once, and {name} has a row for each"
-            )
+            twice = listed(sorted({str(env) for env in ids.tolist() if (ids == env).sum() > 1}))
+            raise SimulationError(f"env_ids: environments {twice} are named more than once, and {name} has a row for each")
         return result
 
-    def _judged(self, name: str, value: Float[Tensor, "env ..."]) -> tuple[Float[Tensor, "env ..."], Bool[Tensor, "2 env"]]:
-        """Return a value with quaternions of unit length, and where it is not finite and where a quaternion is zero."""
-        is_finite = torch.isfinite(value.to(self._arrays[name].dtype))
-        is_unfinite = ~(is_finite.flatten(1).all(dim=1) if is_finite.ndim > 1 else is_finite)
-        quats = None
-        if name == "qpos" and len(self._quats):
-            quats = value[:, self._quats]
-        elif name == "mocap_quat":
-            quats = value
-        if quats is None:
-            return value, torch.stack([is_unfinite, torch.zeros_like(is_unfinite)])
+    def _normalised(self, name: str, value: Float[Tensor, "env ..."]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a value with quaternions of unit length, where it is not finite, and where a quaternion is zero."""
+        unfinite = ~torch.isfinite(value.to(self._arrays[name].dtype)).reshape(len(value), -1).all(dim=1)
+        is_qpos = name == "qpos" and len(self._quats) > 0
+        if not is_qpos and name != "mocap_quat":
+            return value, unfinite, torch.zeros_like(unfinite)
+        quats = value[:, self._quats] if is_qpos else value
         w, x, y, z = quats.unbind(dim=-1)
         norm = (w * w + x * x + y * y + z * z).sqrt()
         # As `mju_normalize4` does it, bit for bit.
         scale = torch.where((norm - 1).abs() > _MIN_NORM, 1 / norm, 1.0)
         unit = quats * scale[..., None]
-        if name == "qpos":
+        if is_qpos:
             unit = value.index_copy(1, self._quats.flatten(), unit.flatten(1))
-        return unit, torch.stack([is_unfinite, (norm < _MIN_NORM).any(dim=1)])
+        return unit, unfinite, (norm < _MIN_NORM).any(dim=1)
 
-    def _refuse(self, name: str, bad: Bool[Tensor, "2 env"], env_ids: EnvIds | None) -> None:
-        if not bad.any():
-            return
-        is_named = torch.zeros(self._num_envs, dtype=torch.bool)
-        is_named[torch.from_numpy(env_indices(env_ids, self._num_envs))] = True
-        for problem, where in zip(("is not finite", "holds a quaternion of length 0"), bad.cpu() & is_named, strict=True):
-            if where.any():
-                envs = listed([str(env) for env in torch.nonzero(where).flatten().tolist()])
-                raise SimulationError(f"{name} {problem} in environments {envs}")
+    def _refuse(self, problem: str, bad: Bool[Tensor, " env"], env_ids: EnvIds | None) -> None:
+        if bad.any() and (envs := sorted({int(env) for env in env_indices(env_ids, len(bad)) if bad[env]})):
+            raise SimulationError(f"{problem} in environments {listed(list(map(str, envs)))}")
+
+
+def control_tensor(control: Tensor | np.ndarray, num_envs: int, num_actuators: int) -> Float[Tensor, "*env actuator"]:
+    """Return controls, (actuator,) or (env, actuator), as a tensor without gradients; an array becomes float64."""
+    values = control.detach() if isinstance(control, Tensor) else torch.from_numpy(np.array(control, dtype=np.float64))
+    if tuple(values.shape) not in ((num_actuators,), (num_envs, num_actuators)):
+        expected = f"({num_envs}, {num_actuators}) or ({num_actuators},)"
+        raise SimulationError(f"control has shape {tuple(values.shape)}, expected {expected}")
+    return values
+
+
+def write_controls(
+    control: Tensor | np.ndarray, ctrl: Float[Tensor, "env actuator"], refuses_unfinite: bool
+) -> Bool[Tensor, "*env"]:
+    """Write controls in place where they are finite; return the environments where they are not, or for all whether they are.
+
+    Those on a GPU are looked at there; those of the host are refused if they are not finite and `refuses_unfinite`.
+    """
+    values = control_tensor(control, *ctrl.shape)
+    is_on_host = not (values.is_cuda and ctrl.is_cuda)
+    values = values.to(ctrl.device, ctrl.dtype)
+    is_bad = ~torch.isfinite(values).all(dim=-1)
+    if is_on_host and refuses_unfinite and (rows := torch.nonzero(is_bad.reshape(-1)).flatten().tolist()):
+        raise SimulationError(f"control is not finite in environments {listed([str(row) for row in rows])}")
+    ctrl.copy_(torch.where(is_bad[..., None], ctrl, values))
+    return is_bad
+
+
+def warn_of_range(control: Tensor | np.ndarray, model: mujoco.MjModel) -> bool:
+    """Warn of the first control on the host that is far beyond its actuator's range; return whether there is one."""
+    if isinstance(control, Tensor) and control.is_cuda:
+        return False
+    values = np.atleast_2d(control.detach().double().numpy() if isinstance(control, Tensor) else control)
+    low, high = model.actuator_ctrlrange.T
+    reach = np.where(model.actuator_ctrllimited, FAR_BEYOND * (high - low), np.inf)
+    far = np.argwhere(np.maximum(low - values, values - high) > reach)
+    if not len(far):
+        return False
+    env, i = far[0]
+    where = f"environment {env}" if len(values) > 1 else "all environments"
+    problem = f'control of actuator "{model.actuator(int(i)).name}" is {values[env, i]:g} in {where}'
+    warnings.warn(f"{problem}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; this is said once", stacklevel=4)
+    return True
 
 
 FIELDS = (
@@ -163,22 +184,16 @@ FIELDS = (
     "joint_effort",
 )
 """Fields of a state that follow from forces."""
-Contacts = str | Mapping[str, Tensor]
-"""The contacts of a start, or how to get them, "evaluate" or "none": see `Simulation.reset`."""
+Contacts = str | Mapping[str, Tensor]  # the contacts of a start: "evaluate", "none" or fields, see `Simulation.reset`
 
 
 class StartContacts:
-    """The contacts of environments that were placed since the last step, in the place of what the simulator has.
-
-    Attributes:
-        is_placed: Environments that were placed; None if none were.
-        values: What was stored of their contacts, by field.
-    """
+    """The contacts of environments that were placed since the last step, in the place of what the simulator has."""
 
     def __init__(self, inputs: Inputs):
         self._inputs = inputs
-        self.is_placed: Bool[Tensor, " env"] | None = None
-        self.values: dict[str, Tensor] = {}
+        self.is_placed: Bool[Tensor, " env"] | None = None  # environments that were placed; None if none were
+        self.values: dict[str, Tensor] = {}  # their contacts, by field
 
     def forget(self, chosen: Bool[Tensor, " env"] | None = None) -> None:
         """Forget some environments (default: all), whose contacts the simulator has evaluated."""
@@ -189,13 +204,14 @@ class StartContacts:
 
     def place(self, chosen: Bool[Tensor, " env"], contacts: Contacts) -> None:
         """Note environments that were placed, and their contacts: "none", or fields of a state by name, the others zero."""
-        given = self._given(contacts, chosen)
+        if isinstance(contacts, str) and contacts != "none":
+            raise SimulationError(f'contacts is "{contacts}"; {did_you_mean(contacts, ("evaluate", "none"), "choices")}')
+        given = {} if isinstance(contacts, str) else {n: self._fitting(n, contacts[n], chosen) for n in contacts}
         for name in {**self.values, **given}:
             old, new = self.values.get(name), given.get(name)
-            like = old if new is None else new
-            assert like is not None
-            old, new = (torch.zeros_like(like) if value is None else value for value in (old, new))
-            self.values[name] = torch.where(broadcast_over(chosen, like), new, old.to(new.dtype))
+            new = torch.zeros_like(old) if new is None else new  # pyright: ignore[reportArgumentType]
+            old = torch.zeros_like(new) if old is None else old
+            self.values[name] = torch.where(broadcast_over(chosen, new), new, old.to(new.dtype))
         self.is_placed = chosen.clone() if self.is_placed is None else self.is_placed | chosen
 
     def applied_to(
@@ -207,23 +223,13 @@ class StartContacts:
         """
         if self.is_placed is None:
             return state
-        is_placed = self.is_placed[rows]
         values: dict[str, Any] = {}
         for name in FIELDS:
-            now = getattr(state, name)
-            if now is not None:
+            if (now := getattr(state, name)) is not None:
                 start = self.values.get(name) if is_stored else None
                 value = torch.zeros_like(now) if start is None else start[rows].to(now.device, now.dtype)
-                values[name] = torch.where(broadcast_over(is_placed.to(now.device), now), value, now)
+                values[name] = torch.where(broadcast_over(self.is_placed[rows].to(now.device), now), value, now)
         return dataclasses.replace(state, **values)
-
-    def _given(self, contacts: Contacts, chosen: Bool[Tensor, " env"]) -> dict[str, Tensor]:
-        """Return the fields that are given for the environments, (env, …)."""
-        if not isinstance(contacts, str):
-            return {name: self._fitting(name, contacts[name], chosen) for name in contacts}
-        if contacts != "none":
-            raise SimulationError(f'contacts is "{contacts}"; {did_you_mean(contacts, ("evaluate", "none"), "choices")}')
-        return {}
 
     def _fitting(self, name: str, value: Tensor, chosen: Bool[Tensor, " env"]) -> Tensor:
         field_names = [field for field in FIELDS if field in self._inputs.fields]

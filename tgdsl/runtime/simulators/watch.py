@@ -5,6 +5,7 @@ Shapes: `env` environments, `body`, `site`, `joint`, `actuator` and `pair` as a 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.geometry.rotations import product, rotated
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
+from tgdsl.runtime.simulators.fields import StateReader
 from tgdsl.runtime.simulators.model_ids import element_id
 
 _BODY_FIELDS = ("body_pos", "body_quat", "body_linvel", "body_angvel")
@@ -28,12 +30,11 @@ _JOINT_FIELDS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
 class Watch:
     """Names of elements whose motion and forces are read: see `SimOptions`."""
 
-    bodies: tuple[str, ...] = ()  # bodies, for their poses and velocities
-    sites: tuple[str, ...] = ()  # sites, for their poses
+    bodies: tuple[str, ...] = ()  # for their poses and velocities
+    sites: tuple[str, ...] = ()  # for their poses
     joints: tuple[str, ...] = ()  # hinges and slides, for positions, velocities and efforts
-    actuators: tuple[str, ...] = ()  # actuators, for the controls that acted
-    # pairs (link, object) whose whole force is read; a sensor of the module has to read it too
-    pairs: tuple[tuple[str, str], ...] = ()
+    actuators: tuple[str, ...] = ()  # for the controls that acted
+    pairs: tuple[tuple[str, str], ...] = ()  # (link, object), for their whole force; a sensor of the module has to read it too
 
 
 class BodyMotion(NamedTuple):
@@ -68,59 +69,51 @@ class Watched:
         Raises:
             SimulationError: If it is not watched.
         """
-        if name not in self.watch.bodies:
-            raise SimulationError(
-                f'the body "{name}" is not watched; {did_you_mean(name, self.watch.bodies, "watched bodies")}'
-            )
-        i = self.watch.bodies.index(name)
+        bodies = self.watch.bodies
+        if name not in bodies:
+            raise SimulationError(f'the body "{name}" is not watched; {did_you_mean(name, bodies, "watched bodies")}')
+        i = bodies.index(name)
         return BodyMotion(self.body_pos[:, i], self.body_quat[:, i], self.body_linvel[:, i], self.body_angvel[:, i])
 
 
 class WatchReader:
-    """Makes a `Watched` of what a simulator reads."""
+    """Reads what a `Watch` names from a simulator's arrays."""
 
     def __init__(self, watch: Watch, inputs: Inputs, model: mujoco.MjModel, device: torch.device):
-        self._watch = watch
         sites = np.array([element_id(model, "site", name) for name in watch.sites], dtype=np.int64)
         of_sites = [_carrier(model, int(site)) for site in sites]
         bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
         fields = (*_BODY_FIELDS, *_JOINT_FIELDS)
-        self.inputs = Inputs(fields, bodies, (), {}, 0, joints=watch.joints, actuators=watch.actuators)
-        """What a simulator has to read for it."""
-        carriers = [bodies.index(name) for name in of_sites]
-        self._carriers = torch.tensor(carriers, dtype=torch.int64, device=device)
-        self._site_pos = torch.from_numpy(model.site_pos[sites]).to(device)
-        self._site_quat = torch.from_numpy(model.site_quat[sites]).to(device)
-        pairs = [_pair(inputs, pair) for pair in watch.pairs]
-        self._pairs = torch.tensor(pairs, dtype=torch.int64, device=device)
+        wanted = Inputs(fields, bodies, (), {}, 0, joints=watch.joints, actuators=watch.actuators)
+        self.reader, self._watch = StateReader(wanted, model, device), watch
+        self._carriers = torch.tensor([bodies.index(name) for name in of_sites], dtype=torch.int64, device=device)
+        self._site_pos, self._site_quat = (torch.from_numpy(v[sites]).to(device) for v in (model.site_pos, model.site_quat))
+        self._pairs = torch.tensor([_pair(inputs, pair) for pair in watch.pairs], dtype=torch.int64, device=device)
 
     @property
     def has_pairs(self) -> bool:
-        """Whether forces of pairs are watched."""
-        return bool(len(self._pairs))
+        return len(self._pairs) > 0
+
+    def read(self, arrays: Mapping[str, Tensor]) -> SceneState:
+        """Return bodies and joints, those that carry sites included."""
+        return SceneState(**self.reader.read(arrays))  # pyright: ignore[reportArgumentType]
 
     def watched(self, values: SceneState, state: SceneState | None) -> Watched:
-        """Return what was looked at, from the fields of `inputs` and, for pairs, the module's state of that instant."""
+        """Return what was looked at, from what `read` has returned and, for pairs, the module's state of that instant."""
         fields: dict[str, Tensor] = {name: getattr(values, name) for name in (*_BODY_FIELDS, *_JOINT_FIELDS)}
         pos, quat, num = fields["body_pos"], fields["body_quat"], len(self._watch.bodies)
-        site_pos, site_quat = self._sites(pos, quat) if self._watch.sites else (pos[:, :0], quat[:, :0])
+        site_pos, site_quat = pos[:, :0], quat[:, :0]
+        if self._watch.sites:
+            carried = quat[:, self._carriers]
+            site_pos, site_quat = (v.to(pos.dtype).expand(len(pos), -1, -1) for v in (self._site_pos, self._site_quat))
+            site_pos = pos[:, self._carriers] + rotated(carried, site_pos)
+            site_quat = product(carried, site_quat)
         force = pos.new_zeros((len(pos), 0, 3))
         if self.has_pairs:
             assert state is not None and state.contact_netforce is not None
             force = state.contact_netforce[:, self._pairs]
-        return Watched(
-            watch=self._watch,
-            **{name: fields[name][:, :num] for name in _BODY_FIELDS},
-            site_pos=site_pos,
-            site_quat=site_quat,
-            **{name: fields[name] for name in _JOINT_FIELDS},
-            pair_force=force,
-        )
-
-    def _sites(self, pos: Float[Tensor, "env body 3"], quat: Float[Tensor, "env body 4"]) -> tuple[Tensor, Tensor]:
-        carried = quat[:, self._carriers]
-        site_pos, site_quat = (local.to(pos.dtype).expand(len(pos), -1, -1) for local in (self._site_pos, self._site_quat))
-        return pos[:, self._carriers] + rotated(carried, site_pos), product(carried, site_quat)
+        fields |= {name: fields[name][:, :num] for name in _BODY_FIELDS}
+        return Watched(self._watch, site_pos=site_pos, site_quat=site_quat, pair_force=force, **fields)
 
 
 def _carrier(model: mujoco.MjModel, site: int) -> str:

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.objects.choices import EnvObjects
-from tgdsl.runtime.simulators.objects.properties import (
+from tgdsl.runtime.simulators.objects import (
     MASS_FIELDS,
     PER_ENV,
+    EnvObjects,
     ObjectProperties,
     RigidObject,
     refuse_other_fields,

@@ -5,8 +5,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import mujoco
@@ -18,15 +17,13 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, listed
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.faults import BAD_VALUES, DIVERGED, NO_ROOM, EnvFaults
-from tgdsl.runtime.simulators.fields import FORCES, STATE_ARRAYS, BodyFields, JointColumns
-from tgdsl.runtime.simulators.objects.choices import EnvObjects
-from tgdsl.runtime.simulators.objects.properties import PER_ENV
-from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, SomeRows, refuse_two_instants
-from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
-from tgdsl.runtime.source import Control
+from tgdsl.runtime.simulators.fields import FORCES, POSES, Rows, StateReader
+from tgdsl.runtime.simulators.objects import PER_ENV, EnvObjects
+from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, refuse_two_instants
+from tgdsl.runtime.simulators.state_values import INTEGRATED, Control, NewValues, StateTable
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.objects import OBJECT_FIELDS, WorldObjects, WorldProperties
-from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries, view
 from tgdsl.tensors.env_ids import put_rows
 from tgdsl.tensors.on_host import HostCopy
 from tgdsl.tensors.torch_internals import copy_each
@@ -114,42 +111,9 @@ def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
 T = TypeVar("T")
 _VELOCITIES = ("cvel", "cdof_dot")
 """What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
-_DERIVED = tuple(dict.fromkeys((*STATE_ARRAYS, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
+_DERIVED = tuple(dict.fromkeys((*POSES, "sensordata", *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48  # default capacity for contacts per environment
-
-
-class StateReader:
-    """Gathers the fields of a state by index, on the device."""
-
-    def __init__(
-        self,
-        inputs: Inputs,
-        model: mujoco.MjModel,
-        sources: Mapping[str, Tensor],
-        kept: Mapping[str, Tensor],
-        contacts: PairContacts | None = None,
-    ):
-        self._sources, self._contacts = sources, contacts
-        device = sources["xpos"].device
-        self._bodies = BodyFields(
-            inputs,
-            model,
-            index=lambda ids: torch.from_numpy(ids).to(device),
-            take=lambda array, ids: array[:, ids],
-            cross=torch.linalg.cross,
-        )
-        indices = JointColumns.of(inputs, model)
-        self._joints = {
-            name: ({**sources, **kept}[array], torch.from_numpy(indices.by_array[array]).to(device))
-            for name, array in indices.fields.items()
-        }
-
-    def read(self, rows: SomeRows = None) -> dict[str, Tensor]:
-        """Return poses, velocities, contacts and joints by field of a state, each a tensor of its own, of all environments."""
-        values = self._bodies.read(self._sources) | ({} if self._contacts is None else self._contacts.read())
-        values |= {name: array[:, columns] for name, (array, columns) in self._joints.items()}
-        return values
 
 
 class WarpSimulation(Simulation):
@@ -286,30 +250,13 @@ class WarpSimulation(Simulation):
         self._stream = WarpStream(device, options.get("graph", True))
         return self._stream.device
 
-    def _start(self, num_envs: int, keyframe: int, options: SimOptions) -> None:
+    def _start(self, num_envs: int, keyframe: int, options: SimOptions, readers: Sequence[StateReader]) -> None:
         inputs, stream, device, model = self._touch.inputs, self._stream, self._device, self.model
         per_env = [field for word in options.get("per_env", ()) for field in PER_ENV.get(word, (word,))]
         if self._objects is not None:
             self._world_objects = WorldObjects(self._objects, inputs)
             model, per_env = self._world_objects.model, per_env + list(OBJECT_FIELDS)
-        self._put_model(model, list(dict.fromkeys(per_env)), num_envs, keyframe, options)
-        self.properties = WorldProperties(self.parameters, self.model, inputs.bodies_of, num_envs, device)
-        with stream.scope():
-            self._table = StateTable(self.model, self._arrays)
-        self._has_stale, self._is_in_graphs = True, False
-        self._has_loops = model.neq > 0
-        if self._world_objects is not None:
-            self._world_objects.write_to(self.parameters, self._arrays)
-        self._restarting, self._evaluation = GraphedCall(stream, self._restart), GraphedCall(stream, self._evaluate_stale)
-        self._posing = GraphedCall(stream, self._evaluate_poses)
-        self._step = GraphedCall(stream, lambda: self._physics(self.substeps))
-        self._substep = GraphedCall(stream, lambda: self._physics(1))
-        self._step_and_read = GraphedCall(stream, self._physics_and_touch)
-        self._held: tuple[object, ...] = ()
-        self._driven = self.drive
-
-    def _put_model(self, model: mujoco.MjModel, per_env: list[str], num_envs: int, keyframe: int, options: SimOptions) -> None:
-        """Put model and data on the device, all environments at the start."""
+        per_env = list(dict.fromkeys(per_env))
         refuse_two_instants(model, "bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
         nconmax, njmax = options.get("nconmax"), options.get("njmax")
         self._nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
@@ -318,9 +265,6 @@ class WarpSimulation(Simulation):
         start = mujoco.MjData(model)
         if keyframe >= 0:
             mujoco.mj_resetDataKeyframe(model, start, keyframe)
-        inputs, stream = self._touch.inputs, self._stream
-        if self._watch is not None:  # its joints are copied before a physics step too
-            inputs = replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *self._watch.inputs.fields))))
         with stream.scope():
             try:
                 self.warp_model = self._mjw.put_model(model, batch_sizes=dict.fromkeys(per_env, num_envs))
@@ -332,22 +276,32 @@ class WarpSimulation(Simulation):
             # face where two are nearly parallel. Otherwise it takes either, and normals differ by the angle between them.
             self.warp_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
             self._leave_out_sensors(wp, model, inputs)
-            joints = JointColumns.of(inputs, model)
             names = (*INTEGRATED, *_DERIVED, *_WATCHED)
-            self._arrays = {name: view(wp, getattr(self.warp_data, name), stream.device) for name in names}
-            self.parameters = {name: view(wp, getattr(self.warp_model, name), stream.device) for name in per_env}
-            self._kept = {array: self._arrays[array].clone() for array in (*joints.moved.values(), "time")}
-            self._instant = self._kept["time"]
-            self._contacts = PairContacts(inputs, model, num_envs, stream.device)
+            self._arrays = {name: view(wp, getattr(self.warp_data, name), device) for name in names}
+            self.parameters = {name: view(wp, getattr(self.warp_model, name), device) for name in per_env}
+            moved = [name for reader in readers for name in reader.moved]
+            self._kept = {name: self._arrays[name].clone() for name in (*moved, "time")}
+            self._instant, self._sources = self._kept["time"], self._arrays | self._kept
+            self._pairs = PairContacts(inputs, model, num_envs, device)
             self._start_arrays = {name: self._arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
-            self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=stream.device)
-            self._is_reset = torch.zeros_like(self._is_stale)
-            self._restarted = torch.zeros_like(self._is_stale)
+            self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=device)
+            self._is_reset, self._restarted = (torch.zeros_like(self._is_stale) for _ in range(2))
             self._faults = Faults(self._arrays, options.get("on_fault", "raise"))
+            self._table = StateTable(self.model, self._arrays)
+        self.properties = WorldProperties(self.parameters, self.model, inputs.bodies_of, num_envs, device)
+        self._has_stale, self._is_in_graphs, self._has_loops = True, False, model.neq > 0
+        if self._world_objects is not None:
+            self._world_objects.write_to(self.parameters, self._arrays)
+        self._restarting, self._evaluation = GraphedCall(stream, self._restart), GraphedCall(stream, self._evaluate_stale)
+        self._posing = GraphedCall(stream, self._evaluate_poses)
+        self._step = GraphedCall(stream, lambda: self._physics(self.substeps))
+        self._substep = GraphedCall(stream, lambda: self._physics(1))
+        self._step_and_read = GraphedCall(stream, self._physics_and_touch)
+        self._held: tuple[object, ...] = ()
+        self._driven = self.drive
 
-    def _make_reader(self, inputs: Inputs) -> StateReader:
-        contacts = self._contacts if inputs is self._touch.inputs else None
-        return StateReader(inputs, self.model, self._arrays, self._kept, contacts)
+    def _contacts(self, rows: Rows) -> dict[str, Tensor]:
+        return self._pairs.read()
 
     def _use_objects(self, objects: EnvObjects) -> None:
         assert self._world_objects is not None
@@ -396,7 +350,7 @@ class WarpSimulation(Simulation):
         finally:
             self.warp_model.opt.disableflags = whole
         # MuJoCo Warp's integrators leave contacts and constraint forces as its last `forward` found them.
-        self._contacts.update(self.warp_model, self.warp_data)
+        self._pairs.update(self.warp_model, self.warp_data)
         self._is_stale.zero_()
         is_faulty = self._faults.update()
         if self._faults.on_fault == "reset":
@@ -412,24 +366,24 @@ class WarpSimulation(Simulation):
         if self._faults.on_fault == "reset" and not is_evaluated:
             self._note_stale()
 
-    def _begin_episodes(self, mask: Bool[Tensor, " env"], rows: Rows, *, finds_contacts: bool) -> None:
+    def _begin_episodes(self, mask: Bool[Tensor, " env"], new: NewValues, *, finds_contacts: bool) -> None:
         """Restart some environments, with values."""
         self._is_reset.copy_(mask)
         self._restarting()
-        self._put(mask, rows)
+        self._put(mask, new)
         if finds_contacts:
             self._evaluate(mask)
         else:
             self._posing()
 
-    def _put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+    def _put(self, mask: Bool[Tensor, " env"], new: NewValues) -> None:
         """Write values into the state of some environments; those that cannot be used are left out and noted."""
         with torch.no_grad():
             is_put = mask
-            if rows.is_bad is not None:
-                is_put = mask & ~rows.is_bad
-                self._faults.note(BAD_VALUES, mask & rows.is_bad)
-            for name, values in rows.values.items():
+            if new.is_bad is not None:
+                is_put = mask & ~new.is_bad
+                self._faults.note(BAD_VALUES, mask & new.is_bad)
+            for name, values in new.values.items():
                 array = self._arrays[name]
                 if array.numel():
                     put_rows(array, is_put, values)
@@ -461,12 +415,12 @@ class WarpSimulation(Simulation):
 
     def _evaluate_stale(self) -> None:
         """Evaluate all environments where they are now, then give those that are not stale back their earlier instant."""
-        arrays = {name: self._arrays[name] for name in (*_DERIVED, "history")} | self._contacts.arrays
+        arrays = {name: self._arrays[name] for name in (*_DERIVED, "history")} | self._pairs.arrays
         arrays = {name: array for name, array in arrays.items() if array.numel()}
         earlier = _copied(arrays)
         for _ in range(2 if self._has_loops else 1):
             self._mjw.forward(self.warp_model, self.warp_data)
-        self._contacts.update(self.warp_model, self.warp_data)
+        self._pairs.update(self.warp_model, self.warp_data)
         self._give_back(self._is_stale, earlier, arrays)
         self._is_stale.zero_()
 
@@ -513,8 +467,3 @@ def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
     copies = {name: torch.empty_like(array) for name, array in arrays.items()}
     copy_each(list(copies.values()), list(arrays.values()))
     return copies
-
-
-def view(wp: Any, array: Any, device: torch.device) -> Tensor:
-    """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
-    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=device)

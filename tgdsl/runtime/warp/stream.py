@@ -170,3 +170,8 @@ class GraphedCall(Generic[T]):
         graph, result = self._captured
         self._stream.replay(graph)
         return result
+
+
+def view(wp: Any, array: Any, device: torch.device) -> torch.Tensor:
+    """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
+    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=device)

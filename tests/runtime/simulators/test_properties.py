@@ -8,7 +8,7 @@ from warp_cases import SCENE, module, warp
 
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.simulators.objects.properties import MASS_FIELDS
+from tgdsl.runtime.simulators.objects import MASS_FIELDS
 
 OWN = ("mass", "friction")
 ODD = {"geoms": [{"type": "sphere", "size": [0.012], "pos": [0, 0, 0.02]}, {"type": "box", "size": [0.01, 0.01, 0.02]}]}

@@ -1,1 +1,0 @@
-"""Objects that differ between environments: variants, sizes, masses and frictions."""
