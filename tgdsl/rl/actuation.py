@@ -49,8 +49,7 @@ from tgdsl.fields.models import NonNegative, PositiveLength, Quantity, Range, Ra
 from tgdsl.rl.draws import Draws, within
 from tgdsl.tensors.env_ids import put
 
-BREAKAWAY_SPEED = 0.05
-"""Below this a joint counts as at rest, where its drive has to break away [rad/s]."""
+BREAKAWAY_SPEED = 0.05  # below this a joint counts as at rest, where its drive has to break away [rad/s]
 ONE: Range = (1.0, 1.0)
 ZERO: Range = (0.0, 0.0)
 Factor = Annotated[Range, RangeOf("number", gt=0.0)]
@@ -89,8 +88,7 @@ class ActionSpec(SpecModel):
         return self
 
 
-MOST_DELAY = 1000
-"""Longest delay of a target [control steps]: of each environment so many targets are kept."""
+MOST_DELAY = 1000  # longest delay of a target [control steps]: of each environment so many targets are kept
 
 
 class DriveSpec(SpecModel):
@@ -362,8 +360,7 @@ class Actuation:
 
 _DRAWN = ("gain", "damping", "strength", "bias", "deadband", "backlash", "kick", "delay")
 """What is drawn for each drive; whole numbers last."""
-_ANGLES = ("bias", "deadband", "backlash")
-"""Those that are angles, and so of hinges alone."""
+_ANGLES = ("bias", "deadband", "backlash")  # those that are angles, and so of hinges alone
 
 
 def _within(value: Tensor, limit: Tensor) -> Tensor:

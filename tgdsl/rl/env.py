@@ -44,36 +44,24 @@ from tgdsl.tensors.torch_internals import below_autograd
 
 SINGLE_THREAD_MAX_TAXELS = 2**16
 """On a CPU one thread reads up to so many taxels of all environments: each of two would get fewer than 2¹⁵ numbers."""
-FAR_BEYOND = 10.0
-"""Actions of that size are a mistake, such as angles in degrees."""
-PREPARING_STEPS = 3
-"""The third step is captured on a GPU, and the second one compiled."""
+FAR_BEYOND = 10.0  # actions of that size are a mistake, such as angles in degrees
+PREPARING_STEPS = 3  # the third step is captured on a GPU, and the second one compiled
 
 
 Observations = dict[str, Float[Tensor, "env feature"]]
 
 
 class StepInfo(NamedTuple):
-    """Further results of a step. Values of an episode are those of the one that has just ended, where one has.
+    """Further results of a step. Values of an episode are those of the one that has just ended, where one has."""
 
-    Attributes:
-        ended: Episodes that have ended, terminated or truncated.
-        final_obs: Observations before the reset: they differ from `Step.obs` where an episode has ended.
-        terms: Terms of the reward of this step by name, weights and Δt included.
-        score: Score of the episode, in `task.score_unit`.
-        episode_return: Sum of its rewards.
-        episode_steps: Its control steps.
-        episode_terms: Sums of its terms by name.
-        faults: Environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0.
-    """
-
-    ended: Bool[Tensor, " env"]
-    final_obs: Observations
-    terms: dict[str, Float[Tensor, " env"]]
-    score: Float[Tensor, " env"]
-    episode_return: Float[Tensor, " env"]
-    episode_steps: Int[Tensor, " env"]
-    episode_terms: dict[str, Float[Tensor, " env"]]
+    ended: Bool[Tensor, " env"]  # episodes that have ended, terminated or truncated
+    final_obs: Observations  # observations before the reset: they differ from `Step.obs` where an episode has ended
+    terms: dict[str, Float[Tensor, " env"]]  # terms of the reward of this step by name, weights and Δt included
+    score: Float[Tensor, " env"]  # score of the episode, in `task.score_unit`
+    episode_return: Float[Tensor, " env"]  # sum of its rewards
+    episode_steps: Int[Tensor, " env"]  # its control steps
+    episode_terms: dict[str, Float[Tensor, " env"]]  # sums of its terms by name
+    # environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0
     faults: Bool[Tensor, " env"]
 
     def __repr__(self) -> str:
@@ -85,21 +73,13 @@ class StepInfo(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Result of a control step.
+    """Result of a control step."""
 
-    Attributes:
-        obs: Observations by group; of episodes that have ended, the first of the next one.
-        reward: Sum of the terms.
-        terminated: Episodes that have ended for good.
-        truncated: Episodes that have merely lasted long enough.
-        info: Further results.
-    """
-
-    obs: Observations
-    reward: Float[Tensor, " env"]
-    terminated: Bool[Tensor, " env"]
-    truncated: Bool[Tensor, " env"]
-    info: StepInfo
+    obs: Observations  # observations by group; of episodes that have ended, the first of the next one
+    reward: Float[Tensor, " env"]  # sum of the terms
+    terminated: Bool[Tensor, " env"]  # episodes that have ended for good
+    truncated: Bool[Tensor, " env"]  # episodes that have merely lasted long enough
+    info: StepInfo  # further results
 
     def __repr__(self) -> str:
         return "Step\n" + listing((name, shapes(value)) for name, value in self._asdict().items())
@@ -388,10 +368,7 @@ class TouchEnv:
             counted.masked_fill_(chosen, 0)
 
     def _advance(self) -> tuple[Step, Now]:
-        """Make one control step with the action that was copied, and return the instant it ends at: see the top of this page.
-
-        A captured step runs no Python: its results are in the tensors that were returned at its capture.
-        """
+        """Make one control step with the action that was copied, and return the instant at its end."""
         sim = self.sim
         with self._logic_by():
             self._before.copy_(self._used)

@@ -8,8 +8,7 @@ from typing import Literal
 
 from tgdsl.console.tables import TaxelTable
 
-GoalPart = Literal["orientation", "difference", "angle"]
-"""Parts of an observed goal, an orientation."""
+GoalPart = Literal["orientation", "difference", "angle"]  # parts of an observed goal, an orientation
 AXES = ("x", "y", "z")
 COLUMNS = ("xx", "xy", "xz", "yx", "yy", "yz")
 """Components of the first two columns of a rotation's matrix, that is of the turned x axis and y axis."""
@@ -17,29 +16,17 @@ COLUMNS = ("xx", "xy", "xz", "yx", "yy", "yz")
 
 @dataclass(frozen=True)
 class Features:
-    """Adjacent features of one kind.
+    """Adjacent features of one kind."""
 
-    Attributes:
-        name: Name of the quantity; of a vector, its components in order: `force_x, force_y, force_z`.
-        size: How many there are.
-        unit: Unit of the quantity, before it is scaled; "1" if it has none.
-        frame: Axes of a vector's components: `world`, or `link`, the frame of the link; empty without a direction.
-        link: The body; empty if there is none.
-        scale: Factor from the quantity to the features.
-        rows: Rows of `env.touch.rows[sensor]`, one feature each: taxels or probes; else empty.
-        sensor: The reading; empty if there is none.
-        note: Where the reading is cut off.
-    """
-
-    name: str
-    size: int
-    unit: str = "1"
-    frame: str = ""
-    link: str = ""
-    scale: float = 1.0
-    rows: range = range(0)
-    sensor: str = ""
-    note: str = ""
+    name: str  # name of the quantity; of a vector, its components in order: `force_x, force_y, force_z`
+    size: int  # how many there are
+    unit: str = "1"  # unit of the quantity, before it is scaled; "1" if it has none
+    frame: str = ""  # axes of a vector's components: `world`, or `link`, the frame of the link; empty without a direction
+    link: str = ""  # the body; empty if there is none
+    scale: float = 1.0  # factor from the quantity to the features
+    rows: range = range(0)  # rows of `env.touch.rows[sensor]`, one feature each: taxels or probes; else empty
+    sensor: str = ""  # the reading; empty if there is none
+    note: str = ""  # where the reading is cut off
 
 
 def vector(name: str, unit: str, link: str = "", frame: str = "world") -> Features:

@@ -26,8 +26,7 @@ from tgdsl.schema.yaml import Path as Place
 from tgdsl.schema.yaml import Source, from_mapping
 
 C = TypeVar("C")
-SHARED_GROUPS = ("proprio", "tactile_sensors", "priv_proprio")
-"""Groups of observations that all tasks have."""
+SHARED_GROUPS = ("proprio", "tactile_sensors", "priv_proprio")  # groups of observations that all tasks have
 REQUIRED = ("tgdsl", "task", "document", "object", "joints")
 
 

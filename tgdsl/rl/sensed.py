@@ -23,12 +23,9 @@ from tgdsl.schema.select import matching
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.compile import compile as compile_document
 
-GROUP = "tactile_sensors"
-"""The observation group of what a policy feels."""
-PER_LINK = ("agg_bool", "agg_force")
-"""Types that have numbers of links, not of taxels."""
-CLEAN = "clean"
-"""The noise profile that has none."""
+GROUP = "tactile_sensors"  # the observation group of what a policy feels
+PER_LINK = ("agg_bool", "agg_force")  # types that have numbers of links, not of taxels
+CLEAN = "clean"  # the noise profile that has none
 
 
 class Felt(NamedTuple):
@@ -169,11 +166,7 @@ def compile_sensed(
 
 
 def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what of the sensors' document is set for policies that feel several things, and the module's observations.
-
-    Each sensor is computed once, on all links that are asked for, of which a policy takes its own columns, and gives readings
-    with and without noise: of one profile beside `clean`.
-    """
+    """Return what of the sensors' document is set for policies that feel several things, and the module's observations."""
     result, observations = dict[str, Any](), dict[str, Any]()
     for sensor in dict.fromkeys(felts.values()):
         carried = [felt for felt, carrier in felts.items() if carrier == sensor]
@@ -268,7 +261,6 @@ def sensors_document(loaded: LoadedTask) -> Loaded:
 
 
 def _sensor_overrides(loaded: LoadedTask) -> dict[str, Any]:
-    """Return what the task replaces in the sensors' document, by dotted path."""
     return {f"sensors.{name}.{key}": value for name, keys in loaded.spec.sensors.items() for key, value in keys.items()}
 
 

@@ -30,8 +30,7 @@ SENSED: dict[str, tuple[str, str]] = {
 }
 """The kind of sensor that each type reads, and the observation that is made of it."""
 ForceRange = Annotated[Range, RangeOf("force")]
-Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]
-"""Between the bounds that MuJoCo has."""
+Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]  # between the bounds that MuJoCo has
 Power = Annotated[float, Quantity("number", ge=1.0)]
 
 

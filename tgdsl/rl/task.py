@@ -166,8 +166,7 @@ class Start(NamedTuple):
     """As for `sim.reset`: "none" for an object that touches nothing yet, or what was stored with a grasp."""
 
 
-Rate = Callable[[Now], Float[Tensor, " env"]]
-"""A term of the reward without its weight."""
+Rate = Callable[[Now], Float[Tensor, " env"]]  # a term of the reward without its weight
 
 
 @dataclass(frozen=True)
@@ -204,38 +203,27 @@ def reward_term(weight: float, unit: str, name: str | None = None) -> Callable[[
 
 
 class Task(ABC, Generic[S]):
-    """A task of all environments.
+    """A task of all environments."""
 
-    Attributes:
-        Spec: Model of its document.
-        senses: Kinds of sensors of the sensors' document that it looks at, besides what the policy feels: `now.link_force` is
-            that of `link_contact`, `now.distance` that of `surface_distance`.
-        wants_normal_force: Whether it looks at the normal force of the `link_contact` sensor, besides the force.
-        score_unit: Unit of its score.
-        is_less_better: Whether its score is an error.
-        hand_groups: Groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task.
-        constants: Keys of its document that are read once, when it is made: no curriculum can change them.
-        goal_units: Units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for.
-        terms: Terms of its reward by name.
-        Rewards: Model of their weights.
-        spec: Its document.
-        setup: Its setup.
-        memory: Its own state, (env, …) each, kept by `state_dict`.
-    """
-
-    Spec: ClassVar[type[TaskSpec]]
+    Spec: ClassVar[type[TaskSpec]]  # model of its document
+    # kinds of sensors of the sensors' document that it looks at, besides what the policy feels: `now.link_force` is that of
+    # `link_contact`, `now.distance` that of `surface_distance`
     senses: ClassVar[tuple[str, ...]] = ()
+    # whether it looks at the normal force of the `link_contact` sensor, besides the force
     wants_normal_force: ClassVar[bool] = False
-    score_unit: ClassVar[str]
-    is_less_better: ClassVar[bool] = False
+    score_unit: ClassVar[str]  # unit of its score
+    is_less_better: ClassVar[bool] = False  # whether its score is an error
+    # groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task
     hand_groups: ClassVar[tuple[str, ...]] = ()
+    # keys of its document that are read once, when it is made: no curriculum can change them
     constants: ClassVar[tuple[str, ...]] = ()
+    # units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for
     goal_units: ClassVar[tuple[str, ...]] = ()
-    terms: ClassVar[Mapping[str, TaskReward]] = {}
-    Rewards: ClassVar[type[SpecModel]] = SpecModel
-    spec: S
-    setup: Setup
-    memory: dict[str, Tensor]
+    terms: ClassVar[Mapping[str, TaskReward]] = {}  # terms of its reward by name
+    Rewards: ClassVar[type[SpecModel]] = SpecModel  # model of their weights
+    spec: S  # its document
+    setup: Setup  # its setup
+    memory: dict[str, Tensor]  # its own state, (env, …) each, kept by `state_dict`
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Collect the terms of the reward; add `rewards`, their weights, and their parameters to the document's model."""

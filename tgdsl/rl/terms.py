@@ -44,8 +44,7 @@ from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.schema.select import matching
 from tgdsl.tensors.env_ids import put_rows
 
-FREE_SHARE = 0.95
-"""Share of a joint's range that costs nothing."""
+FREE_SHARE = 0.95  # share of a joint's range that costs nothing
 Force = Annotated[float, Quantity("force", gt=0.0)]
 Speed = Annotated[float, Quantity("speed", gt=0.0)]
 

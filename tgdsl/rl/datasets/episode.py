@@ -18,26 +18,18 @@ from jaxtyping import Float, Int
 
 from tgdsl.errors import TgdslError
 
-FORCE = ("force_x", "force_y", "force_z")
-"""The components of touch, in the frame of the taxels' body."""
+FORCE = ("force_x", "force_y", "force_z")  # the components of touch, in the frame of the taxels' body
 TOUCH = "observation.tactile"
-EPS = 1e-6
-"""Share of a frame by which a sample may be late."""
+EPS = 1e-6  # share of a frame by which a sample may be late
 
 
 @dataclass(frozen=True, eq=False)
 class LinkTaxels:
-    """The taxels of a link. A hand that reports only the sum of a fingertip's forces has one, at an unknown place.
+    """The taxels of a link. A hand that reports only the sum of a fingertip's forces has one, at an unknown place."""
 
-    Attributes:
-        body: The link's body.
-        pos: Positions in the body's frame [m].
-        normal: Outward normals in the body's frame.
-    """
-
-    body: str
-    pos: Float[np.ndarray, "taxel 3"] | None = None
-    normal: Float[np.ndarray, "taxel 3"] | None = None
+    body: str  # the link's body
+    pos: Float[np.ndarray, "taxel 3"] | None = None  # positions in the body's frame [m]
+    normal: Float[np.ndarray, "taxel 3"] | None = None  # outward normals in the body's frame
 
     @property
     def num_taxels(self) -> int:
@@ -47,29 +39,17 @@ class LinkTaxels:
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """What all episodes of a dataset have in common.
+    """What all episodes of a dataset have in common."""
 
-    Attributes:
-        name: The document, task or log.
-        task: The task in words.
-        joints: Names of the joints.
-        links: Taxels by link.
-        unit: Unit of touch.
-        control_step: Time between samples, of a log its median [s].
-        fps: Frames per second.
-        has_outcome: Whether there are rewards and success.
-        has_policy: Whether a policy acts.
-    """
-
-    name: str
-    task: str
-    joints: tuple[str, ...]
-    links: Mapping[str, LinkTaxels]
-    unit: str
-    control_step: float
-    fps: float
-    has_outcome: bool = False
-    has_policy: bool = False
+    name: str  # the document, task or log
+    task: str  # the task in words
+    joints: tuple[str, ...]  # names of the joints
+    links: Mapping[str, LinkTaxels]  # taxels by link
+    unit: str  # unit of touch
+    control_step: float  # time between samples, of a log its median [s]
+    fps: float  # frames per second
+    has_outcome: bool = False  # whether there are rewards and success
+    has_policy: bool = False  # whether a policy acts
 
     @property
     def window(self) -> int:
@@ -92,42 +72,26 @@ class Header:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """The samples of one episode.
+    """The samples of one episode."""
 
-    Attributes:
-        time: Time of each sample [s].
-        state: Joint positions [rad].
-        action: Set-points of the joints [rad].
-        touch: Touch by link, in the header's unit and the frame of the taxels' body.
-        policy_action: The policy's actions, from −1 to 1.
-        reward: Reward of the step that follows each sample.
-        score: Score of the episode.
-        is_success: Whether it succeeded.
-    """
-
-    time: Float[np.ndarray, " step"]
-    state: Float[np.ndarray, "step joint"]
-    action: Float[np.ndarray, "step joint"]
+    time: Float[np.ndarray, " step"]  # time of each sample [s]
+    state: Float[np.ndarray, "step joint"]  # joint positions [rad]
+    action: Float[np.ndarray, "step joint"]  # set-points of the joints [rad]
+    # touch by link, in the header's unit and the frame of the taxels' body
     touch: Mapping[str, Float[np.ndarray, "step taxel channel"]]
-    policy_action: Float[np.ndarray, "step joint"] | None = None
-    reward: Float[np.ndarray, " step"] | None = None
-    score: float | None = None
-    is_success: bool | None = None
+    policy_action: Float[np.ndarray, "step joint"] | None = None  # the policy's actions, from −1 to 1
+    reward: Float[np.ndarray, " step"] | None = None  # reward of the step that follows each sample
+    score: float | None = None  # score of the episode
+    is_success: bool | None = None  # whether it succeeded
 
 
 @dataclass(frozen=True)
 class Feature:
-    """A column of a dataset.
+    """A column of a dataset."""
 
-    Attributes:
-        dtype: Its dtype.
-        shape: Shape of a frame's value.
-        names: Names of its numbers, or of its axes if it has several.
-    """
-
-    dtype: str
-    shape: tuple[int, ...]
-    names: tuple[str, ...] | None = None
+    dtype: str  # its dtype
+    shape: tuple[int, ...]  # shape of a frame's value
+    names: tuple[str, ...] | None = None  # names of its numbers, or of its axes if it has several
 
 
 def features(header: Header) -> dict[str, Feature]:

@@ -35,8 +35,7 @@ from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS
 from tgdsl.scene.scene import scene_model
 
-LOG_FPS = 30.0
-"""Frames per second of a hand's log unless others are asked for."""
+LOG_FPS = 30.0  # frames per second of a hand's log unless others are asked for
 
 
 class _Sampler(Actor):

@@ -48,13 +48,11 @@ from tgdsl.scene.scene import SceneModels
 
 JOINT_POS, JOINT_VEL = "joint_pos", "joint_vel"
 """Groups of the module that proprioception is made of: all actuated joints, in the order of the actuators."""
-EMULATED = "agg_force"
-"""What an emulated hand's fingertips feel, whatever a policy makes of it."""
+EMULATED = "agg_force"  # what an emulated hand's fingertips feel, whatever a policy makes of it
 CARD_KEYS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel")
 """What of a task's document is as it was where the policy was learned."""
 EVERYONE = torch.ones(1, dtype=torch.bool)
-APPROACH_S = 2.0
-"""Time in which a hand that may move goes to the keyframe from which it shall act [s]."""
+APPROACH_S = 2.0  # time in which a hand that may move goes to the keyframe from which it shall act [s]
 
 
 class DeployError(TgdslError):

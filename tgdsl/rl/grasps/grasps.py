@@ -173,24 +173,15 @@ class Drawn(NamedTuple):
 
 
 class GraspTable:
-    """Grasps as environments draw them: each those of its own variant of the object, ordered by variant.
-
-    Attributes:
-        ctrl: Controls of all actuators, with which the hand presses.
-        contacts: Fields of a state that follow from forces, by name, (grasp, …): those that the module wants.
-        pos: Position of the object's body in each, in the world [m].
-        quat: Its orientation, w, x, y, z.
-        first: The first grasp of each environment's variant.
-        count: How many that variant has.
-    """
+    """Grasps as environments draw them: each those of its own variant of the object, ordered by variant."""
 
     qpos: Float[Tensor, "grasp nq"]
-    ctrl: Float[Tensor, "grasp nu"]
-    contacts: dict[str, Tensor]
-    pos: Float[Tensor, "grasp 3"]
-    quat: Float[Tensor, "grasp 4"]
-    first: Int[Tensor, " env"]
-    count: Int[Tensor, " env"]
+    ctrl: Float[Tensor, "grasp nu"]  # controls of all actuators, with which the hand presses
+    contacts: dict[str, Tensor]  # fields of a state that follow from forces, by name, (grasp, …): those that the module wants
+    pos: Float[Tensor, "grasp 3"]  # position of the object's body in each, in the world [m]
+    quat: Float[Tensor, "grasp 4"]  # its orientation, w, x, y, z
+    first: Int[Tensor, " env"]  # the first grasp of each environment's variant
+    count: Int[Tensor, " env"]  # how many that variant has
 
     def __init__(self, grasps: Grasps, sim: Simulation, body: str, variant: Int[Tensor, " env"], draws: Draws):
         """Evaluate the contacts of all grasps, in the simulation; it has to be reset afterwards.

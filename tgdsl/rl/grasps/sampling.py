@@ -46,16 +46,11 @@ from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.digest import scene_digest
 from tgdsl.schema.yaml import Path
 
-SIDE_BY_SIDE = 256
-"""Most trials at once; of a few grasps there are twice as many."""
-PUSHES = 4
-"""Pushes of each trial."""
-SHARE = 0.25
-"""Most that `spread` may be, as a share of a joint's range, so that few grasps begin at a joint's limit."""
-LEAST_SHARE, ENOUGH = 0.01, 1000
-"""Share of trials that must be kept of a variant, once so many were made."""
-Count = Callable[[int, int], None]
-"""Called with the number of grasps so far and the number wanted."""
+SIDE_BY_SIDE = 256  # most trials at once; of a few grasps there are twice as many
+PUSHES = 4  # pushes of each trial
+SHARE = 0.25  # most that `spread` may be, as a share of a joint's range, so that few grasps begin at a joint's limit
+LEAST_SHARE, ENOUGH = 0.01, 1000  # share of trials that must be kept of a variant, once so many were made
+Count = Callable[[int, int], None]  # called with the number of grasps so far and the number wanted
 
 
 def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -> Grasps:
@@ -125,7 +120,6 @@ class _Trials:
 
     @property
     def failures(self) -> str:
-        """Why trials were not kept, in words."""
         return ", ".join(f"{num} {reason}" for reason, num in self._failed.items())
 
     def run(self, round_: int) -> tuple[Int[Tensor, " grasp"], Float[Tensor, "grasp nq"], Float[Tensor, "grasp nu"]]:
@@ -251,7 +245,6 @@ class _Place:
             qpos[:, self._pos] += draws.uniform("offset", count, 3, *self._offset).double()
 
     def keep(self, sim: BatchSimulation, start: Float[Tensor, "env nq"]) -> None:
-        """Put objects back where they were, at rest."""
         sim.qpos[:, self._qpos] = start[:, self._qpos]
         sim.qvel[:, self._qvel] = 0.0
 

@@ -19,8 +19,7 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor
 
-KINDS = ("zero", "random", "script")
-"""Actions by one word; else they are a function of a file, `FILE.py:FUNCTION`."""
+KINDS = ("zero", "random", "script")  # actions by one word; else they are a function of a file, `FILE.py:FUNCTION`
 ScriptFunction = Callable[[TouchEnv, Mapping[str, Tensor]], Any]
 """Takes an environment and its observations by group, and returns actions (env, joint)."""
 

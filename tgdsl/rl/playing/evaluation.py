@@ -22,11 +22,9 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.gait import METRICS, SHARE, UNITS, Gait, GaitMeter
 from tgdsl.rl.playing.rollout import Actor, rollout
 
-SEED = 1_000_003
-"""What is random in the episodes follows from it, whatever a policy was learned with."""
+SEED = 1_000_003  # what is random in the episodes follows from it, whatever a policy was learned with
 Z95 = 1.959963984540054
-CHECK_INTERVAL = 40
-"""Control steps after which the host looks whether all episodes have ended."""
+CHECK_INTERVAL = 40  # control steps after which the host looks whether all episodes have ended
 DIMENSIONS = {"score": "number", "held": SHARE} | {name: dimension for name, (_, dimension) in METRICS.items()}
 """What may be required of a policy: names of `Evaluation` and `Gait`, and what each is."""
 COMPARISONS: dict[str, Callable[[float, float], bool]] = {"<=": le, ">=": ge, "<": lt, ">": gt}

@@ -40,15 +40,12 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.task import Now
 from tgdsl.rl.tasks.holding import are_fingers
 
-TOUCH = 0.01
-"""Force above which a link touches the object [N]."""
-SATURATED = 0.98
-"""Share of the largest torque from which on a joint is at its torque limit."""
+TOUCH = 0.01  # force above which a link touches the object [N]
+SATURATED = 0.98  # share of the largest torque from which on a joint is at its torque limit
 LEAST, WIDTH, NUM_BINS = 1e-6, math.log(1.01), 2800
 """Lower end of the first bin, width of the bins of the logarithm, and their number: up to 1.3e6."""
 PERCENTILE = 0.99
-SHARE = "share"
-"""A plain number, or one in percent."""
+SHARE = "share"  # a plain number, or one in percent
 SPIN = Dimension("angular speed", {"rad/s": 1.0})
 UNITS: dict[str | Dimension, str] = {"length": "m", "force": "N", "speed": "m/s", SPIN: "rad/s"}
 METRICS: dict[str, tuple[str, str | Dimension]] = {

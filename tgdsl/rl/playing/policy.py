@@ -46,14 +46,11 @@ ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
 
 OF_LEARNING, OF_TOUCH = ("train", "distill"), ("touch", "placement", "resolution", "noise")
 """What of a document matters to those alone who learn, and to those alone who feel."""
-POLICY = "policy.pt"
-"""Name of a run's policy in its folder."""
-CARD = "card.json"
-"""Name of the card in the file."""
+POLICY = "policy.pt"  # name of a run's policy in its folder
+CARD = "card.json"  # name of the card in the file
 FIELDS = ("groups", "joints", "taxels", "spec", "spec.task", "spec.action", "spec.physics.timestep", "spec.physics.substeps")
 """What every card has."""
-TAXELS = "taxels.csv"
-"""Name of the table of taxels in the file."""
+TAXELS = "taxels.csv"  # name of the table of taxels in the file
 
 
 class PolicyError(TgdslError):

@@ -36,8 +36,7 @@ SCENE = {
     "actuators": ("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange"),
 }
 """Arrays of MuJoCo's model by what they are of."""
-LEAST = 1e-12
-"""What counts as 0, in the array's unit: rounding differs between machines."""
+LEAST = 1e-12  # what counts as 0, in the array's unit: rounding differs between machines
 
 
 def provenance(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:

@@ -19,13 +19,9 @@ from tgdsl.rl.env import Observations, Step, TouchEnv
 
 
 class Actor(ABC):
-    """Who acts in environments.
+    """Who acts in environments."""
 
-    Attributes:
-        changes: What of the task was otherwise when that was learned, a line each.
-    """
-
-    changes: Sequence[str] = ()
+    changes: Sequence[str] = ()  # what of the task was otherwise when that was learned, a line each
 
     @abstractmethod
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:

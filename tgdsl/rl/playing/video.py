@@ -23,10 +23,8 @@ from tgdsl.errors import FileError, TgdslError, did_you_mean
 from tgdsl.files.write import atomic_path
 from tgdsl.view.trace import TouchTrace
 
-WIDTH, HEIGHT = 960, 720
-"""Pixels of a frame."""
-MAX_RATE = 60.0
-"""Frames per second that a video has at most."""
+WIDTH, HEIGHT = 960, 720  # pixels of a frame
+MAX_RATE = 60.0  # frames per second that a video has at most
 Frame = UInt8[np.ndarray, "row column 3"]
 
 

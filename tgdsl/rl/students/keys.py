@@ -21,8 +21,7 @@ from tgdsl.rl.students.encoders import Encoder, Grid
 from tgdsl.rl.students.spec import StudentNetworksSpec
 from tgdsl.rl.students.student import Architecture
 
-NONE = "none"
-"""The type that feels nothing."""
+NONE = "none"  # the type that feels nothing
 
 
 class StudentError(TgdslError):

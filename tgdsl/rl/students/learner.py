@@ -33,8 +33,7 @@ from tgdsl.rl.train.model import Normalisation
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
 
-LEAST_STD = 1e-3
-"""Least deviation of the teacher's actions by which an error is divided."""
+LEAST_STD = 1e-3  # least deviation of the teacher's actions by which an error is divided
 
 
 class Rollout:

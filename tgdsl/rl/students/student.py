@@ -148,8 +148,7 @@ def forgotten(memory: Tensor, ended: Tensor) -> Tensor:
     return torch.where(ended[..., None], 0.0, memory)
 
 
-NORM_EPS = 1e-6
-"""What `torch.nn.utils.clip_grad_norm_` adds to a norm."""
+NORM_EPS = 1e-6  # what `torch.nn.utils.clip_grad_norm_` adds to a norm
 
 
 class Stack:

@@ -13,8 +13,7 @@ from tgdsl.rl.playing.policy import OF_TOUCH, Policy, PolicyError, changes_since
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 from tgdsl.rl.spec import PushSpec
 
-WARM_CALLS = 3
-"""Calls in which TorchScript optimises a policy, before one is captured on a GPU."""
+WARM_CALLS = 3  # calls in which TorchScript optimises a policy, before one is captured on a GPU
 
 
 class Teacher:

@@ -54,8 +54,7 @@ from tgdsl.rl.tasks.progress import ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
 
-UPRIGHT = math.radians(20.0)
-"""Tilt below which a turn counts for the score [rad]; ours."""
+UPRIGHT = math.radians(20.0)  # tilt below which a turn counts for the score [rad]; ours
 
 
 class Train(with_defaults(TrainSpec, iterations=5000, steps=12, discount=0.99, entropy=0.0)):

@@ -157,13 +157,11 @@ def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _clock(env: TouchEnv) -> dict[str, Tensor]:
-    """Return the counts by which the module's random numbers differ; none if no sensor draws any."""
     clock: Any = env.touch.memory.clock
     return {"step": clock.step, "episode": clock.episode} if clock.num_envs else {}
 
 
 def _rounded(part: Any) -> Any:
-    """Return a state with Adam's moments in bfloat16; optimisers widen them again."""
     if isinstance(part, Mapping):
         return {name: each.bfloat16() if str(name).startswith("exp_avg") else _rounded(each) for name, each in part.items()}
     return [_rounded(each) for each in part] if isinstance(part, list) else part

@@ -11,8 +11,7 @@ from tgdsl.rl.sensed import GROUP
 
 PROPRIO, PRIVILEGED, STATE, PROPS = "proprio", "priv_proprio", "priv_obj_state", "priv_obj_props"
 """What is known of the hand; that and its forces; the object's motion; what it is like."""
-MOST_STD = 1e6
-"""Bound above of the actions' standard deviation: rsl_rl's."""
+MOST_STD = 1e6  # bound above of the actions' standard deviation: rsl_rl's
 
 PPO_OPTIONS = {
     "num_learning_epochs": "epochs",

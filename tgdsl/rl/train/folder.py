@@ -39,10 +39,8 @@ from tgdsl.rl.playing.provenance import differences, provenance, spec_difference
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
-COLUMNS = ("iteration", "samples", "seconds")
-"""First columns of a curve."""
-ORIGIN = frozenset({"spec", "seed", "envs", "module", "taxels"})
-"""What a resumed run needs of an entry of `run.json`."""
+COLUMNS = ("iteration", "samples", "seconds")  # first columns of a curve
+ORIGIN = frozenset({"spec", "seed", "envs", "module", "taxels"})  # what a resumed run needs of an entry of `run.json`
 
 
 class RunFolder:

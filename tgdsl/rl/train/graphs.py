@@ -10,8 +10,7 @@ from typing import Generic, TypeVar
 import torch
 
 T = TypeVar("T")
-EAGER_CALLS = 2
-"""Calls before the one that is captured: they load kernels, and make what lasts."""
+EAGER_CALLS = 2  # calls before the one that is captured: they load kernels, and make what lasts
 
 
 class Captured(Generic[T]):

@@ -23,8 +23,7 @@ from torch import Tensor, nn
 
 from tgdsl.rl.train.ranks import add_up, num_processes
 
-UNTIL = 10**8
-"""As rsl_rl has it: after so many states, and rewards, their normalisation does not change any more."""
+UNTIL = 10**8  # as rsl_rl has it: after so many states, and rewards, their normalisation does not change any more
 
 
 class Normalisation(EmpiricalNormalization):

@@ -27,8 +27,7 @@ from tgdsl.rl.train.model import Distillation, Gaussian
 from tgdsl.rl.train.ranks import add_up, num_processes
 from tgdsl.tensors.torch_internals import copy_each
 
-LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
-"""Bounds of the adaptive learning rate, and by what it changes: rsl_rl's."""
+LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5  # bounds of the adaptive learning rate, and by what it changes: rsl_rl's
 LOSSES = ("value", "surrogate", "entropy", "rnd")
 
 

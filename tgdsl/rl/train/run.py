@@ -23,8 +23,7 @@ from tgdsl.rl.train.checkpoint import not_finite, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder
 from tgdsl.rl.train.iteration import Iteration, Learning
 
-LINE_INTERVAL = 10.0
-"""Time between lines where there is no terminal for a progress bar [s]."""
+LINE_INTERVAL = 10.0  # time between lines where there is no terminal for a progress bar [s]
 
 
 class ProgressBar:
