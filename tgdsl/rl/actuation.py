@@ -149,11 +149,7 @@ class Actuators:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, names: Sequence[str]) -> Actuators:
-        """Look up the actuators of joints.
-
-        Raises:
-            SimulationError: If there is no such joint, it has no limits, or no position actuator of its own.
-        """
+        """Look up the actuators of joints."""
         joint_names = [model.joint(i).name for i in range(model.njnt)]
         rows = []
         for name in names:
@@ -217,11 +213,7 @@ class Actuation:
         draws: Draws,
         substeps: int = 1,
     ):
-        """Begin with all drives ideal, at their joints' present positions.
-
-        Raises:
-            SimulationError: If a drive's noise, kick or speed limit needs a largest torque that a joint does not have.
-        """
+        """Begin with all drives ideal, at their joints' present positions."""
         self._arrays, self._draws, self.spec, self.action, self._ahead = arrays, draws, drive, action, substeps
         qpos = arrays["qpos"]
         device, dtype, num_envs, num = qpos.device, qpos.dtype, len(qpos), len(actuators.names)

@@ -50,15 +50,7 @@ class Description(dict[str, tuple[tuple[slice, Features], ...]]):
 def describe(
     loaded: LoadedTask, sensed: Sensed, task: Task[Any], terms: Mapping[str, Term], sizes: Mapping[str, int]
 ) -> Description:
-    """Return the features of each group of observations.
-
-    Args:
-        loaded: The task's document.
-        sensed: The sensors.
-        task: The task.
-        terms: Terms that the document adds.
-        sizes: Size of each group.
-    """
+    """Return the features of each group of observations."""
     setup, substeps = task.setup, loaded.spec.physics.substeps if loaded.spec.temporal == "stack" else 0
     names, is_slide = setup.actuators.names, setup.actuators.is_slide.tolist()
     known: dict[str, Sequence[Features]] = {

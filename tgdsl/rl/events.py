@@ -50,11 +50,7 @@ class Events:
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], sim: Simulation, setup: Setup, actuation: Actuation):
-        """Make the counters of events at intervals; each reset draws when the first ones come.
-
-        Raises:
-            SimulationError: If an event would come more often than control steps.
-        """
+        """Make the counters of events at intervals; each reset draws when the first ones come."""
         self._terms, self._setup, self.memory = terms, setup, dict[str, Tensor]()
         self._event = partial(Event, sim, setup, actuation)
         for name, term in terms.items():

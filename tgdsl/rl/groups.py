@@ -55,14 +55,7 @@ def proprio(now: Now | HandNow, vel_scale: float = 1.0) -> Float[Tensor, "env fe
 
 
 def noisy_proprio(now: Now, spec: ProprioSpec, draws: Draws, count: Int[Tensor, " env"]) -> Float[Tensor, "env feature"]:
-    """Return `proprio` with noise.
-
-    Args:
-        now: The instant.
-        spec: Noise and scale.
-        draws: Random numbers.
-        count: Counter of each environment, another number at each control step.
-    """
+    """Return `proprio` with noise."""
     if spec.pos_noise or spec.vel_noise:
         pos, vel = draws.normal("proprio", count, 2 * now.joint_pos.shape[1]).to(now.joint_pos).chunk(2, dim=1)
         now = replace(now, joint_pos=now.joint_pos + spec.pos_noise * pos, joint_vel=now.joint_vel + spec.vel_noise * vel)

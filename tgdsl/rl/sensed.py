@@ -99,21 +99,7 @@ def compile_sensed(
     feels: Sequence[Felt] | None = None,
     also: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
 ) -> Sensed:
-    """Compile what a task's environments feel.
-
-    Args:
-        loaded: The task's document.
-        device: Where the module lives.
-        progress: Called with a line of text for each long job.
-        only: Kinds of sensors to use, instead of the policy's and the task's.
-        feels: What policies feel, in place of the document's `touch`, `placement` and `noise`.
-        also: Groups of observations that the module has besides, as a document has them: `{"q": [{"type": "joint_pos"}]}`.
-
-    Raises:
-        SpecError: If the sensors' document lacks a sensor or the object, at the place in the task's document; or all mistakes
-            of the sensors' document.
-        RobotError: If a robot or scene file cannot be read.
-    """
+    """Compile what a task's environments feel."""
     spec, document = loaded.spec, sensors_document(loaded)
     senses = loaded.senses if only is None else only
     of_policy = [] if only is not None or spec.touch == "none" else [spec.touch]
@@ -236,11 +222,7 @@ def _variants(loaded: LoadedTask, document: Loaded) -> list[Any]:
 
 
 def sensors_document(loaded: LoadedTask) -> Loaded:
-    """Return the sensors' document.
-
-    Raises:
-        SpecError: All its mistakes, or if it is not there, or lacks the task's object.
-    """
+    """Return the sensors' document."""
     spec = loaded.spec
     file = loaded.folder / spec.document
     if not file.is_file():

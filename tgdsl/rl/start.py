@@ -27,11 +27,7 @@ from tgdsl.schema.select import is_plain, matching
 
 
 def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
-    """Return the joints that the policy moves, in the order of the actuators.
-
-    Raises:
-        SpecError: If a name or wildcard matches no joint with an actuator, or there is no such keyframe.
-    """
+    """Return the joints that the policy moves, in the order of the actuators."""
     model = SceneModels(sensed.touch.plan.scene).model({})
     of_actuators = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
     joint_names = list(dict.fromkeys(model.joint(int(i)).name for i in of_actuators))
@@ -63,11 +59,7 @@ def make_simulation(
     threads: int = 0,
     first_env: int = 0,
 ) -> Simulation:
-    """Simulate the task's scene; environments with faults wait for a reset.
-
-    Raises:
-        SimulationError: If the scene cannot be simulated as the document says, or of no whole number of environments.
-    """
+    """Simulate the task's scene; environments with faults wait for a reset."""
     if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
         raise SimulationError(f"num_envs is {num_envs!r}, expected a whole number of at least 1")
     spec = loaded.spec
@@ -96,11 +88,7 @@ def make_simulation(
 def make_setup(
     loaded: LoadedTask, sensed: Sensed, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
 ) -> Setup:
-    """Return the setup of a task without grasps.
-
-    Raises:
-        SpecError: If a joint that the policy moves has no position actuator of its own, or no limits.
-    """
+    """Return the setup of a task without grasps."""
     try:
         actuators = Actuators.of(sim.model, joints)
     except SimulationError as error:

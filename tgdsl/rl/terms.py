@@ -339,11 +339,7 @@ class LinkForce(ObservationTerm):
         return features.link_forces([setup.links[i] for i in self.rows(setup)])
 
     def rows(self, setup: Setup) -> list[int]:
-        """Return which links are observed.
-
-        Raises:
-            SimulationError: If a name or wildcard matches none.
-        """
+        """Return which links are observed."""
         for pattern in self.links:
             if not matching(pattern, setup.links):
                 raise SimulationError(f'no link matches "{pattern}"; {did_you_mean(pattern, setup.links, "links")}')

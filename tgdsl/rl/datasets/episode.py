@@ -145,11 +145,7 @@ def frames(header: Header, episode: Episode) -> dict[str, np.ndarray]:
 
 
 def numbered_frames(header: Header, episodes: Iterable[Episode]) -> Iterator[tuple[int, Episode, dict[str, np.ndarray]]]:
-    """Yield each episode's number, from 0, itself and its frames.
-
-    Raises:
-        TgdslError: If there is no episode.
-    """
+    """Yield each episode's number, from 0, itself and its frames."""
     number = -1
     for number, episode in enumerate(episodes):
         yield number, episode, frames(header, episode)

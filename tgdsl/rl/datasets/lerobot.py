@@ -24,11 +24,7 @@ INDICES = {name: Feature("int64", (1,)) for name in ("frame_index", "episode_ind
 
 
 def write_lerobot(header: Header, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
-    """Write a dataset into an empty folder; return the numbers of episodes and frames.
-
-    Raises:
-        TgdslError: If pyarrow or pandas is not installed, or there is no episode.
-    """
+    """Write a dataset into an empty folder; return the numbers of episodes and frames."""
     try:
         import pandas
         import pyarrow as pa

@@ -61,20 +61,7 @@ class _Sampler(Actor):
 def of_environments(
     env: TouchEnv, actor: Actor, episodes: int, fps: float | None = None, reading: str | None = None, least: float | None = None
 ) -> tuple[Header, Iterator[Episode]]:
-    """Return the first episodes of fresh environments, as many of each.
-
-    Args:
-        env: The environments.
-        actor: Who acts.
-        episodes: How many.
-        fps: Frames per second; default: one per control step.
-        reading: The reading that is exported; default: the first force on taxels.
-        least: Least score with which an episode succeeds, or the largest where less is better; default: it succeeds if it
-            lasts to the end.
-
-    Raises:
-        TgdslError: If there is no such reading of a force on taxels.
-    """
+    """Return the first episodes of fresh environments, as many of each."""
     output = _force_of(env.touch.outputs, reading)
     table = env.touch.taxels[output.sensor]
     rows, links = _links(table)
@@ -125,19 +112,7 @@ def of_deployment(
     fps: float | None = None,
     least: float | None = None,
 ) -> tuple[Header, Iterator[Episode]]:
-    """Return episodes of a policy on an emulated hand, a real one or a log: the force on each fingertip, as the hand says it.
-
-    Args:
-        deployment: The policy on its source.
-        episodes: How many.
-        unit: Unit of the forces, as the hand's calibration has it.
-        seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
-        fps: Frames per second; default: one per control step.
-        least: As for `of_environments`; without a scene there is no score, and no success.
-
-    Raises:
-        TgdslError: If the policy does not feel forces on fingertips, or acts in a simulation.
-    """
+    """Return episodes of a policy on an emulated hand, a real one or a log: the force on each fingertip."""
     prepared, felt = deployment.prepared, deployment.prepared.felt
     if felt is None or felt.type != EMULATED or "proprio" not in prepared.groups:
         problem = f"this policy feels {'nothing' if felt is None else felt.type}"
@@ -190,14 +165,6 @@ def of_run(
 
     A recording has positions and readings after each step: a frame's action is the next step's.
 
-    Args:
-        file: The recording.
-        touch: The module of its document.
-        fps: Frames per second; default: one per control step.
-        reading: As for `of_environments`.
-
-    Raises:
-        TgdslError: If the recording holds no such reading or less than two steps, or is of another scene.
     """
     with np.load(file, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -245,16 +212,6 @@ def of_log(
     A log does not hold commands: the action is where the joints are a frame later. Where no reading came for 0.1 s, the next
     episode begins.
 
-    Args:
-        file: A log of `tgdsl hand record`.
-        fps: Frames per second; default: 30.
-        calibration: What counts mean; default: what the log says.
-        side: Which hand it is, "right" or "left", by which links and joints are called as in its robot file; default: names
-            are without it.
-
-    Raises:
-        LogError: If the log cannot be read.
-        TgdslError: If frames come faster than readings.
     """
     log = open_log(file)
     meaning = calibration or log.calibration or Calibration.none()

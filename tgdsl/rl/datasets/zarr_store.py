@@ -16,11 +16,7 @@ CHUNK_BYTES = 2**20
 
 
 def write_zarr(header: Header, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
-    """Write a dataset into an empty folder; return the numbers of episodes and frames.
-
-    Raises:
-        TgdslError: If zarr is not installed, or there is no episode.
-    """
+    """Write a dataset into an empty folder; return the numbers of episodes and frames."""
     try:
         import zarr
     except ImportError as error:

@@ -252,10 +252,6 @@ class Deployment:
         A scene's episodes end as the task says; others, and a log that is not over, after so many seconds: by default an
         episode's, and all of a log.
 
-        Raises:
-            DeployError: If there is nothing to do.
-            ObservationError: If the source cannot give what the policy feels; no hand was touched then.
-            HandError: If a hand does not answer, or may not move like this.
         """
         if episodes < 1 or not (seconds is None or 0 < seconds < math.inf):
             raise DeployError(f"{episodes} episodes of {seconds} s, expected at least 1, and more than 0 s")

@@ -101,10 +101,6 @@ def prepare(
     and `noise` count for a policy without one. An emulated hand has to feel what the fingertips would. For the other arguments
     see `Deployment`.
 
-    Raises:
-        SpecError: All mistakes of the documents, at their places.
-        PolicyError: If the policy cannot be read, or was learned in another task, with other actions, joints or taxels.
-        DeployError: If it sees what no hand can know, or is asked for what it cannot be.
     """
     loaded, saved = load_task(task, overrides), read_policy(policy)
     card, changes = saved.card, list[str]()
@@ -297,11 +293,7 @@ class Hand:
         return {name: result[name].float() for name in prepared.groups}
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:
-        """Make one control step; joints that the policy does not move are held. Without a scene its score is not a number.
-
-        Raises:
-            PolicyError: If an action is not finite.
-        """
+        """Make one control step; joints that the policy does not move are held. Without a scene its score is not a number."""
         action = action.to(self.action)
         if not bool(action.isfinite().all()):
             problem = f"at control step {self.steps} this policy returns {action[0].tolist()}, expected finite actions"

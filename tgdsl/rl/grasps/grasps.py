@@ -103,11 +103,7 @@ class Grasps:
 
     @classmethod
     def unpacked(cls, arrays: Mapping[str, np.ndarray]) -> Grasps:
-        """Return what `packed` has made arrays of.
-
-        Raises:
-            KeyError, ValueError: If they are none.
-        """
+        """Return what `packed` has made arrays of."""
         if str(arrays["format"]) != FORMAT:
             raise ValueError(f"format {arrays['format']}")
         qpos, ctrl, variant = arrays["qpos"], arrays["ctrl"], arrays["variant"]
@@ -133,21 +129,13 @@ def cache_key(scene: str, settings: str) -> str:
 
 
 def write_grasps(grasps: Grasps, file: Path) -> None:
-    """Write grasps to a file; one that is there is replaced.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
+    """Write grasps to a file; one that is there is replaced."""
     with atomic_open(with_folder(file)) as out:
         np.savez(out, allow_pickle=False, **grasps.packed())
 
 
 def read_grasps(file: Path, scene: str, object: str) -> Grasps:
-    """Read grasps of an object in a scene from a file.
-
-    Raises:
-        SimulationError: If it cannot be read, or holds something else.
-    """
+    """Read grasps of an object in a scene from a file."""
     try:
         with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
             grasps = Grasps.unpacked(archive)
@@ -188,8 +176,6 @@ class GraspTable:
 
         Its objects have to be as those that the grasps were sampled with, and not yet of a mass and friction of their own.
 
-        Raises:
-            SimulationError: If the grasps are of other joints or actuators, or a variant that some environment has is lacking.
         """
         shape = (sim.model.nq, sim.model.nu)
         sizes = (grasps.qpos.shape[1], grasps.ctrl.shape[1])

@@ -54,11 +54,7 @@ Count = Callable[[int, int], None]  # called with the number of grasps so far an
 
 
 def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -> Grasps:
-    """Sample a task's grasps, on the CPU.
-
-    Raises:
-        SpecError: If there is no such keyframe, the object cannot be turned or moved as asked, or hardly any trial holds.
-    """
+    """Sample a task's grasps, on the CPU."""
     spec, sensed = grasp_spec(loaded.spec), compile_sensed(loaded, "cpu", progress, only=("link_contact",))
     assert spec is not None
     trials = _Trials(loaded, sensed, spec)
@@ -250,11 +246,7 @@ class _Place:
 
 
 def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None = None) -> Setup:
-    """Return a setup with the grasps of its document, if it has any; the simulation has to be reset afterwards.
-
-    Raises:
-        SpecError: If the document's file of grasps is none of this scene, hardly any grasp holds, or a variant has none.
-    """
+    """Return a setup with the grasps of its document, if it has any; the simulation has to be reset afterwards."""
     spec, tell = grasp_spec(loaded.spec), progress or silent
     if spec is None:
         return setup
@@ -272,10 +264,6 @@ def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneF
 def cached_grasps(
     loaded: LoadedTask, scene: SceneFile, joints: tuple[str, ...], count: Count, progress: Progress | None = None
 ) -> Grasps:
-    """Return the task's grasps from the user's cache, under a hash of scene and settings; sample them if it has none.
-
-    Raises:
-        SpecError: If there is no such keyframe, the object cannot be held as asked, or hardly any grasp holds.
-    """
+    """Return the task's grasps from the user's cache, under a hash of scene and settings; sample them if it has none."""
     key = cache_key(scene_digest(scene), settings_of(loaded.spec, joints))
     return cached(key, lambda: sample(loaded, count, progress), Grasps.packed, Grasps.unpacked)

@@ -74,11 +74,7 @@ class ScriptActor(Actor):
 
 
 def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
-    """Return the actor of one of `KINDS`, `script` being the task's own method `script(obs)`, or of `FILE.py:FUNCTION`.
-
-    Raises:
-        ScriptError: If there is no such script.
-    """
+    """Return the actor of one of `KINDS`, `script` being the task's own method `script(obs)`, or of `FILE.py:FUNCTION`."""
     if actions == "zero":
         return ZeroActor(env)
     if actions == "random":

@@ -162,11 +162,7 @@ class Requirement:
 
 
 def parse_requirements(text: str) -> list[Requirement]:
-    """Return what a text requires, its parts separated by commas: `coasting<0.1, penetration<2 mm, held>=95 %`.
-
-    Raises:
-        TgdslError: If a part is not NAME<VALUE with a name and a unit that are known.
-    """
+    """Return what a text requires, its parts separated by commas: `coasting<0.1, penetration<2 mm, held>=95 %`."""
     return [_requirement(part.strip()) for part in text.split(",")]
 
 

@@ -20,16 +20,7 @@ from tgdsl.module.export.formats import write_onnx
 
 
 def write_onnx_policy(network: Any, texts: dict[str, str], file: Path) -> None:
-    """Write a policy.
-
-    Args:
-        network: The policy: a module with `input_names`, `output_names` and `get_dummy_inputs`, as rsl_rl's `as_onnx` returns.
-        texts: The card and the table of taxels by the names that they have in the TorchScript file; metadata of this one.
-        file: The file.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
+    """Write a policy."""
     module = network.cpu().eval().requires_grad_(False)
     inputs = network.get_dummy_inputs()
     env = torch.export.Dim("env", min=1)

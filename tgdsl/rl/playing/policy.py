@@ -101,11 +101,7 @@ def read_policy(file: Path) -> PolicyFile:
 
 
 def write_policy(scripted: torch.nn.Module, texts: Mapping[str, str], file: Path) -> None:
-    """Write a policy as TorchScript with its `card_texts` in it, and the card beside it.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
+    """Write a policy as TorchScript with its `card_texts` in it, and the card beside it."""
     content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
@@ -203,11 +199,7 @@ class Policy(Actor):
 
 
 def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> Policy:
-    """Return a policy that acts in some environments.
-
-    Raises:
-        PolicyError: If it is for other environments, or feels something else than they do.
-    """
+    """Return a policy that acts in some environments."""
     card, file = saved.card, saved.file
     if card is not None:
         check_learned(card, file, env.spec)
@@ -266,8 +258,6 @@ def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None
     Taxels may differ by rounding, as those of a robot that was exported do. Sensors that the environments lack, such as those
     that only the task reads, are not compared.
 
-    Raises:
-        PolicyError: If joints are others, or taxels are, and it feels with them.
     """
     card, file = saved.card, saved.file
     assert card is not None

@@ -61,11 +61,7 @@ class PlayRecord(Record):
     """
 
     def __init__(self, env: TouchEnv, num_steps: int):
-        """Begin with environments that have just been reset.
-
-        Raises:
-            SimulationError: If this computer has too little memory for so many steps.
-        """
+        """Begin with environments that have just been reset."""
         super().__init__(env.joint_names)
         self._env = env
         names = ("qpos", "mocap_pos", "mocap_quat") if env.sim.model.nmocap else ("qpos",)

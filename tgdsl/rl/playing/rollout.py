@@ -64,11 +64,7 @@ def rollout(actor: Actor, env: Environments, num_steps: int | None = None) -> It
 
 
 def steps_of(env: TouchEnv, seconds: float | None) -> int:
-    """Return how many control steps a duration has, at least one; default: an episode's.
-
-    Raises:
-        SimulationError: If it is not positive.
-    """
+    """Return how many control steps a duration has, at least one; default: an episode's."""
     if seconds is None:
         return env.max_steps
     if not 0 < seconds < float("inf"):

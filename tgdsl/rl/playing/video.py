@@ -48,12 +48,7 @@ def video(
     progress: Progress = silent,
     trace: TouchTrace | None = None,
 ) -> Path:
-    """Draw an environment in real time; return the file.
-
-    Raises:
-        VideoError: If the scene has no such camera, OpenGL cannot be started, or imageio-ffmpeg is missing.
-        FileError: If the file cannot be written.
-    """
+    """Draw an environment in real time; return the file."""
     check_camera(model, camera)
     every = max(1, math.ceil(1.0 / (MAX_RATE * control_step) - 1e-9))
     steps, encoder = range(0, len(poses["qpos"]), every), _encoder()

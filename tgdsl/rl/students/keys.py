@@ -47,11 +47,7 @@ class StudentKey:
 
 
 def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequence[str], seeds: int) -> list[StudentKey]:
-    """Return a student per type, placement, noise and seed; of those that feel nothing, one per seed.
-
-    Raises:
-        StudentError: If there is no such type, something is named twice, two have one name, or nobody is taught.
-    """
+    """Return a student per type, placement, noise and seed; of those that feel nothing, one per seed."""
     all_types = [NONE, *SENSED]
     selected = [name for type_ in types for name in (all_types if type_ == "all" else [type_])]
     for name in selected:
@@ -85,11 +81,7 @@ def feels(dealt: Sequence[StudentKey], also: Felt | None = None) -> list[Felt]:
 
 
 def check_blocks(num_envs: int, num_students: int, num_variants: int) -> None:
-    """See that environments divide into blocks in which all variants of the object are, equally often.
-
-    Raises:
-        StudentError: If they do not.
-    """
+    """See that environments divide into blocks in which all variants of the object are, equally often."""
     unit = num_students * num_variants
     if num_envs % unit:
         of = f", {num_variants} variants of the object in the environments of each" if num_variants > 1 else ""
@@ -99,11 +91,7 @@ def check_blocks(num_envs: int, num_students: int, num_variants: int) -> None:
 
 
 def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
-    """Return the groups of observations that all students see, with `tactile_sensors` where touch stands among them.
-
-    Raises:
-        SpecError: If a group that is named is not there.
-    """
+    """Return the groups of observations that all students see, with `tactile_sensors` where touch stands among them."""
     named = loaded.spec.distill.groups
     other_groups = [name for name in groups if not name.startswith(f"{GROUP}/")]
     for i, name in enumerate(named or ()):
@@ -122,11 +110,7 @@ def seen_by(key: StudentKey, names: Sequence[str]) -> list[str]:
 
 
 def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequence[str]) -> Architecture:
-    """Return a student's networks: students whose networks are equal are stacked.
-
-    Raises:
-        StudentError: If images are wanted of a type whose links are not all on grids.
-    """
+    """Return a student's networks: students whose networks are equal are stacked."""
     networks, parts = loaded.spec.distill.networks, []
     for name in seen_by(key, names):
         size = env.groups[name]

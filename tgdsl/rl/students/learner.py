@@ -97,12 +97,7 @@ class Distiller(Learning):
     rates = "distill.learning_rate"
 
     def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: Policy, keys: Sequence[StudentKey], seed: int):
-        """Make the students; torch's own random generators are seeded.
-
-        Raises:
-            SpecError: If a group of observations or a privileged number that is named is not there.
-            StudentError: If images are wanted of taxels on no grid.
-        """
+        """Make the students; torch's own random generators are seeded."""
         self._teacher, self._spec = teacher, loaded.spec.distill
         super().__init__(env, Ranks(), self._spec.steps)
         self._targets = list(self._spec.decoders)

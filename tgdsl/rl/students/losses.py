@@ -33,16 +33,7 @@ def behaviour(
     *,
     is_huber: bool = False,
 ) -> Float[Tensor, " student"]:
-    """Return the error of actions.
-
-    Args:
-        action: a_s.
-        label: a_t.
-        before: a_0.
-        std: σ_t; None: 1.
-        clip: Bound of a_s − a_0; None: there is none.
-        is_huber: Whether h is Huber's loss.
-    """
+    """Return the error of actions."""
     error = (action - label).abs()
     if clip is not None:
         bounded = before + (action - before).clamp(-clip, clip)

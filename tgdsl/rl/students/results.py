@@ -118,11 +118,7 @@ def write_students(
     folder: Path,
     progress: Progress,
 ) -> None:
-    """Write each student as a policy file, with its card, for `tgdsl play --policy` and `tgdsl evaluate`.
-
-    Raises:
-        FileError: If one cannot be written.
-    """
+    """Write each student as a policy file, with its card, for `tgdsl play --policy` and `tgdsl evaluate`."""
     with_folder(folder / "any")
     alone: dict[Felt | None, Any] = {}
     for i, key in enumerate(distiller.keys):

@@ -230,11 +230,7 @@ class Stack:
         return {"networks": networks, "seen": seen, "optimiser": self.optimiser.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved, with the learning rate that the stack has.
-
-        Raises:
-            RuntimeError: If it is of other networks.
-        """
+        """Go on from what was saved, with the learning rate that the stack has."""
         current = self.state_dict()
         for part in ("networks", "seen"):
             if current[part].keys() != state[part].keys():

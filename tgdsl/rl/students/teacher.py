@@ -20,12 +20,7 @@ class Teacher:
     """A learned policy, seen to be of this task: its file, its card, and what it feels; None: nothing."""
 
     def __init__(self, file: Path, loaded: LoadedTask):
-        """Read it, and see that it is for this task and these actions.
-
-        Raises:
-            PolicyError: If it cannot be read, has no card, or was learned in another task, with other joints or actions, or a
-                loss needs the deviations of its actions, which it does not tell.
-        """
+        """Read it, and see that it is for this task and these actions."""
         self.saved, self._loaded = read_policy(file), loaded
         card = self.saved.card
         if card is None:
@@ -53,11 +48,7 @@ class Teacher:
             check_card(self.saved, self.card["joints"], touch)
 
     def bound(self, env: TouchEnv) -> Policy:
-        """Return the policy for some environments.
-
-        Raises:
-            PolicyError: If joints or groups of observations are others.
-        """
+        """Return the policy for some environments."""
         card, file = self.card, self.saved.file
         if list(env.joint_names) != list(card["joints"]):
             moved = (", ".join(names) for names in (card["joints"], env.joint_names))

@@ -132,11 +132,7 @@ class GripForce(Task[GripForceSpec]):
 
     @classmethod
     def asked_for(cls, spec: GripForceSpec, goal: tuple[float, ...]) -> GripForceSpec:
-        """Return the document in which every command is this force [N].
-
-        Raises:
-            LowerError: If it is beyond the document's forces.
-        """
+        """Return the document in which every command is this force [N]."""
         low, high = spec.force
         if not low <= goal[0] <= high:
             raise LowerError(f"a force of {goal[0]:g} N", "force", f"expected {low:g} to {high:g} N")
@@ -147,11 +143,7 @@ class GripForce(Task[GripForceSpec]):
         return {"goal": now.goal}
 
     def __init__(self, spec: GripForceSpec, setup: Setup):
-        """Look up the keyframes.
-
-        Raises:
-            LowerError: If there is no such keyframe, or not one for each variant, or commands change within a control step.
-        """
+        """Look up the keyframes."""
         super().__init__(spec, setup)
         self.qpos, self.ctrl = (_keyframes(spec, setup, name)[setup.variant] for name in ("qpos", "ctrl"))
         self.item, actuators = setup.free_qpos(), setup.actuators

@@ -55,11 +55,7 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
 
 
 def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False) -> None:
-    """Write a checkpoint to the disk; if slim, the optimisers' moments, two thirds of it, are rounded to bfloat16.
-
-    Raises:
-        FileError: If it cannot be written; then the file that was there is as it was.
-    """
+    """Write a checkpoint to the disk; if slim, the optimisers' moments, two thirds of it, are rounded to bfloat16."""
     content = io.BytesIO()
     torch.save(_rounded(state) if is_slim else dict(state), content)
     with atomic_open(file) as opened:
@@ -97,11 +93,7 @@ def _no_checkpoint(file: Path, found: str) -> CheckpointError:
 
 
 def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
-    """Have a learner of the same groups and networks go on from a checkpoint; `file` is named in errors.
-
-    Raises:
-        CheckpointError: If it is of other groups or networks.
-    """
+    """Have a learner of the same groups and networks go on from a checkpoint; `file` is named in errors."""
     env, rank = learner.env, learner.ranks.rank
     names = state["groups"].keys() | learner.groups.keys()
     if state["groups"].keys() ^ learner.groups.keys() == {"rnd_state"}:  # RND was turned on or off

@@ -31,11 +31,7 @@ PPO_OPTIONS = {
 
 
 def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[str]]:
-    """Return the groups of observations of actor, critic and, if there is one, random network distillation.
-
-    Raises:
-        SpecError: If a group that is named is not there, or is empty.
-    """
+    """Return the groups of observations of actor, critic and, if there is one, random network distillation."""
     train = loaded.spec.train
     privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
     actor = _given(loaded, groups, ("actor",)) or [name for name in privileged if name != PROPS]
@@ -46,11 +42,7 @@ def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[st
 
 
 def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str, int] | None = None) -> dict[str, Any]:
-    """Return rsl_rl's configuration, for `PPO.construct_algorithm` or an `OnPolicyRunner`.
-
-    Raises:
-        SpecError: If a group that is named is not there.
-    """
+    """Return rsl_rl's configuration, for `PPO.construct_algorithm` or an `OnPolicyRunner`."""
     train, networks = loaded.spec.train, loaded.spec.train.networks
     encoders = {GROUP: networks.touch_encoder, "*": networks.encoder}
     normalisation = {"eps": networks.eps, "clip": networks.clip}

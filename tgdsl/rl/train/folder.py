@@ -58,12 +58,7 @@ class RunFolder:
         return self.checkpoint.exists() or bool(self.rows())
 
     def check(self, is_resumed: bool) -> None:
-        """Check that a run can begin or resume here, without writing.
-
-        Raises:
-            FileError: If the folder cannot be written.
-            TgdslError: If there is a run already, or none to go on with, or what should be its curve is none.
-        """
+        """Check that a run can begin or resume here, without writing."""
         if not is_resumed and self.has_run:
             raise TgdslError(f"{self.path}: this folder holds a run; go on with --resume {self.path}, or give another --out")
         if is_resumed and not self.checkpoint.is_file():
@@ -73,12 +68,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Lock the folder; the lock ends with the process. The folder is created, and removed if it stays empty.
-
-        Raises:
-            FileError: If it cannot be created, or written into.
-            TgdslError: If another process has locked it.
-        """
+        """Lock the folder; the lock ends with the process. The folder is created, and removed if it stays empty."""
         with new_folder(check_writable(self.run)):
             folder = os.open(self.path, os.O_RDONLY)
             try:
@@ -94,11 +84,7 @@ class RunFolder:
                 os.close(folder)
 
     def begin(self, origin: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
-        """Write the origin of a run, or of its resumption; entries without a run are dropped.
-
-        Raises:
-            FileError: If it cannot be written.
-        """
+        """Write the origin of a run, or of its resumption; entries without a run are dropped."""
         with_folder(self.run)
         for file in self.path.iterdir():  # temporary files that a run which was killed has left
             if re.fullmatch(TEMPORARY.pattern + r"\.\w+", file.name):
@@ -117,11 +103,7 @@ class RunFolder:
         return starts[-1]
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the complete rows of the curve; a killed run may leave half a line.
-
-        Raises:
-            TgdslError: If it is no curve.
-        """
+        """Return the complete rows of the curve; a killed run may leave half a line."""
         if not self.curve.is_file():
             return []
         text = self.curve.read_text(encoding="utf-8", errors="replace")
@@ -137,12 +119,7 @@ class RunFolder:
         return rows
 
     def keep_rows(self, iterations: int) -> None:
-        """Keep the curve's complete rows up to an iteration; later iterations run again.
-
-        Raises:
-            TgdslError: If it is no curve.
-            FileError: If it cannot be written.
-        """
+        """Keep the curve's complete rows up to an iteration; later iterations run again."""
         rows = [row for row in self.rows() if int(row["iteration"]) <= iterations]
         text = io.StringIO()
         if rows:
@@ -154,11 +131,7 @@ class RunFolder:
             atomic_write(self.curve, content)
 
     def add_row(self, row: Mapping[str, float | int]) -> None:
-        """Append a row to the curve, with the columns of its header; an unknown value is nan.
-
-        Raises:
-            FileError: If it cannot be written.
-        """
+        """Append a row to the curve, with the columns of its header; an unknown value is nan."""
         with as_file_error(self.curve), self.curve.open("a+", newline="", encoding="utf-8") as file:
             file.seek(0)
             names = next(csv.reader([file.readline()]), None) or list(row)

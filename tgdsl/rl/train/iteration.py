@@ -149,14 +149,7 @@ class Learning(Actor):
     def card(
         self, origin: Mapping[str, Any], seconds: float, command: str, groups: Mapping[str, int] | None = None
     ) -> dict[str, Any]:
-        """Return the card of a policy, as plain values.
-
-        Args:
-            origin: The origin of its run: see `run_origin`.
-            seconds: How long it has learned [s].
-            command: How to learn it again.
-            groups: Size of each group of observations that it takes, in its order; default: those of the actor.
-        """
+        """Return the card of a policy, as plain values."""
         return {
             "groups": dict(groups or {name: self.env.groups[name] for name in self.groups["actor"]}),
             "joints": list(self.env.joint_names),
@@ -175,11 +168,7 @@ class Learning(Actor):
 
     @abstractmethod
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved; it may hold more than `state_dict` returned.
-
-        Raises:
-            RuntimeError: If networks are of other sizes; also ValueError and KeyError.
-        """
+        """Go on from what was saved; it may hold more than `state_dict` returned."""
 
     def _mark(self) -> Any:
         """Return the time; on a GPU as an event, which nobody waits for."""

@@ -36,11 +36,7 @@ class Learner(Learning):
     rates = "train.learning_rate or train.desired_kl"
 
     def __init__(self, env: TouchEnv, loaded: LoadedTask, seed: int, ranks: Ranks | None = None):
-        """Make the networks; torch's own random generators are seeded.
-
-        Raises:
-            SpecError: If a group of observations that is named is not there.
-        """
+        """Make the networks; torch's own random generators are seeded."""
         train = self._train = loaded.spec.train
         super().__init__(env, ranks or Ranks(), train.steps, train.desynchronise)
         self._score: float | None = None  # of the episodes that have ended last
@@ -87,11 +83,7 @@ class Learner(Learning):
         return None if std is None else std.tolist()
 
     def write_policy(self, card: Mapping[str, Any], file: Path) -> None:
-        """Write the policy without exploration, as TorchScript and ONNX, and its card beside it as JSON, for people.
-
-        Raises:
-            FileError: If it cannot be written.
-        """
+        """Write the policy without exploration, as TorchScript and ONNX, and its card beside it as JSON, for people."""
         policy: Any = self.algorithm.get_policy()
         texts = card_texts(self.env.touch, card)
         write_policy(policy.as_jit(), texts, file)

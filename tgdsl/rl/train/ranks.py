@@ -50,11 +50,7 @@ class Ranks:
         return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.size} if self.size > 1 else None
 
     def device(self, device: str) -> str:
-        """Return this process's device: "cuda" is one GPU each.
-
-        Raises:
-            RankError: If several processes shall share a GPU that is named.
-        """
+        """Return this process's device: "cuda" is one GPU each."""
         if self.size == 1 or device.partition(":")[0] != "cuda":
             return device
         if device != "cuda":

@@ -126,11 +126,7 @@ class Run:
     """
 
     def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
-        """Write the first checkpoint: a folder or disk that cannot take it is found now.
-
-        Raises:
-            FileError: If no checkpoint can be written.
-        """
+        """Write the first checkpoint: a folder or disk that cannot take it is found now."""
         self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
         self._rate, self._samples, self._saved = 0.0, learner.samples, learner.iteration
         self.stopped_by: signal.Signals | None = None
@@ -151,12 +147,7 @@ class Run:
         return self._board is not None and self._board.is_there
 
     def save(self) -> None:
-        """Write a checkpoint; of several processes the first one does.
-
-        Raises:
-            DivergedError: If something of it is no finite number; the checkpoint that is there stays.
-            FileError: If it cannot be written; the same.
-        """
+        """Write a checkpoint; of several processes the first one does."""
         learner = self._learner
         state = state_of(learner, self.seconds)
         if wrong := not_finite(state, learner.groups, learner.env.groups):
@@ -186,9 +177,6 @@ class Run:
         Iterations get the share of the run that is over: of iterations, or if that is more, of time, what was learned before
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
 
-        Raises:
-            DivergedError: If losses or state are no numbers any more; the last checkpoint is from before.
-            FileError: If something cannot be written; the same.
         """
         try:
             with StopRequest() as request:
@@ -261,11 +249,7 @@ class Run:
 
 
 def end_if_stopped(run: Run, command: str) -> None:
-    """End the process if a signal has stopped a run, and say how to go on.
-
-    Raises:
-        SystemExit: With the exit code of a process that such a signal ends.
-    """
+    """End the process if a signal has stopped a run, and say how to go on."""
     if run.stopped_by is not None:
         print(f"stopped by {run.stopped_by.name} after iteration {run.iteration}; to go on: {command}", file=sys.stderr)
         raise SystemExit(128 + run.stopped_by)
