@@ -19,9 +19,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from mcap.reader import make_reader
 
 from tgdsl.rl.datasets.episode import Episode, Header, LinkTaxels, frames
-from tgdsl.rl.datasets.lerobot import write_lerobot
-from tgdsl.rl.datasets.mcap_file import write_mcap
-from tgdsl.rl.datasets.zarr_store import write_zarr
+from tgdsl.rl.datasets.writers import write_lerobot, write_mcap, write_zarr
 
 
 def made_up():

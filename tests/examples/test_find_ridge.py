@@ -13,8 +13,8 @@ from task_records import reference_rates
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.playing.actions import ZeroActor
 from tgdsl.rl.playing.evaluation import evaluate
+from tgdsl.rl.playing.rollout import ZeroActor
 from tgdsl.rl.task import HandNow
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -5,7 +5,7 @@ import torch
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.policy import card_texts, write_policy
 from tgdsl.rl.train.folder import run_origin
-from tgdsl.rl.train.iteration import ORIGIN_KEYS
+from tgdsl.rl.train.learner import ORIGIN_KEYS
 
 
 class FindRidge(torch.nn.Module):

@@ -12,11 +12,10 @@ from tiny_tasks import tiny_env, write_task
 
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.load import load_task
-from tgdsl.rl.playing.actions import ZeroActor
+from tgdsl.rl.load import load_task, task_schema
 from tgdsl.rl.playing.evaluation import evaluate
-from tgdsl.rl.playing.provenance import provenance
-from tgdsl.rl.schema import task_schema
+from tgdsl.rl.playing.policy import provenance
+from tgdsl.rl.playing.rollout import ZeroActor
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 REPOSITORY = Path(__file__).parents[2]

@@ -69,9 +69,7 @@ class ExportDataset:
     def run(self) -> None:
         """Read or play the episodes, and write them."""
         from tgdsl.files.write import as_file_error, check_writable, with_folder
-        from tgdsl.rl.datasets.lerobot import write_lerobot
-        from tgdsl.rl.datasets.mcap_file import write_mcap
-        from tgdsl.rl.datasets.zarr_store import write_zarr
+        from tgdsl.rl.datasets.writers import write_lerobot, write_mcap, write_zarr
 
         out = self.out or Path("out") / f"{self.input.stem}_{self.to}"
         if out.exists():
@@ -121,8 +119,8 @@ class ExportDataset:
         from tgdsl.rl.datasets.sources import of_deployment, of_environments
         from tgdsl.rl.deploying.deploy import Deployment
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.playing.actions import actor_of
         from tgdsl.rl.playing.policy import policy_for, read_policy
+        from tgdsl.rl.playing.rollout import actor_of
 
         overrides, least = parsed_overrides(self.set), self.success_score
         if self.source != "environments":

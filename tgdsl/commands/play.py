@@ -54,10 +54,9 @@ class Play:
     def run(self) -> None:
         """Step, show, and write the files."""
         from tgdsl.files.write import check_writable
-        from tgdsl.rl.playing.actions import check_actions
         from tgdsl.rl.playing.policy import read_policy
         from tgdsl.rl.playing.record import PlayRecord
-        from tgdsl.rl.playing.rollout import steps_of
+        from tgdsl.rl.playing.rollout import check_actions, steps_of
 
         files = {name: check_writable(self.out / file) for name, file in _FILES.items()}
         if self.policy is not None and self.actions != "zero":
@@ -89,8 +88,8 @@ class Play:
         return env
 
     def _actor(self, env: TouchEnv, saved: PolicyFile | None) -> Actor:
-        from tgdsl.rl.playing.actions import actor_of
         from tgdsl.rl.playing.policy import policy_for
+        from tgdsl.rl.playing.rollout import actor_of
 
         if saved is None:
             return actor_of(env, self.actions, self.seed)

@@ -22,7 +22,7 @@ class Schema:
     def run(self) -> None:
         """Write it."""
         from tgdsl.files.write import atomic_write
-        from tgdsl.rl.schema import task_schema
+        from tgdsl.rl.load import task_schema
         from tgdsl.schema.document import json_schema
 
         out = self.out or Path("tgdsl.task.schema.json" if self.tasks else "tgdsl.schema.json")

@@ -95,8 +95,8 @@ class View:
 
     def _task_stage(self, progress: StatusLine | None) -> Stage:
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.playing.actions import actor_of
         from tgdsl.rl.playing.policy import policy_for, read_policy
+        from tgdsl.rl.playing.rollout import actor_of
         from tgdsl.rl.playing.stage import TaskStage
 
         saved = None if self.policy is None else read_policy(self.policy)

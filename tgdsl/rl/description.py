@@ -14,10 +14,10 @@ import numpy as np
 
 from tgdsl.console.tables import text_table
 from tgdsl.observations.observations import WANTED, AggBoolObservation, AggForceObservation
-from tgdsl.rl.features import Features, link_forces, runs_of
+from tgdsl.rl.groups import link_forces, runs_of
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import PER_LINK, Sensed, Source, sensors_document
-from tgdsl.rl.task import Task
+from tgdsl.rl.task import Features, Task
 from tgdsl.rl.terms import ObservationTerm, Term
 
 HEADER = ("group", "features", "what", "unit", "frame", "link", "scale", "note")

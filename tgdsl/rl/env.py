@@ -32,9 +32,8 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.events import Curricula, Events, event_terms
 from tgdsl.rl.grasps.sampling import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
-from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
+from tgdsl.rl.sensed import Felt, Sensed, SubstepTouch, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints
-from tgdsl.rl.substeps import SubstepTouch
 from tgdsl.rl.task import Now, checked
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_be_nonempty
@@ -339,7 +338,7 @@ class TouchEnv:
         episodes |= {"friction": setup.friction, "mass": setup.mass} | {f"sums/{name}": value for name, value in sums}
         memory = {"episodes": episodes, "actuation": self.actuation.memory(), "task": self.task.memory}
         memory["actions"] = {"used": self._used, "before": self._before}
-        memory["speeds"] = self._speeds.memory() if self._speeds else {}
+        memory["speeds"] = self._speeds.memory if self._speeds else {}
         memory |= {"curricula": self.curricula.values, "events": self._events.memory}
         return {part: tensors for part, tensors in memory.items() if tensors or part == "task"}
 

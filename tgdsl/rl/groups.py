@@ -1,4 +1,4 @@
-"""Groups of observations that tasks share.
+"""Groups of observations that tasks share: parts of them, each with its numbers and what they are.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Observation groups".
 
@@ -8,31 +8,30 @@ Shapes: `env` environments, `feature` numbers of a group.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.features import GoalPart
 from tgdsl.rl.rotations import Quat, between, inverse, product, six_numbers
 from tgdsl.rl.spec import ProprioSpec
-from tgdsl.rl.task import HandNow, Now
+from tgdsl.rl.task import Features, HandNow, Now, Part, Setup
+
+GoalPart = Literal["orientation", "difference", "angle"]  # parts of an observed goal, an orientation
 
 
 class MeasuredVelocity:
-    """Joint velocities as an XHand1's driver has them: `tgdsl.runtime.xhand1.source.VelocityFilter`, of all environments.
-
-    Attributes:
-        value: The velocities after the last positions [rad/s].
-    """
+    """Joint velocities [rad/s] as an XHand1's driver has them: `tgdsl.runtime.xhand1.source.VelocityFilter`, batched."""
 
     def __init__(self, joint_pos: Float[Tensor, "env joint"], control_step: float, time_constant: float = 0.02):
         self._before, self.value = joint_pos.clone(), torch.zeros_like(joint_pos)
         self._control_step = control_step
         self._share = -math.expm1(-control_step / time_constant)
+        self.memory = {"before": self._before, "value": self.value}  # live tensors
 
     def update(self, joint_pos: Float[Tensor, "env joint"]) -> None:
         """Take the positions of the next control step [rad]."""
@@ -44,10 +43,6 @@ class MeasuredVelocity:
         self.value.masked_fill_(chosen[:, None], 0.0)
         self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
 
-    def memory(self) -> dict[str, Tensor]:
-        """Return its state by name: live tensors, (env, joint) [rad, rad/s]."""
-        return {"before": self._before, "value": self.value}
-
 
 def proprio(now: Now | HandNow, vel_scale: float = 1.0) -> Float[Tensor, "env feature"]:
     """Return positions [rad], velocities [rad/s] times a factor, and last action of the joints that the policy moves."""
@@ -55,7 +50,7 @@ def proprio(now: Now | HandNow, vel_scale: float = 1.0) -> Float[Tensor, "env fe
 
 
 def noisy_proprio(now: Now, spec: ProprioSpec, draws: Draws, count: Int[Tensor, " env"]) -> Float[Tensor, "env feature"]:
-    """Return `proprio` with noise."""
+    """Return `proprio` with noise; `count` is another number at each control step of an environment."""
     if spec.pos_noise or spec.vel_noise:
         pos, vel = draws.normal("proprio", count, 2 * now.joint_pos.shape[1]).to(now.joint_pos).chunk(2, dim=1)
         now = replace(now, joint_pos=now.joint_pos + spec.pos_noise * pos, joint_vel=now.joint_vel + spec.vel_noise * vel)
@@ -67,22 +62,68 @@ def priv_proprio(now: Now) -> Float[Tensor, "env feature"]:
     return torch.cat([proprio(now), now.link_force.flatten(1)], dim=1)
 
 
-def goal(parts: Sequence[GoalPart], wanted: Quat, quat: Quat) -> Float[Tensor, "env feature"]:
-    """Return parts of a goal, the orientation `wanted` of an object that now has `quat`: see `PlacedTaskSpec.goal`."""
-    values = {
-        "orientation": lambda: six_numbers(wanted),
-        "difference": lambda: six_numbers(product(wanted, inverse(quat))),
-        "angle": lambda: between(wanted, quat)[:, None],
+def goal(parts: Sequence[GoalPart], body: str, wanted: Callable[[], Quat]) -> list[Part]:
+    """Return parts of a goal, the orientation `wanted` of an object: see `PlacedTaskSpec.goal`."""
+    known = {
+        "orientation": Part(lambda now: six_numbers(wanted()), _orientation("goal", body)),
+        "difference": Part(
+            lambda now: six_numbers(product(wanted(), inverse(now.object.quat))), _orientation("goal_from_object", body)
+        ),
+        "angle": Part(lambda now: between(wanted(), now.object.quat)[:, None], [Features("angle_to_goal", 1, "rad", "", body)]),
     }
-    return torch.cat([values[part]() for part in parts], dim=1)
+    return [known[part] for part in parts]
 
 
-def object_state(now: Now) -> Float[Tensor, "env feature"]:
+def object_state(setup: Setup) -> Part:
     """Return the object's position [m], six numbers of its orientation, velocity [m/s] and angular velocity [rad/s]."""
+    body, vectors = setup.object, (("position", "m"), ("velocity", "m/s"), ("angular_velocity", "rad/s"))
+    position, *velocities = (vector(name, unit, body) for name, unit in vectors)
+    return Part(_object_motion, [position, *_orientation("orientation", body), *velocities])
+
+
+def object_props(setup: Setup) -> Part:
+    """Return the object's friction and mass [kg]."""
+    features = [Features("friction", 1, "1", "", setup.object), Features("mass", 1, "kg", "", setup.object)]
+    return Part(lambda now: torch.stack([now.friction, now.mass], dim=1), features)
+
+
+def distances(setup: Setup) -> Part:
+    """Return the distance from each probe to the object's surface, less than 0 inside [m]."""
+    sensor, table = setup.rows["surface_distance"]
+    links = table["link"].tolist()
+    runs = runs_of(links, range(len(links)))
+    return Part(
+        lambda now: now.distance, [Features("distance", len(rows), "m", "", link, 1.0, rows, sensor) for link, rows in runs]
+    )
+
+
+def link_forces(links: Sequence[str]) -> list[Features]:
+    """Describe the object's force on each link."""
+    return [vector("force", "N", link, "link") for link in links]
+
+
+def vector(name: str, unit: str, link: str = "", frame: str = "world") -> Features:
+    """Describe the components of a vector."""
+    return Features(", ".join(f"{name}_{axis}" for axis in "xyz"), 3, unit, frame, link)
+
+
+def runs_of(links: Sequence[str], rows: Sequence[int]) -> list[tuple[str, range]]:
+    """Return rows that follow one another and are of one link."""
+    runs: list[tuple[str, range]] = []
+    for row in rows:
+        if runs and runs[-1][0] == links[row] and runs[-1][1].stop == row:
+            runs[-1] = (links[row], range(runs[-1][1].start, row + 1))
+        else:
+            runs.append((links[row], range(row, row + 1)))
+    return runs
+
+
+def _object_motion(now: Now) -> Float[Tensor, "env feature"]:
     body = now.object
     return torch.cat([body.pos, six_numbers(body.quat), body.linvel, body.angvel], dim=1)
 
 
-def object_props(now: Now) -> Float[Tensor, "env feature"]:
-    """Return the object's friction, mass [kg] and the distance from each probe to its surface [m]."""
-    return torch.cat([now.friction[:, None], now.mass[:, None], now.distance], dim=1)
+def _orientation(name: str, body: str) -> list[Features]:
+    """Describe the first two columns of a rotation's matrix: the turned x axis, then the turned y axis."""
+    parts = ", ".join(f"{name}_{part}" for part in ("xx", "xy", "xz", "yx", "yy", "yz"))
+    return [Features(parts, 6, "1", "world", body)]

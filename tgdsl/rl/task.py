@@ -36,7 +36,6 @@ from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Number, SpecModel
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.features import Features
 from tgdsl.rl.grasps.grasps import GraspTable
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.runtime.simulators.model_ids import element_id
@@ -156,6 +155,28 @@ class HandNow:
     goal: Float[Tensor, "env goal"]  # the goal, as `Task.asked` returns it
 
 
+@dataclass(frozen=True)
+class Features:
+    """Adjacent features of one kind."""
+
+    name: str  # name of the quantity; of a vector, its components in order: `force_x, force_y, force_z`
+    size: int  # how many there are
+    unit: str = "1"  # unit of the quantity, before it is scaled; "1" if it has none
+    frame: str = ""  # axes of a vector's components: `world`, or `link`, the frame of the link; empty without a direction
+    link: str = ""  # the body; empty if there is none
+    scale: float = 1.0  # factor from the quantity to the features
+    rows: range = range(0)  # rows of `env.touch.rows[sensor]`, one feature each: taxels or probes; else empty
+    sensor: str = ""  # the reading; empty if there is none
+    note: str = ""  # where the reading is cut off
+
+
+class Part(NamedTuple):
+    """Part of a group of observations: its numbers, (env, feature), and what they are."""
+
+    observe: Callable[[Now], Tensor]
+    features: Sequence[Features]
+
+
 class Start(NamedTuple):
     """How episodes begin."""
 
@@ -224,6 +245,7 @@ class Task(ABC, Generic[S]):
     spec: S  # its document
     setup: Setup  # its setup
     memory: dict[str, Tensor]  # its own state, (env, …) each, kept by `state_dict`
+    parts: dict[str, list[Part]]  # its groups of observations, which `__init__` may set
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Collect the terms of the reward; add `rewards`, their weights, and their parameters to the document's model."""
@@ -248,7 +270,7 @@ class Task(ABC, Generic[S]):
             cls.Spec = create_model(base.__name__, __base__=base, __module__=cls.__module__, __doc__=base.__doc__, **keys)
 
     def __init__(self, spec: S, setup: Setup):
-        self.spec, self.setup, self.memory = spec, setup, {}
+        self.spec, self.setup, self.memory, self.parts = spec, setup, {}, {}
         weights = getattr(spec, "rewards", None)
         self._rates = {name: term.rate_of(self) for name, term in self.terms.items() if getattr(weights, name) is not None}
 
@@ -303,13 +325,13 @@ class Task(ABC, Generic[S]):
         weights: Any = getattr(self.spec, "rewards", None)
         return {name: getattr(weights, name) * rate(now) for name, rate in self._rates.items()}
 
-    @abstractmethod
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
+        """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`: by default those of `parts`."""
+        return {group: torch.cat([part.observe(now) for part in parts], dim=1) for group, parts in self.parts.items()}
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
         """Describe the features of `observe`, by group and in order; a group that is left out is "not described"."""
-        return {}
+        return {group: [each for part in parts for each in part.features] for group, parts in self.parts.items()}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return privileged numbers that `distill.decoders` may name, which students learn to predict; by default none."""

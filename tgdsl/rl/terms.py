@@ -34,12 +34,11 @@ from torch.linalg import vector_norm
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.fields.models import Number, Positive, PositiveLength, Quantity, Range, RangeOf, SpecModel
-from tgdsl.rl import features, groups, rotations
+from tgdsl.rl import groups, rotations
 from tgdsl.rl.actuation import ZERO, Actuation, Factor
 from tgdsl.rl.draws import within
-from tgdsl.rl.features import Features
 from tgdsl.rl.spec import PushSpec, TaskSpec, Whole
-from tgdsl.rl.task import Now, Rate, Setup, Task, TaskReward
+from tgdsl.rl.task import Features, Now, Rate, Setup, Task, TaskReward
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.schema.select import matching
 from tgdsl.tensors.env_ids import put_rows
@@ -336,7 +335,7 @@ class LinkForce(ObservationTerm):
         return torch.cat([now.link_force[:, i] for i in self.rows(setup)], dim=1)
 
     def describe(self, setup: Setup) -> Sequence[Features]:
-        return features.link_forces([setup.links[i] for i in self.rows(setup)])
+        return groups.link_forces([setup.links[i] for i in self.rows(setup)])
 
     def rows(self, setup: Setup) -> list[int]:
         """Return which links are observed."""
@@ -350,10 +349,10 @@ class ObjectState(ObservationTerm):
     """Position [m], six numbers of the orientation, velocity [m/s] and angular velocity [rad/s] of the object."""
 
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
-        return groups.object_state(now)
+        return groups.object_state(setup).observe(now)
 
     def describe(self, setup: Setup) -> Sequence[Features]:
-        return features.object_state(setup.object)
+        return groups.object_state(setup).features
 
 
 class ObjectVelocity(EventTerm):

@@ -14,7 +14,7 @@ from tgdsl.commands.learning.sweep_document import Trial
 from tgdsl.commands.learning.sweep_trial import run_trial
 from tgdsl.rl.load import load_task
 from tgdsl.rl.students.results import Row
-from tgdsl.rl.train.checkpoint import read_checkpoint
+from tgdsl.rl.train.folder import read_checkpoint
 from tgdsl.rl.train.run import Run
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

@@ -17,8 +17,7 @@ from tgdsl.commands.learning.sweep_document import Trial, load_sweep
 from tgdsl.commands.learning.sweep_trial import left, run_trial
 from tgdsl.errors import SpecError
 from tgdsl.rl.load import load_task
-from tgdsl.rl.train.checkpoint import FORMAT, KEYS, read_checkpoint
-from tgdsl.rl.train.folder import RunFolder
+from tgdsl.rl.train.folder import FORMAT, RunFolder, read_checkpoint
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "tasks" / "sweep.yaml"
 FIXED = {"--device": "cpu", "--envs": 4, "--iterations": 3, "--episodes": 4, **SMALL}
@@ -170,7 +169,7 @@ def test_a_run_that_goes_on_learns_the_minutes_that_are_left(tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)
     (tmp_path / place / "curve.csv").write_text("iteration,samples,seconds\n1,8,9.0\n2,16,12.0\n3,2")
     for seconds, expected in ((9.0, 0.35), (42.0, 0.0)):
-        state = dict.fromkeys(KEYS) | {"format": FORMAT, "seconds": seconds}
+        state = {"format": FORMAT, "seconds": seconds}
         torch.save(state, tmp_path / place / "checkpoint.pt")
         found = left(words, tmp_path)
         assert found[:3] + found[4:] == words[:3] + words[4:] and float(found[3]) == pytest.approx(expected)

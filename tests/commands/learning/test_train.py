@@ -12,8 +12,7 @@ from small_runs import ARGUMENTS
 from small_tasks import small_task
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.train.checkpoint import read_checkpoint
-from tgdsl.rl.train.folder import RunFolder
+from tgdsl.rl.train.folder import RunFolder, read_checkpoint
 from tgdsl.rl.train.learner import Learner
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

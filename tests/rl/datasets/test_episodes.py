@@ -13,8 +13,7 @@ from tgdsl.rl.datasets.episode import Episode, Header, LinkTaxels, features, fra
 from tgdsl.rl.datasets.sources import of_deployment, of_environments, of_log, of_run
 from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actions import RandomActor
-from tgdsl.rl.playing.rollout import rollout
+from tgdsl.rl.playing.rollout import RandomActor, rollout
 
 
 def felt_task(folder):

@@ -10,8 +10,8 @@ from scipy import stats
 from small_tasks import small_task
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actions import ZeroActor
 from tgdsl.rl.playing.evaluation import evaluate, mean_interval, share_interval
+from tgdsl.rl.playing.rollout import ZeroActor
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,8 @@ import pytest
 import torch
 from small_runs import small_learner
 
-from tgdsl.rl.playing.onnx_policy import write_onnx_policy
-from tgdsl.rl.playing.policy import Policy, read_policy
-from tgdsl.rl.students.encoders import Encoder, Grid
-from tgdsl.rl.students.student import Architecture, Student, acting
+from tgdsl.rl.playing.policy import Policy, read_policy, write_onnx_policy
+from tgdsl.rl.students.student import Architecture, Encoder, Grid, Student, acting
 from tgdsl.rl.train.folder import run_origin
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

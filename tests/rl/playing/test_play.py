@@ -8,9 +8,8 @@ from small_tasks import STEPS, small_task
 from tgdsl.errors import SimulationError
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.actions import ScriptError, actor_of, check_actions
 from tgdsl.rl.playing.record import PlayRecord, Tally
-from tgdsl.rl.playing.rollout import rollout, steps_of
+from tgdsl.rl.playing.rollout import ScriptError, actor_of, check_actions, rollout, steps_of
 
 NUM_ENVS = 3
 

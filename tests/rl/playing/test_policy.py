@@ -5,8 +5,7 @@ import torch
 from rsl_rl.models import MLPModel, RNNModel
 from tensordict import TensorDict
 
-from tgdsl.rl.playing.policy import Policy, PolicyError, actor_groups, read_policy
-from tgdsl.rl.playing.provenance import is_close
+from tgdsl.rl.playing.policy import Policy, PolicyError, actor_groups, is_close, read_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 GROUPS = {"proprio": 6, "goal": 7}

@@ -10,8 +10,7 @@ from small_runs import small_learner
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.playing.policy import policy_for, read_policy
-from tgdsl.rl.playing.provenance import SCENE, changes_around, provenance
+from tgdsl.rl.playing.policy import SCENE, changes_around, policy_for, provenance, read_policy
 from tgdsl.rl.train.folder import run_origin
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

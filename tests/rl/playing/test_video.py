@@ -13,9 +13,8 @@ import pytest
 from tgdsl.errors import FileError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing import video as module
-from tgdsl.rl.playing.actions import ZeroActor
 from tgdsl.rl.playing.record import PlayRecord
-from tgdsl.rl.playing.rollout import rollout
+from tgdsl.rl.playing.rollout import ZeroActor, rollout
 from tgdsl.rl.playing.video import HEIGHT, WIDTH, VideoError, video
 
 SCENE = """

@@ -10,8 +10,8 @@ from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.sensed import Felt
-from tgdsl.rl.students.encoders import Images
 from tgdsl.rl.students.keys import grid_of
+from tgdsl.rl.students.student import Images
 
 TYPES = ("bool", "agg_bool", "depth", "agg_force", "force", "force_torque")
 FEELS = [Felt(type_, placement, noise) for type_ in TYPES for placement in ("ends", "all") for noise in ("clean", "noisy")]

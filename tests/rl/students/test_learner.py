@@ -16,7 +16,8 @@ from tgdsl.rl.sensed import Felt
 from tgdsl.rl.students.keys import feels, student_keys
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.teacher import Teacher
-from tgdsl.rl.train.checkpoint import CheckpointError, read_checkpoint, restore, state_of, write_checkpoint
+from tgdsl.rl.train.folder import CheckpointError, read_checkpoint, write_checkpoint
+from tgdsl.rl.train.run import restore, state_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 SMALL = {

@@ -6,10 +6,19 @@ import pytest
 import torch
 from torch import nn
 
-from tgdsl.rl.students import losses
-from tgdsl.rl.students.encoders import Encoder, Grid, Lstm, network
-from tgdsl.rl.students.student import Architecture, Stack, acting, deployed, forgotten, seeded_student
-from tgdsl.rl.train.checkpoint import FORMAT, KEYS, read_checkpoint, write_checkpoint
+from tgdsl.rl.students.learner import action_error, decoder_error
+from tgdsl.rl.students.student import (
+    Architecture,
+    Encoder,
+    Grid,
+    Lstm,
+    Stack,
+    acting,
+    deployed,
+    forgotten,
+    network,
+    seeded_student,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # what policies are written in
 SEEDS = (3, 4, 9)
@@ -65,7 +74,7 @@ def test_updates_are_those_of_separate_trainings(kind):
         held, total = memory, 0.0
         for _ in range(2):
             action, told, held = stack(x, held)
-            total = total + losses.behaviour(action, label, before, std, 0.1) + losses.decoded(told, target, scales, weights)
+            total = total + action_error(action, label, before, std, 0.1) + decoder_error(told, target, scales, weights)
         stack.descend(total)
         for i, (student, optimiser) in enumerate(zip(plain, optimisers, strict=True)):
             own, loss = memory[i], torch.zeros(())
@@ -237,22 +246,6 @@ def test_gradients_lie_as_their_weights_do(kind, seeds):
     x, memory = inputs(stack, 6, torch.float32)
     stack.descend(stack(x, memory).action.square().mean(dim=(1, 2)) + 0.0 * sum(w.sum() for w in stack.parameters.values()))
     assert all(weight.grad.stride() == weight.stride() for weight in stack.parameters.values())
-
-
-def test_a_slim_checkpoint_rounds_moments_alone(tmp_path):
-    one, other = (Stack(architecture("mlp"), seeds, 1e-2, 0.1) for seeds in (SEEDS, (1, 2, 5)))
-    x, memory = inputs(one, 6, torch.float32)
-    made = one(x, memory)
-    one.descend(torch.cat([made.action, made.decoded], dim=2).square().mean(dim=(1, 2)))
-    state = dict.fromkeys(KEYS) | {"format": FORMAT, "stacks": [one.state_dict()]}
-    for slim in (False, True):
-        write_checkpoint(state, tmp_path / f"{slim}.pt", slim)
-    assert (tmp_path / "True.pt").stat().st_size < 0.9 * (tmp_path / "False.pt").stat().st_size
-    other.load_state_dict(read_checkpoint(tmp_path / "True.pt")["stacks"][0])
-    assert all(torch.equal(value, other.parameters[name]) for name, value in one.parameters.items())
-    own, kept = (next(iter(each.optimiser.state.values()))["exp_avg"] for each in (one, other))
-    assert kept.dtype == torch.float32
-    torch.testing.assert_close(kept, own, rtol=2**-8, atol=0)
 
 
 def test_what_goes_on_at_another_rate_learns_at_it():

@@ -10,7 +10,7 @@ from task_references import pay as paid
 from tiny_tasks import tiny_env
 
 from tgdsl.rl import terms
-from tgdsl.rl.tasks.holding import Holding, HoldSpec, are_fingers
+from tgdsl.rl.tasks.parts import Holding, HoldSpec, are_fingers
 
 HAND = """<mujoco><worldbody>
   <body name="arm"><joint name="lift" type="slide" axis="0 0 1"/><geom size=".01" mass="1"/>

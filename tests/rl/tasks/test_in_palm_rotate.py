@@ -12,8 +12,8 @@ from tiny_tasks import tiny_env
 
 from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.tasks.holding import are_fingers
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
+from tgdsl.rl.tasks.parts import are_fingers
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "in_palm_rotate.yaml"
 MORE = "episode: 0.5 s\nmax_force: 0.05 N\nfree_distance: 1 mm\ndrop_distance: 20 mm\naction: {scale: 0.3}\n"

@@ -14,7 +14,7 @@ from task_references import screwdriver
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.tasks.holding import are_fingers
+from tgdsl.rl.tasks.parts import are_fingers
 from tgdsl.rl.tasks.screwdriver import Screwdriver
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "screwdriver.yaml"

@@ -6,7 +6,7 @@ from small_tasks import TASK, small_task
 
 from tgdsl.errors import SpecError
 from tgdsl.rl.load import load_task
-from tgdsl.rl.train.config import config, observed
+from tgdsl.rl.train.learner import config, observed
 
 GROUPS = {"proprio": 6, "tactile_sensors": 4, "priv_proprio": 9, "goal": 7, "priv_obj_state": 15, "priv_obj_props": 6}
 

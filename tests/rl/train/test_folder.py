@@ -4,8 +4,6 @@ import contextlib
 import subprocess
 import sys
 
-import pytest
-
 from tgdsl.errors import TgdslError
 from tgdsl.rl.train.folder import RunFolder
 
@@ -30,28 +28,6 @@ def test_a_curve_goes_on_whatever_byte_was_its_last(tmp_path):
         assert folder.curve.read_bytes() == (header + first if whole else b""), size
         folder.add_row(row_of(2))
         assert folder.curve.read_bytes() == (content if whole else header + second), size
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("iteration,samp1,\n", "1: found 3 values, 'iteration,samp1,', expected the columns iteration, samples, seconds, …"),
-        ("\0\0\n", r"1: found 1 values, '\x00\x00', expected the columns iteration, samples, seconds, …"),
-        ("iteration,samples,seconds\n1,2,3\n\0,,\n", r"3: found 3 values, '\x00,,', expected 3 values of an iteration"),
-        ("iteration,samples,seconds\n1,2\n2,3,4\n", "2: found 2 values, '1,2', expected 3 values of an iteration"),
-        ("iteration,samples,seconds\n1,2,3,4,5\n", "2: found 5 values, '1,2,3', expected 3 values of an iteration"),
-        ("iteration,samples,seconds\n\n1,2,3\n", "2: found 0 values, '', expected 3 values of an iteration"),
-    ],
-    ids=["torn", "zeros", "zeros later", "too few", "too many", "empty"],
-)
-def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, expected):
-    folder = RunFolder(tmp_path)
-    folder.checkpoint.write_bytes(b"")
-    folder.curve.write_text(text)
-    with pytest.raises(TgdslError) as raised:
-        folder.check(is_resumed=True)
-    assert str(raised.value) == f"{folder.curve}:{expected}; move this file away, and the run goes on with a new one"
-    assert folder.curve.read_text() == text
 
 
 def is_held(folder):
@@ -81,13 +57,3 @@ def test_two_processes_do_not_run_in_one_folder(tmp_path):
         other.kill()
         other.wait()
         assert not is_held(folder) and list(folder.path.iterdir()) == []
-
-
-@pytest.mark.parametrize("text", ["[]", '{"starts": 3}', '{"starts": [{"seed": 0}]}', "{}"])
-def test_what_does_not_say_what_a_run_was_made_from_is_refused(tmp_path, text):
-    folder = RunFolder(tmp_path)
-    folder.run.write_text(text)
-    with pytest.raises(
-        TgdslError, match=r"run\.json: expected what a run was made from, as tgdsl writes it: starts with envs, "
-    ):
-        folder.last_start()

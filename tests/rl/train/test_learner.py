@@ -5,7 +5,7 @@ import torch
 from small_runs import small_learner
 from small_tasks import STEPS
 
-from tgdsl.rl.train.iteration import EpisodeTally
+from tgdsl.rl.train.learner import EpisodeTally
 
 
 def test_an_iteration(tmp_path):

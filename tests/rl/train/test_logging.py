@@ -13,7 +13,7 @@ from tgdsl.rl.train.run import Board, ProgressBar
 def test_what_tensorboard_cannot_write_is_named(tmp_path, monkeypatch, at):
     """It writes in a thread of its own, and raises what that has met where it is called next, without a file's name."""
     board = Board(tmp_path, 0)
-    writer = board._writer
+    writer = board.writer
 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -10,8 +10,7 @@ import torch
 from small_runs import ARGUMENTS
 from small_tasks import small_task
 
-from tgdsl.rl.train.checkpoint import read_checkpoint
-from tgdsl.rl.train.folder import RunFolder
+from tgdsl.rl.train.folder import RunFolder, read_checkpoint
 from tgdsl.rl.train.ranks import RankError, Ranks
 
 SCRIPT = Path(__file__).parents[2] / "helpers" / "joint_learning.py"

@@ -220,7 +220,7 @@ class _Part:
         """
         from tgdsl.files.write import check_writable
         from tgdsl.rl.sensed import compile_sensed
-        from tgdsl.rl.train.checkpoint import read_checkpoint
+        from tgdsl.rl.train.folder import read_checkpoint
 
         self._goes_on = is_resumed and self._folder.has_run  # one that had not begun begins
         if self._goes_on:
@@ -238,11 +238,10 @@ class _Part:
             file: Where what the run goes on with is written, once nothing is refused any more; None: it has been.
         """
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.playing.provenance import changes_around
+        from tgdsl.rl.playing.policy import changes_around
         from tgdsl.rl.students.learner import Distiller
-        from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import run_origin
-        from tgdsl.rl.train.run import Run
+        from tgdsl.rl.train.run import Run, restore
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
         state = self._state

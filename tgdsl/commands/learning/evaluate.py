@@ -43,9 +43,9 @@ class Evaluate:
         """Play, and print."""
         from tgdsl.files.write import atomic_write, check_writable, with_folder
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.playing.actions import ZeroActor
         from tgdsl.rl.playing.evaluation import SEED, evaluate, parse_requirements
         from tgdsl.rl.playing.policy import policy_for, read_policy
+        from tgdsl.rl.playing.rollout import ZeroActor
 
         if self.episodes < 1 or self.envs < 1:
             raise TgdslError(f"--episodes {self.episodes} --envs {self.envs}: expected at least 1 of each")

@@ -56,7 +56,7 @@ def left(words: list[str], folder: Path) -> list[str]:
 
     Students keep theirs in the folder of their resolution; with `--minutes` there is only one.
     """
-    from tgdsl.rl.train.checkpoint import read_checkpoint
+    from tgdsl.rl.train.folder import read_checkpoint
 
     checkpoints = [*folder.glob("checkpoint.pt"), *folder.glob("*/checkpoint.pt")]
     if "--minutes" not in words or not checkpoints:

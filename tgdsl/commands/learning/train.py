@@ -61,8 +61,7 @@ class Train:
             import tgdsl.rl.train.learner  # noqa: F401
         except ImportError as error:
             raise TgdslError(f'to learn needs rsl-rl-lib, and what that needs: pip install "tgdsl[rl]" ({error})') from error
-        from tgdsl.rl.train.checkpoint import read_checkpoint
-        from tgdsl.rl.train.folder import RunFolder
+        from tgdsl.rl.train.folder import RunFolder, read_checkpoint
         from tgdsl.rl.train.ranks import Ranks
 
         ranks = Ranks.of()
@@ -106,10 +105,9 @@ class Train:
         state: dict[str, Any] | None,
     ) -> None:
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import changes, run_origin
         from tgdsl.rl.train.learner import Learner
-        from tgdsl.rl.train.run import Run
+        from tgdsl.rl.train.run import Run, restore
 
         envs = self.envs or before.get("envs", ENVS)
         seed = self.seed if self.seed is not None else before.get("seed", 0)

@@ -32,12 +32,12 @@ from tgdsl.rl.playing.policy import (
     Policy,
     PolicyError,
     PolicyFile,
+    changes_around,
     changes_since,
     check_card,
     check_learned,
     read_policy,
 )
-from tgdsl.rl.playing.provenance import changes_around
 from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
 from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.start import moved_joints

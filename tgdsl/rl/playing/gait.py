@@ -38,7 +38,7 @@ from tgdsl.console.tables import text_table
 from tgdsl.fields.units import Dimension
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.task import Now
-from tgdsl.rl.tasks.holding import are_fingers
+from tgdsl.rl.tasks.parts import are_fingers
 
 TOUCH = 0.01  # force above which a link touches the object [N]
 SATURATED = 0.98  # share of the largest torque from which on a joint is at its torque limit

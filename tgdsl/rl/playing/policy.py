@@ -1,10 +1,9 @@
-"""A learned policy in a file: TorchScript, as rsl_rl's `export_policy_to_jit` writes it.
+"""A learned policy in a file, the card that says how it was learned, and how the card differs from the present task.
 
-Such a file takes groups of observations side by side, (env, feature), and returns actions, (env, joint). Which groups these
-are, and in which order, rsl_rl does not write: they are those of the actor, in the order of the runner's `obs_groups`. What
-`tgdsl train` writes has a card in it that names them, and the joints and taxels that the policy was learned with.
-
-Weights may be stored in float16, which makes a file half as large: they are float32 in the module that is read.
+The file is TorchScript, as rsl_rl's `export_policy_to_jit` writes it: it takes groups of observations side by side,
+(env, feature), and returns actions, (env, joint). rsl_rl does not write which groups: they are those of the actor, in the order
+of the runner's `obs_groups`. What `tgdsl train` writes has a card that names them. Weights may be stored in float16: they are
+float32 in the module that is read.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -12,9 +11,11 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import itertools
 import json
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZipFile, is_zipfile
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -30,15 +32,105 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from tgdsl.errors import TaxelError, TgdslError, did_you_mean
-from tgdsl.files.write import atomic_write
+from tgdsl.files.write import atomic_path, atomic_write
 from tgdsl.layout.identity import Columns
+from tgdsl.module.export.formats import write_onnx
 from tgdsl.module.module import TactileModule
 from tgdsl.module.taxels.identity import HasPlan, check_taxels, plan_tables
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.provenance import changes_around, is_close, spec_differences
+from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.rollout import Actor
-from tgdsl.rl.sensed import GROUP
+from tgdsl.rl.sensed import GROUP, sensors_document
 from tgdsl.rl.spec import TaskSpec
+
+ELSEWHERE = {"tgdsl", "robot", "scene", "resolution", "observations"}
+"""What of a sensors' document is compared by joints, taxels and scene, and what the task's document says."""
+SCENE = {
+    "gravity": ("opt.gravity",),
+    "bodies": ("body_mass", "body_inertia", "body_ipos", "body_pos", "body_quat"),
+    "geoms": ("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_contype", "geom_conaffinity", "geom_friction"),
+    "joints": (
+        "jnt_type",
+        "jnt_pos",
+        "jnt_axis",
+        "jnt_range",
+        "jnt_stiffness",
+        "dof_damping",
+        "dof_armature",
+        "dof_frictionloss",
+    ),
+    "actuators": ("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange"),
+}
+"""Arrays of MuJoCo's model by what they are of."""
+LEAST = 1e-12  # what counts as 0, in the array's unit: rounding differs between machines
+
+
+def provenance(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:
+    """Return what a card says of sensors and scene, as plain values."""
+    spec = sensors_document(loaded).spec
+    return {
+        "sensors": spec.model_dump(mode="json", exclude=ELSEWHERE),
+        "scene": {part: _digest(model, names) for part, names in SCENE.items()},
+    }
+
+
+def changes_around(card: Mapping[str, Any], loaded: LoadedTask, model: mujoco.MjModel) -> list[str]:
+    """Return what of sensors and scene is otherwise than where a policy was learned, a line each; nothing of older cards."""
+    if "sensors" not in card:
+        return []
+    now, scene = provenance(loaded, model), card["scene"]
+    lines = differences(card["sensors"], _known(card["sensors"], now["sensors"]))
+    results = [f"{loaded.spec.document}: {line}" for line in lines]
+    return results + [f"the scene's {part}" for part, digest in now["scene"].items() if scene.get(part, digest) != digest]
+
+
+def _known(before: Any, now: Any) -> Any:
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return now
+    return {name: _known(before[name], value) for name, value in now.items() if name in before}
+
+
+def _digest(model: mujoco.MjModel, names: tuple[str, ...]) -> str:
+    """Return a hash of arrays to five digits, within which machines and versions of MuJoCo agree."""
+    result = hashlib.sha256()
+    for name in names:
+        array: Any = model
+        for part in name.split("."):
+            array = getattr(array, part)
+        values = np.asarray(array, dtype=np.float64)
+        rounded = np.where(np.abs(values) < LEAST, 0.0, values) + 0.0
+        result.update(f"{name} {values.shape} {' '.join(f'{value:.4e}' for value in rounded.flat)}\n".encode())
+    return result.hexdigest()[:16]
+
+
+def differences(before: Any, now: Any, path: str = "") -> list[str]:
+    """Return how two plain values differ, a line each: `rewards.spin: 2.0, now 3.0`."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        names = dict.fromkeys((*before, *now))
+        return [line for name in names for line in differences(before.get(name), now.get(name), f"{path}.{name}".lstrip("."))]
+    return [] if is_close(before, now) else [f"{path}: {json.dumps(before)}, now {json.dumps(now)}"]
+
+
+def is_close(one: Any, other: Any) -> bool:
+    """Return whether plain values are equal, numbers but for rounding: 0.7 cm are not quite 7 mm."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(is_close(value, other[name]) for name, value in one.items())
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(is_close, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-9)
+    return one == other
+
+
+def spec_differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec], leave_out: tuple[str, ...] = ()
+) -> list[str]:
+    """Return how two documents differ."""
+    with suppress(ValidationError):  # of a version with other names: its values stand as they are
+        before = model.model_validate(before).model_dump(mode="json")
+    left, other = ({name: value for name, value in spec.items() if name not in leave_out} for spec in (before, now))
+    return differences(left, other)
+
 
 ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
 """Groups that a policy sees unless others are named: of these, those that there are."""
@@ -281,3 +373,14 @@ def _module(content: bytes, device: torch.device | str, extra_files: dict[str, A
         if weight.dtype == torch.float16:
             weight.data = weight.data.float()
     return module
+
+
+def write_onnx_policy(network: Any, texts: dict[str, str], file: Path) -> None:
+    """Write a policy."""
+    module = network.cpu().eval().requires_grad_(False)
+    inputs = network.get_dummy_inputs()
+    env = torch.export.Dim("env", min=1)
+    with torch.no_grad():
+        program = torch.export.export(module, inputs, dynamic_shapes=tuple({0: env} for _ in inputs))
+    with atomic_path(file) as temporary:
+        write_onnx(program, network.input_names, network.output_names, texts, temporary)

@@ -17,9 +17,8 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.policy import ACTOR_GROUPS
 from tgdsl.rl.sensed import GROUP, PER_LINK, SENSED, Felt
-from tgdsl.rl.students.encoders import Encoder, Grid
 from tgdsl.rl.students.spec import StudentNetworksSpec
-from tgdsl.rl.students.student import Architecture
+from tgdsl.rl.students.student import Architecture, Encoder, Grid
 
 NONE = "none"  # the type that feels nothing
 

@@ -3,6 +3,17 @@
 An iteration is a rollout of `steps` control steps and `epochs` passes through it, a gradient step per `gradient_length` control
 steps. On a GPU, who acts and each pass are CUDA graphs.
 
+With a_s a student's action, a_t the teacher's, σ_t the standard deviation of the teacher's exploration (`inverse_variance`) or
+actions (`normalise`), else 1, a_0 what the student asked for in the rollout (in an earlier one that is kept: would ask for when
+the pass begins), a_c = a_0 + clamp(a_s − a_0, ±clip), and h(e) = e², or for `huber` e² up to |e| = 1 and 2|e| − 1 beyond:
+
+    action error     mean of h((a_s − a_t)/σ_t);  with a clip, of max(h((a_s − a_t)/σ_t), h((a_c − a_t)/σ_t))
+    decoder k        w_k · mean of (d_k − s_k y_k)²,  y_k being the privileged number
+
+Source: Chung et al., *Tactile Genesis*, appendix. It names the loss, "inv-var MSE", and a clip parameter of 0.1; the formulas
+are ours: σ_t² as the variance, and the clip as PPO bounds values. Normalised actions and Huber's loss are of the authors'
+public code: see docs/paper.md; its bound of 1 is ours.
+
 Shapes: `env` environments, `student` students of a stack, `row` environments of a block, `joint`, `target` as in `student.py`.
 """
 
@@ -23,15 +34,45 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.policy import Policy
 from tgdsl.rl.playing.rollout import Actor, Moment
-from tgdsl.rl.students import losses
 from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.students.student import Architecture, Stack, Student, forgotten
 from tgdsl.rl.train.graphs import Captured, SideBySide
-from tgdsl.rl.train.iteration import Learning
+from tgdsl.rl.train.learner import Learning
 from tgdsl.rl.train.model import Normalisation
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
+
+Actions = Float[Tensor, "student row joint"]
+Targets = Float[Tensor, "student row target"]
+
+
+def action_error(
+    action: Actions,
+    label: Actions,
+    before: Actions,
+    std: Float[Tensor, " joint"] | None = None,
+    clip: float | None = None,
+    *,
+    is_huber: bool = False,
+) -> Float[Tensor, " student"]:
+    """Return the error of actions."""
+    error = (action - label).abs()
+    if clip is not None:
+        bounded = before + (action - before).clamp(-clip, clip)
+        error = torch.maximum(error, (bounded - label).abs())
+    if std is not None:
+        error = error / std
+    loss = torch.where(error <= 1.0, error.square(), 2.0 * error - 1.0) if is_huber else error.square()
+    return loss.mean(dim=(1, 2))
+
+
+def decoder_error(
+    output: Targets, targets: Targets, scales: Float[Tensor, " target"], weights: Float[Tensor, " target"]
+) -> Float[Tensor, " student"]:
+    """Return the weighted error of the decoders; zeros if there are none."""
+    return ((output - scales * targets).square().mean(dim=1) * weights).sum(dim=1)
+
 
 LEAST_STD = 1e-3  # least deviation of the teacher's actions by which an error is divided
 
@@ -230,13 +271,13 @@ class Distiller(Learning):
                     for values in (self._labels, self._privileged, self._ended[..., None])
                 )
                 outputs = rollout.stack(x, memory if rollout.stack.memory else x[..., :0])
-                error = losses.behaviour(
-                    outputs.action, label, target, self._std, spec.clip, is_huber=spec.loss == "huber"
-                ) / len(parts)
+                error = action_error(outputs.action, label, target, self._std, spec.clip, is_huber=spec.loss == "huber") / len(
+                    parts
+                )
                 detached = detached + error.detach()
                 total = total + error
                 if self._targets:
-                    total = total + losses.decoded(outputs.decoded, targets, self._scales, self._weights) / len(parts)
+                    total = total + decoder_error(outputs.decoded, targets, self._scales, self._weights) / len(parts)
                 memory = forgotten(outputs.memory, ended[..., 0]) if rollout.stack.memory else memory
             rollout.stack.descend(total)
         return detached, memory.detach()

@@ -22,8 +22,7 @@ from tgdsl.console.tables import text_table
 from tgdsl.files.write import atomic_write, with_folder
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.evaluation import Evaluation
-from tgdsl.rl.playing.onnx_policy import write_onnx_policy
-from tgdsl.rl.playing.policy import card_texts, write_policy
+from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 from tgdsl.rl.students.keys import StudentKey
 from tgdsl.rl.students.learner import Distiller

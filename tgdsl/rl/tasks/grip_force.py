@@ -39,7 +39,6 @@ ends the episode, since what is crushed stays so.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -50,11 +49,10 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Positive, PositiveLength, Range, RangeOf
-from tgdsl.rl import features, groups, rotations, terms
+from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.draws import whole
-from tgdsl.rl.features import Features
 from tgdsl.rl.spec import TaskSpec, Time
-from tgdsl.rl.task import HandNow, Now, Setup, Start, Task, reward_term
+from tgdsl.rl.task import Features, HandNow, Now, Part, Setup, Start, Task, reward_term
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -161,6 +159,16 @@ class GripForce(Task[GripForceSpec]):
         self.left, self.since = self.keep("left", dtype=torch.int64), self.keep("since", dtype=torch.int64)
         self.count = self.keep("count", dtype=torch.int64)  # of commands, above them of episodes
         self.squares, self.samples = self.keep("squares"), self.keep("samples")
+        sizes = [
+            Features("sum of normal forces", 1, "N"),
+            *(Features("normal force", 1, "N", "", link) for link in setup.links),
+        ]
+        self.parts = {
+            "goal": [Part(lambda now: self.asked(), [Features("force to press with", 1, "N")])],
+            "priv_force": [Part(_forces, sizes)],
+            "priv_obj_state": [groups.object_state(setup)],
+            "priv_obj_props": [groups.object_props(setup), groups.distances(setup)],
+        }
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Hold objects with the force of the first command."""
@@ -193,27 +201,6 @@ class GripForce(Task[GripForceSpec]):
         """Return the command [N]."""
         return self.command[:, None]
 
-    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the command, and what is privileged of the force and the object."""
-        return {
-            "goal": self.asked(),
-            "priv_force": torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
-        }
-
-    def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Describe these groups."""
-        return {
-            "goal": [Features("force to press with", 1, "N")],
-            "priv_force": [
-                Features("sum of normal forces", 1, "N"),
-                *(Features("normal force", 1, "N", "", link) for link in self.setup.links),
-            ],
-            "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
-        }
-
     def score(self) -> Float[Tensor, " env"]:
         mean = self.squares / self.samples.clamp(min=1.0)
         return torch.where(self.samples > 0, mean.sqrt(), 1.0)
@@ -240,3 +227,7 @@ def _keyframes(spec: GripForceSpec, setup: Setup, field: str) -> Float[Tensor, "
         except SimulationError as error:
             raise LowerError(str(error), "starts") from error
     return torch.from_numpy(np.array(rows)).to(setup.device, setup.dtype)
+
+
+def _forces(now: Now) -> Float[Tensor, "env feature"]:
+    return torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1)

@@ -26,7 +26,6 @@ refused.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -37,10 +36,9 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf, Temperature
-from tgdsl.rl import features, groups, terms
-from tgdsl.rl.features import Features
+from tgdsl.rl import groups, terms
 from tgdsl.rl.spec import RandomSpec, TaskSpec
-from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
+from tgdsl.rl.task import Features, Now, Part, Setup, Start, Task, reward_term
 
 
 class HotBallRandomSpec(RandomSpec):
@@ -128,6 +126,14 @@ class HotBall(Task[HotBallSpec]):
         self.progress = self.keep("progress", len(self.cells))
         self.is_latched, self.is_touched = (self.keep(name, dtype=torch.bool) for name in ("is_latched", "is_touched"))
         self.held = self.keep("held")
+        links = dict.fromkeys(table["link"])
+        names = ("whether the latch is on", "whether the hot ball is touched")
+        heat = [*(Features("progress", 1, "1", "", link) for link in links), *(Features(name, 1) for name in names)]
+        self.parts = {
+            "priv_heat": [Part(self._heat_numbers, heat)],
+            "priv_obj_state": [groups.object_state(setup)],
+            "priv_obj_props": [groups.object_props(setup), groups.distances(setup)],
+        }
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Give the balls each other's places, from a random one on, and move each a little."""
@@ -156,33 +162,13 @@ class HotBall(Task[HotBallSpec]):
         """Return where the hot ball has left the bin."""
         return now.object.pos[:, 2] < self.spec.lost_height
 
-    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return what is privileged: of heat, and of the hot ball."""
-        bits = torch.stack([self.is_latched, self.is_touched], dim=1).to(self.progress)
-        return {
-            "priv_heat": torch.cat([self.progress, bits], dim=1),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
-        }
-
-    def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Describe these groups."""
-        return {
-            "priv_heat": [
-                *(
-                    Features("progress", 1, "1", "", link)
-                    for link in dict.fromkeys(self.setup.rows["temperature_grid"][1]["link"])
-                ),
-                Features("whether the latch is on", 1),
-                Features("whether the hot ball is touched", 1),
-            ],
-            "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
-        }
-
     def score(self) -> Float[Tensor, " env"]:
         """Return for how long a fingertip was on the hot ball with the latch on [s]."""
         return self.held
+
+    def _heat_numbers(self, now: Now) -> Float[Tensor, "env feature"]:
+        bits = torch.stack([self.is_latched, self.is_touched], dim=1)
+        return torch.cat([self.progress, bits.to(self.progress)], dim=1)
 
 
 def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:

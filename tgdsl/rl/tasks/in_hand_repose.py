@@ -37,7 +37,6 @@ speaks of penalties of grip and slip, which its table does not have, and which a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -46,14 +45,12 @@ from pydantic import model_validator
 from torch import Tensor
 
 from tgdsl.fields.models import Angle, PositiveLength, Range, RangeOf, with_defaults
-from tgdsl.rl import features, groups, rotations, terms
+from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.draws import within
-from tgdsl.rl.features import Features
 from tgdsl.rl.spec import Whole
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.placing import PlacedTaskSpec
-from tgdsl.rl.tasks.progress import ProgressSpec
+from tgdsl.rl.tasks.parts import PlacedTaskSpec, ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -158,6 +155,11 @@ class InHandRepose(Task[InHandReposeSpec]):
         self.episode, self.reached = self.keep("episode", dtype=torch.int64), self.keep("reached", dtype=torch.int64)
         self.held, self.waited = self.keep("held", dtype=torch.int64), self.keep("waited", dtype=torch.int64)
         self.is_reached, self.is_late = self.keep("is_reached", dtype=torch.bool), self.keep("is_late", dtype=torch.bool)
+        self.parts = {
+            "goal": groups.goal(spec.goal, setup.object, lambda: self.goal),
+            "priv_obj_state": [groups.object_state(setup)],
+            "priv_obj_props": [groups.object_props(setup), groups.distances(setup)],
+        }
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random, and give each a first goal."""
@@ -191,22 +193,6 @@ class InHandRepose(Task[InHandReposeSpec]):
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped or the goal was not reached in time."""
         return self.drop(now) | self.is_late
-
-    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the goal, and what is privileged of the object."""
-        return {
-            "goal": groups.goal(self.spec.goal, self.goal, now.object.quat),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
-        }
-
-    def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Describe these groups."""
-        return {
-            "goal": features.goal(self.spec.goal, self.setup.object),
-            "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
-        }
 
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return by how much the object has come closer to its goal in this control step [rad]."""

@@ -13,10 +13,10 @@ sees it knows the object's exact angle, or what else the document's `goal` lists
 `groups`.
 
 Weights of the reward's terms are the paper's. Progress pays c, 1 where the object is held, else `hold.coasting_pay`: see
-`holding`. s is the share of Σ max(0, Δψ) since the goal
+`parts`. s is the share of Σ max(0, Δψ) since the goal
 before that was paid, Σ c max(0, Δψ) over it. By default c = s = 1: whether an object is held or coasts makes no difference.
 
-`spin` pays a bounded rate, see `progress`, and up to a tilt of `spin_tilt` alone.
+`spin` pays a bounded rate, see `parts`, and up to a tilt of `spin_tilt` alone.
 
 An episode ends for good where the object is further than `drop_distance` from p_0, or below it. Score: quarter turns, k.
 
@@ -29,7 +29,6 @@ that coasts; goals that were reached stay reached.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -38,13 +37,10 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Angle, PositiveLength
-from tgdsl.rl import features, groups, rotations, terms
-from tgdsl.rl.features import Features
+from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.tasks.placing import PlacedTaskSpec
-from tgdsl.rl.tasks.progress import ProgressSpec
+from tgdsl.rl.tasks.parts import Holding, HoldSpec, PlacedTaskSpec, ProgressSpec
 
 QUARTER = 0.5 * math.pi
 
@@ -133,6 +129,11 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.reached, self.is_reached = self.keep("reached"), self.keep("is_reached", dtype=torch.bool)
         self.pay, self.share = self.keep("pay"), self.keep("share")  # c of this step, and s of the goal that is under way
         self.forth, self.paid = self.keep("forth"), self.keep("paid")  # Σ max(0, Δψ) and Σ c max(0, Δψ) since the goal before
+        self.parts = {
+            "goal": groups.goal(spec.goal, setup.object, self._goal_quat),
+            "priv_obj_state": [groups.object_state(setup)],
+            "priv_obj_props": [groups.object_props(setup), groups.distances(setup)],
+        }
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         pos, quat = self.setup.start[:, self.item].split([3, 4], dim=1)
@@ -171,22 +172,6 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the object has turned in this control step [rad]."""
         return self.rate * self.setup.control_step
-
-    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the goal, and what is privileged of the object."""
-        return {
-            "goal": groups.goal(self.spec.goal, self._goal_quat(), now.object.quat),
-            "priv_obj_state": groups.object_state(now),
-            "priv_obj_props": groups.object_props(now),
-        }
-
-    def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Describe these groups."""
-        return {
-            "goal": features.goal(self.spec.goal, self.setup.object),
-            "priv_obj_state": features.object_state(self.setup.object),
-            "priv_obj_props": features.object_props(self.setup.object, self.setup.rows["surface_distance"]),
-        }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return the object's height when it stands upright [m], and the angle from the goal to its orientation [rad]."""

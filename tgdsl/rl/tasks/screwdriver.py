@@ -12,10 +12,10 @@ Groups: `priv_obj_state` as in `groups`, and the distance from each probe to the
 and mass [kg] alone. There is no goal.
 
 Weights of the reward's terms are the paper's. Progress pays c, 1 where the object is held, else `hold.coasting_pay`, 1 by
-default: see `holding`. At 2 rad/s `spin` is worth 20 1/s; `near` is worth 1 if all probes touch, `drop` −2.5 in all,
+default: see `parts`. At 2 rad/s `spin` is worth 20 1/s; `near` is worth 1 if all probes touch, `drop` −2.5 in all,
 `joint_limit` −1.9 for a finger stretched out, `action_rate` −0.05 for random actions of eight joints, `work` −0.002 at 2 W.
 
-So a spin of 2 rad/s pays up to a tilt of 15°; `spin` pays a bounded rate, see `progress`. An episode ends for good where
+So a spin of 2 rad/s pays up to a tilt of 15°; `spin` pays a bounded rate, see `parts`. An episode ends for good where
 θ > `drop_tilt`, where the tip is out of the screw, |s − s_0| > `engagement`, or with `stall` where Σ Δψ does not exceed by
 `stall.turn` within `stall.within` what it was. Score: what was turned at a tilt of less than 20°, over the duration of a whole
 episode [rad/s]: after a drop nothing is added.
@@ -34,7 +34,6 @@ alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 
 import mujoco
 import torch
@@ -43,14 +42,12 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Angle, Positive, PositiveLength, SpecModel, with_defaults
-from tgdsl.rl import features, groups, rotations, terms
-from tgdsl.rl.features import Features
+from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.grasps.grasps import GraspSpec
 from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
-from tgdsl.rl.tasks.holding import Holding, HoldSpec
-from tgdsl.rl.tasks.progress import ProgressSpec
+from tgdsl.rl.tasks.parts import Holding, HoldSpec, ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
 
@@ -174,6 +171,10 @@ class Screwdriver(Task[ScrewdriverSpec]):
         if spec.stall:
             self.angle, self.mark = self.keep("angle"), self.keep("mark")  # Σ Δψ, and that after the last turn that counted
             self.since = self.keep("since", dtype=torch.int64)  # control steps since then
+        self.parts = {
+            "priv_obj_state": [groups.object_state(setup), groups.distances(setup)],
+            "priv_obj_props": [groups.object_props(setup)],
+        }
 
     @classmethod
     def watch(cls, spec: ScrewdriverSpec) -> Watch:
@@ -213,23 +214,6 @@ class Screwdriver(Task[ScrewdriverSpec]):
     def step_progress(self) -> Float[Tensor, " env"]:
         """Return the angle that the screwdriver has turned in this control step [rad]."""
         return self.rate * self.setup.control_step
-
-    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return what is privileged of the object."""
-        return {
-            "priv_obj_state": torch.cat([groups.object_state(now), now.distance], dim=1),
-            "priv_obj_props": torch.stack([now.friction, now.mass], dim=1),
-        }
-
-    def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Describe these groups."""
-        return {
-            "priv_obj_state": [
-                *features.object_state(self.setup.object),
-                *features.distances(*self.setup.rows["surface_distance"]),
-            ],
-            "priv_obj_props": features.object_props(self.setup.object),
-        }
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return the screwdriver's tilt [rad], and its rate of turning [rad/s]."""

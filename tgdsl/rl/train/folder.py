@@ -4,7 +4,7 @@
 - `task.yaml`, the sensors' document, the module of a user's task: copies
 - `taxels.csv`: the taxels of all sensors
 - `curve.csv`: a row per iteration
-- `checkpoint.pt`: its state, to resume
+- `checkpoint.pt`: its state, to resume: see `run.py`
 - `policy.pt`: the policy without exploration and its card, for `tgdsl play --policy`
 - `policy.onnx`: the same for ONNX Runtime
 - `evaluation.json`: the evaluation at the end
@@ -23,6 +23,7 @@ import os
 import platform
 import re
 import sys
+import zipfile
 from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -31,16 +32,14 @@ from typing import Any
 import torch
 
 from tgdsl.errors import TgdslError
-from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, new_folder, with_folder
+from tgdsl.files.write import TEMPORARY, as_file_error, atomic_open, atomic_write, check_writable, new_folder, with_folder
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.policy import taxel_csv
-from tgdsl.rl.playing.provenance import differences, provenance, spec_differences
+from tgdsl.rl.playing.policy import differences, provenance, spec_differences, taxel_csv
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
-COLUMNS = ("iteration", "samples", "seconds")  # first columns of a curve
-ORIGIN = frozenset({"spec", "seed", "envs", "module", "taxels"})  # what a resumed run needs of an entry of `run.json`
+FORMAT = 1  # of checkpoints
 
 
 class RunFolder:
@@ -63,7 +62,6 @@ class RunFolder:
             raise TgdslError(f"{self.path}: this folder holds a run; go on with --resume {self.path}, or give another --out")
         if is_resumed and not self.checkpoint.is_file():
             raise TgdslError(f"{self.path}: there is no checkpoint.pt to go on with")
-        self.rows()
         check_writable(self.checkpoint)
 
     @contextlib.contextmanager
@@ -96,7 +94,7 @@ class RunFolder:
         atomic_write(self.path / "taxels.csv", taxel_csv(env.touch).encode())
 
     def last_start(self) -> dict[str, Any]:
-        """Return the origin of the run's last start; raise `TgdslError` if it cannot be read."""
+        """Return the origin of the run's last start."""
         starts = self._starts()
         if not starts:
             raise TgdslError(f"{self.path}: there is no run to go on with: run.json is missing or empty")
@@ -104,19 +102,8 @@ class RunFolder:
 
     def rows(self) -> list[dict[str, str]]:
         """Return the complete rows of the curve; a killed run may leave half a line."""
-        if not self.curve.is_file():
-            return []
-        text = self.curve.read_text(encoding="utf-8", errors="replace")
-        lines = csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))
-        names: list[str] = next(lines, [*COLUMNS])
-        if names[: len(COLUMNS)] != list(COLUMNS):
-            raise self._no_curve(1, names, f"the columns {', '.join(COLUMNS)}, …")
-        rows = []
-        for row in lines:
-            if len(row) != len(names) or not row[0].isdecimal():
-                raise self._no_curve(lines.line_num, row, f"{len(names)} values of an iteration")
-            rows.append(dict(zip(names, row, strict=True)))
-        return rows
+        text = self.curve.read_text(encoding="utf-8") if self.curve.is_file() else ""
+        return list(csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1])))
 
     def keep_rows(self, iterations: int) -> None:
         """Keep the curve's complete rows up to an iteration; later iterations run again."""
@@ -126,12 +113,11 @@ class RunFolder:
             writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
-        content = text.getvalue().encode()
-        if self.curve.is_file() and self.curve.read_bytes() != content:
-            atomic_write(self.curve, content)
+        if self.curve.is_file():
+            atomic_write(self.curve, text.getvalue().encode())
 
     def add_row(self, row: Mapping[str, float | int]) -> None:
-        """Append a row to the curve, with the columns of its header; an unknown value is nan."""
+        """Append a row to the curve, with the columns of its header."""
         with as_file_error(self.curve), self.curve.open("a+", newline="", encoding="utf-8") as file:
             file.seek(0)
             names = next(csv.reader([file.readline()]), None) or list(row)
@@ -141,20 +127,48 @@ class RunFolder:
                 writer.writeheader()
             writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
 
-    def _no_curve(self, line: int, values: list[str], expected: str) -> TgdslError:
-        first, hint = ",".join(values[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
-        return TgdslError(f"{self.curve}:{line}: found {len(values)} values, {first!r}, expected {expected}; {hint}")
-
     def _starts(self) -> list[dict[str, Any]]:
         try:
-            result = json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {"starts": []}
+            return json.loads(self.run.read_text(encoding="utf-8"))["starts"] if self.run.is_file() else []
         except (OSError, ValueError) as error:
             raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
-        starts = result.get("starts") if isinstance(result, dict) else None
-        if not isinstance(starts, list) or not all(isinstance(start, dict) and start.keys() >= ORIGIN for start in starts):
-            expected = f"what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ORIGIN))}"
-            raise TgdslError(f"{self.run}: expected {expected}")
-        return starts
+
+
+class CheckpointError(TgdslError):
+    """A checkpoint that cannot be read, or that is of something else."""
+
+
+def write_checkpoint(state: Mapping[str, Any], file: Path) -> None:
+    """Write a checkpoint to the disk: it replaces the file that is there whole, or not at all."""
+    content = io.BytesIO()
+    torch.save(dict(state), content)
+    with atomic_open(file) as opened:
+        opened.write(content.getbuffer())
+        opened.flush()
+        os.fsync(opened.fileno())
+
+
+def read_checkpoint(file: Path) -> dict[str, Any]:
+    """Return what a checkpoint holds, on the CPU."""
+    if not file.is_file():
+        raise CheckpointError(f"{file}: there is no checkpoint")
+    what = "a file of something else"
+    try:
+        content = io.BytesIO(file.read_bytes())
+        state = torch.load(content, map_location="cpu", weights_only=True)
+        if isinstance(state, dict) and state.get("format") == FORMAT:
+            return state
+        if isinstance(state, dict) and "format" in state:
+            what = f"a checkpoint of format {state['format']}, not {FORMAT}, of another version of tgdsl"
+        cause = None
+    except OSError as error:
+        raise CheckpointError(f"{file}: cannot read this file: {error.strerror or error}") from error
+    except Exception as error:  # whatever torch and pickle raise
+        if not zipfile.is_zipfile(content):
+            what = f"{file.stat().st_size:,} bytes that are cut off, or of something else"
+        cause = error
+    hint = "put back a copy of one, or begin again with another --out"
+    raise CheckpointError(f"{file}: found {what}, expected a checkpoint of `tgdsl train` or `tgdsl distill`; {hint}") from cause
 
 
 def documents(loaded: LoadedTask) -> dict[str, Path]:

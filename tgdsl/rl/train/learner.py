@@ -1,33 +1,298 @@
 """Environments and the algorithm that learns in them, iteration by iteration: rollout, and update.
 
 rsl_rl's `OnPolicyRunner` does this too, but waits for the device at every control step (its logger looks which episodes have
-ended, its check for NaN at all observations), and saves by iterations. This loop is short, and waits once per iteration.
+ended, its check for NaN at all observations), and saves by iterations. This loop waits once per iteration.
+
+Shapes: `env` environments.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import math
+import time
+from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
+from jaxtyping import Int
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 from torch import Tensor
 
+from tgdsl.errors import did_you_mean
 from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
-from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.env import Step, TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.onnx_policy import write_onnx_policy
-from tgdsl.rl.playing.policy import card_texts, write_policy
-from tgdsl.rl.playing.rollout import Moment
-from tgdsl.rl.train.config import config
-from tgdsl.rl.train.iteration import Iteration, Learning
+from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
+from tgdsl.rl.playing.rollout import Actor, Moment, rollout
+from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.train.ppo import LOSSES, CapturedPPO
-from tgdsl.rl.train.ranks import Ranks
+from tgdsl.rl.train.ranks import Ranks, add_up
 from tgdsl.tensors.env_ids import may_be_nonempty
+
+EPISODE_NAMES = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
+"""Numbers of a finished episode, before its terms: return, steps, score, whether it ended for good, and by a fault."""
+ORIGIN_KEYS = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "sensors", "scene", "versions", "spec")
+"""Entries of a run's origin that a policy's card has."""
+
+
+class EpisodeTally:
+    """Sums over finished episodes; `names` are set at the first control step."""
+
+    def __init__(self):
+        self.names: list[str] = []
+        self._sums: Tensor | None = None
+
+    def add(self, step: Step) -> None:
+        """Add a control step, without waiting for the device."""
+        info = step.info
+        numbers = [info.episode_return, info.episode_steps, info.score, step.terminated, info.faults]
+        values = torch.stack([info.ended.double(), *(each.double() for each in (*numbers, *info.episode_terms.values()))])
+        sums = torch.where(info.ended, values, 0.0).sum(dim=1)
+        if self._sums is None:
+            self.names = [*EPISODE_NAMES, *(f"Reward/{name}" for name in info.episode_terms)]
+            self._sums = torch.zeros_like(sums)
+        self._sums += sums
+
+    def pop(self) -> Tensor:
+        """Return the sums over all processes, the number of episodes first, and restart; the host does not wait."""
+        assert self._sums is not None
+        sums = self._sums.clone()
+        add_up(sums)
+        self._sums.zero_()
+        return sums
+
+    def means(self, sums: list[float]) -> dict[str, float]:
+        """Return means over episodes by name, from the sums of `pop`; none if no episode has ended."""
+        count = sums[0]
+        return {name: total / count for name, total in zip(self.names, sums[1:], strict=True)} if count else {}
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """An iteration, over all processes."""
+
+    episodes: int  # how many episodes ended
+    metrics: dict[str, float]
+    """Means over these episodes, and the learner's numbers, by the names that TensorBoard groups: `Episode/score`."""
+    rollout: float  # duration of the rollout [s]
+    update: float  # duration of the update [s]
+
+
+class Learning(Actor):
+    """Environments and who learns in them, iteration by iteration: a rollout in which it acts, and an update.
+
+    On a GPU the host waits once per iteration, but for captures at the first ones.
+
+    Attributes:
+        groups: Groups of observations of each network.
+        iteration: Number of iterations so far.
+        samples: How many control steps these took, over all processes and environments.
+        rates: What of the document makes smaller steps.
+    """
+
+    rates: ClassVar[str]
+    groups: dict[str, list[str]]
+    std: list[float] | None = None
+    """Standard deviation of its actions."""
+
+    def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
+        """Take the environments of this process; `steps` control steps are a rollout."""
+        self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
+        self._num_steps, self._desynchronise, self._has_begun = steps, desynchronise, False
+        self._tally = EpisodeTally()
+
+    @property
+    def episode_names(self) -> list[str]:
+        """Numbers of the episodes that ended, from iterations in which any did."""
+        return self._tally.names
+
+    def iterate(self, share: float = 0.0) -> Iteration:
+        """Make a rollout, and learn from it; `share` is how much of the run is over, 0 to 1."""
+        self.set_rate(share)
+        self.roll()
+        start, middle = self._roll_start, self._mark()
+        self.learn()
+        sums, numbers = self._tally.pop(), self._numbers()
+        values = torch.cat([sums, torch.stack(list(numbers.values())).double().to(sums.device)]).tolist()  # here the host waits
+        end = self._mark()
+        if self.env.device.type == "cuda":
+            end.synchronize()
+            durations = 1e-3 * start.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
+        else:
+            durations = middle - start, end - middle
+        pairs = zip(numbers, values[len(sums) :], strict=True)
+        metrics = {name: value for name, value in pairs if not (name.startswith("Score/") and math.isnan(value))}
+        return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | metrics, *durations)
+
+    def set_rate(self, share: float) -> None:
+        """Set the learning rate for a share of the run that is over; by default it stays."""
+
+    def roll(self) -> None:
+        """Make a rollout."""
+        if not self._has_begun:
+            self.go_on(torch.randint_like(self.env.steps, self.env.max_steps) if self._desynchronise else None)
+        self._start_rollout()
+        self._roll_start = self._mark()
+        for moment in rollout(self, self.env, self._num_steps):
+            self._keep(moment)
+            self._tally.add(moment.step)
+
+    def learn(self) -> None:
+        """Learn from the rollout."""
+        self._update()
+        self.iteration += 1
+        self.samples += self._num_steps * self.env.num_envs * self.ranks.size
+
+    def go_on(self, steps: Int[Tensor, " env"] | None = None) -> None:
+        """Begin episodes, at given numbers of control steps; default: 0."""
+        self.env.reset()
+        if steps is not None:
+            self.env.steps.copy_(steps)
+        self.go_on_here()
+
+    def go_on_here(self) -> None:
+        """Go on from where the environments are, with an empty memory of their episodes."""
+        self._has_begun = True
+        self.begin(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
+
+    def card(
+        self, origin: Mapping[str, Any], seconds: float, command: str, groups: Mapping[str, int] | None = None
+    ) -> dict[str, Any]:
+        """Return the card of a policy, as plain values."""
+        return {
+            "groups": dict(groups or {name: self.env.groups[name] for name in self.groups["actor"]}),
+            "joints": list(self.env.joint_names),
+            "iterations": self.iteration,
+            "samples": self.samples,
+            "minutes": round(seconds / 60.0, 2),
+            "command": command,
+            "score": None,
+            **{name: origin[name] for name in ORIGIN_KEYS},
+            "std": self.std,
+        }
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return what is learned, and what learning goes on from."""
+
+    @abstractmethod
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what was saved; it may hold more than `state_dict` returned."""
+
+    def _mark(self) -> Any:
+        """Return the time; on a GPU as an event, which nobody waits for."""
+        if self.env.device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
+
+    def _start_rollout(self) -> None:
+        """Prepare for a rollout."""
+
+    @abstractmethod
+    def _keep(self, moment: Moment) -> None:
+        """Keep a control step of the rollout."""
+
+    @abstractmethod
+    def _update(self) -> None:
+        """Learn from the rollout."""
+
+    @abstractmethod
+    def _numbers(self) -> dict[str, Tensor]:
+        """Return the learner's numbers of the iteration, on the device; a score of no episode is not a number."""
+
+
+PROPRIO, PRIVILEGED, STATE, PROPS = "proprio", "priv_proprio", "priv_obj_state", "priv_obj_props"
+"""What is known of the hand; that and its forces; the object's motion; what it is like."""
+MOST_STD = 1e6  # bound above of the actions' standard deviation: rsl_rl's
+
+PPO_OPTIONS = {
+    "num_learning_epochs": "epochs",
+    "num_mini_batches": "mini_batches",
+    "clip_param": "clip",
+    "gamma": "discount",
+    "lam": "gae",
+    "value_loss_coef": "value",
+    "entropy_coef": "entropy",
+    "learning_rate": "learning_rate",
+    "max_grad_norm": "max_grad_norm",
+    "use_clipped_value_loss": "clip_values",
+    "desired_kl": "desired_kl",
+    "precision": "precision",
+}
+"""Numbers of `train` by rsl_rl's names."""
+
+
+def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[str]]:
+    """Return the groups of observations of actor, critic and, if there is one, random network distillation."""
+    train = loaded.spec.train
+    privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
+    actor = _given(loaded, groups, ("actor",)) or [name for name in privileged if name != PROPS]
+    result = {"actor": actor, "critic": _given(loaded, groups, ("critic",)) or privileged}
+    if train.rnd != "off":
+        result["rnd_state"] = _given(loaded, groups, ("rnd", "groups")) or ([STATE] if STATE in groups else actor)
+    return result
+
+
+def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str, int] | None = None) -> dict[str, Any]:
+    """Return rsl_rl's configuration, for `PPO.construct_algorithm` or an `OnPolicyRunner`."""
+    train, networks = loaded.spec.train, loaded.spec.train.networks
+    encoders = {GROUP: networks.touch_encoder, "*": networks.encoder}
+    normalisation = {"eps": networks.eps, "clip": networks.clip}
+    model = normalisation | {
+        "class_name": "tgdsl.rl.train.model:EncodedModel",
+        "hidden_dims": list(networks.hidden),
+        "activation": "elu",
+        "obs_normalization": True,
+        "encoders": {name: {"hidden": list(spec.hidden), "size": spec.size} for name, spec in encoders.items()},
+    }
+    gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian", "init_std": networks.initial_std}
+    algorithm = {name: getattr(train, own) for name, own in PPO_OPTIONS.items()}
+    algorithm |= {"class_name": "tgdsl.rl.train.ppo:CapturedPPO", "schedule": "adaptive" if train.adaptive else "fixed"}
+    rnd = (
+        None
+        if train.rnd == "off"
+        else normalisation
+        | {
+            "weight": train.rnd.weight,
+            "num_outputs": train.rnd.outputs,
+            "predictor_hidden_dims": list(train.rnd.predictor),
+            "target_hidden_dims": list(train.rnd.target),
+            "state_normalization": True,
+            "reward_normalization": True,
+            "learning_rate": train.rnd.learning_rate,
+        }
+    )
+    return {
+        "num_steps_per_env": train.steps,
+        "save_interval": 1000,
+        "obs_groups": observed(loaded, groups),
+        "actor": model | {"distribution_cfg": gaussian | {"std_range": (networks.min_std, MOST_STD)}},
+        "critic": dict(model),
+        "algorithm": algorithm | {"rnd_cfg": rnd},
+        "multi_gpu": None if multi_gpu is None else dict(multi_gpu),
+    }
+
+
+def _given(loaded: LoadedTask, groups: Mapping[str, int], place: tuple[str, ...]) -> list[str]:
+    """Return the groups that a document names; none if it names none."""
+    result: Any = loaded.spec.train
+    for key in place:
+        result = getattr(result, key)
+    for i, name in enumerate(result or ()):
+        if name not in groups:
+            problem = f'there is no group of observations "{name}"'
+            raise loaded.error(("train", *place, i), problem, did_you_mean(name, groups, "groups"))
+        if groups[name] == 0:
+            raise loaded.error(("train", *place, i), f'the group of observations "{name}" is empty')
+    return list(result or ())
 
 
 class Learner(Learning):

@@ -1,4 +1,10 @@
-"""A run: iterations until enough were made or time is over, with checkpoints on the way, so that it may be killed."""
+"""A run: iterations until enough were made or time is over, with checkpoints on the way, so that it may be killed.
+
+A checkpoint holds networks, normalisers, optimisers, learning rate, iteration, random generators, and of each environment how
+often it was reset, how often it was read and how long its episode has lasted; of the physics it holds nothing. A run that goes
+on begins new episodes, with random numbers that were not drawn before, whose remaining times are as they were. Other numbers of
+environments or processes go on from it too, with episodes that begin as in a new run.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +15,21 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
+import torch
+from torch import Tensor
 from tqdm import tqdm
 
-from tgdsl.errors import FileError, TgdslError
+from tgdsl.errors import FileError, TgdslError, listed
 from tgdsl.files.write import as_file_error
-from tgdsl.rl.train.checkpoint import not_finite, state_of, write_checkpoint
-from tgdsl.rl.train.folder import RunFolder
-from tgdsl.rl.train.iteration import Iteration, Learning
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.train.folder import FORMAT, CheckpointError, RunFolder, write_checkpoint
+from tgdsl.rl.train.learner import Iteration, Learning
 
 LINE_INTERVAL = 10.0  # time between lines where there is no terminal for a progress bar [s]
 
@@ -61,30 +69,25 @@ class Board:
     """TensorBoard's file of a run, if TensorBoard is installed."""
 
     def __init__(self, folder: Path, done: int):
-        self._writer: Any = None
+        self.writer: Any = None
         self._file = folder / "events.out.tfevents"
         with contextlib.suppress(ImportError), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of its own packages
             from torch.utils.tensorboard import SummaryWriter
 
-            self._writer = SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
-
-    @property
-    def is_there(self) -> bool:
-        """Whether TensorBoard is installed."""
-        return self._writer is not None
+            self.writer = SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
 
     def add(self, metrics: Mapping[str, float], iteration: int) -> None:
-        """Add an iteration's numbers; raise `FileError` if those before could not be written."""
+        """Add an iteration's numbers."""
         with as_file_error(self._file):
-            for name, value in metrics.items() if self._writer else ():
-                self._writer.add_scalar(name, value, iteration)
+            for name, value in metrics.items() if self.writer else ():
+                self.writer.add_scalar(name, value, iteration)
 
     def close(self) -> None:
-        """Write what has not been written; raise `FileError` if it cannot be."""
+        """Write what has not been written."""
         with as_file_error(self._file):
-            if self._writer:
-                self._writer.close()
+            if self.writer:
+                self.writer.close()
 
 
 class DivergedError(TgdslError):
@@ -127,7 +130,7 @@ class Run:
 
     def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
         """Write the first checkpoint: a folder or disk that cannot take it is found now."""
-        self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
+        self.learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
         self._rate, self._samples, self._saved = 0.0, learner.samples, learner.iteration
         self.stopped_by: signal.Signals | None = None
         self._writes = learner.ranks.is_first
@@ -137,18 +140,13 @@ class Run:
         self._board = Board(folder.path, learner.iteration) if self._writes else None
 
     @property
-    def iteration(self) -> int:
-        """Number of iterations so far."""
-        return self._learner.iteration
-
-    @property
     def has_board(self) -> bool:
         """Whether this process writes for TensorBoard."""
-        return self._board is not None and self._board.is_there
+        return self._board is not None and self._board.writer is not None
 
     def save(self) -> None:
         """Write a checkpoint; of several processes the first one does."""
-        learner = self._learner
+        learner = self.learner
         state = state_of(learner, self.seconds)
         if wrong := not_finite(state, learner.groups, learner.env.groups):
             raise DivergedError(
@@ -163,8 +161,8 @@ class Run:
         """Learn up to `iterations`, else the document's `default`, or for so many minutes, with a progress bar: see `learn`."""
         total, limit = iterations or default, math.inf if minutes is None else 60.0 * minutes
         shown_total = total if minutes is None or iterations else None  # else time ends the run
-        unit = self._learner.env.task.score_unit
-        bar = ProgressBar(shown_total, self._learner.iteration, unit) if self._writes else None
+        unit = self.learner.env.task.score_unit
+        bar = ProgressBar(shown_total, self.learner.iteration, unit) if self._writes else None
         try:
             self.learn(total, limit, bar.show if bar else None)
         finally:
@@ -193,7 +191,7 @@ class Run:
 
     def _iterate(self, iterations: int, seconds: float, show: Show | None, request: StopRequest) -> None:
         """Make iterations until enough were made, time is over or someone asks to stop."""
-        learner, seconds_before = self._learner, self.seconds
+        learner, seconds_before = self.learner, self.seconds
         begun = saved = time.monotonic()
         is_over = learner.iteration >= iterations or seconds <= 0.0
         while not is_over:
@@ -215,7 +213,7 @@ class Run:
         """Write an iteration into curve and TensorBoard, and show it."""
         if not self._writes:
             return
-        learner = self._learner
+        learner = self.learner
         samples, self._samples = learner.samples - self._samples, learner.samples
         self._rate = duration if not self._rate else 0.9 * self._rate + 0.1 * duration
         perf = {
@@ -243,13 +241,95 @@ class Run:
         problem = ", ".join(f"{name} is {value}" for name, value in losses.items() if not math.isfinite(value))
         if problem:
             raise DivergedError(
-                f"iteration {self._learner.iteration}: {problem}; {self._folder.checkpoint} is from before: try a smaller "
-                f"{self._learner.rates}"
+                f"iteration {self.learner.iteration}: {problem}; {self._folder.checkpoint} is from before: try a smaller "
+                f"{self.learner.rates}"
             )
 
 
 def end_if_stopped(run: Run, command: str) -> None:
     """End the process if a signal has stopped a run, and say how to go on."""
     if run.stopped_by is not None:
-        print(f"stopped by {run.stopped_by.name} after iteration {run.iteration}; to go on: {command}", file=sys.stderr)
+        print(f"stopped by {run.stopped_by.name} after iteration {run.learner.iteration}; to go on: {command}", file=sys.stderr)
         raise SystemExit(128 + run.stopped_by)
+
+
+def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
+    """Return all that a run goes on from, after so many seconds of learning; all processes call it."""
+    env = learner.env
+    state = {
+        "resets": env.resets.cpu().clone(),
+        "steps": env.steps.cpu().clone(),
+        "touch": {name: count.cpu().clone() for name, count in _clock(env).items()},
+        "cpu": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state(env.device) if env.device.type == "cuda" else None,
+    }
+    return {
+        "format": FORMAT,
+        "iteration": learner.iteration,
+        "samples": learner.samples,
+        "seconds": seconds,
+        "groups": learner.groups,
+        **learner.state_dict(),
+        "processes": learner.ranks.gathered(state),
+    }
+
+
+def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
+    """Have a learner of the same groups and networks go on from a checkpoint; `file` is named in errors."""
+    env, rank = learner.env, learner.ranks.rank
+    names = state["groups"].keys() | learner.groups.keys()
+    if state["groups"].keys() ^ learner.groups.keys() == {"rnd_state"}:  # RND was turned on or off
+        names -= {"rnd_state"}
+    if any(state["groups"].get(name) != learner.groups.get(name) for name in names):
+        raise CheckpointError(f"{file}: learned from the groups {state['groups']}, not {learner.groups}")
+    try:
+        learner.load_state_dict(state)
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{file}: its networks are of other sizes: {str(error).splitlines()[-1].strip()}") from error
+    learner.iteration, learner.samples = state["iteration"], state["samples"]
+    ours = state["processes"][rank] if rank < len(state["processes"]) else None
+    if ours is not None and ours["resets"].shape == env.resets.shape:
+        _count_on(env, [ours])
+        learner.go_on(ours["steps"].to(env.device))
+    else:
+        _count_on(env, state["processes"])
+    if ours is None:
+        return
+    torch.set_rng_state(ours["cpu"])
+    if ours["cuda"] is not None and env.device.type == "cuda":
+        torch.cuda.set_rng_state(ours["cuda"], env.device)
+
+
+def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping[str, int], path: str = "") -> str:
+    """Return the name of the first tensor of a state that is not all finite numbers, or nothing.
+
+    Moments of observations are named with their groups: `networks` has the groups of each network, `sizes` the size of each.
+    """
+    if isinstance(state, Mapping | list | tuple):
+        parts = state.items() if isinstance(state, Mapping) else enumerate(state)
+        return next(filter(None, (not_finite(part, networks, sizes, f"{path}.{name}".lstrip(".")) for name, part in parts)), "")
+    if not isinstance(state, Tensor) or not state.is_floating_point() or bool(state.isfinite().all()):
+        return ""
+    if "normalizer" not in path and ".seen." not in path:
+        return path
+    wrong = (~state.isfinite()).reshape(-1, state.shape[-1] if state.ndim else 1).any(dim=0).tolist()
+    named = [name for name in networks if f"{name}_state_dict" in path] or list(networks)  # one of rsl_rl's, or students
+    columns = [[group for group in networks[name] for _ in range(sizes.get(group, 0))] for name in named]
+    result = (group for each in columns if len(each) == len(wrong) for group, is_it in zip(each, wrong, strict=True) if is_it)
+    return f"{path}, which observes {listed([*dict.fromkeys(result)])},"
+
+
+def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
+    """Have environments go on to draw what was not drawn: each from its own counts, or all from the largest of any."""
+    for name, count in ({"resets": env.resets} | _clock(env)).items():
+        saved = [each["resets"] if name == "resets" else each.get("touch", {}).get(name) for each in processes]
+        saved = [value for value in saved if value is not None]  # an earlier checkpoint has none of touch
+        if len(saved) == 1 and saved[0].shape == count.shape:
+            count.copy_(saved[0])
+        elif saved:
+            count.fill_(max(int(value.max()) for value in saved))
+
+
+def _clock(env: TouchEnv) -> dict[str, Tensor]:
+    clock: Any = env.touch.memory.clock
+    return {"step": clock.step, "episode": clock.episode} if clock.num_envs else {}

@@ -1,8 +1,9 @@
-"""Whether a hand holds the object that it turns, or lets it coast.
+"""Parts of several tasks: what progress pays, whether an object is held, when it is dropped.
 
 Fingers that flick an object make more progress than fingers that hold it. With f_l the object's force on link l, the object is
 held where at least `links` links carry load, |f_l| ≥ `load`, and one of them is a finger's: two fingers, or one and the palm.
-Elsewhere it coasts, and its progress pays the share c = `coasting_pay`.
+Elsewhere it coasts, and its progress pays the share c = `coasting_pay`. With ω the rate of progress and
+b = clip(ω, ω_min, ω_max), it pays b where b ≥ 0, and κ b elsewhere.
 
 Shapes: `env` environments.
 """
@@ -10,17 +11,19 @@ Shapes: `env` environments.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from pydantic import Field, StrictInt
+from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.fields.models import Quantity, SpecModel
+from tgdsl.fields.models import Positive, Quantity, SpecModel
+from tgdsl.rl.groups import GoalPart
+from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec
 from tgdsl.rl.task import Now, Setup
 from tgdsl.runtime.simulators.model_ids import element_id
 
@@ -75,3 +78,43 @@ def _joints_above(model: mujoco.MjModel, body: int) -> set[int]:
         body = int(model.body_parentid[body])
     kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     return {joint for joint in result if int(model.jnt_type[joint]) in kinds}
+
+
+class ProgressSpec(SpecModel):
+    """Bounds of the rate that pays: part of a task's document."""
+
+    max_spin: Positive = 4.0
+    """ω_max: what is faster pays no more [rad/s]."""
+    min_spin: Annotated[float, Quantity("number", le=0.0)] | None = None
+    """ω_min, at most 0: what goes back faster costs no more [rad/s]; null: it always does."""
+    backward: Positive = 1.0
+    """κ, factor on what goes back."""
+
+    def pay(self, rate: Float[Tensor, " env"]) -> Float[Tensor, " env"]:
+        """Return what pays of a rate [rad/s]."""
+        bounded = rate.clamp(max=self.max_spin)
+        if self.min_spin is not None:
+            bounded = bounded.clamp(min=self.min_spin)
+        return torch.where(bounded < 0, self.backward * bounded, bounded)
+
+
+class PlacedTaskSpec(TaskSpec):
+    """A task whose object is put down freely, and has an orientation as its goal."""
+
+    randomise: PlacedRandomSpec = PlacedRandomSpec()
+    """What is random."""
+    goal: Annotated[tuple[GoalPart, ...], Field(min_length=1)] = ("orientation", "angle")
+    """What the group `goal` has, in order: six numbers of the goal's `orientation`; the same of the `difference`, the turn from
+    the object to the goal in world axes; the `angle` of that turn [rad]."""
+    drop_measure: Literal["distance", "below"] = "distance"
+    """What `drop_distance` bounds: how far the object is from where it started, or how far below."""
+
+    @model_validator(mode="after")
+    def _has_each_part_once(self) -> PlacedTaskSpec:
+        if twice := [part for part in self.goal if self.goal.count(part) > 1]:
+            raise ValueError(f"goal names {twice[0]} twice")
+        return self
+
+    def drop_extent(self, offset: Float[Tensor, "env 3"]) -> Float[Tensor, " env"]:
+        """Return what `drop_distance` bounds, of an object's position less that at its start [m]."""
+        return vector_norm(offset, dim=1) if self.drop_measure == "distance" else -offset[:, 2]

@@ -1,6 +1,8 @@
-"""A dataset in the format of LeRobot, version 3.0, written with pyarrow and pandas.
+"""Datasets as files: LeRobot 3.0, one MCAP file of JSON messages, a Zarr store.
 
-LeRobot's own writer pins torch below 2.11; the format is as lerobot 0.4.4 reads it.
+LeRobot's own writer pins torch below 2.11; the format is as lerobot 0.4.4 reads it. A Zarr store has `data/<feature>`
+(frame, …), `meta/episode_ends`, and `meta/tactile/<link>` with the taxels. Each writer takes an empty folder and returns the
+numbers of episodes and frames.
 """
 
 # pyright: reportMissingImports=false
@@ -15,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from tgdsl.errors import TgdslError
-from tgdsl.rl.datasets.episode import Episode, Feature, Header, features, numbered_frames
+from tgdsl.rl.datasets.episode import FORCE, Episode, Feature, Header, features, numbered_frames
 
 FILE_MB = 100
 PATHS = {name: name + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet" for name in ("data", "meta/episodes")}
@@ -109,3 +111,80 @@ def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     variance = np.tensordot(count / count.sum(), stacked["std"] ** 2 + (stacked["mean"] - result["mean"]) ** 2, 1)
     ends = {"min": stacked["min"].min(axis=0), "max": stacked["max"].max(axis=0)}
     return result | ends | {"std": np.sqrt(variance), "count": np.array([int(count.sum())])}
+
+
+FILE = "episodes.mcap"
+SECOND = 1_000_000_000
+
+
+def write_mcap(header: Header, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
+    """Write `episodes.mcap` into a folder; return the numbers of episodes and frames.
+
+    A message is `{"episode": …, "value": …}`; the next episode begins a second after the last frame of the one before. The
+    names of a topic's numbers stand in its channel's metadata, and what touch is in the file's metadata `tactile`.
+
+    """
+    try:
+        from mcap.writer import Writer
+    except ImportError as error:
+        raise TgdslError(f'an MCAP file needs mcap: pip install "tgdsl[data]" ({error})') from error
+    schema = {"type": "object", "properties": {"episode": {"type": "integer"}, "value": {}}}
+    channels: dict[str, int] = {}
+    number, total, start = 0, 0, 0
+    with (folder / FILE).open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        kind = writer.register_schema("tgdsl.Feature", "jsonschema", json.dumps(schema).encode())
+        for name, feature in features(header).items():
+            metadata = {"names": json.dumps(feature.names), "shape": json.dumps(feature.shape)}
+            channels[name] = writer.register_channel(f"/{name.replace('.', '/')}", "json", kind, metadata)
+        for number, _, values in numbered_frames(header, episodes):
+            for frame in range(len(values["action"])):
+                time = start + round(frame * SECOND / header.fps)
+                for name, channel in channels.items():
+                    message = json.dumps({"episode": number, "value": values[name][frame].tolist()}).encode()
+                    writer.add_message(channel, time, message, time, frame)
+            total += len(values["action"])
+            start += round(len(values["action"]) * SECOND / header.fps) + SECOND
+        writer.add_metadata("tactile", {name: json.dumps(value) for name, value in header.describe().items()})
+        writer.finish()
+    return number + 1, total
+
+
+CHUNK_BYTES = 2**20
+
+
+def write_zarr(header: Header, episodes: Iterable[Episode], folder: Path) -> tuple[int, int]:
+    """Write a dataset into an empty folder; return the numbers of episodes and frames."""
+    try:
+        import zarr
+    except ImportError as error:
+        raise TgdslError(f'a Zarr store needs zarr: pip install "tgdsl[data]" ({error})') from error
+    root = zarr.open_group(str(folder), mode="w", zarr_format=2)
+    data, meta = root.create_group("data"), root.create_group("meta")
+    arrays, ends = {}, list[int]()
+    outcome: dict[str, list[float]] = {"score": [], "success": []}
+    for name, feature in features(header).items():
+        shape = () if feature.shape == (1,) else feature.shape
+        rows = max(1, CHUNK_BYTES // (4 * int(np.prod(shape))))
+        arrays[name] = data.create_array(name, shape=(0, *shape), chunks=(rows, *shape), dtype=feature.dtype)
+        arrays[name].attrs["names"] = feature.names
+    for _, episode, values in numbered_frames(header, episodes):
+        for name, array in arrays.items():
+            array.append(values[name])
+        ends.append(len(values["action"]) + (ends[-1] if ends else 0))
+        for name, value in (("score", episode.score), ("success", episode.is_success)):
+            outcome[name] += [] if value is None else [float(value)]
+    numbers = {"episode_ends": np.array(ends), **{name: np.array(value) for name, value in outcome.items() if value}}
+    for name, value in numbers.items():
+        meta.create_array(name, data=value)
+    tactile = meta.create_group("tactile")
+    tactile.attrs.update({"unit": header.unit, "channels": list(FORCE), "sample_step": header.control_step})
+    for name, link in header.links.items():
+        group = tactile.create_group(name)
+        group.attrs["body"] = link.body
+        for column, value in (("pos", link.pos), ("normal", link.normal)):
+            if value is not None:
+                group.create_array(column, data=value)
+    root.attrs.update({"fps": header.fps, "task": header.task, "source": header.name, "window": header.window})
+    return len(ends), ends[-1]
