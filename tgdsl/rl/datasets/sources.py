@@ -164,7 +164,6 @@ def of_run(
     """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of joints' actuators.
 
     A recording has positions and readings after each step: a frame's action is the next step's.
-
     """
     with np.load(file, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -211,7 +210,6 @@ def of_log(
 
     A log does not hold commands: the action is where the joints are a frame later. Where no reading came for 0.1 s, the next
     episode begins.
-
     """
     log = open_log(file)
     meaning = calibration or log.calibration or Calibration.none()

@@ -122,7 +122,6 @@ def write_mcap(header: Header, episodes: Iterable[Episode], folder: Path) -> tup
 
     A message is `{"episode": …, "value": …}`; the next episode begins a second after the last frame of the one before. The
     names of a topic's numbers stand in its channel's metadata, and what touch is in the file's metadata `tactile`.
-
     """
     try:
         from mcap.writer import Writer

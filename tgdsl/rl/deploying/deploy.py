@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -99,30 +99,18 @@ class Scores(NamedTuple):
     held: float
     held_interval: tuple[float, float]
 
-    @classmethod
-    def of(cls, scores: Sequence[float], are_held: Sequence[bool]) -> Scores:
-        """Return the mean of scores and the share of episodes of full length, with their intervals."""
-        num = len(scores)
-        mean, share = math.fsum(scores) / num, sum(are_held) / num
-        interval = mean_interval(mean, math.fsum(score**2 for score in scores), num)
-        return cls(tuple(scores), mean, interval, share, share_interval(share, num))
-
 
 @dataclass(frozen=True)
 class Report:
     """What came of a policy that acted."""
 
-    task: str
-    policy: str
     source: str  # on what it acted, as `tgdsl.connect` takes it
     unit: str
     episodes: int
     steps: int  # control steps of all episodes
-    scores: Scores | None
-    """None where no scene says what happened, as on a real hand and of a log, or no episode was whole."""
+    scores: Scores | None  # None where no scene says what happened, as on a real hand and of a log, or no episode was whole
     has_scene: bool  # whether a scene says what happened
-    age: Quantiles | None
-    """How old the sample was that an action was chosen from; None where nothing runs in real time."""
+    age: Quantiles | None  # how old the sample was that an action was chosen from; None where nothing runs in real time
     inference: Quantiles | None  # from a sample to set-points: what it took to observe and to choose
     latency: Quantiles | None  # age and inference, of each step together; None where there is no age
     control_rate: float  # control steps per second that the task asks for [Hz]
@@ -131,38 +119,23 @@ class Report:
     moves: bool  # whether set-points went to joints
 
     def __str__(self) -> str:
-        lines = [self._scored(), self._timed()]
+        count = f"{self.episodes:,} episode{'' if self.episodes == 1 else 's'}, {self.steps:,} control steps"
+        rate = f"{self.rate:.1f} of {self.control_rate:.1f} control steps per second"
+        if self.scores is None:
+            why = "no episode has ended" if self.has_scene else f"{self.source} has no scene that knows what happened"
+            lines = [f"no score: {why}; {count}"]
+        else:
+            scores, (low, high) = self.scores, self.scores.interval
+            between = f" (95 %: {low:.4f} to {high:.4f})" if len(scores.each) > 1 else ""
+            lines = [f"score {scores.mean:.4f} {self.unit}{between}, {scores.held:.1%} of full length; {count}"]
+        if self.latency is None:
+            lines.append(f"inference {self.inference}; {rate}, not in real time")
+        else:
+            parts = f"latency {self.latency}: sample age {self.age}, inference {self.inference}"
+            lines.append(f"{parts}; {rate}, {self.late_steps} late")
         if not self.moves:
             lines.append(f"{self.source} was not moved: actions were computed, and went nowhere")
         return "\n".join(lines)
-
-    def _scored(self) -> str:
-        count = f"{self.episodes:,} episode{'' if self.episodes == 1 else 's'}, {self.steps:,} control steps"
-        if self.scores is None:
-            why = "no episode has ended" if self.has_scene else f"{self.source} has no scene that knows what happened"
-            return f"no score: {why}; {count}"
-        scores = self.scores
-        between = f" (95 %: {scores.interval[0]:.4f} to {scores.interval[1]:.4f})" if len(scores.each) > 1 else ""
-        return f"score {scores.mean:.4f} {self.unit}{between}, {scores.held:.1%} of full length; {count}"
-
-    def _timed(self) -> str:
-        rate = f"{self.rate:.1f} of {self.control_rate:.1f} control steps per second"
-        if self.latency is None:
-            return f"inference {self.inference}; {rate}, not in real time"
-        parts = f"latency {self.latency}: sample age {self.age}, inference {self.inference}"
-        return f"{parts}; {rate}, {self.late_steps} late"
-
-
-@dataclass
-class _Steps:
-    """The steps that were made."""
-
-    ages: list[float | None] = field(default_factory=list)
-    inferences: list[float] = field(default_factory=list)
-    scores: list[float] = field(default_factory=list)
-    are_held: list[bool] = field(default_factory=list)
-    seconds: float = 0.0
-    late: int = 0
 
 
 class Deployment:
@@ -244,21 +217,26 @@ class Deployment:
         self.moves = not self._is_log and (motion is not None or "motion" not in kind.options)
         self._start = None if start is None else prepared.model.key_ctrl[keyframe_id(prepared.model, start)]
         self._options = options | {"calibration": calibration, "motion": motion, "lockstep": lockstep}
-        self._steps = _Steps()
+        self._start_over()
+
+    def _start_over(self) -> None:
+        self._times: list[tuple[float | None, float, float]] = []  # of each step: age, inference and duration [s]
+        self._episodes: list[tuple[float, bool]] = []  # of each: its score, and whether it lasted as long as one may
+        self._late = 0
 
     def steps(self, episodes: int = 1, seconds: float | None = None) -> Iterator[HandMoment]:
         """Act, and yield each control step.
 
         A scene's episodes end as the task says; others, and a log that is not over, after so many seconds: by default an
         episode's, and all of a log.
-
         """
         if episodes < 1 or not (seconds is None or 0 < seconds < math.inf):
             raise DeployError(f"{episodes} episodes of {seconds} s, expected at least 1, and more than 0 s")
         prepared = self.prepared
         longest = prepared.loaded.spec.episode if seconds is None else seconds
         num_steps = None if seconds is None and self._is_log else max(1, round(longest / prepared.control_step))
-        self._steps, policy = _Steps(), prepared.policy()
+        self._start_over()
+        policy = prepared.policy()
         if self.has_scene:
             for episode in range(episodes):
                 env = TouchEnv(prepared.loaded, 1, threads=1, first_env=episode, sensed=prepared.sensed, **self._env_options)
@@ -276,25 +254,28 @@ class Deployment:
 
     def report(self) -> Report:
         """Return what came of the steps that were made; raise `DeployError` if none was made."""
-        steps, prepared = self._steps, self.prepared
-        num = len(steps.inferences)
-        if not num:
+        if not self._times:
             raise DeployError(f"{self.source}: not one control step was made")
+        ages, inferences, seconds = zip(*self._times, strict=True)
+        prepared, num, scores = self.prepared, len(self._episodes), None
+        if self.has_scene and num:
+            each, are_held = zip(*self._episodes, strict=True)
+            mean, held = math.fsum(each) / num, sum(are_held) / num
+            interval = mean_interval(mean, math.fsum(score**2 for score in each), num)
+            scores = Scores(each, mean, interval, held, share_interval(held, num))
         return Report(
-            task=prepared.loaded.spec.task,
-            policy=str(prepared.saved.file),
             source=self.source,
             unit=prepared.loaded.task.score_unit,
-            episodes=len(steps.scores) if self.has_scene else max(1, len(steps.are_held)),
-            steps=num,
-            scores=Scores.of(steps.scores, steps.are_held) if steps.scores else None,
+            episodes=num if self.has_scene else max(1, num),
+            steps=len(ages),
+            scores=scores,
             has_scene=self.has_scene,
-            age=Quantiles.of([age for age in steps.ages if age is not None]),
-            inference=Quantiles.of(steps.inferences),
-            latency=Quantiles.of([a + b for a, b in zip(steps.ages, steps.inferences, strict=True) if a is not None]),
+            age=Quantiles.of([age for age in ages if age is not None]),
+            inference=Quantiles.of(inferences),
+            latency=Quantiles.of([a + b for a, b in zip(ages, inferences, strict=True) if a is not None]),
             control_rate=1.0 / prepared.control_step,
-            rate=num / steps.seconds,
-            late_steps=steps.late,
+            rate=len(ages) / sum(seconds),
+            late_steps=self._late,
             moves=self.moves,
         )
 
@@ -312,25 +293,22 @@ class Deployment:
         self, episode: int, connection: Connection, policy: Policy, num_steps: int | None, scene: TaskScene | None
     ) -> Iterator[HandMoment]:
         """Make the steps of one episode."""
-        steps, late = self._steps, getattr(connection.source, "num_late_steps", 0)
+        late = getattr(connection.source, "num_late_steps", 0)
         hand = Hand(self.prepared, connection, scene, is_exact=self.has_scene and not self._is_emulated)
         hand.begin(self._start, self.moves)
         policy.begin(EVERYONE)
         info = empty_step().info
         for moment in rollout(policy, hand, num_steps):
             info = moment.step.info
-            steps.seconds += hand.seconds
-            steps.ages.append(hand.age_s)
-            steps.inferences.append(hand.inference_s)
+            self._times.append((hand.age_s, hand.inference_s, hand.seconds))
             yield HandMoment(
                 **vars(moment), episode=episode, target=hand.target, age_s=hand.age_s, inference_s=hand.inference_s
             )
             if info.ended or connection.is_over:
                 break
-        steps.late += getattr(connection.source, "num_late_steps", 0) - late
-        steps.are_held.append(bool(~info.ended | (scene is not None and info.is_whole(scene.max_steps))))
-        if scene is not None:
-            steps.scores.append(float(info.score))
+        self._late += getattr(connection.source, "num_late_steps", 0) - late
+        is_held = bool(~info.ended | (scene is not None and info.is_whole(scene.max_steps)))
+        self._episodes.append((float(info.score), is_held))
 
 
 def deploy(

@@ -100,7 +100,6 @@ def prepare(
     What it feels, where, how densely and with what noise stand in its card; the document's `touch`, `placement`, `resolution`
     and `noise` count for a policy without one. An emulated hand has to feel what the fingertips would. For the other arguments
     see `Deployment`.
-
     """
     loaded, saved = load_task(task, overrides), read_policy(policy)
     card, changes = saved.card, list[str]()

@@ -175,7 +175,6 @@ class GraspTable:
         """Evaluate the contacts of all grasps, in the simulation; it has to be reset afterwards.
 
         Its objects have to be as those that the grasps were sampled with, and not yet of a mass and friction of their own.
-
         """
         shape = (sim.model.nq, sim.model.nu)
         sizes = (grasps.qpos.shape[1], grasps.ctrl.shape[1])

@@ -349,7 +349,6 @@ def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None
 
     Taxels may differ by rounding, as those of a robot that was exported do. Sensors that the environments lack, such as those
     that only the task reads, are not compared.
-
     """
     card, file = saved.card, saved.file
     assert card is not None

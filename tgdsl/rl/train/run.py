@@ -174,7 +174,6 @@ class Run:
 
         Iterations get the share of the run that is over: of iterations, or if that is more, of time, what was learned before
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
-
         """
         try:
             with StopRequest() as request:
