@@ -67,14 +67,13 @@ def test_a_state_of_other_environments_changes_nothing(make, is_begun):
     cases = [({name: own for name, own in saved.items() if name != part}, part) for part in saved if part != "sim"]
     cases += [
         ({name: own for name, own in saved.items() if name != "sim"}, "the state of another simulation: state/time"),
-        (saved | {"speeds": {}}, "speeds missing or not known"),
         (saved | {"sim": dict(list(saved["sim"].items())[1:])}, "the state of another simulation: state/time missing"),
     ]
     for part in ("touch", "obs", "seed", "actuation"):
-        match = f"the {part} that was saved is of other environments"
+        match = f"is of other environments: .*{part} .* missing"
         cases.append((saved | {part: dict(list(saved[part].items())[1:])}, match))
     if is_begun:
-        cases.append((saved | {"episodes": saved["episodes"] | {"sums/other": torch.zeros(4)}}, "sums/other missing"))
+        cases.append((saved | {"episodes": saved["episodes"] | {"sums/other": torch.zeros(4)}}, "episodes sums/other missing"))
     for state, match in cases:
         with pytest.raises(SimulationError, match=match):
             other.load_state_dict(state)

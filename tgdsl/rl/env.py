@@ -90,26 +90,19 @@ class TouchEnv:
     Groups of observations: `proprio` (positions [rad], velocities [rad/s] and last action of the joints that the policy moves),
     `tactile_sensors` (none with `touch: none`), `priv_proprio` (`proprio` and the force on each link [N]), and the task's own.
 
+    `curricula.advance` changes numbers of terms while a policy is learned; whoever learns calls it.
+
     Attributes:
-        loaded: The task's document, and where it stands.
-        spec: What it says.
-        task: The task.
-        sim: The simulation.
-        touch: The module.
-        actuation: The drives of the joints that the policy moves.
-        curricula: Numbers of terms that change while a policy is learned: whoever learns calls `advance`.
         groups: Size of each group of observations.
         felt: Sources of the groups of touch.
-        num_envs: Number of environments.
-        num_actions: Number of joints that the policy moves.
-        joint_names: These joints, in the order of actions.
-        device: Where observations and rewards are.
+        joint_names: Joints that the policy moves, in the order of actions.
         control_step: Duration of a control step [s].
         max_steps: Control steps of an episode that nothing ends before.
         steps: Control steps of each environment's present episode: a live tensor, which may be written.
         resets: How often each environment was reset, from which its random numbers follow: the same.
     """
 
+    _instant: Now | None
     steps: Int[Tensor, " env"]
     resets: Int[Tensor, " env"]
 
@@ -198,15 +191,18 @@ class TouchEnv:
         self._step_by, self._logic_by = (
             one_thread if is_alone else nullcontext for is_alone in (is_small, is_plain and not is_small)
         )
-        self._has_stepped, tell = False, progress or silent
+        self._has_stepped, tell = True, progress or silent
         if is_cuda or is_compiled:
             tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
         obs = self.reset(seed)
         self._terms = tuple(self._rates(self.now, torch.zeros_like(self.sim.faults)))
         self._sums = self._return.new_zeros((len(self._terms), num_envs))
         self.groups = {name: value.shape[1] for name, value in obs.items()}
-        if is_cuda or is_compiled:
-            self._prepare(seed)
+        if is_cuda or is_compiled:  # compile kernels and, on a GPU, capture the step
+            for _ in range(PREPARING_STEPS):
+                self.step(torch.zeros_like(self._action))
+            self.reset(seed)
+        self._has_stepped = False
 
     @property
     def now(self) -> Now:
@@ -215,7 +211,7 @@ class TouchEnv:
         Raises:
             SimulationError: If a state was loaded: there is none until the next step.
         """
-        if self._is_loaded:
+        if self._instant is None:
             raise SimulationError("a state was loaded: what was read then is there again after the next step")
         return self._instant
 
@@ -233,8 +229,8 @@ class TouchEnv:
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
-            now = self._instant = self._begin_instant(everyone, self.sim.read())
-            self._obs, self._is_loaded = self._observe(now), False
+            self._instant = self._begin_instant(everyone, self.sim.read())
+            self._obs = self._observe(self._instant)
             return dict(self._obs)
 
     def step(self, action: Float[Tensor, "env joint"] | Float[np.ndarray, "env joint"]) -> Step:
@@ -263,7 +259,7 @@ class TouchEnv:
             self._action.copy_(action)
             step, self._instant = self._call()
             step = _copied(step) if self.device.type == "cuda" else step
-        self._obs, self._is_loaded = step.obs, False
+        self._obs = step.obs
         return step._replace(obs=dict(step.obs))
 
     def observe(self) -> Observations:
@@ -287,7 +283,7 @@ class TouchEnv:
             self._events.advance()
             now = self._instant = self._advance_task(self._step_physics(self.sim.ctrl))
             step = self._judged(now, self.sim.faults)
-        self._obs, self._is_loaded = step.obs, False
+        self._obs = step.obs
         return step
 
     def images(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -324,7 +320,7 @@ class TouchEnv:
         self.touch.load_state_dict(dict(state["touch"]))
         self._draws.reseed(int(state["seed"]["seed"]))
         self._obs = {name: value.to(self.device, copy=True) for name, value in state["obs"].items()}
-        self._is_loaded = True
+        self._instant = None
         return dict(self._obs)
 
     def close(self) -> None:
@@ -341,14 +337,6 @@ class TouchEnv:
         memory["speeds"] = self._speeds.memory if self._speeds else {}
         memory |= {"curricula": self.curricula.values, "events": self._events.memory}
         return {part: tensors for part, tensors in memory.items() if tensors or part == "task"}
-
-    def _prepare(self, seed: int) -> None:
-        """Compile kernels and, on a GPU, capture the step, by a few steps before a reset."""
-        self._has_stepped = True
-        for _ in range(PREPARING_STEPS):
-            self.step(torch.zeros_like(self._action))
-        self._has_stepped = False
-        self.reset(seed)
 
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin a new episode in some environments, in the simulation and the module too."""
@@ -375,7 +363,13 @@ class TouchEnv:
             self._events.advance()
         readings = self._step_physics(control)
         with self._logic_by():
-            return self._conclude(readings)
+            now = self._advance_task(readings)
+            step = self._judged(now, sim.faults)
+            if may_be_nonempty(step.info.ended):
+                self._begin(step.info.ended)
+                now = self._begin_instant(step.info.ended, sim.read(step.info.ended))
+                step = step._replace(obs=self._observed(now))
+            return step, now
 
     def _step_physics(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
         """Make the physics steps of a control step, and return the readings at its end."""
@@ -383,16 +377,6 @@ class TouchEnv:
             return self._substeps.step(control)
         self.sim.step(control)
         return self.sim.read()
-
-    def _conclude(self, readings: dict[str, Tensor]) -> tuple[Step, Now]:
-        """Return result and instant of a control step from its readings; begin episodes where some have ended."""
-        sim, now = self.sim, self._advance_task(readings)
-        step = self._judged(now, sim.faults)
-        if may_be_nonempty(step.info.ended):
-            self._begin(step.info.ended)
-            now = self._begin_instant(step.info.ended, sim.read(step.info.ended))
-            step = step._replace(obs=self._observed(now))
-        return step, now
 
     def _advance_task(self, readings: dict[str, Tensor]) -> Now:
         """Update the task; return the instant at the end of a control step."""
@@ -501,13 +485,13 @@ class TouchEnv:
 
 def _refuse_other(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, Mapping[str, Tensor]]) -> None:
     """Raise `SimulationError` if parts, or names or shapes in one, differ from what was saved."""
-    if wrong := sorted(own.keys() ^ given.keys()):
-        raise SimulationError(f"the state that was saved is of other environments: {listed(wrong)} missing or not known")
-    for part, tensors in own.items():
-        shapes, saved = ({name: value.shape for name, value in each.items()} for each in (tensors, given[part]))
-        if wrong := [name for name in {**shapes, **saved} if shapes.get(name) != saved.get(name)]:
-            problem = f"{listed(wrong)} missing or of another shape"
-            raise SimulationError(f"the {part} that was saved is of other environments: {problem}")
+    expected, saved = (
+        {f"{part} {name}": value.shape for part, tensors in state.items() for name, value in tensors.items()}
+        for state in (own, given)
+    )
+    if wrong := [name for name in {**expected, **saved} if expected.get(name) != saved.get(name)]:
+        problem = f"{listed(wrong)} missing, not known or of another shape"
+        raise SimulationError(f"the state that was saved is of other environments: {problem}")
 
 
 def _copied(value: Any) -> Any:
