@@ -13,7 +13,7 @@ Each part has a process of its own, and they take turns on the GPU: see turns.py
   the kernel of a step and once with its definition in torch;
 - `energy`: replayed calls whose contacts come and go: what all store, against what the reports say came in, summed in float64,
   over the heat that was exchanged;
-- `sweep`: the kernel alone, by how many numbers a program and a warp have.
+- `sweep`: the kernel alone, by how many pairs a program has, and numbers a warp.
 
 Five links of 2 × 2 × 2 cells or 10 × 10 × 10; unless a case leaves it out there are a source, radiation, convection, a lag, and
 contact: each link touches one object at a random point. `conduction` sets a step of `exact` beside the paper's: mirror the
@@ -72,8 +72,8 @@ PARTS = (
     ("all", "sweep"),
 )
 """What `run` does, in this order."""
-SWEPT = ((64, 64), (128, 64), (128, 128), (256, 128), (256, 256), (512, 256), (512, 512))
-"""Numbers in a program, and of each of its warps."""
+SWEPT = ((16, 128), (32, 128), (32, 256), (64, 256), (64, 512), (128, 256), (128, 512))
+"""Pairs of an environment and a row in a program, and numbers of each of its warps."""
 CHECKED, PROFILED, ENERGY_ENVS, LARGE = 64, 3, 1_024, 1e9
 """Environments whose readings are compared; calls that are profiled; environments of `energy`; bytes of state from which on
 calls from Python are not timed."""
@@ -171,13 +171,13 @@ def run_sweep(options: argparse.Namespace, name: str) -> Iterator[dict[str, Any]
         touch(state_of(touch, options.envs, seed).to(bench.device))
     step_kernel.heat_step, found = own, {}
     turn = turns.Turn(options.turn)
-    for fewest, of_warp in SWEPT:
-        step_kernel.MIN_PROGRAMS, step_kernel.OF_WARP = fewest, (of_warp, of_warp)
+    for pairs, of_warp in SWEPT:
+        step_kernel.MAX_PAIRS, step_kernel.OF_WARP = pairs, of_warp
         turn.give_back()
         step_kernel.launch(step_kernel.step_kernel, *given[-1])
         turn.take()
         call = captured(lambda: [step_kernel.launch(step_kernel.step_kernel, *given[-1]) for _ in range(8)], bench.device)
-        found[f"{fewest} a program, {of_warp} a warp"] = median_ms(call, options.repeats, bench.device) / 8
+        found[f"{pairs} pairs a program, {of_warp} numbers a warp"] = median_ms(call, options.repeats, bench.device) / 8
         yield {"sweep": found}
 
 

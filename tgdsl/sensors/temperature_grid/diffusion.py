@@ -24,6 +24,7 @@ modes along an axis.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -183,9 +184,9 @@ def _there(modes: tuple[Modes, ...]) -> Tensor:
     return outer([(own.vectors[:, 0] > 0).to(own.vectors.dtype) for own in modes], torch.mul)
 
 
-def exponents(rates: Float[Tensor, "env row 3"], modes: tuple[Modes, ...]) -> Cells:
+def exponents(rates: Sequence[Float[Tensor, "env row"]], modes: tuple[Modes, ...]) -> Cells:
     """Return x = Σ aμ of the modes of a box, from a of each axis."""
-    return outer([rates[..., axis, None] * own.exponent for axis, own in enumerate(modes)], torch.add)
+    return outer([rate[..., None] * own.exponent for rate, own in zip(rates, modes, strict=True)], torch.add)
 
 
 def semi_implicit(cells: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple[Modes, ...]) -> Spread:

@@ -45,7 +45,7 @@ def stepped(
         dt: Δt [s].
     """
     alpha = rows.diffusivity * dt
-    x = diffusion.exponents(dt * torch.stack(rows.rates, dim=-1), rows.modes)
+    x = diffusion.exponents([dt * rate for rate in rows.rates], rows.modes)
     x = torch.maximum(x, alpha[..., None, None, None] * least_squared_wavenumber())
     spread = diffusion.semi_implicit(cells, x, rows.modes).gained
     heat = rows.conductivity / rows.diffusivity

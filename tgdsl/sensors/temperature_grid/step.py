@@ -177,7 +177,7 @@ def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> dif
 
 
 def _exponents(rows: Rows, dt: Tensor) -> Tensor:
-    return diffusion.exponents(dt * torch.stack(rows.rates, dim=-1), rows.modes)
+    return diffusion.exponents([dt * rate for rate in rows.rates], rows.modes)
 
 
 def _inverse(patches: ContactPatch) -> Tensor:
@@ -199,14 +199,16 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     series = resistance(area, patches, patches.topology.lumped, constants)
     assert series is not None  # objects of one temperature have one
     source = constants.get("source")
+    less = [part[0].flatten(1) for part in decays(_exponents(rows, dt), is_implicit=False)]
     gained, nodes_gained, got, nodes_got = heat_step(
         [cells, nodes],
         [part.expand(cells.shape[0], -1, -1) for part in (area, series, *patches.pos, *patches.normal)],
         [*(constants[name] for name in ("conductivity", "volumetric_heat", "volume", "box")), *rows.ends],
-        _films(rows),
+        constants.get("film"),
+        constants.get("film_radiated"),
         constants.get("emissivity"),
         source,
-        _mode_table(rows, dt),
+        [*(own.vectors for own in rows.modes), *(own.totals for own in rows.modes), *less],
         [objects.volumetric_heat, objects.volume, objects.area, objects.conductivity, objects.emissivity],
         [dt, constants["ambient"]],
         constants.get("convection"),
@@ -215,24 +217,6 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     if source is not None:
         made = made + dt * constants["power"]
     return Stepped(gained, nodes_gained, (made, *got.unbind(1)), nodes_got.unbind(1))
-
-
-def _mode_table(rows: Rows, dt: Tensor) -> Tensor:
-    """Return of each mode its values in the cells, their sum, and what `decays` returns (row, mode, cells + 5)."""
-    waves = rows.modes[0].vectors[:, :, None, None, :, None, None] * rows.modes[1].vectors[:, None, :, None, None, :, None]
-    waves = (waves * rows.modes[2].vectors[:, None, None, :, None, None, :]).flatten(4).flatten(1, 3)
-    less = [part[0].flatten(1) for part in decays(_exponents(rows, dt), is_implicit=False)]
-    total = diffusion.outer([own.totals for own in rows.modes], torch.mul).flatten(1)
-    return torch.cat([waves, torch.stack([total, *less], dim=-1)], dim=-1)
-
-
-def _films(rows: Rows) -> list[Tensor]:
-    """Return resistances between cells and faces, then what modes lose there (row, 6); the share of that which is radiation."""
-    resistance = [part[0] for part in rows.resistance]
-    if rows.film is None or rows.film_radiated is None:
-        idle = torch.zeros_like(resistance[0])
-        return [torch.stack([*resistance, idle, idle, idle], dim=-1), idle]
-    return [torch.stack([*resistance, *rows.film], dim=-1), rows.film_radiated]
 
 
 def _inputs(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> list[Tensor]:
