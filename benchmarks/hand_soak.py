@@ -18,10 +18,8 @@ from jaxtyping import Float
 
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, Emulator, StillBody, TipForces
-from tgdsl.runtime.xhand1.wire.client import SerialCounters, SerialTiming
-from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
-from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD
-from tgdsl.runtime.xhand1.wire.serial_port import BAUD
+from tgdsl.runtime.xhand1.wire.client import BAUD, SerialCounters, SerialTiming
+from tgdsl.runtime.xhand1.wire.protocol import COMMAND_SIZE, OVERHEAD, STATE_SIZE
 
 WIRE_S = 10 * (COMMAND_SIZE + STATE_SIZE + 2 * OVERHEAD) / BAUD
 """Time that an exchange's bytes are on the line [s]."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, TipForces, is_driven
-from tgdsl.runtime.xhand1.wire.payloads import NUM_JOINTS, PASSIVE, JointCommand
+from tgdsl.runtime.xhand1.wire.protocol import NUM_JOINTS, PASSIVE, JointCommand
 
 ForceField = Callable[[float, np.ndarray], TipForces]
 """Takes the time [s] and the joint angles [rad]; is called once per state that the hand sends."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from tgdsl.runtime.xhand1.driver import Reading
 from tgdsl.runtime.xhand1.log.log import Fault, LogWriter
-from tgdsl.runtime.xhand1.wire.payloads import FORCE_MAX, FORCE_MIN, HandState
+from tgdsl.runtime.xhand1.wire.protocol import FORCE_MAX, FORCE_MIN, HandState
 
 
 def random_state(rng: np.random.Generator) -> HandState:

@@ -16,9 +16,8 @@ from tgdsl.runtime.xhand1 import driver, source
 from tgdsl.runtime.xhand1.driver import HandReader, XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
-from tgdsl.runtime.xhand1.wire.client import Addresses, SerialClient, SerialCounters, SerialTiming
+from tgdsl.runtime.xhand1.wire.client import POLL_S, Addresses, SerialClient, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError
-from tgdsl.runtime.xhand1.wire.serial_port import POLL_S
 
 
 class VirtualTime:

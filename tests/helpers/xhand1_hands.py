@@ -13,9 +13,8 @@ import numpy as np
 
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import TipForces
-from tgdsl.runtime.xhand1.wire.client import SerialTiming
+from tgdsl.runtime.xhand1.wire.client import SerialPort, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.serial_port import open_serial_port
 
 PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 """So that a busy machine, whose pseudo-terminals may take half a second, is no failure of the line."""
@@ -53,7 +52,7 @@ class WrittenBytes:
         self.times: list[float] = []
 
     def open(self, device: str, baud: int):
-        port = open_serial_port(device, baud)
+        port = SerialPort(device, baud)
         plain_write = port.write
 
         def write(data: bytes) -> None:

@@ -17,7 +17,7 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.emulator.simulated import EmulatedSource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.payloads import FORCE_MAX
+from tgdsl.runtime.xhand1.wire.protocol import FORCE_MAX
 
 
 @pytest.fixture(scope="module")

@@ -20,15 +20,13 @@ from tgdsl.runtime import connect as connecting
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.source import XHand1Source
-from tgdsl.runtime.xhand1.wire.client import SerialTiming
+from tgdsl.runtime.xhand1.wire.client import PortInfo, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
     HandDisconnectedError,
     HandTimeoutError,
     MotionError,
 )
-from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, encode_command
-from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
-from tgdsl.runtime.xhand1.wire.serial_port import PortInfo
+from tgdsl.runtime.xhand1.wire.protocol import PASSIVE, Frame, encode_command, encode_frame
 
 PASSIVE_READ = encode_frame(Frame(0xFE, 0x80, 2, encode_command(PASSIVE)))
 VERSION = bytes.fromhex("55aafe80130000efc3")

@@ -26,7 +26,7 @@ from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import TipForces
 from tgdsl.runtime.xhand1.log.log import Fault
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
-from tgdsl.runtime.xhand1.wire.payloads import JOINTS, STATE_SIZE, decode_state
+from tgdsl.runtime.xhand1.wire.protocol import JOINTS, STATE_SIZE, decode_state
 from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
 from tgdsl.view.page import Page
 from tgdsl.view.stages import RunStage, SceneStage, SimStage, Stage

@@ -31,8 +31,7 @@ from tgdsl.runtime.xhand1.log.replay import ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.observe import HandConnection, HandObserver, moved_joints, warn_of_noise
 from tgdsl.runtime.xhand1.source import XHand1Source, refuse_beyond_watchdog
-from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
-from tgdsl.runtime.xhand1.wire.serial_port import list_ports
+from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming, list_ports
 from tgdsl.scene.scene import scene_model
 
 CONTROL_STEP = 0.02

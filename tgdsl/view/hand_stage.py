@@ -24,8 +24,8 @@ from tgdsl.runtime.xhand1.log.log import Fault, HandLog
 from tgdsl.runtime.xhand1.motion import JointControls
 from tgdsl.runtime.xhand1.observe import finger_of
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandError
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, HandState
 from tgdsl.runtime.xhand1.wire.ports import the_hand
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS, HandState
 from tgdsl.scene.scene import scene_model
 from tgdsl.tuning.compile import compile
 from tgdsl.view.hand_table import StreamCounter

@@ -13,7 +13,7 @@ from tgdsl.console.live import LiveTable
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading
 from tgdsl.runtime.xhand1.log.log import Fault
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, JOINTS
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS, FORCE_MAX, JOINTS
 
 BAR = 32  # width of a full bar [characters]
 _PARTS = " ▏▎▍▌▋▊▉"

@@ -23,7 +23,7 @@ from tgdsl.calibration.hand.report import calibrated, drawing, picture, report
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.log.log import open_log
-from tgdsl.runtime.xhand1.wire.payloads import FORCE_MAX, FORCE_MIN
+from tgdsl.runtime.xhand1.wire.protocol import FORCE_MAX, FORCE_MIN
 
 AXES = np.eye(3)
 PRESSES = np.concatenate([np.zeros((1, 3)), 2 * AXES, -2 * AXES, [[1.0, 1.0, 3.0], [0.5, -1.0, 4.0]]])

@@ -7,10 +7,8 @@ from resting_hands import resting
 
 from tgdsl.runtime.xhand1 import driver
 from tgdsl.runtime.xhand1.wire import ports
-from tgdsl.runtime.xhand1.wire.client import SerialTiming
-from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, encode_command
-from tgdsl.runtime.xhand1.wire.protocol import Command, Register
-from tgdsl.runtime.xhand1.wire.serial_port import PortInfo
+from tgdsl.runtime.xhand1.wire.client import PortInfo, SerialTiming
+from tgdsl.runtime.xhand1.wire.protocol import PASSIVE, Command, Register, encode_command
 
 ALLOWED = {Command.VERSION, Command.READ_REGISTER, Command.EXCHANGE}
 

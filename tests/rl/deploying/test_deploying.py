@@ -14,7 +14,7 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.evaluation import SEED, evaluate
 from tgdsl.rl.playing.policy import policy_for, read_policy
 from tgdsl.runtime.xhand1.source import VelocityFilter
-from tgdsl.runtime.xhand1.wire.payloads import JOINTS
+from tgdsl.runtime.xhand1.wire.protocol import JOINTS
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 EPISODES = 3

@@ -12,7 +12,7 @@ from xhand1_hands import PATIENT, Stamps, WrittenBytes, open_again, read_again, 
 
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import TipForces
-from tgdsl.runtime.xhand1.wire import payloads, serial_port
+from tgdsl.runtime.xhand1.wire import client, protocol
 from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
     HandClosedError,
@@ -24,7 +24,7 @@ from tgdsl.runtime.xhand1.wire.errors import (
 from tgdsl.runtime.xhand1.wire.ports import find_hands, identify
 from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
 
-READ = encode_frame(Frame(0xFE, 0x80, 2, payloads.encode_command(payloads.PASSIVE)))
+READ = encode_frame(Frame(0xFE, 0x80, 2, protocol.encode_command(protocol.PASSIVE)))
 VERSION = bytes.fromhex("55aafe80130000efc3")
 CALM = SerialTiming(reply_timeout_s=0.5, silence_s=0.4)
 BRISK = SerialTiming(reply_timeout_s=0.2, silence_s=0.1)
@@ -61,7 +61,7 @@ def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
         assert (emulator.hand.position == 0).all()
     assert len(written.writes) > 100
     assert set(written.writes) == {READ, VERSION}
-    for joint in payloads.decode_command(READ[7:-2]):
+    for joint in protocol.decode_command(READ[7:-2]):
         assert (joint.mode, joint.kp, joint.ki, joint.kd, joint.current_limit) == (0, 0, 0, 0, 0)
 
 
@@ -199,11 +199,11 @@ def test_without_pyserial_the_extra_is_named(monkeypatch):
 
 
 def test_ports_are_listed():
-    assert all(isinstance(port, serial_port.PortInfo) for port in serial_port.list_ports())
+    assert all(isinstance(port, client.PortInfo) for port in client.list_ports())
 
 
 def test_only_one_file_knows_pyserial_and_only_in_a_function():
-    folder = Path(serial_port.__file__).parents[2]
+    folder = Path(client.__file__).parents[2]
     found = {file.name for file in folder.rglob("*.py") if "import serial" in file.read_text(encoding="utf-8")}
-    assert found == {"serial_port.py"}
-    assert "\nimport serial" not in Path(serial_port.__file__).read_text(encoding="utf-8")
+    assert found == {"client.py"}
+    assert "\nimport serial" not in Path(client.__file__).read_text(encoding="utf-8")

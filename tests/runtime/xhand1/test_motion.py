@@ -18,8 +18,7 @@ from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, MotionError, WatchdogError
-from tgdsl.runtime.xhand1.wire.payloads import JOINTS, PASSIVE, Mode, encode_command
-from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
+from tgdsl.runtime.xhand1.wire.protocol import JOINTS, PASSIVE, Frame, Mode, encode_command, encode_frame
 
 RANGES = [
     (0, 1.832), (-0.698, 1.57), (0, 1.57), (-0.174, 0.174), (0, 1.919), (0, 1.919),

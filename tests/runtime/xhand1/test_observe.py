@@ -12,7 +12,7 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading
 from tgdsl.runtime.xhand1.observe import HandObserver, finger_of, hand_terms, warn_of_noise
 from tgdsl.runtime.xhand1.source import HandSample, VelocityFilter
-from tgdsl.runtime.xhand1.wire.payloads import HandState
+from tgdsl.runtime.xhand1.wire.protocol import HandState
 
 AGGREGATES = [
     {"type": "agg_force", "of": "depth"},

@@ -28,7 +28,7 @@ from tgdsl.fields.models import Quantity, SpecModel
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.log.log import HandLog
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, NUM_TAXELS
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS, NUM_TAXELS
 from tgdsl.schema.load import read_spec
 
 Seconds = Annotated[float, Quantity("time", ge=0.0)]

@@ -15,7 +15,7 @@ from tgdsl.calibration.hand.fit import FingerFit, FitError
 from tgdsl.calibration.hand.loads import Samples
 from tgdsl.files.write import atomic_open
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 from tgdsl.view.style import DPI, FAINT, INK
 
 AXIS_COLOURS = ("#c8553d", "#588157", "#3d5a80")

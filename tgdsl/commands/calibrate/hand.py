@@ -73,7 +73,7 @@ class CalibrateHand:
         from tgdsl.files.write import atomic_write, with_folder
         from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
         from tgdsl.runtime.xhand1.log.log import open_log
-        from tgdsl.runtime.xhand1.wire.payloads import FINGERS
+        from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 
         for file in (self.out, self.plot):
             refuse_to_replace(file, self.force)
@@ -130,7 +130,7 @@ class CalibrateHand:
 
         from tgdsl.calibration.hand.fit import time_offset
         from tgdsl.calibration.hand.loads import samples_under_forces
-        from tgdsl.runtime.xhand1.wire.payloads import FINGERS
+        from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 
         time, forces = self._known_forces(path)
         loaded = [name for name in forces if np.ptp(forces[name], axis=0).any()]

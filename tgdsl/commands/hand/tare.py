@@ -37,8 +37,8 @@ class Tare:
         from tgdsl.files.write import atomic_write, with_folder
         from tgdsl.runtime.xhand1.calibration import Calibration
         from tgdsl.runtime.xhand1.driver import XHand1
-        from tgdsl.runtime.xhand1.wire.payloads import FINGERS
         from tgdsl.runtime.xhand1.wire.ports import the_hand
+        from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 
         refuse_to_replace(self.out, self.force)
         base, found = calibration_of(self.calibration) or Calibration.none(), the_hand(self.port, self.hand_id)

@@ -32,7 +32,7 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S
 from tgdsl.runtime.xhand1.log.log import open_log
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
-from tgdsl.runtime.xhand1.wire.payloads import JOINTS
+from tgdsl.runtime.xhand1.wire.protocol import JOINTS
 from tgdsl.scene.scene import scene_model
 
 LOG_FPS = 30.0  # frames per second of a hand's log unless others are asked for

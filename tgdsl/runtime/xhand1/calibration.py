@@ -21,7 +21,7 @@ from pydantic import model_validator
 
 from tgdsl.fields.models import Number, Positive, SpecModel
 from tgdsl.runtime.xhand1.driver import Tare
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 from tgdsl.schema.load import parse_spec, read_spec
 
 Sign = Literal[-1, 1]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
-from tgdsl.runtime.xhand1.wire.client import Addresses, Reply, SerialClient, SerialCounters, SerialTiming
+from tgdsl.runtime.xhand1.wire.client import Addresses, Port, Reply, SerialClient, SerialCounters, SerialPort, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
     HandClosedError,
     HandDisconnectedError,
@@ -22,18 +22,17 @@ from tgdsl.runtime.xhand1.wire.errors import (
     MotionError,
     ProtocolError,
 )
-from tgdsl.runtime.xhand1.wire.payloads import (
+from tgdsl.runtime.xhand1.wire.protocol import (
     JOINTS,
     NUM_JOINTS,
     PASSIVE,
     STATE_SIZE,
+    Command,
     HandState,
     JointCommand,
     decode_state,
     encode_command,
 )
-from tgdsl.runtime.xhand1.wire.protocol import Command
-from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
 
 _RECONNECT_S = 0.02
 _LAST_TRIES = 6
@@ -220,7 +219,7 @@ class XHand1:
         motion: MotionLimits | None = None,
         timing: SerialTiming | None = None,
         max_age_s: float | None = None,
-        open_port: Callable[[str, int], Port] = open_serial_port,
+        open_port: Callable[[str, int], Port] = SerialPort,
     ) -> XHand1:
         """Open a hand and wait for its first reading.
 

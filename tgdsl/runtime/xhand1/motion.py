@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from tgdsl.errors import listed
 from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogError
-from tgdsl.runtime.xhand1.wire.payloads import JOINTS, NUM_JOINTS, PASSIVE, JointCommand, Mode
+from tgdsl.runtime.xhand1.wire.protocol import JOINTS, NUM_JOINTS, PASSIVE, JointCommand, Mode
 
 JointArray = Float[np.ndarray, " joint"]
 ROUNDING = 1e-6  # how far a target may lie beyond its range to count as its end [rad]: float32 angles are rounded by less

@@ -33,7 +33,7 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import ROUNDING, JointControls, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.source import HandSample, HandSource, is_chosen
 from tgdsl.runtime.xhand1.wire.errors import MotionError
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, JOINTS
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS, JOINTS
 from tgdsl.scene.scene import scene_model
 from tgdsl.tensors.env_ids import EnvIds
 

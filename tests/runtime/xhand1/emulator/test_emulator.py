@@ -13,8 +13,18 @@ from xhand1_hands import wait_until
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, EmulatedLine, TipForces
 from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, HandState, JointCommand, Mode, decode_state, encode_command
-from tgdsl.runtime.xhand1.wire.protocol import Command, Frame, FrameParser, encode_frame
+from tgdsl.runtime.xhand1.wire.protocol import (
+    PASSIVE,
+    Command,
+    Frame,
+    FrameParser,
+    HandState,
+    JointCommand,
+    Mode,
+    decode_state,
+    encode_command,
+    encode_frame,
+)
 
 BAUD = 3_000_000
 MOVING = tuple(JointCommand(0.1 * i, 100, 0, 0, 300, Mode.POSITION) for i in range(12))

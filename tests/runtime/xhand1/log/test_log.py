@@ -16,8 +16,8 @@ from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.log.log import CHUNK, RECORD, STATE, Fault, LogError, LogWriter, events, open_log
 from tgdsl.runtime.xhand1.wire import errors
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandError, HandTimeoutError
-from tgdsl.runtime.xhand1.wire.payloads import STATE_SIZE
 from tgdsl.runtime.xhand1.wire.ports import HandIdentity
+from tgdsl.runtime.xhand1.wire.protocol import STATE_SIZE
 
 IDENTITY = HandIdentity("/dev/ttyUSB7", 3, b"\x01\xff", None, b"SN-1\0\0", b"")
 

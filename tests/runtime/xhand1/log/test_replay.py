@@ -23,7 +23,7 @@ from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.source import HandSample, XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandTimeoutError
-from tgdsl.runtime.xhand1.wire.payloads import saturated
+from tgdsl.runtime.xhand1.wire.protocol import saturated
 
 RNG = np.random.default_rng(5)
 NEWTON = Calibration(

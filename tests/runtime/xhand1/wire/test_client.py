@@ -4,13 +4,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tgdsl.runtime.xhand1.wire import payloads
-from tgdsl.runtime.xhand1.wire.client import Addresses, SerialClient, SerialTiming
+from tgdsl.runtime.xhand1.wire import protocol
+from tgdsl.runtime.xhand1.wire.client import POLL_S, Addresses, SerialClient, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandRefusedError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.protocol import Command, Frame, encode_frame
-from tgdsl.runtime.xhand1.wire.serial_port import POLL_S
 
-REQUEST = payloads.encode_command(payloads.PASSIVE)
+REQUEST = protocol.encode_command(protocol.PASSIVE)
 MS = 1e-3
 VERSION_REQUEST = bytes.fromhex("55aafe80130000efc3")
 VERSION_REPLY = encode_frame(Frame(0x80, 0xFE, 0x13, b"1.0"))
@@ -77,12 +76,12 @@ def connected(
 
 def ask(client: SerialClient) -> int:
     """Exchange and return the tag of the reply."""
-    return client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE).payload[0]
+    return client.exchange(Command.EXCHANGE, REQUEST, protocol.STATE_SIZE).payload[0]
 
 
 def test_a_reply_says_when_it_was_asked_for_and_when_it_was_there():
     client, line = connected([(9 * MS, reply(1))])
-    found = client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
+    found = client.exchange(Command.EXCHANGE, REQUEST, protocol.STATE_SIZE)
     assert found.payload == bytes([1]) * 2208
     assert found.requested_at == line.written[0][0]
     assert found.received_at == pytest.approx(found.requested_at + 9 * MS, abs=1e-9)
@@ -173,7 +172,7 @@ def test_of_a_hand_that_tells_its_version_no_reply_however_late_is_taken_for_ano
     found = []
     for _ in range(40):
         try:
-            exchange = client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
+            exchange = client.exchange(Command.EXCHANGE, REQUEST, protocol.STATE_SIZE)
         except HandTimeoutError:
             continue
         sent_at = line.written[exchange.payload[0] - 1][0]
@@ -244,7 +243,7 @@ def test_whatever_comes_each_exchange_ends_in_time_with_a_whole_reply_or_a_named
     for _ in range(4):
         start = line.now
         try:
-            found = client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
+            found = client.exchange(Command.EXCHANGE, REQUEST, protocol.STATE_SIZE)
         except (HandTimeoutError, HandRefusedError):
             pass
         else:

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from xhand1_streams import bitwise_crc16
 
-from tgdsl.runtime.xhand1.wire import payloads, protocol
+from tgdsl.runtime.xhand1.wire import protocol
 from tgdsl.runtime.xhand1.wire.errors import ProtocolError
-from tgdsl.runtime.xhand1.wire.payloads import JointCommand, Mode
-from tgdsl.runtime.xhand1.wire.protocol import Frame, FrameParser
+from tgdsl.runtime.xhand1.wire.protocol import Frame, FrameParser, JointCommand, Mode
 
 BYTE = st.integers(0, 255)
 WORD = st.integers(0, 0xFFFF)
@@ -34,20 +33,20 @@ def test_a_version_request_is_the_published_one():
 
 
 def test_sizes_are_the_published_ones():
-    passive = payloads.encode_command(payloads.PASSIVE)
-    assert len(passive) == payloads.COMMAND_SIZE == 288
-    assert payloads.STATE_SIZE == 2208
+    passive = protocol.encode_command(protocol.PASSIVE)
+    assert len(passive) == protocol.COMMAND_SIZE == 288
+    assert protocol.STATE_SIZE == 2208
     assert len(protocol.encode_frame(Frame(0xFE, 0x80, 2, passive))) == 297
     assert len(protocol.encode_frame(Frame(0x80, 0xFE, 2, bytes(2208)))) == 2217
 
 
 def test_the_passive_command_byte_by_byte():
-    assert payloads.encode_command(payloads.PASSIVE) == b"".join(struct.pack("<H", i) + bytes(22) for i in range(12))
+    assert protocol.encode_command(protocol.PASSIVE) == b"".join(struct.pack("<H", i) + bytes(22) for i in range(12))
 
 
 def test_a_command_byte_by_byte():
     joints = [JointCommand(0.5 * i, 100 + i, -i, 2 * i, 300 + i, Mode.POSITION) for i in range(12)]
-    payload = payloads.encode_command(joints)
+    payload = protocol.encode_command(joints)
     for i in range(12):
         at = 24 * i
         assert int.from_bytes(payload[at : at + 2], "little") == i
@@ -70,7 +69,7 @@ def test_a_state_byte_by_byte():
     payload[tip : tip + 3] = bytes([0xFF, 0x80, 0xC8])
     payload[tip + 3 + 3 * 119 : tip + 363] = bytes([5, 0xFE, 255])
     payload[tip + 363 : tip + 384] = bytes(range(30, 51))
-    state = payloads.decode_state(bytes(payload))
+    state = protocol.decode_state(bytes(payload))
     assert (state.joint_id[7], state.sensor_id[7], state.position[7]) == (7, 3, 1.25)
     assert (state.current[7], state.raw_position[7], state.joint_temperature[7]) == (40, 5000, 0x1220)
     assert state.joint_error[7].tolist() == [1, 2, 3]
@@ -86,7 +85,7 @@ def test_a_state_byte_by_byte():
 
 
 def test_a_state_cannot_be_written_to():
-    state = payloads.decode_state(bytes(2208))
+    state = protocol.decode_state(bytes(2208))
     for name in ("position", "total_force", "taxel_force", "joint_error"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(state, name)[...] = 0
@@ -97,13 +96,13 @@ def test_a_state_cannot_be_written_to():
     [((127, 0, 0), 0), ((-127, 0, 0), 0), ((0, -128, 0), 1), ((0, 0, 255), 2), ((126, -126, 254), None), ((0, 0, 0), None)],
 )
 def test_saturation(counts, is_end):
-    assert payloads.saturated(np.array(counts)).tolist() == [i == is_end for i in range(3)]
+    assert protocol.saturated(np.array(counts)).tolist() == [i == is_end for i in range(3)]
 
 
 @given(st.binary(min_size=2208, max_size=2208))
 @settings(max_examples=200, deadline=None)
 def test_any_state_comes_back_byte_for_byte(payload):
-    assert payloads.encode_state(payloads.decode_state(payload)) == payload
+    assert protocol.encode_state(protocol.decode_state(payload)) == payload
 
 
 JOINT = st.builds(JointCommand, st.floats(width=32, allow_nan=False, allow_infinity=False), SHORT, SHORT, SHORT, WORD, WORD)
@@ -112,7 +111,7 @@ JOINT = st.builds(JointCommand, st.floats(width=32, allow_nan=False, allow_infin
 @given(st.lists(JOINT, min_size=12, max_size=12))
 @settings(max_examples=100, deadline=None)
 def test_any_command_comes_back(joints):
-    assert payloads.decode_command(payloads.encode_command(joints)) == tuple(joints)
+    assert protocol.decode_command(protocol.encode_command(joints)) == tuple(joints)
 
 
 @given(BYTE, BYTE, BYTE.filter(lambda c: c not in protocol.FIRMWARE_COMMANDS), st.binary(max_size=400))
@@ -134,14 +133,13 @@ def test_firmware_is_never_written(command):
         (lambda: protocol.encode_frame(Frame(256, 0, 2)), "source is 256, expected 0 to 255"),
         (lambda: protocol.encode_frame(Frame(0, 0, 2, bytes(8225))), "the payload has 8225 bytes, expected at most 8224"),
         (lambda: protocol.hand_address(128), "hand id 128: expected 0 to 127"),
-        (lambda: payloads.encode_command([]), "0 joint commands, expected 12"),
-        (lambda: payloads.encode_command([JointCommand(float("nan"))] * 12), "joint 0: position is nan, expected a finite"),
-        (lambda: payloads.encode_command([JointCommand(kp=40000)] * 12), "joint 0: .* does not fit the protocol's fields"),
-        (lambda: payloads.encode_command([JointCommand(1e300)] * 12), "joint 0: .* does not fit the protocol's fields"),
-        (lambda: payloads.decode_command(bytes(288)), "joint command 1 is of joint 0"),
-        (lambda: payloads.decode_command(bytes(287)), "a command of 287 bytes, expected 288"),
-        (lambda: payloads.decode_state(bytes(2207)), "a state of 2207 bytes, expected 2208"),
-        (lambda: payloads.encode_register_request(70000), "register 70000: expected 0 to 65535"),
+        (lambda: protocol.encode_command([]), "0 joint commands, expected 12"),
+        (lambda: protocol.encode_command([JointCommand(float("nan"))] * 12), "joint 0: position is nan, expected a finite"),
+        (lambda: protocol.encode_command([JointCommand(kp=40000)] * 12), "joint 0: .* does not fit the protocol's fields"),
+        (lambda: protocol.encode_command([JointCommand(1e300)] * 12), "joint 0: .* does not fit the protocol's fields"),
+        (lambda: protocol.decode_command(bytes(288)), "joint command 1 is of joint 0"),
+        (lambda: protocol.decode_command(bytes(287)), "a command of 287 bytes, expected 288"),
+        (lambda: protocol.decode_state(bytes(2207)), "a state of 2207 bytes, expected 2208"),
     ],
 )
 def test_what_does_not_fit_is_refused(wrong, message):
@@ -150,9 +148,9 @@ def test_what_does_not_fit_is_refused(wrong, message):
 
 
 def test_a_force_beyond_its_byte_is_refused():
-    state = payloads.decode_state(bytes(2208))
+    state = protocol.decode_state(bytes(2208))
     beyond = np.zeros((5, 120, 3), dtype=np.int16)
     beyond[0, 0, 0] = 128
     fields = {name: getattr(state, name) for name in state.__dataclass_fields__} | {"taxel_force": beyond}
     with pytest.raises(ProtocolError, match="taxel forces from 0 to 128: expected x, y in"):
-        payloads.encode_state(payloads.HandState(**fields))
+        protocol.encode_state(protocol.HandState(**fields))

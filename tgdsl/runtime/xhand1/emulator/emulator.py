@@ -23,22 +23,28 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.runtime.xhand1.wire.client import BAUD
 from tgdsl.runtime.xhand1.wire.errors import HandError, ProtocolError
-from tgdsl.runtime.xhand1.wire.payloads import (
+from tgdsl.runtime.xhand1.wire.protocol import (
     FINGERS,
     FORCE_MAX,
     FORCE_MIN,
     NUM_JOINTS,
     NUM_TAXELS,
+    OVERHEAD,
     PASSIVE,
+    Command,
+    Frame,
+    FrameParser,
     HandState,
     JointCommand,
     Mode,
+    Register,
     decode_command,
+    encode_frame,
     encode_state,
+    hand_address,
 )
-from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD, Command, Frame, FrameParser, Register, encode_frame, hand_address
-from tgdsl.runtime.xhand1.wire.serial_port import BAUD
 
 VERSION = b"tgdsl emulator"
 _ROOM_TEMPERATURE = 25

@@ -37,7 +37,7 @@ from tgdsl.runtime.xhand1.observe import HandTerm
 from tgdsl.runtime.xhand1.source import XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import WatchdogError
-from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, PASSIVE, JointCommand
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, PASSIVE, JointCommand
 
 PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 """For an emulator on a busy machine, where bytes are late but not lost: pseudo-terminals then take up to half a second."""

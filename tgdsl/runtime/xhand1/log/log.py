@@ -41,8 +41,8 @@ from tgdsl.runtime.xhand1.calibration import Calibration, parse_calibration
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.wire import errors
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandError
-from tgdsl.runtime.xhand1.wire.payloads import STATE_SIZE, HandState, decode_state
 from tgdsl.runtime.xhand1.wire.ports import HandIdentity
+from tgdsl.runtime.xhand1.wire.protocol import STATE_SIZE, HandState, decode_state
 
 FORMAT = 1
 TIMES = ("sequence", "requested_at", "received_at")

@@ -1,4 +1,4 @@
-"""One request and its reply on the serial line, with all that can come between.
+"""One request and its reply on the serial line, with all that can come between; and the port, by pyserial, an extra.
 
 Replies carry no number that says which request they answer. So that an old one is never taken for a new one:
 
@@ -14,19 +14,116 @@ for all hands: one that is repeated after a silence, just when the next one woul
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandRefusedError, HandTimeoutError
-from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
-from tgdsl.runtime.xhand1.wire.protocol import HOST_ADDRESS, OVERHEAD, Command, Frame, FrameParser, encode_frame, hand_address
-from tgdsl.runtime.xhand1.wire.serial_port import BAUD, Port
+from tgdsl.runtime.xhand1.wire.protocol import (
+    COMMAND_SIZE,
+    HOST_ADDRESS,
+    OVERHEAD,
+    STATE_SIZE,
+    Command,
+    Frame,
+    FrameParser,
+    encode_frame,
+    hand_address,
+)
 
+BAUD = 3_000_000
+POLL_S = 0.0005  # how long a read waits for the first byte [s]
+_WRITE_TIMEOUT_S = 0.5
+_LARGEST_READ = 4096
 _CLOCK_TOLERANCE = 0.97  # part of the nominal time that a UART with a fast clock may take for a frame
-
 _VERSION_TRIES = 3
 _BABBLE = "the line does not fall silent: something else is sending on it"
+
+
+@runtime_checkable
+class Port(Protocol):
+    """A line of bytes. Each call may raise `HandDisconnectedError`."""
+
+    def write(self, data: bytes) -> None: ...
+
+    def read(self) -> bytes:
+        """Return what has arrived; if nothing has, wait `POLL_S` for it and return what came, or no bytes."""
+        ...
+
+    def pending(self) -> int:
+        """Return how many bytes have arrived and were not read."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class PortInfo(NamedTuple):
+    """A serial port of this computer."""
+
+    device: str  # name to open it by, such as `/dev/ttyUSB0`
+    description: str  # what the adapter calls itself
+    serial_number: str  # the adapter's serial number, or empty
+
+
+def list_ports() -> tuple[PortInfo, ...]:
+    """Return the serial ports of this computer, whatever is behind them.
+
+    Raises:
+        HandError: If pyserial is not installed.
+    """
+    ports = _pyserial().tools.list_ports.comports()
+    return tuple(sorted(PortInfo(port.device, port.description or "", port.serial_number or "") for port in ports))
+
+
+class SerialPort:
+    """A serial port of this process alone: 8 data bits, no parity, 1 stop bit, no flow control."""
+
+    def __init__(self, device: str, baud: int = BAUD):
+        """Open it by its name, such as `/dev/ttyUSB0`; one of `/dev/serial/by-id` stays the same when others are plugged in.
+
+        Raises:
+            HandDisconnectedError: If it cannot be opened.
+            HandError: If pyserial is not installed.
+        """
+        self._device = device
+        self._errors = (_pyserial().SerialException, OSError)
+        try:
+            self._serial = _pyserial().Serial(device, baud, timeout=POLL_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True)
+        except (*self._errors, ValueError) as error:
+            raise HandDisconnectedError(f"{device} cannot be opened at {baud} baud: {error}") from error
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            # FTDI adapters else hold the end of a reply back for 16 ms; others know no such mode.
+            self._serial.set_low_latency_mode(True)
+
+    def write(self, data: bytes) -> None:
+        self._named(lambda: self._serial.write(data))
+
+    def read(self) -> bytes:
+        return self._named(lambda: self._serial.read(min(max(self._serial.in_waiting, 1), _LARGEST_READ)))
+
+    def pending(self) -> int:
+        return self._named(lambda: self._serial.in_waiting)
+
+    def close(self) -> None:
+        with contextlib.suppress(*self._errors):
+            self._serial.close()
+
+    def _named(self, call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except self._errors as error:
+            raise HandDisconnectedError(f"{self._device} went away: {error}") from error
+
+
+def _pyserial() -> Any:
+    try:
+        import serial
+        import serial.tools.list_ports
+    except ImportError as error:
+        raise HandError('a real hand needs pyserial, which is not installed: pip install "tgdsl[hardware]"') from error
+    return serial
 
 
 @dataclass(frozen=True)
@@ -35,8 +132,7 @@ class SerialTiming:
 
     baud: int = BAUD  # bits per second; 10 bits carry one byte
     reply_timeout_s: float = 0.03  # how long a reply may take to be complete [s]
-    # silence after which a reply that has begun will not go on [s]. FTDI adapters pause for up to 16 ms.
-    silence_s: float = 0.018
+    silence_s: float = 0.018  # silence after which a reply that has begun will not go on [s]; FTDI pauses for up to 16 ms
     settle_s: float = 0.018  # silence that is asked for after a failure [s]: if the hand tells its version, since the last byte
     quiet_s: float = 0.0005  # silence that ends a good reply [s]
     # whether a reply that is complete sooner than the baud rate allows is refused as that of an earlier request. Turn it off
@@ -66,9 +162,9 @@ class SerialCounters:
 class Addresses:
     """Where requests go, and from and to where replies come. What a real hand puts into its replies is unverified."""
 
-    hand_id: int = 0  # the hand's id
-    reply_source: int | None = None  # source of its replies; default: the hand's address
-    reply_destination: int | None = None  # destination of its replies; default: the host's address
+    hand_id: int = 0
+    reply_source: int | None = None  # default: the hand's address
+    reply_destination: int | None = None  # default: the host's address
 
     @property
     def reply(self) -> tuple[int, int]:
@@ -77,11 +173,10 @@ class Addresses:
         return source, HOST_ADDRESS if self.reply_destination is None else self.reply_destination
 
 
-@dataclass(frozen=True)
-class Reply:
+class Reply(NamedTuple):
     """A reply."""
 
-    payload: bytes  # its bytes
+    payload: bytes
     requested_at: float  # when the request went out, on the client's clock [s]: the reply is not older than this
     received_at: float  # when the reply was complete [s]
     source: int  # address that it came from
@@ -142,23 +237,10 @@ class SerialClient:
         counters: SerialCounters | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Take over an open port.
-
-        Args:
-            port: The port.
-            addresses: The hand's; None accepts replies from and to any address but those of the host's own requests.
-            timing: Times of the line.
-            counters: Where to count; default: new counters.
-            clock: Seconds that only go forward.
-        """
-        self.port = port
-        self.timing = timing
-        self.counters = SerialCounters() if counters is None else counters
-        self._addresses = addresses
-        self._clock = clock
-        self._parser = FrameParser()
-        self._is_suspect = True
-        self._silent_since = clock()
+        """Take over an open port; without addresses replies from and to any are accepted but the host's own requests."""
+        self.port, self.timing, self.counters = port, timing, counters or SerialCounters()
+        self._addresses, self._clock, self._parser = addresses, clock, FrameParser()
+        self._is_suspect, self._silent_since = True, clock()
         self._tells_version: bool | None = None if addresses else False
 
     def exchange(self, command: Command, payload: bytes = b"", reply_size: int | None = None, hand_id: int = 0) -> Reply:
@@ -186,23 +268,27 @@ class SerialClient:
         Raises:
             HandDisconnectedError: If the port went away.
         """
-        hand_id = 0 if self._addresses is None else self._addresses.hand_id
-        self._is_suspect = True
         self._silent_since = self._clock()
-        self.counters.num_requests += 1
-        self.port.write(encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload)))
+        self._write(self._request(command, payload, 0))
 
     def close(self) -> None:
-        """Release the port."""
         self.port.close()
 
-    def _ask(self, command: Command, payload: bytes, reply_size: int | None, hand_id: int) -> Reply:
+    def _request(self, command: Command, payload: bytes, hand_id: int) -> bytes:
         hand_id = hand_id if self._addresses is None else self._addresses.hand_id
-        request = encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload))
+        return encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload))
+
+    def _write(self, request: bytes) -> None:
         self._is_suspect = True
         self.counters.num_requests += 1
-        waiting = _Waiting(command, reply_size, self._addresses, self._wire_time(request, reply_size), self._clock())
         self.port.write(request)
+
+    def _ask(self, command: Command, payload: bytes, reply_size: int | None, hand_id: int) -> Reply:
+        request, wire_time = self._request(command, payload, hand_id), 0.0
+        if self.timing.checks_wire_time:
+            wire_time = _CLOCK_TOLERANCE * 10 * (len(request) + OVERHEAD + (reply_size or 0)) / self.timing.baud
+        waiting = _Waiting(command, reply_size, self._addresses, wire_time, self._clock())
+        self._write(request)
         self._listen(waiting)
         if waiting.reply is None:
             raise self._failure(waiting)
@@ -225,12 +311,6 @@ class SerialClient:
                 self._tells_version = True
                 return
         self._tells_version = False
-
-    def _wire_time(self, request: bytes, reply_size: int | None) -> float:
-        if not self.timing.checks_wire_time:
-            return 0.0
-        num_bytes = len(request) + OVERHEAD + (reply_size or 0)
-        return _CLOCK_TOLERANCE * 10 * num_bytes / self.timing.baud
 
     def _await_silence(self) -> None:
         """Wait until the line is silent, if it may not be; raise an error if it does not fall silent."""
@@ -258,11 +338,10 @@ class SerialClient:
             if data:
                 last_byte_at = now
                 waiting.sort(parser.feed(data), now)
+            silent_s = now - last_byte_at
             is_damaged = bool(parser.num_buffered) or parser.num_discarded > discarded
             is_answered = waiting.reply is not None and not parser.num_buffered
-            if (is_answered and now - last_byte_at >= timing.quiet_s) or (
-                is_damaged and now - last_byte_at >= timing.silence_s
-            ):
+            if (is_answered and silent_s >= timing.quiet_s) or (is_damaged and silent_s >= timing.silence_s):
                 break
             if now >= give_up_at and waiting.reply is None:
                 waiting.num_incomplete = parser.num_buffered
@@ -281,17 +360,17 @@ class SerialClient:
 
     def _failure(self, waiting: _Waiting) -> HandError:
         request = f"command {waiting.command:#04x} ({waiting.command.name.lower()})"
-        within = f"{1e3 * self.timing.reply_timeout_s:.0f} ms"
         if waiting.refusal is not None:
-            return HandRefusedError(
-                f"the hand refused {request}; its error reply holds {waiting.refusal.hex(' ') or 'nothing'}"
-            )
+            what = waiting.refusal.hex(" ") or "nothing"
+            return HandRefusedError(f"the hand refused {request}; its error reply holds {what}")
         if waiting.is_babble:
             return HandTimeoutError(_BABBLE)
         if waiting.num_damaged > waiting.num_incomplete:
             self.counters.num_damaged += 1
             return HandTimeoutError(f"the reply to {request} came damaged: {waiting.num_damaged} bytes are in no sound frame")
         self.counters.num_timeouts += 1
+        within = f"within {1e3 * self.timing.reply_timeout_s:.0f} ms"
+        message = f"no reply to {request} {within}"
         if waiting.foreign is not None and self._addresses is not None:
             expected = "from {:#04x} to {:#04x}".format(*self._addresses.reply)
             ends = f"from {waiting.foreign.source:#04x} to {waiting.foreign.destination:#04x}"
@@ -302,7 +381,5 @@ class SerialClient:
         elif waiting.wrong_size is not None:
             message = f"the reply to {request} has {waiting.wrong_size} bytes, expected {waiting.reply_size}"
         elif waiting.num_incomplete:
-            message = f"the reply to {request} was not complete within {within}: {waiting.num_incomplete} bytes had come"
-        else:
-            message = f"no reply to {request} within {within}"
+            message = f"the reply to {request} was not complete {within}: {waiting.num_incomplete} bytes had come"
         return HandTimeoutError(message)

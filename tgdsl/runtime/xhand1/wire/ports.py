@@ -6,23 +6,20 @@ Only versions and registers are asked for: no request holds a set-point.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
-from tgdsl.runtime.xhand1.wire.client import Addresses, SerialClient, SerialTiming
+from tgdsl.runtime.xhand1.wire.client import Addresses, Port, PortInfo, SerialClient, SerialPort, SerialTiming, list_ports
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandRefusedError, HandTimeoutError
-from tgdsl.runtime.xhand1.wire.payloads import encode_register_request
-from tgdsl.runtime.xhand1.wire.protocol import Command, Register
-from tgdsl.runtime.xhand1.wire.serial_port import Port, PortInfo, list_ports, open_serial_port
+from tgdsl.runtime.xhand1.wire.protocol import Command, Register, encode_register_request
 
-_ALL_IDS = tuple(range(8))
+_OpenPort = Callable[[str, int], Port]  # opens a port, given its name and baud rate
 _PATIENT = SerialTiming(reply_timeout_s=0.1)
 """A reply that comes later is taken for that of the next id which is asked, so a busy computer is given time."""
 _MORE_PATIENT = SerialTiming(reply_timeout_s=0.4)
 
 
-@dataclass(frozen=True)
-class FoundHand:
+class FoundHand(NamedTuple):
     """A hand that answered."""
 
     device: str  # its serial port
@@ -35,15 +32,9 @@ def find_hands(
     hand_ids: Iterable[int] = range(8),
     *,
     timing: SerialTiming | None = None,
-    open_port: Callable[[str, int], Port] = open_serial_port,
+    open_port: _OpenPort = SerialPort,
 ) -> tuple[FoundHand, ...]:
     """Ask each id on a port for its version and return those that answer.
-
-    Args:
-        device: The serial port, such as `/dev/ttyUSB0`.
-        hand_ids: Ids to ask.
-        timing: Times of the line.
-        open_port: Opens a port, given its name and baud rate.
 
     Raises:
         HandDisconnectedError: If the port cannot be opened, or went away.
@@ -64,12 +55,11 @@ def find_hands(
     return tuple(results)
 
 
-@dataclass(frozen=True)
-class AskedPort:
+class AskedPort(NamedTuple):
     """A serial port that was asked for hands."""
 
-    port: PortInfo  # the port
-    hands: tuple[FoundHand, ...]  # the hands that answered
+    port: PortInfo
+    hands: tuple[FoundHand, ...]  # that answered
     trouble: str = ""  # why it could not be asked, or empty
 
     def __str__(self) -> str:
@@ -88,13 +78,14 @@ def ask_ports(device: str | None = None, hand_id: int | None = None) -> tuple[As
         HandDisconnectedError: If the port that was named cannot be opened.
         HandError: If pyserial is not installed.
     """
+    ids, timing = (range(8), _PATIENT) if hand_id is None else ((hand_id,), _MORE_PATIENT)
+    ports = {port.device: port for port in list_ports()}
     if device is not None:
-        by_device = {port.device: port for port in list_ports()}
-        return (AskedPort(by_device.get(device, PortInfo(device, "", "")), _hands(device, hand_id)),)
+        return (AskedPort(ports.get(device, PortInfo(device, "", "")), find_hands(device, ids, timing=timing)),)
     results = []
-    for port in list_ports():
+    for name, port in ports.items():
         try:
-            results.append(AskedPort(port, _hands(port.device, hand_id)))
+            results.append(AskedPort(port, find_hands(name, ids, timing=timing)))
         except HandError as error:
             results.append(AskedPort(port, (), str(error)))
     return tuple(results)
@@ -102,10 +93,6 @@ def ask_ports(device: str | None = None, hand_id: int | None = None) -> tuple[As
 
 def the_hand(device: str | None = None, hand_id: int | None = None) -> FoundHand:
     """Return the only hand there is, or that on a port, or with an id.
-
-    Args:
-        device: The hand's serial port; default: any.
-        hand_id: Its id; default: any from 0 to 7.
 
     Raises:
         HandError: If there is none or more than one; it lists the ports, or the hands.
@@ -121,18 +108,7 @@ def the_hand(device: str | None = None, hand_id: int | None = None) -> FoundHand
     problem = "no hand answers" if hand_id is None else f"no hand with id {hand_id} answers"
     if device is not None:
         raise HandDisconnectedError(f"{problem} on {device}; is it switched on, and is this its port?")
-    listed = "; ".join(map(str, ports)) or "this computer has no serial port"
-    raise HandDisconnectedError(f"{problem}; {listed}")
-
-
-def _hands(device: str, hand_id: int | None) -> tuple[FoundHand, ...]:
-    if hand_id is None:
-        return find_hands(device, _ALL_IDS, timing=_PATIENT)
-    return find_hands(device, (hand_id,), timing=_MORE_PATIENT)
-
-
-UNTOLD = "not told"
-_BYTES = ("version", "side", "serial_number", "name")
+    raise HandDisconnectedError(f"{problem}; {'; '.join(map(str, ports)) or 'this computer has no serial port'}")
 
 
 @dataclass(frozen=True)
@@ -140,31 +116,31 @@ class HandIdentity:
     """What a hand says about itself; bytes as they came, for the layout of these replies is unverified."""
 
     device: str  # the serial port that it answers on
-    hand_id: int  # its id
-    version: bytes = b""  # its version; empty if it was not asked
+    hand_id: int
+    version: bytes = b""  # empty if it was not asked
     side: bytes | None = None  # register 20, which hand it is; None if it does not tell
     serial_number: bytes | None = None  # register 21; None if it does not tell
     name: bytes | None = None  # register 54; None if it does not tell
 
     def as_json(self) -> dict[str, Any]:
         """Return it for a log, bytes as hexadecimal text."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value.hex() if isinstance(value, bytes) else value for name, value in values.items()}
+        return {name: value.hex() if isinstance(value, bytes) else value for name, value in asdict(self).items()}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> HandIdentity:
         """Return the identity that `as_json` has written."""
-        as_bytes = {name: None if values[name] is None else bytes.fromhex(values[name]) for name in _BYTES}
-        return cls(str(values["device"]), int(values["hand_id"]), **as_bytes)  # type: ignore[arg-type]
+        names = ("version", "side", "serial_number", "name")
+        as_bytes: dict[str, Any] = {name: None if values[name] is None else bytes.fromhex(values[name]) for name in names}
+        return cls(str(values["device"]), int(values["hand_id"]), **as_bytes)
 
     def __str__(self) -> str:
         values = {"version": self.version, "side": self.side, "serial number": self.serial_number, "name": self.name}
-        return f"{self.device}: hand {self.hand_id}, " + ", ".join(f"{label} {shown(value)}" for label, value in values.items())
+        return f"{self.device}: hand {self.hand_id}, " + ", ".join(
+            f"{label} {_shown(value)}" for label, value in values.items()
+        )
 
 
-def identify(
-    hand: FoundHand, *, timing: SerialTiming | None = None, open_port: Callable[[str, int], Port] = open_serial_port
-) -> HandIdentity:
+def identify(hand: FoundHand, *, timing: SerialTiming | None = None, open_port: _OpenPort = SerialPort) -> HandIdentity:
     """Ask a hand that was found for its registers.
 
     Raises:
@@ -172,26 +148,25 @@ def identify(
     """
     timing = timing or SerialTiming()
     client = SerialClient(open_port(hand.device, timing.baud), hand.addresses, timing)
+
+    def register(number: int) -> bytes | None:
+        try:
+            return client.exchange(Command.READ_REGISTER, encode_register_request(number)).payload
+        except (HandRefusedError, HandTimeoutError):
+            return None
+
     try:
-        registers = [_register(client, number) for number in (Register.SIDE, Register.SERIAL_NUMBER, Register.NAME)]
+        registers = [register(number) for number in (Register.SIDE, Register.SERIAL_NUMBER, Register.NAME)]
     finally:
         client.close()
     return HandIdentity(hand.device, hand.addresses.hand_id, hand.version, *registers)
 
 
-def shown(value: bytes | None) -> str:
+def _shown(value: bytes | None) -> str:
     """Return what a reply held as text if it is text, padded with zeros or not; else as hexadecimal bytes."""
     if value is None:
-        return UNTOLD
+        return "not told"
     text = value.rstrip(b"\0")
     if text and text.isascii() and text.decode().isprintable():
         return f'"{text.decode()}"'
     return value.hex(" ") or "empty"
-
-
-def _register(client: SerialClient, number: int) -> bytes | None:
-    """Return what a register holds; None if the hand refuses to tell, or does not answer."""
-    try:
-        return client.exchange(Command.READ_REGISTER, encode_register_request(number)).payload
-    except (HandRefusedError, HandTimeoutError):
-        return None

@@ -1,17 +1,28 @@
-"""The XHand1's serial protocol: frames, their checksum, and the search for them in a stream of bytes.
+"""The XHand1's serial protocol: frames, their checksum, the search for them in a stream of bytes, and what they carry.
 
 A frame is `55 AA | source | destination | command | length u16 | payload | crc u16`, all little-endian; the checksum is
-CRC-16/XMODEM over all that stands before it. Source: the facts that a republished vendor header, a PNDbotics wiki and an open
-driver tested on hardware agree on. Our assumptions, where they leave something open, are marked *unverified* below:
-the payloads of every command but the exchange, and the addresses in replies.
+CRC-16/XMODEM over all that stands before it. The exchange (command 0x02) is the only request whose reply is known. It carries a
+set-point for every joint, so to read is also to command: `PASSIVE` is the command that asks nothing.
+
+Source: the facts that a republished vendor header, a PNDbotics wiki and an open driver tested on hardware agree on. Our
+assumptions, where they leave something open, are marked *unverified*: the payloads of every command but the exchange, and the
+addresses in replies.
+
+Shapes: `joint` the 12 joints by their id, `finger` thumb, index, middle, ring, pinky; `taxel` the 120 of a fingertip.
 """
 
 from __future__ import annotations
 
 import binascii
+import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from tgdsl.runtime.xhand1.wire.errors import ProtocolError
 
@@ -21,8 +32,7 @@ HAND_ADDRESS = 0x80  # a hand's address is this with its id in the low seven bit
 HEAD_SIZE = 7
 OVERHEAD = HEAD_SIZE + 2
 MAX_PAYLOAD = 8224
-
-FIRMWARE_COMMANDS = frozenset({0xA1, 0xA2, 0xA3, 0xA4, 0xB0})  # commands that write firmware: they are never sent
+FIRMWARE_COMMANDS = frozenset({0xA1, 0xA2, 0xA3, 0xA4, 0xB0})  # they write firmware, and are never sent
 
 
 class Command(IntEnum):
@@ -62,7 +72,7 @@ class Frame:
     source: int  # address of who sent it
     destination: int  # address of whom it is for
     command: int  # what it asks or answers: a `Command`, or a number that has no name here
-    payload: bytes = b""  # its bytes, at most `MAX_PAYLOAD`
+    payload: bytes = b""  # at most `MAX_PAYLOAD`
 
 
 def hand_address(hand_id: int) -> int:
@@ -140,14 +150,14 @@ class FrameParser:
             is_whole = start + size <= len(buffer)
             if not is_whole and not is_end:
                 break
-            frame = _frame(buffer, start, size) if is_whole else None
-            if frame is None:
-                self._discard(1)
-                at += 1
-            else:
-                frames.append(frame)
+            raw = bytes(buffer[start : start + size])
+            if is_whole and size and crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little"):
+                frames.append(Frame(*raw[2:5], payload=raw[HEAD_SIZE:-2]))
                 self.num_trailing = 0
                 at += size
+            else:
+                self._discard(1)
+                at += 1
         if start < 0:
             end = len(buffer) - (not is_end and buffer.endswith(HEADER[:1], at))
             self._discard(end - at)
@@ -168,12 +178,153 @@ def _size(buffer: bytearray, start: int) -> int:
     return OVERHEAD + length if length <= MAX_PAYLOAD else 0
 
 
-def _frame(buffer: bytearray, start: int, size: int) -> Frame | None:
-    """Return the frame of this size that starts here, or None if its checksum is wrong."""
-    if not size:
-        return None
-    raw = bytes(buffer[start : start + size])
-    if crc16(raw[:-2]) != int.from_bytes(raw[-2:], "little"):
-        return None
-    source, destination, command = raw[2:5]
-    return Frame(source, destination, command, raw[HEAD_SIZE:-2])
+NUM_JOINTS = 12
+NUM_TAXELS = 120
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+JOINTS = (
+    *("thumb_bend_joint", "thumb_rota_joint1", "thumb_rota_joint2", "index_bend_joint", "index_joint1", "index_joint2"),
+    *("mid_joint1", "mid_joint2", "ring_joint1", "ring_joint2", "pinky_joint1", "pinky_joint2"),
+)
+"""The joints' names by id, without the `right_hand_` or `left_hand_` that they have in robot files."""
+
+
+class Mode(IntEnum):
+    """What a joint's drive does."""
+
+    PASSIVE = 0
+    POSITION = 3
+    FORCE = 5
+
+
+class JointCommand(NamedTuple):
+    """What one joint's drive shall do."""
+
+    position: float = 0.0  # set-point [rad]
+    kp: int = 0  # proportional gain [hand's unit]
+    ki: int = 0  # integral gain [hand's unit]
+    kd: int = 0  # derivative gain [hand's unit]
+    current_limit: int = 0  # largest motor current [mA]
+    mode: int = Mode.PASSIVE  # what the drive does
+
+
+_JOINT_COMMAND = struct.Struct("<Hhhhf6H")
+COMMAND_SIZE = NUM_JOINTS * _JOINT_COMMAND.size
+PASSIVE = (JointCommand(),) * NUM_JOINTS  # mode 0, no gain, no current: the request that reads, and asks no joint to move
+
+
+def encode_command(joints: Sequence[JointCommand]) -> bytes:
+    """Return the exchange's request, 288 bytes, of one command per joint in the order of their ids.
+
+    Raises:
+        ProtocolError: If there are not 12, or a value is not finite or does not fit its field.
+    """
+    if len(joints) != NUM_JOINTS:
+        raise ProtocolError(f"{len(joints)} joint commands, expected {NUM_JOINTS}")
+    parts = []
+    for i, joint in enumerate(joints):
+        position, kp, ki, kd, current_limit, mode = joint
+        if not math.isfinite(position):
+            raise ProtocolError(f"joint {i}: position is {position}, expected a finite angle in rad")
+        try:
+            parts.append(_JOINT_COMMAND.pack(i, kp, ki, kd, position, current_limit, mode, 0, 0, 0, 0))
+        except (struct.error, OverflowError) as error:
+            raise ProtocolError(f"joint {i}: {joint} does not fit the protocol's fields: {error}") from error
+    return b"".join(parts)
+
+
+def decode_command(payload: bytes) -> tuple[JointCommand, ...]:
+    """Return the joint commands of an exchange's request."""
+    _expect_size("a command", payload, COMMAND_SIZE)
+    joints = []
+    for i, (id_, kp, ki, kd, position, current_limit, mode, *_) in enumerate(_JOINT_COMMAND.iter_unpack(payload)):
+        if id_ != i:
+            raise ProtocolError(f"joint command {i} is of joint {id_}")
+        joints.append(JointCommand(position, kp, ki, kd, current_limit, mode))
+    return tuple(joints)
+
+
+_FORCE = np.dtype([("x", "i1"), ("y", "i1"), ("z", "u1")])
+_JOINT = np.dtype(
+    [("joint_id", "u1"), ("sensor_id", "u1"), ("position", "<f4"), ("current", "<u2"), ("raw_position", "<u2")]
+    + [("joint_temperature", "<u2"), ("joint_error", "<u2", (3,)), ("reserved", "<u2", (3,))]
+)
+_TIP = np.dtype(
+    [("total_force", _FORCE), ("taxel_force", _FORCE, (NUM_TAXELS,)), ("taxel_temperature", "u1", (20,))]
+    + [("total_temperature", "u1")]
+)
+_STATE = np.dtype([("joint", _JOINT, (NUM_JOINTS,)), ("tip", _TIP, (len(FINGERS),))])
+STATE_SIZE = _STATE.itemsize
+_PARTS = [(part, name) for part in ("joint", "tip") for name in _STATE[part].base.names or ()]
+_FORCES = ("total_force", "taxel_force")
+FORCE_MIN = np.array([-128, -128, 0])
+FORCE_MAX = np.array([127, 127, 255])  # what a force component can hold [counts]
+
+
+@dataclass(frozen=True, eq=False)
+class HandState:
+    """The reply to an exchange: what the hand says of itself. Forces are in counts, whose unit is not published."""
+
+    joint_id: UInt8[np.ndarray, " joint"]  # id that each joint gives itself
+    sensor_id: UInt8[np.ndarray, " joint"]  # meaning not published
+    position: Float[np.ndarray, " joint"]  # joint angles [rad]
+    current: UInt16[np.ndarray, " joint"]  # motor current [mA]
+    raw_position: UInt16[np.ndarray, " joint"]  # encoder counts
+    joint_temperature: UInt16[np.ndarray, " joint"]  # its low byte is in °C; the high byte's meaning is not published
+    joint_error: UInt16[np.ndarray, "joint 3"]  # codes of the communication, joint and fingertip boards; 0 is none
+    reserved: UInt16[np.ndarray, "joint 3"]  # three words without published meaning
+    total_force: Int[np.ndarray, "finger 3"]  # fingertip force as the hand itself sums it up [counts]
+    taxel_force: Int[np.ndarray, "finger taxel 3"]  # force of each taxel [counts]
+    taxel_temperature: UInt8[np.ndarray, "finger 20"]  # 20 thermometers of each fingertip [°C]
+    total_temperature: UInt8[np.ndarray, " finger"]  # the fingertip's own temperature [°C]
+
+    @property
+    def is_total_saturated(self) -> Bool[np.ndarray, "finger 3"]:
+        """Whether a component of the fingertip's force is at the end of its range, so that it may stand for more."""
+        return saturated(self.total_force)
+
+    @property
+    def is_taxel_saturated(self) -> Bool[np.ndarray, "finger taxel 3"]:
+        """Whether a component of a taxel's force is at the end of its range."""
+        return saturated(self.taxel_force)
+
+
+def saturated(force: Int[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch 3"]:
+    """Return which components are at the end of their range: 127 or more either way for x and y, 255 for z."""
+    return np.greater_equal(abs(force), FORCE_MAX)
+
+
+def decode_state(payload: bytes) -> HandState:
+    """Return the state that an exchange's reply of 2208 bytes holds, value for value."""
+    _expect_size("a state", payload, STATE_SIZE)
+    record = np.frombuffer(payload, dtype=_STATE)[0]
+    values = {name: record[part][name] for part, name in _PARTS}
+    for name in _FORCES:
+        values[name] = np.stack([values[name][axis].astype(np.int16) for axis in "xyz"], axis=-1)
+        values[name].setflags(write=False)
+    return HandState(**values)
+
+
+def encode_state(state: HandState) -> bytes:
+    """Return a state's 2208 bytes."""
+    record = np.zeros((), dtype=_STATE)
+    for part, name in _PARTS:
+        value = getattr(state, name)
+        if name not in _FORCES:
+            record[part][name] = value
+            continue
+        if ((value < FORCE_MIN) | (value > FORCE_MAX)).any():
+            what = name.replace("_", " ")
+            raise ProtocolError(f"{what}s from {value.min()} to {value.max()}: expected x, y in -128…127, z in 0…255")
+        for i, axis in enumerate("xyz"):
+            record[part][name][axis] = value[..., i]
+    return record.tobytes()
+
+
+def encode_register_request(number: int) -> bytes:
+    """Return the payload that asks for a register: its number as u16 (*unverified*)."""
+    return struct.pack("<H", number)
+
+
+def _expect_size(what: str, payload: bytes, size: int) -> None:
+    if len(payload) != size:
+        raise ProtocolError(f"{what} of {len(payload)} bytes, expected {size}")
