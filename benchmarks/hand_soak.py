@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, Emulator, StillBody, TipForces
+from tgdsl.runtime.xhand1.emulator.emulator import Body, EmulatedHand, Emulator, TipForces
 from tgdsl.runtime.xhand1.wire.client import BAUD, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.protocol import COMMAND_SIZE, OVERHEAD, STATE_SIZE
 
@@ -26,7 +26,7 @@ WIRE_S = 10 * (COMMAND_SIZE + STATE_SIZE + 2 * OVERHEAD) / BAUD
 PATIENT = SerialTiming(reply_timeout_s=20.0, silence_s=10.0)
 
 
-class NumberedStates(StillBody):
+class NumberedStates(Body):
     """A body that writes into the thumb's first taxels how many states the hand has sent."""
 
     def __init__(self) -> None:

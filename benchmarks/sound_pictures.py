@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 import tgdsl
-from tgdsl.runtime.rollout import rollout
-from tgdsl.runtime.scripted import script_of
+from tgdsl.runtime.rollout import rollout, script_of
 from tgdsl.sensors.microphone.interpolation import TAPS, coefficients
 from tgdsl.sensors.microphone.retarded import age_of_sound
 from tgdsl.view.sound import Sound, draw, sounding

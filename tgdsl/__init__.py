@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from tgdsl.runtime.by_name import bodies_by_name as bodies_by_name
     from tgdsl.runtime.by_name import contacts_by_pair as contacts_by_pair
     from tgdsl.runtime.connect import connect as connect
+    from tgdsl.runtime.connect import simulate as simulate
     from tgdsl.runtime.read import read_mujoco as read_mujoco
     from tgdsl.runtime.read import read_warp as read_warp
-    from tgdsl.runtime.simulate import simulate as simulate
     from tgdsl.runtime.warp import WarpSimulation
     from tgdsl.tuning.compile import compile as compile
     from tgdsl.view.page import show as show
@@ -77,7 +77,7 @@ _PLACES = {
     "read_warp": "runtime.read",
     "save": "module.artifact",
     "show": "view.page",
-    "simulate": "runtime.simulate",
+    "simulate": "runtime.connect",
 }
 
 __all__ = [

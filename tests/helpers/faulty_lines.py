@@ -1,6 +1,5 @@
 """An emulated hand's line that damages, drops, delays and repeats the hand's replies, with a seed."""
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
@@ -118,7 +117,6 @@ class FaultyEmulator(Emulator):
         with self._lock:
             self.check()
             change()
-        os.write(self._wake_write, b"!")
 
     def set_faults(self, faults: Faults) -> None:
         """Let other faults strike from now on."""

@@ -13,7 +13,7 @@ from oracles.comparison import Values, field
 from oracles.setups.scenes import TAXELS, compiled, document, folder, pad, points, resting, settled, wrench
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.runtime.simulate import simulate
+from tgdsl.runtime.connect import simulate
 
 G = 9.81
 """Gravity [m/s²]."""

@@ -12,7 +12,7 @@ import torch
 from oracles.comparison import Values, field
 from oracles.forces import MASS, PAPER, G
 from oracles.setups.scenes import BOX, folder, module, pad, probed, resting, state, wrench
-from tgdsl.runtime.simulate import simulate
+from tgdsl.runtime.connect import simulate
 
 DEPTH, STIFFNESS, DAMPING, SHEAR, SPIN, EXPONENT = 0.004, 500.0, 1.0, 2.0, 2.0, 1.2
 """Depth of the box [m]; the paper's k_n, c_n, k_t, k_ω and α."""

@@ -9,7 +9,7 @@ import torch
 from tiny_tasks import NOISY, RADIUS, RANDOM, actions, same, taxel_world, tiny_env, tiny_envs
 
 from tgdsl.errors import SimulationError, SpecError
-from tgdsl.runtime import simulate
+from tgdsl.runtime import connect
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connect import SOURCES
 from tgdsl.runtime.xhand1.source import VelocityFilter
@@ -379,7 +379,7 @@ def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
             )
 
     mine = dataclasses.replace(SOURCES[0], name="mine", simulate=Mine, recognise=None)
-    monkeypatch.setattr(simulate, "known_sources", lambda: (SOURCES[0], mine))
+    monkeypatch.setattr(connect, "known_sources", lambda: (SOURCES[0], mine))
     env, other = make(3, simulator="mine"), make(3, simulator="mujoco")
     assert isinstance(env.sim, Mine)
     for _ in range(3):
@@ -388,7 +388,7 @@ def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
     with pytest.raises(SimulationError, match='simulator is "min"; did you mean "mine"'):
         make(3, simulator="min")
     with pytest.raises(SimulationError, match='MuJoCo steps on the CPU, and the device is "cuda"'):
-        simulate.simulator_for("cuda", "mujoco")
+        connect.simulator_for("cuda", "mujoco")
 
 
 def test_joints_are_observed_with_noise_and_scaled(tmp_path):

@@ -138,7 +138,7 @@ def test_only_the_environment_that_there_is_can_be_reset(tmp_path):
         for nobody in ([], [False], torch.zeros(1, dtype=torch.bool)):
             env.reset(nobody)
             assert (env.observe()["policy"] == pressed).all()
-        with pytest.raises(HandError, match=r"env_ids: found \[3\], expected index 0, or a mask of 1"):
+        with pytest.raises(HandError, match=r"env_ids: found 3, expected indices from 0 to 0, or a mask of 1"):
             env.reset([3])
         env.reset([True])
         assert (env.observe()["policy"] != pressed).any()

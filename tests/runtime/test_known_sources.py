@@ -12,8 +12,8 @@ from warp_cases import SCENE, module
 import tgdsl
 from tgdsl.errors import ObservationError, SimulationError, TgdslError
 from tgdsl.runtime.connect import SOURCES, known_sources
+from tgdsl.runtime.connection import Source
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.runtime.source import Source
 
 MODULE = '''
 import torch

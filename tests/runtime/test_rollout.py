@@ -9,6 +9,7 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SimulationError
+from tgdsl.runtime.connect import simulate
 from tgdsl.runtime.rollout import (
     Recorder,
     Step,
@@ -19,7 +20,6 @@ from tgdsl.runtime.rollout import (
     silent_readings,
     touching_bodies,
 )
-from tgdsl.runtime.simulate import simulate
 
 SCENE = """
 <mujoco>

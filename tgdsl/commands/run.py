@@ -82,9 +82,8 @@ class Run:
 
     def start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
-        from tgdsl.runtime.rollout import recorded_controls
-        from tgdsl.runtime.scripted import script_of, substeps_of
-        from tgdsl.runtime.simulate import simulate
+        from tgdsl.runtime.connect import simulate
+        from tgdsl.runtime.rollout import recorded_controls, script_of, substeps_of
 
         substeps = substeps_of(touch, 5) if self.substeps is None else self.substeps
         if self.controls is not None:

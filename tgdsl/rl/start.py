@@ -17,8 +17,8 @@ from tgdsl.rl.events import event_terms
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed
 from tgdsl.rl.task import Setup, free_qpos
+from tgdsl.runtime.connect import simulator_for
 from tgdsl.runtime.connection import keyword_options
-from tgdsl.runtime.simulate import simulator_for
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.watch import Watch

@@ -9,9 +9,11 @@ Installed packages bring further kinds of sources by an entry point, in their py
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import ExitStack
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Unpack, overload
 
 from tgdsl.errors import HandError, SimulationError, TgdslError, did_you_mean, listed
 from tgdsl.files.plugins import known
@@ -19,8 +21,9 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.taxels.identity import Taxels, check_taxels
 from tgdsl.observations.observations import HAND_ONLY, hand_only_error
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.connection import Connection, SimulationConnection, SimulatorKind, SourceKind
-from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.connection import Connection, SimulationConnection, SimulatorKind, SourceKind, keyword_options
+from tgdsl.runtime.simulators.machine import checked_device
+from tgdsl.runtime.simulators.simulation import SimOptions, Simulation
 from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.warp.simulation import WarpSimulation
@@ -35,7 +38,10 @@ from tgdsl.runtime.xhand1.wire.client import Addresses, SerialTiming, list_ports
 from tgdsl.scene.scene import scene_model
 
 CONTROL_STEP = 0.02
+MUJOCO = "mujoco"  # what users call the kind "simulation" where they name a simulator
 _USB_PORTS = ("/dev/ttyUSB", "/dev/ttyACM", "/dev/cu.usb", "COM")
+_Calibration = Calibration | str | Path | None
+_Scene = SteppedScene | None
 
 
 def connect(
@@ -100,19 +106,77 @@ def connect(
     return kind.open(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **options)
 
 
+@overload
+def simulate(
+    touch: TactileModule, num_envs: int, *, device: Literal["cpu"] = "cpu", **options: Unpack[SimOptions]
+) -> BatchSimulation: ...
+@overload
+def simulate(
+    touch: TactileModule, num_envs: int, *, device: str, **options: Unpack[SimOptions]
+) -> BatchSimulation | WarpSimulation: ...
+def simulate(
+    touch: TactileModule, num_envs: int, *, device: str = "cpu", **options: Unpack[SimOptions]
+) -> BatchSimulation | WarpSimulation:
+    """Simulate the scene that a module was compiled for.
+
+    Args:
+        touch: The module.
+        num_envs: Number of environments.
+        device: Where physics runs: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" is MuJoCo Warp. States are on the module's
+            device; both on one GPU need no copies.
+        **options: `substeps`, `threads`, `keyframe`, `options`, `watch`, `per_env`, `on_fault`, `nconmax`, `njmax`, `model`,
+            `prepare`, `graph`: see `SimOptions`. With `substeps=1`, the default, `state` is of the instant before the step:
+            see `Simulation`.
+
+    Raises:
+        ArtifactError: If an asset of the scene is missing or has changed.
+        SimulationError: If the device is not supported, an argument is for another device, or the scene lacks what the module
+            wants.
+    """
+    if not isinstance(touch, TactileModule):
+        example = f"tgdsl.compile({touch!r})" if isinstance(touch, (str, PathLike)) else "tgdsl.compile(document)"
+        raise SimulationError(f"found a {type(touch).__name__}, expected a module: {example}")
+    if misspelt := [name for name in options if name not in SimOptions.__annotations__]:
+        hint = did_you_mean(misspelt[0], SimOptions.__annotations__, "options")
+        raise SimulationError(f'simulate has no option "{misspelt[0]}"; {hint}')
+    kind = simulator_for(device)
+    kind_options = keyword_options(kind.simulate)
+    if unknown := [name for name, value in options.items() if name not in kind_options and value]:
+        problem = f'"{kind.name}", which simulates on "{device}", has no option {listed(unknown)}'
+        raise SimulationError(f"{problem}; it knows {listed(kind_options)}")
+    return kind.simulate(touch, num_envs, **{n: v for n, v in {**options, "device": device}.items() if n in kind_options})
+
+
+def simulator_for(device: str, name: str | None = None) -> SimulatorKind:
+    """Return a simulator: by its name, or the default of a device.
+
+    Args:
+        device: Where physics runs.
+        name: "mujoco", "warp" or one that a package brings: see `known_sources`.
+
+    Raises:
+        SimulationError: If there is no such device or simulator, or MuJoCo is asked for on a GPU.
+    """
+    simulators = [kind for kind in known_sources() if isinstance(kind, SimulatorKind)]
+    type_ = device.partition(":")[0]
+    if name is not None:
+        by_name = {MUJOCO if kind.name == "simulation" else kind.name: kind for kind in simulators}
+        if name not in by_name:
+            raise SimulationError(f'simulator is "{name}"; {did_you_mean(name, by_name, "simulators")}')
+        if name == MUJOCO and type_ != "cpu":
+            raise SimulationError(f'MuJoCo steps on the CPU, and the device is "{device}"; leave `simulator` out')
+        return by_name[name]
+    results = [kind for kind in simulators if type_ in kind.devices]
+    if not results:
+        checked_device(device, sorted({type_ for kind in simulators for type_ in kind.devices}, reverse=True))
+    return results[0]
+
+
 def _open_simulation(
-    touch: TactileModule,
-    source: str,
-    *,
-    num_envs: int,
-    control_step: float,
-    keyframe: str | None,
-    scene: SteppedScene | None = None,
+    touch: TactileModule, source: str, *, num_envs: int, control_step: float, keyframe: str | None, scene: _Scene = None
 ) -> Connection:
-    _refuse_hand_only(touch)
-    if scene is None:
-        return SimulationConnection(touch, _simulated(touch, num_envs, control_step, keyframe))
-    return SimulationConnection(touch, _stepping(scene, control_step))
+    options: SimOptions = {"keyframe": keyframe, "threads": 0 if num_envs > 1 else 1}
+    return _simulation(touch, control_step, scene, lambda: BatchSimulation(touch, num_envs, **options))
 
 
 def _open_warp(
@@ -122,17 +186,20 @@ def _open_warp(
     num_envs: int,
     control_step: float,
     keyframe: str | None,
-    scene: SteppedScene | None = None,
+    scene: _Scene = None,
     nconmax: int | None = None,
     njmax: int | None = None,
 ) -> Connection:
-    _refuse_hand_only(touch)
-    if scene is not None:
-        return SimulationConnection(touch, _stepping(scene, control_step))
     device = source.partition(":")[2] or "cuda"
-    sim = WarpSimulation(touch, num_envs, device=device, keyframe=keyframe, nconmax=nconmax, njmax=njmax)
-    _set_control_step(sim, control_step)
-    return SimulationConnection(touch, sim)
+    options: SimOptions = {"keyframe": keyframe, "nconmax": nconmax, "njmax": njmax}
+    return _simulation(touch, control_step, scene, lambda: WarpSimulation(touch, num_envs, device=device, **options))
+
+
+def _simulation(touch: TactileModule, control_step: float, scene: _Scene, make: Callable[[], Simulation]) -> Connection:
+    for term in touch.plan.observations:
+        if term.type in HAND_ONLY:
+            raise hand_only_error(term.group, term.index, term.type)
+    return SimulationConnection(touch, _with_step(make(), control_step) if scene is None else _stepping(scene, control_step))
 
 
 def _open_emulator(
@@ -141,26 +208,27 @@ def _open_emulator(
     *,
     control_step: float,
     keyframe: str | None,
-    calibration: Calibration | str | Path | None,
+    calibration: _Calibration,
     motion: MotionLimits | None,
     timing: SerialTiming | None,
     lockstep: bool,
-    scene: SteppedScene | None = None,
+    scene: _Scene = None,
 ) -> Connection:
-    read_calibration = _read(calibration) or Calibration.none()
-    observer = HandObserver(touch, read_calibration, control_step)
+    known_calibration = _read(calibration) or Calibration.none()
+    observer = HandObserver(touch, known_calibration, control_step)
     tips = SimulatedTips(touch, observer.terms)
     if scene is None:
         model = scene_model(touch.plan.scene)
-        joints = tuple(model.joint(int(i)).name for i in joint_ids(model))
-        scene = SteppedScene(touch, _simulated(touch, 1, control_step, keyframe, Watch(joints=joints)))
+        watch = Watch(joints=tuple(model.joint(int(i)).name for i in joint_ids(model)))
+        sim = BatchSimulation(touch, 1, keyframe=keyframe, threads=1, watch=watch)
+        scene = SteppedScene(touch, _with_step(sim, control_step))
     _stepping(scene, control_step)
     if not lockstep:
         _refuse_unfit_steps(control_step, motion, timing)
     actuators = moved_joints(touch, motion)
-    body = SimulatedBody(scene, tips, read_calibration)
+    body = SimulatedBody(scene, tips, known_calibration)
     hand = EmulatedSource(
-        body, control_step=control_step, calibration=read_calibration, motion=motion, timing=timing, lockstep=lockstep
+        body, control_step=control_step, calibration=known_calibration, motion=motion, timing=timing, lockstep=lockstep
     )
     return HandConnection(hand, observer, actuators, "the emulated hand")
 
@@ -170,29 +238,29 @@ def _open_hand(
     source: str,
     *,
     control_step: float,
-    calibration: Calibration | str | Path | None,
+    calibration: _Calibration,
     motion: MotionLimits | None,
     addresses: Addresses | None,
     timing: SerialTiming | None,
     lockstep: bool,
 ) -> Connection:
-    read_calibration = _read(calibration) or Calibration.none()
+    known_calibration = _read(calibration) or Calibration.none()
     if lockstep:
         raise HandError("a real hand moves in its own time: lockstep is for emulators and logs")
-    observer = HandObserver(touch, read_calibration, control_step)
+    observer = HandObserver(touch, known_calibration, control_step)
     actuators = moved_joints(touch, motion)
     _refuse_unfit_steps(control_step, motion, timing)
     warn_of_noise(touch.plan)
-    port = source.partition(":")[2] or _only_port()
     with ExitStack() as opened:
+        port = source.partition(":")[2] or _only_port()
         hand = opened.enter_context(XHand1.open(port, addresses, motion=motion, timing=timing))
-        stepped = XHand1Source(hand, control_step=control_step, calibration=read_calibration)
+        stepped = XHand1Source(hand, control_step=control_step, calibration=known_calibration)
         opened.pop_all()
     return HandConnection(stepped, observer, actuators, "the hand")
 
 
 def _open_log(
-    touch: TactileModule, source: str, *, control_step: float, calibration: Calibration | str | Path | None, lockstep: bool
+    touch: TactileModule, source: str, *, control_step: float, calibration: _Calibration, lockstep: bool
 ) -> Connection:
     speed = math.inf if lockstep else 1.0
     replay = ReplaySource(Path(source), control_step=control_step, speed=speed, calibration=_read(calibration))
@@ -247,32 +315,19 @@ def kind_of(source: str) -> SourceKind:
     raise TgdslError(f'unknown source "{source}"; expected {", ".join(most)} or {last}')
 
 
-def _simulated(
-    touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None, watch: Watch | None = None
-) -> BatchSimulation:
-    sim = BatchSimulation(touch, num_envs, keyframe=keyframe, threads=0 if num_envs > 1 else 1, watch=watch)
-    _set_control_step(sim, control_step)
-    return sim
-
-
-def _set_control_step(sim: Simulation, control_step: float) -> None:
+def _with_step(sim: Simulation, control_step: float) -> Simulation:
     timestep = float(sim.model.opt.timestep)
     sim.substeps = round(control_step / timestep)
     if sim.substeps < 1 or abs(sim.control_step - control_step) > 1e-6 * timestep:
         problem = f"a control step of {control_step:g} s"
         raise SimulationError(f"{problem}, expected a whole number of the scene's physics steps of {timestep:g} s")
+    return sim
 
 
 def _stepping(scene: SteppedScene, control_step: float) -> SteppedScene:
     if abs(scene.control_step - control_step) > 1e-9:
         raise SimulationError(f"control steps of {control_step:g} s, and the scene's are {scene.control_step:g} s")
     return scene
-
-
-def _refuse_hand_only(touch: TactileModule) -> None:
-    for term in touch.plan.observations:
-        if term.type in HAND_ONLY:
-            raise hand_only_error(term.group, term.index, term.type)
 
 
 def _refuse_unfit_steps(control_step: float, motion: MotionLimits | None, timing: SerialTiming | None) -> None:
@@ -284,7 +339,7 @@ def _refuse_unfit_steps(control_step: float, motion: MotionLimits | None, timing
     refuse_beyond_watchdog(control_step, None if motion is None else motion.watchdog_s)
 
 
-def _read(calibration: Calibration | str | Path | None) -> Calibration | None:
+def _read(calibration: _Calibration) -> Calibration | None:
     return load_calibration(Path(calibration)) if isinstance(calibration, (str, Path)) else calibration
 
 

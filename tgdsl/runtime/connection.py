@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -18,9 +18,34 @@ from torch import Tensor
 from tgdsl.errors import ObservationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.runtime.source import Control, Source
+from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.tensors.env_ids import EnvIds
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Environments that are stepped: what a connection needs of a simulator, a hand or a recording."""
+
+    @property
+    def num_envs(self) -> int: ...
+
+    @property
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+        ...
+
+    def step(self, control: Control = None) -> None:
+        """Advance all environments by one control step."""
+        ...
+
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Begin a new episode in some environments (default: all)."""
+        ...
+
+    def close(self) -> None:
+        """Release the simulator, the device or the file."""
+        ...
 
 
 class Connection(ABC):
@@ -163,7 +188,6 @@ class SourceKind:
         return keyword_options(self.open)
 
     def recognises(self, source: str) -> bool:
-        """Return whether a source that a user named is of this kind."""
         return source.partition(":")[0] == self.name if self.recognise is None else self.recognise(source)
 
 

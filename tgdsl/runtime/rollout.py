@@ -1,4 +1,4 @@
-"""Rollouts: a scene stepped through given controls, with every reading kept.
+"""Rollouts: a scene stepped through controls, with every reading kept; and the default script of a scene.
 
 Shapes: `step` control steps, `env` environments, `actuator` actuators, `taxel` and `channel` as the readings'.
 """
@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 from zipfile import BadZipFile
 
 import mujoco
@@ -17,22 +18,25 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SimulationError
 from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.closing.closing import START, Closing, closing_of
 from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import control_tensor
+from tgdsl.scene.options import Options
+from tgdsl.scene.scene import scene_model
 
 PLACES = ("link", "body", "pos", "normal", "area")  # columns of `taxels.taxel_table` that a recording holds
 MISSED = 0.9  # share of a load that no taxel feels above which a run reports it
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """One control step of a rollout: its number, and the time [s], the readings and MuJoCo's positions after it."""
 
     index: int
@@ -41,13 +45,59 @@ class Step:
     qpos: Float[Tensor, "env nq"]
 
 
-def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds: float, control_step: float) -> Controls:
-    """Return controls that hold the `ctrl` of each keyframe for some seconds and move evenly to the next one's in as long.
+class Run(NamedTuple):
+    """A scene at its start, and the controls that it is stepped through."""
 
-    Raises:
-        SimulationError: If the scene has no such keyframe, none is given, or the duration is not positive, or takes more steps
-            than there is memory for.
+    sim: BatchSimulation
+    controls: Controls
+
+
+@dataclass(frozen=True)
+class Script:
+    """How a scene is run."""
+
+    # keyframes whose controls are held and moved between, in turn; None: the start is held
+    keyframes: tuple[str, ...] | None = None
+    closing: Closing | None = None  # how the hand closes on an object, where there are no keyframes
+    note: str = ""  # what a user should know of it; may be empty
+
+    def begin(self, touch: TactileModule, num_envs: int, substeps: int, seconds: float, options: Options | None = None) -> Run:
+        """Start the scene; each hold and each move takes some seconds."""
+        closing, prepare, keyframe = self.closing, None, self.keyframes[0] if self.keyframes else None
+        if closing is not None:
+            keyframe, prepare = START, closing.prepare
+        sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=keyframe, options=options, prepare=prepare)
+        if closing is not None:
+            return Run(sim, controls_between(closing.targets(sim.model.nu), seconds, sim.control_step))
+        if self.keyframes is None:
+            return Run(sim, held_controls(sim.model, seconds, sim.control_step))
+        return Run(sim, scripted_controls(sim.model, self.keyframes, seconds, sim.control_step))
+
+
+def substeps_of(touch: TactileModule, others: int) -> int:
+    """Return the physics steps of a control step: as many as sensors that read blocks want, else `others`."""
+    return max((sensor.substeps for sensor in touch.plan.sensors), default=0) or others
+
+
+def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, progress: Progress = silent) -> Script:
+    """Return how a scene is run: between keyframes, by default `rest` and `squeeze` if the scene has them.
+
+    Else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
     """
+    if keyframes is not None:
+        return Script(keyframes)
+    model = scene_model(touch.plan.scene)
+    if {"rest", "squeeze"} <= {model.key(i).name for i in range(model.nkey)}:
+        return Script(("rest", "squeeze"))
+    progress("finding out how the hand closes")
+    closing = closing_of(touch)
+    if isinstance(closing, str):
+        return Script(note=f"no keyframes rest and squeeze, and the hand does not close ({closing})")
+    return Script(closing=closing, note=f"no keyframes rest and squeeze: {closing}")
+
+
+def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds: float, control_step: float) -> Controls:
+    """Return controls that hold the `ctrl` of each keyframe for some seconds and move evenly to the next one's in as long."""
     if not keyframes or not 0 < seconds < np.inf:
         raise SimulationError(f"{len(keyframes)} keyframes held for {seconds:g} s: expected at least one, and more than 0 s")
     targets = [model.key_ctrl[element_id(model, "key", name)] for name in keyframes]
@@ -84,10 +134,8 @@ def recorded_controls(path: Path) -> Controls:
     except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
         raise SimulationError(f"{path}: expected an .npz file with an array `ctrl`: {error}") from error
     if controls.ndim not in (2, 3) or not len(controls) or not np.issubdtype(controls.dtype, np.floating):
-        raise SimulationError(
-            f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, "
-            "expected floats (step, actuator) or (step, env, actuator)"
-        )
+        expected = "expected floats (step, actuator) or (step, env, actuator)"
+        raise SimulationError(f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, {expected}")
     if len(bad := np.argwhere(~np.isfinite(controls))):
         place = ", ".join(map(str, bad[0]))
         more = f", and {len(bad) - 1} more" if len(bad) > 1 else ""
@@ -171,19 +219,18 @@ class Recorder:
     """Keeps the readings of a rollout and writes them as one `.npz` file.
 
     The file holds `time` (step,) [s], `ctrl` (step, …, actuator), MuJoCo's `qpos` (step, env, nq) after the step, the path of
-    the `document`, each reading by its name (step, env, taxel, channel) as
-    float32, and its channels' names and units under `<name>:channels` and `<name>:units`. Where its taxels are is under
-    `<name>:link`, `<name>:body`, `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings
-    of bodies there is `<name>:body` alone, of those with rows of their own the columns of `touch.rows[<name>]`.
+    the `document`, each reading by its name (step, env, taxel, channel) as float32, and its channels' names and units under
+    `<name>:channels` and `<name>:units`. Where its taxels are is under `<name>:link`, `<name>:body`, `<name>:pos` and
+    `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings of bodies there is `<name>:body` alone, of those
+    with rows of their own the columns of `touch.rows[<name>]`.
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
         self._outputs, self._taxels, self._rows = touch.outputs, touch.taxels, touch.rows
         size = 4 * num_steps * num_envs * sum(math.prod(output.shape) for output in self._outputs)
         refuse_beyond_memory(f"readings of {num_envs} environments at {num_steps} steps", size)
-        self._readings = {
-            output.name: np.empty((num_steps, num_envs, *output.shape), dtype=np.float32) for output in self._outputs
-        }
+        shapes = {output.name: (num_steps, num_envs, *output.shape) for output in self._outputs}
+        self._readings = {name: np.empty(shape, dtype=np.float32) for name, shape in shapes.items()}
         self._time = np.empty(num_steps)
         self._qpos: list[np.ndarray] = []
 
@@ -195,13 +242,7 @@ class Recorder:
             column[step.index] = step.readings[name].detach().cpu().numpy()
 
     def write(self, path: Path, controls: Controls, document: Path) -> None:
-        """Write the file; it appears whole or not at all.
-
-        Args:
-            path: The file.
-            controls: What the scene was stepped through.
-            document: The document or artefact of the scene, by which `tgdsl view` finds it again.
-        """
+        """Write the file; it appears whole or not at all. `tgdsl view` finds the scene again by the document or artefact."""
         arrays: dict[str, np.ndarray] = {"time": self._time, "ctrl": controls, **self._readings}
         arrays |= {"qpos": np.array(self._qpos), "document": np.array(str(document.resolve()))}
         for output in self._outputs:

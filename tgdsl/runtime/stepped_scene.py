@@ -16,8 +16,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.runtime.simulators.state_values import control_tensor
-from tgdsl.runtime.source import Control
+from tgdsl.runtime.simulators.state_values import Control, control_tensor
 from tgdsl.tensors.env_ids import EnvIds
 
 
@@ -31,16 +30,14 @@ class SteppedScene:
         readings: What the module reads at the end of the last step, or at the start.
     """
 
+    num_envs = 1
+
     def __init__(self, touch: TactileModule, sim: Any):
         if sim.num_envs != 1:
             raise SimulationError(f"an emulated hand has one environment, found {sim.num_envs}")
         self.sim: Simulation = sim
         self._touch = touch
         self.readings = self.read()
-
-    @property
-    def num_envs(self) -> int:
-        return 1
 
     @property
     def control_step(self) -> float:
@@ -51,11 +48,7 @@ class SteppedScene:
         self.sim.ctrl[0, torch.from_numpy(actuators)] = torch.from_numpy(setpoints).to(self.sim.ctrl)
 
     def step(self, control: Control = None) -> None:
-        """Make one control step, and read the sensors.
-
-        Args:
-            control: Set-points of all actuators, (actuator,) or (1, actuator); default: as they were.
-        """
+        """Make one control step with set-points of all actuators, (actuator,) or (1, actuator), and read the sensors."""
         if control is not None:
             values = control_tensor(control, *self.sim.ctrl.shape).reshape(-1)
             self.put(np.arange(len(values)), values.cpu().numpy())

@@ -24,7 +24,7 @@ from tgdsl.module.accuracy.states import narrowed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.scripted import Script, script_of, substeps_of
+from tgdsl.runtime.rollout import Script, script_of, substeps_of
 from tgdsl.scene.scene import scene_model
 
 LEAST_ENVS = 2  # half of the environments choose, the others verify

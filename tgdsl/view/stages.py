@@ -20,8 +20,8 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.runtime.scripted import substeps_of
-from tgdsl.runtime.simulate import simulate
+from tgdsl.runtime.connect import simulate
+from tgdsl.runtime.rollout import substeps_of
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.scene import scene_model
 from tgdsl.view.overview import drawn_outputs

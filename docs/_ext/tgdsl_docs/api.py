@@ -16,7 +16,7 @@ MORE = {
     "BatchSimulation": (
         "tgdsl.runtime.simulators.simulation.Simulation",
         "tgdsl.runtime.simulators.simulation.SimOptions",
-        "tgdsl.runtime.source.Source",
+        "tgdsl.runtime.connection.Source",
     ),
     "WarpSimulation": (),
 }

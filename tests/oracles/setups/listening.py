@@ -18,7 +18,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.reference import References
-from tgdsl.runtime.simulate import simulate
+from tgdsl.runtime.connect import simulate
 from tgdsl.sensors.base import (
     Channel,
     Constants,

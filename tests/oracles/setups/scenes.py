@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from tgdsl.errors import UnfeltWarning
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.runtime.simulate import simulate
+from tgdsl.runtime.connect import simulate
 from tgdsl.tuning.compile import compile
 
 BOX = '<geom type="box" size=".02 .02 .02"/>'

@@ -8,7 +8,7 @@ from batch_cases import ARM, PAD, arm, module, scene, value, wanting
 
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.simulate import simulate
+from tgdsl.runtime.connect import simulate
 
 # stepping and resetting
 

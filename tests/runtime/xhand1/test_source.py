@@ -10,7 +10,7 @@ from virtual_hands import virtual_hand
 from xhand1_hands import PATIENT, wait_until
 
 from tgdsl.errors import StateError
-from tgdsl.runtime.source import Source
+from tgdsl.runtime.connection import Source
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator, TipForces

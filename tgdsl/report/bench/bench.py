@@ -18,7 +18,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.report.bench.physics import measure_physics
 from tgdsl.report.bench.results import Report, Subject
 from tgdsl.report.bench.sensors import Options, measure
-from tgdsl.runtime.scripted import script_of
+from tgdsl.runtime.rollout import script_of
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.choose import choose
 from tgdsl.tuning.recording import Recording, load_recording, record, save_recording

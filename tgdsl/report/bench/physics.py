@@ -20,7 +20,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
 from tgdsl.report.bench.results import Measured, Subject, with_front
 from tgdsl.report.bench.timing import median_of
-from tgdsl.runtime.scripted import Script
+from tgdsl.runtime.rollout import Script
 from tgdsl.scene.scene import scene_model
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.recording import varied

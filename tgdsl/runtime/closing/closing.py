@@ -10,11 +10,10 @@ another, and the object moves as through oil, so that it waits for the last fing
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -28,92 +27,101 @@ from tgdsl.placement.propose.propose import closing_motion
 from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.scene import SceneModels
 
-_SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+START = "tgdsl/open"  # the keyframe with the hand open
+SHARES = np.linspace(0.0, 1.0, 9)  # how far the hand is closed: where its tips are tried, and where touch is looked for
+TOWARD_PALM = (0.0, 0.2, 0.4, 0.6, -0.25, -0.5)  # how far from the tips' middle to the palm a place is tried
+OPPOSED = -0.3  # two links that touch an object oppose each other if the cosine between their directions is less than this
+OVERLAP = 0.1  # how deep an object may lie in the open hand where it is left, as a share of its radius
+GRIP, MOST = 1.0, 10.0  # force at the fingertips: so many times the object's weight, but at most so much [N]
+FIXED_GRIP = 1.0  # the same where the object is fixed [N]
+LAG = 0.2  # by how much a hinge lags its target when its servo gives all it can [rad]; a slide by this times the hand's reach
+TIP_MASS = 0.05  # least inertia of a fingertip as a joint moves it [kg]
+SPEED = 0.2  # how fast one finger pushes the object away [m/s]
+STEPS = 0.3  # most that a servo's natural frequency turns in one physics step [rad]
+NUM_GROUPS = 31  # groups of actuators that MuJoCo can disable, from 0; those in the next one always act
+_EARTH = 9.81
+_TORQUE_SCALE = 10
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+_UNBOUNDED = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
-@dataclass(frozen=True, eq=False)
 class Movement:
-    """How the hand of a scene moves.
+    """How the hand of a scene moves whose `bodies` carry sensors; nothing closes if it is not clear how.
 
-    Shapes: joints and bodies are MuJoCo's indices.
+    Joints and bodies are MuJoCo's indices.
+
+    Attributes:
+        trees: Topmost bodies of the kinematic trees that carry taxels.
+        paths: By body, it and all above it but the world, upward.
+        joints: All joints of the trees.
+        ends: Open and closed end of each joint that closes the hand and follows no other such joint [rad, of slides m].
+        closing: Joints that close the hand, those that follow such included: each after the one that it follows.
+        held: Joints of the trees that neither close the hand nor follow or lead another that does, nor are in a closed loop.
+        hand: Bodies of the smallest subtrees, one of each tree, that hold all that closes; an arm is none of them.
+        tips: Bodies with geoms below the joints that close, which have no other such below them.
     """
 
-    model: mujoco.MjModel  # the scene
-    trees: frozenset[int]  # topmost bodies of the kinematic trees that carry taxels
-    # open and closed end of each joint that closes the hand and follows no other such joint [rad, of slides m]
-    ends: Mapping[int, tuple[float, float]]
-    # by joint, those that an equality has follow another: that one, and the polynomial's coefficients
-    follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]]]
+    def __init__(self, scene: Model, bodies: frozenset[str]):
+        model = self.model = scene.compiled
+        self.paths: list[list[int]] = [[]]
+        for body in range(1, model.nbody):
+            self.paths.append([body, *self.paths[model.body_parentid[body]]])
+        self.body_of: list[int] = model.jnt_bodyid.tolist()
+        root_of: list[int] = model.body_rootid[model.jnt_bodyid].tolist()
+        self.trees = frozenset(int(model.body_rootid[model.body(name).id]) for name in bodies) - {0}
+        self.joints = tuple(joint for joint in range(model.njnt) if root_of[joint] in self.trees)
+        # By joint, those that an equality has follow another: that one, and the polynomial's coefficients.
+        self._follows: dict[int, tuple[int, Float[np.ndarray, " 5"]]] = {}
+        for i in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool)):
+            if (leader := int(model.eq_obj2id[i])) >= 0:
+                self._follows[int(model.eq_obj1id[i])] = leader, model.eq_data[i, :5].copy()
+        ends = {int(model.joint(name).id): pair for name, pair in closing_motion(scene).items()}
+        ends = {joint: pair for joint, pair in ends.items() if root_of[joint] in self.trees}
+        self.ends = {joint: pair for joint, pair in ends.items() if not {*self._leaders(joint)} & ends.keys()}
+        followers = [joint for joint in self._follows if {*self._leaders(joint)} & self.ends.keys()]
+        self.closing = (*self.ends, *sorted(followers, key=lambda joint: len(self._leaders(joint))))
+        coupled = {*self.ends, *self._follows, *(leader for joint in self.ends for leader in self._leaders(joint))}
+        looped = self._looped()
+        self.held = tuple(joint for joint in self.joints if joint not in coupled and self.body_of[joint] not in looped)
+        moved = {self.body_of[joint] for joint in self.closing}
+        hand: set[int] = set()
+        for tree in {root_of[joint] for joint in self.closing}:
+            common = set.intersection(*(set(self.paths[body]) for body in moved if self.paths[body][-1] == tree))
+            above = max(common - moved, default=tree)
+            hand |= {body for body, path in enumerate(self.paths) if above in path}
+        self.hand = frozenset(hand)
+        below = {b for b, path in enumerate(self.paths) if model.body_geomnum[b] and moved & set(path)}
+        self.tips = tuple(sorted(below - {above for body in below for above in self.paths[body][1:]}))
 
-    @cached_property
-    def closing(self) -> tuple[int, ...]:
-        """Joints that close the hand, those that follow such included: each after the one that it follows."""
-        followers = [joint for joint in self.follows if set(leaders(joint, self.follows)) & self.ends.keys()]
-        return (*self.ends, *sorted(followers, key=lambda joint: len(leaders(joint, self.follows))))
-
-    @cached_property
-    def hand(self) -> frozenset[int]:
-        """Bodies of the smallest subtrees, one of each tree, that hold all that closes; an arm is none of them."""
-        result: set[int] = set()
-        for tree in {self._root(joint) for joint in self.closing}:
-            paths = [self.path(int(self.model.jnt_bodyid[joint])) for joint in self.closing if self._root(joint) == tree]
-            common = set.intersection(*map(set, paths))
-            above = max(common - {int(self.model.jnt_bodyid[joint]) for joint in self.closing}, default=tree)
-            result |= {body for body in range(1, self.model.nbody) if above in self.path(body)}
-        return frozenset(result)
-
-    @cached_property
+    @property
     def num_joints(self) -> int:
         """Number of the hand's hinges and slides, of those that follow another only the ones that close it."""
-        counted_joints = [joint for joint in self.joints if joint in self.ends or joint not in self.follows]
-        return sum(self.is_scalar(joint) and int(self.model.jnt_bodyid[joint]) in self.hand for joint in counted_joints)
-
-    @cached_property
-    def joints(self) -> tuple[int, ...]:
-        """All joints of the trees."""
-        return tuple(joint for joint in range(self.model.njnt) if self._root(joint) in self.trees)
-
-    @cached_property
-    def held(self) -> tuple[int, ...]:
-        """Joints of the trees that neither close the hand nor follow or lead another that does, nor are in a closed loop."""
-        looped = self._looped()
-        led = {leader for joint in self.ends for leader in leaders(joint, self.follows)}
-        coupled = {*self.ends, *self.follows, *led}
-        return tuple(j for j in self.joints if j not in coupled and int(self.model.jnt_bodyid[j]) not in looped)
-
-    @cached_property
-    def tips(self) -> tuple[int, ...]:
-        """Bodies with geoms below the joints that close, which have no other such below them."""
-        below = {int(self.model.jnt_bodyid[joint]) for joint in self.closing}
-        moved = {b for b in range(self.model.nbody) if self.model.body_geomnum[b] and below & set(self.path(b))}
-        return tuple(sorted(moved - {above for body in moved for above in self.path(body)[1:]}))
+        counted = [joint for joint in self.joints if joint in self.ends or joint not in self._follows]
+        return sum(self.is_scalar(joint) and self.body_of[joint] in self.hand for joint in counted)
 
     def pose(self, share: float) -> Float[np.ndarray, " qpos"]:
         """Return where the joints are when the hand has closed by a share; all else is at its start."""
-        result = self.model.qpos0.copy()
+        result, start, address = self.model.qpos0.copy(), self.model.qpos0, self.model.jnt_qposadr
         for joint, (opened, closed) in self.ends.items():
-            result[self.model.jnt_qposadr[joint]] = (1.0 - share) * opened + share * closed
+            result[address[joint]] = (1.0 - share) * opened + share * closed
         for joint in self.closing[len(self.ends) :]:
-            leader, coefficients = self.follows[joint]
-            moved = result[self.model.jnt_qposadr[leader]] - self.model.qpos0[self.model.jnt_qposadr[leader]]
-            result[self.model.jnt_qposadr[joint]] += np.polynomial.polynomial.polyval(moved, coefficients)
+            leader, coefficients = self._follows[joint]
+            moved = result[address[leader]] - start[address[leader]]
+            result[address[joint]] += np.polynomial.polynomial.polyval(moved, coefficients)
         return result
-
-    def path(self, body: int) -> list[int]:
-        """Return a body and all above it but the world, upward."""
-        results = []
-        while body:
-            results.append(body)
-            body = int(self.model.body_parentid[body])
-        return results
 
     def is_scalar(self, joint: int) -> bool:
         """Return whether a joint is a hinge or a slide."""
-        return int(self.model.jnt_type[joint]) in (_SLIDE, _HINGE)
+        return int(self.model.jnt_type[joint]) in _SCALAR
 
-    def _root(self, joint: int) -> int:
-        return int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
+    def _leaders(self, joint: int) -> list[int]:
+        """Return the joint that one follows, the one that this follows, and so on."""
+        results: list[int] = []
+        while joint in self._follows and self._follows[joint][0] not in results:
+            joint = self._follows[joint][0]
+            results.append(joint)
+        return results
 
     def _looped(self) -> set[int]:
         """Return the bodies between two that an equality holds together, and where their paths upward meet."""
@@ -122,54 +130,18 @@ class Movement:
             ids = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
             if int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE):
                 ids = int(model.site_bodyid[ids[0]]), int(model.site_bodyid[ids[1]])
-            one, two = (set(self.path(max(body, 0))) for body in ids)
+            one, two = (set(self.paths[max(body, 0)]) for body in ids)
             result |= (one ^ two) if one and two else set()
         return result
 
 
-def leaders(joint: int, follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]]]) -> list[int]:
-    """Return the joint that one follows, the one that this follows, and so on; `follows` as in `Movement`."""
-    results: list[int] = []
-    while joint in follows and follows[joint][0] not in results:
-        joint = follows[joint][0]
-        results.append(joint)
-    return results
-
-
-def movement(scene: Model, bodies: frozenset[str]) -> Movement:
-    """Return how the hand of a scene moves whose `bodies` carry sensors; nothing closes if it is not clear how."""
-    model = scene.compiled
-    trees = frozenset(int(model.body_rootid[model.body(name).id]) for name in bodies) - {0}
-    follows = {}
-    for i in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool)):
-        if (leader := int(model.eq_obj2id[i])) >= 0:
-            follows[int(model.eq_obj1id[i])] = leader, model.eq_data[i, :5].copy()
-    ends = {int(model.joint(name).id): pair for name, pair in closing_motion(scene).items()}
-    ends = {joint: pair for joint, pair in ends.items() if int(model.body_rootid[model.jnt_bodyid[joint]]) in trees}
-    driven = {joint: pair for joint, pair in ends.items() if not set(leaders(joint, follows)) & ends.keys()}
-    return Movement(model, trees, driven, follows)
-
-
-SHARES = np.linspace(0.0, 1.0, 9)  # how far the hand is closed: where its tips are tried, and where touch is looked for
-TOWARD_PALM = (0.0, 0.2, 0.4, 0.6, -0.25, -0.5)  # how far from the tips' middle to the palm a place is tried
-OPPOSED = -0.3  # two links that touch an object oppose each other if the cosine between their directions is less than this
-OVERLAP = 0.1  # how deep an object may lie in the open hand where it is left, as a share of its radius
-_UNBOUNDED = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-
-
-@dataclass(frozen=True)
-class Grip:
+class Grip(NamedTuple):
     """What a hand that closes meets of an object, at the first share at which each link does."""
 
     overlap: float  # how deep the object lies in the open hand [m]; negative: how far it is from it
     links: frozenset[int]  # bodies that meet it
     is_opposed: bool  # whether two of these do so from opposite sides
     imbalance: float  # length of the mean of the directions from which they do
-
-    @property
-    def holds(self) -> bool:
-        """Whether several links meet the object, from opposite sides."""
-        return len(self.links) > 1 and self.is_opposed
 
 
 class Sweep:
@@ -180,12 +152,12 @@ class Sweep:
         self.data = mujoco.MjData(self.model)
         self.is_free = int(self.model.body_dofnum[body]) == 6 and int(self.model.body_jntnum[body]) == 1
         weld = self.model.body_weldid
-        rigid = [b for b in range(self.model.nbody) if weld[b] == weld[body] and body in (*movement.path(b), 0)]
+        rigid = [b for b in range(self.model.nbody) if weld[b] == weld[body] and body in (*movement.paths[b], 0)]
         self.object_geoms = [geom for b in rigid for geom in self._touchable(b)]
         self.hand_geoms = [geom for b in sorted(movement.hand) for geom in self._touchable(b)]
-        self._posed(0.0)
+        self._pose(0.0)
         offsets = [self.data.geom_xpos[geom] - self.data.xpos[body] for geom in self.object_geoms]
-        self.middle = self.data.xmat[body].reshape(3, 3).T @ np.mean(offsets, axis=0) if offsets else np.zeros(3)
+        self._middle = self._rotation().T @ np.mean(offsets, axis=0) if offsets else np.zeros(3)
         reach = [np.linalg.norm(p - np.mean(offsets, axis=0)) for p in offsets]
         self.radius = max((r + self.model.geom_rbound[g] for r, g in zip(reach, self.object_geoms, strict=True)), default=0.0)
 
@@ -199,7 +171,7 @@ class Sweep:
         tips = self.movement.tips
         for among in ([tips], [*((tip,) for tip in tips), *combinations(tips, 2)]):
             for candidate in self._candidates(among):
-                origin = candidate - self.data.xmat[self.body].reshape(3, 3) @ self.middle
+                origin = candidate - self._rotation() @ self._middle
                 grip = self.grip(origin)
                 value = grip.is_opposed, len(grip.links), -grip.imbalance
                 if grip.overlap <= 0 and grip.links and value > best:
@@ -213,8 +185,8 @@ class Sweep:
         sides: dict[int, np.ndarray] = {}
         overlap = -np.inf
         for share in SHARES:
-            self._posed(float(share), origin)
-            middle = self.data.xpos[self.body] + self.data.xmat[self.body].reshape(3, 3) @ self.middle
+            self._pose(float(share), origin)
+            middle = self.data.xpos[self.body] + self._rotation() @ self._middle
             for geom in self.hand_geoms:
                 link = int(self.model.geom_bodyid[geom])
                 away = np.linalg.norm(self.data.geom_xpos[geom] - middle) - self.model.geom_rbound[geom]
@@ -231,19 +203,23 @@ class Sweep:
 
     def _candidates(self, among: Sequence[Sequence[int]]) -> list[Float[np.ndarray, " 3"]]:
         """Return places between fingertips, and from there toward the palm, while the hand closes."""
+
+        def middle_of(body: int) -> Float[np.ndarray, " 3"]:
+            geoms = self._touchable(body)
+            return np.mean(self.data.geom_xpos[geoms], axis=0) if geoms else self.data.xpos[body]
+
         results = []
         base = [b for b in sorted(self.movement.hand) if self._touchable(b)]
         for share in SHARES:
-            self._posed(float(share))
+            self._pose(float(share))
             for bodies in among:
-                tips = np.mean([self._middle_of(body) for body in bodies], axis=0)
-                palm = self._middle_of(base[0]) if base[0] not in self.movement.tips else tips
+                tips = np.mean([middle_of(body) for body in bodies], axis=0)
+                palm = middle_of(base[0]) if base[0] not in self.movement.tips else tips
                 results += [(1.0 - toward) * tips + toward * palm for toward in TOWARD_PALM]
         return results
 
-    def _middle_of(self, body: int) -> Float[np.ndarray, " 3"]:
-        geoms = self._touchable(body)
-        return np.mean(self.data.geom_xpos[geoms], axis=0) if geoms else self.data.xpos[body]
+    def _rotation(self) -> Float[np.ndarray, "3 3"]:
+        return self.data.xmat[self.body].reshape(3, 3)
 
     def _gap(self, geom: int) -> tuple[float, Float[np.ndarray, " 3"]]:
         """Return the distance of a geom from the object [m], and the object's nearest point."""
@@ -254,7 +230,7 @@ class Sweep:
                 best, point = gap, ends[:3].copy()
         return best, point
 
-    def _posed(self, share: float, origin: Float[np.ndarray, " 3"] | None = None) -> None:
+    def _pose(self, share: float, origin: Float[np.ndarray, " 3"] | None = None) -> None:
         self.data.qpos[:] = self.movement.pose(share)
         if origin is not None and self.is_free:
             address = int(self.model.jnt_qposadr[self.model.body_jntadr[self.body]])
@@ -267,20 +243,7 @@ class Sweep:
         return [geom for geom in geoms if self.model.geom_contype[geom] or self.model.geom_conaffinity[geom]] or geoms
 
 
-START = "tgdsl/open"  # the keyframe with the hand open
-GRIP, MOST = 1.0, 10.0  # force at the fingertips: so many times the object's weight, but at most so much [N]
-FIXED_GRIP = 1.0  # the same where the object is fixed [N]
-LAG = 0.2  # by how much a hinge lags its target when its servo gives all it can [rad]; a slide by this times the hand's reach
-TIP_MASS = 0.05  # least inertia of a fingertip as a joint moves it [kg]
-SPEED = 0.2  # how fast one finger pushes the object away [m/s]
-STEPS = 0.3  # most that a servo's natural frequency turns in one physics step [rad]
-NUM_GROUPS = 31  # groups of actuators that MuJoCo can disable, from 0; those in the next one always act
-_EARTH = 9.81
-_TORQUE_SCALE = 10
-
-
-@dataclass(frozen=True)
-class Servo:
+class Servo(NamedTuple):
     """A servo on a joint that closes."""
 
     joint: str  # the joint's name
@@ -299,7 +262,6 @@ class Closing:
         target: The object's name.
         place: Where its body starts, in the world [m]; None: where the scene has it.
         servos: One for each joint that closes.
-        num_joints: Number of the hand's joints.
         slack: Joints that follow those that close, by name.
         held: Hinges and slides that are held, by name.
         resting: Indices of actuators that rest.
@@ -311,12 +273,15 @@ class Closing:
         model = moving.model
         force = min(GRIP * float(model.body_subtreemass[sweep.body]) * _EARTH, MOST) if sweep.is_free else FIXED_GRIP
         self.target, self.place, self.num_joints = target, place, moving.num_joints
-        self.servos = tuple(_servo(moving, joint, force) for joint in moving.ends)
+        self.start = moving.pose(0.0)
+        opened = mujoco.MjData(model)
+        opened.qpos[:] = self.start
+        mujoco.mj_fwdPosition(model, opened)
+        self.servos = tuple(_servo(moving, opened, joint, force) for joint in moving.ends)
         self.slack = tuple(model.joint(joint).name for joint in moving.closing if joint not in moving.ends)
         self.held = tuple(model.joint(joint).name for joint in moving.held if moving.is_scalar(joint))
-        self.resting = _acting(model, moving)
+        self.resting = _acting(moving, opened)
         self.body = model.body(sweep.body).name if sweep.is_free else None
-        self.start = moving.pose(0.0)
         if place is not None:
             address = int(model.jnt_qposadr[model.body_jntadr[sweep.body]])
             self.start[address : address + 3] = place
@@ -341,11 +306,15 @@ class Closing:
                 weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
                 weld.name1, weld.name2 = body.name, model.body(body.parentid[0]).name
                 weld.data = np.where(np.arange(len(weld.data)) == _TORQUE_SCALE, 1.0, 0.0)  # a pose of zeros is the initial one
-        for body in range(1, model.nbody):
-            if int(model.body_rootid[body]) in moving.trees:
-                spec.body(model.body(body).name).gravcomp = 1.0
-        for name, other in _apart(moving):
-            spec.add_exclude(bodyname1=name, bodyname2=other)
+        robot = [body for body in range(1, model.nbody) if int(model.body_rootid[body]) in moving.trees]
+        for body in robot:
+            spec.body(model.body(body).name).gravcomp = 1.0
+        # Fingers that meet before they meet the object would hold each other off it; and MuJoCo collides a link with its
+        # parent where that is fixed to the world, although both overlap at the joint by design.
+        excluded = {int(signature) for signature in model.exclude_signature}
+        for a, b in combinations([body for body in robot if model.body_geomnum[body]], 2):
+            if (a << 16) + b not in excluded and model.body_weldid[a] != model.body_weldid[b]:
+                spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
         if self.body is not None:
             spec.body(self.body).gravcomp = 1.0
             spec.body(self.body).joints[0].damping = [self._drag, 0, 0]
@@ -360,11 +329,16 @@ class Closing:
     def _rest(self, spec: mujoco.MjSpec) -> None:
         """Have actuators of the hand give no force, nor tendons that are sprung."""
         if self.resting:
-            groups_in_use = {int(actuator.group) for i, actuator in enumerate(spec.actuators) if i not in self.resting}
-            group = _resting_group(int(spec.option.disableactuator), groups_in_use)
+            in_use = {int(actuator.group) for i, actuator in enumerate(spec.actuators) if i not in self.resting}
+            disabled = int(spec.option.disableactuator)
+            free = [group for group in range(NUM_GROUPS) if disabled >> group & 1 or group not in in_use]
+            if not free:
+                problem = f"the scene's actuators that are not the hand's are in all {NUM_GROUPS} groups"
+                advice = f"leave one of the groups 0 to {NUM_GROUPS - 1} free"
+                raise SimulationError(f"{problem}, and the hand's have to rest in one; {advice}")
             for i in self.resting:
-                spec.actuators[i].group = group
-            spec.option.disableactuator = int(spec.option.disableactuator) | 1 << group
+                spec.actuators[i].group = free[0]
+            spec.option.disableactuator = disabled | 1 << free[0]
         for tendon in spec.tendons:
             tendon.stiffness, tendon.frictionloss = [0, 0, 0], 0.0
 
@@ -388,7 +362,7 @@ def closing_of(touch: TactileModule) -> Closing | str:
         problem = f"{touch.plan.origin.robot}: no hinge turns by more than 2π degrees"
         warnings.warn(f'{problem}: is `angle="radian"` missing in its <compiler>? The hand hardly moves', stacklevel=2)
     links = {link.body for sensor in touch.plan.sensors for link in touch.plan.layout_of(sensor).links}
-    moving = movement(scene, frozenset(links))
+    moving = Movement(scene, frozenset(links))
     if not moving.ends:
         is_stiff = not any(moving.is_scalar(joint) for joint in moving.joints)
         return "it has no hinge and no slide" if is_stiff else "which way its joints close is not clear"
@@ -399,7 +373,8 @@ def closing_of(touch: TactileModule) -> Closing | str:
             left.append(f"{target.name} is part of it")
             continue
         grip = sweep.grip()
-        if (grip.holds and grip.overlap < OVERLAP * sweep.radius) or (not sweep.is_free and len(grip.links) > 0):
+        holds = len(grip.links) > 1 and grip.is_opposed
+        if (holds and grip.overlap < OVERLAP * sweep.radius) or (not sweep.is_free and len(grip.links) > 0):
             return Closing(moving, sweep, target.name, None)
         if not sweep.is_free:
             left.append(f"{target.name} is fixed out of its reach")
@@ -417,11 +392,16 @@ def name_all(spec: mujoco.MjSpec) -> None:
             element.name = element.name or f"tgdsl/{kind}/{i}"
 
 
-def _servo(moving: Movement, joint: int, force: float) -> Servo:
+def _servo(moving: Movement, opened: mujoco.MjData, joint: int, force: float) -> Servo:
     """Return the servo of a joint that presses with a force at the fingertips, stable at the scene's timestep."""
-    model, (opened, closed) = moving.model, moving.ends[joint]
-    reach = _reach(moving, joint)
-    force *= 1 + _num_beyond(moving, joint)  # each joint bears what those beyond it press with
+    model, body = moving.model, moving.body_of[joint]
+    below = [tip for tip in moving.tips if body in moving.paths[tip]]
+    geoms = [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in below]
+    distances = (float(np.linalg.norm(opened.geom_xpos[geom] - opened.xanchor[joint])) for geom in geoms)
+    reach = max(distances, default=0.0) + 0.005  # of the fingertips, with the hand open [m]
+    closing = {moving.body_of[other] for other in moving.closing}
+    paths = [moving.paths[tip] for tip in below]
+    force *= 1 + max((len(closing & set(path[: path.index(body)])) for path in paths), default=0)  # of those beyond it too
     is_slide = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
     lever, lag = (1.0, LAG * reach) if is_slide else (reach, LAG)
     dof = int(model.jnt_dofadr[joint])
@@ -430,47 +410,17 @@ def _servo(moving: Movement, joint: int, force: float) -> Servo:
     inertia = armature + max(link_inertia, 0.0)
     stiffness = min(force * lever / lag, armature * (STEPS / float(model.opt.timestep)) ** 2)
     damping = 2.0 * np.sqrt(stiffness * inertia)
-    return Servo(model.joint(joint).name, opened, closed, force * lever, float(stiffness), float(damping), armature)
+    return Servo(model.joint(joint).name, *moving.ends[joint], force * lever, float(stiffness), float(damping), armature)
 
 
-def _reach(moving: Movement, joint: int) -> float:
-    """Return how far the fingertips below a joint are from it, at most, with the hand open [m]."""
-    model = moving.model
-    data = mujoco.MjData(model)
-    data.qpos[:] = moving.pose(0.0)
-    mujoco.mj_kinematics(model, data)
-    below = [tip for tip in moving.tips if int(model.jnt_bodyid[joint]) in moving.path(tip)]
-    geoms = [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in below]
-    return max((float(np.linalg.norm(data.geom_xpos[geom] - data.xanchor[joint])) for geom in geoms), default=0.0) + 0.005
-
-
-def _num_beyond(moving: Movement, joint: int) -> int:
-    """Return the most joints that close beyond one on the way to a fingertip."""
-    closing = {int(moving.model.jnt_bodyid[other]) for other in moving.closing}
-    body = int(moving.model.jnt_bodyid[joint])
-    paths = [moving.path(tip) for tip in moving.tips]
-    return max((len(closing & set(path[: path.index(body)])) for path in paths if body in path), default=0)
-
-
-def _apart(moving: Movement) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of the robot's bodies that could collide."""
-    # Fingers that meet before they meet the object would hold each other off it; and MuJoCo collides a link with its parent
-    # where that is fixed to the world, although both overlap at the joint by design.
-    model = moving.model
-    excluded = {int(signature) for signature in model.exclude_signature}
-    bodies = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees and model.body_geomnum[b]]
-    pairs = [(a, b) for a, b in combinations(bodies, 2) if (a << 16) + b not in excluded]
-    return tuple((model.body(a).name, model.body(b).name) for a, b in pairs if model.body_weldid[a] != model.body_weldid[b])
-
-
-def _acting(model: mujoco.MjModel, moving: Movement) -> tuple[int, ...]:
+def _acting(moving: Movement, opened: mujoco.MjData) -> tuple[int, ...]:
     """Return the actuators that act on the joints of a hand's trees, with the hand open."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = moving.pose(0.0)
-    mujoco.mj_fwdPosition(model, data)
+    model = moving.model
     moments = np.zeros((model.nu, model.nv))
     if model.nu:
-        mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+        mujoco.mju_sparse2dense(
+            moments, opened.actuator_moment, opened.moment_rownnz, opened.moment_rowadr, opened.moment_colind
+        )
     is_hand = np.isin(model.dof_jntid, moving.joints)
     return tuple(np.flatnonzero((moments[:, is_hand] != 0).any(axis=1)).tolist())
 
@@ -479,9 +429,8 @@ def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:
     joint = spec.joint(servo.joint)
     _slacken(joint)
     joint.damping, joint.armature = [servo.damping, 0, 0], servo.armature
-    actuator = spec.add_actuator(
-        name=f"tgdsl/{servo.joint}", target=servo.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, group=NUM_GROUPS
-    )
+    name, kind = f"tgdsl/{servo.joint}", mujoco.mjtTrn.mjTRN_JOINT
+    actuator = spec.add_actuator(name=name, target=servo.joint, trntype=kind, group=NUM_GROUPS)
     # Nothing of the scene's own <default> for actuators: neither gear nor a range.
     actuator.gear, actuator.inheritrange = [1, 0, 0, 0, 0, 0], 0.0
     actuator.ctrllimited = actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -492,14 +441,3 @@ def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:
 def _slacken(joint: mujoco.MjsJoint) -> None:
     joint.stiffness, joint.damping, joint.frictionloss = [0, 0, 0], [0, 0, 0], 0.0
     joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-
-
-def _resting_group(disabled: int, others: set[int]) -> int:
-    """Return a group of actuators that is disabled already, by the bits of `disableactuator`, or that no other is in."""
-    groups = [group for group in range(NUM_GROUPS) if disabled >> group & 1 or group not in others]
-    if not groups:
-        problem = f"the scene's actuators that are not the hand's are in all {NUM_GROUPS} groups"
-        raise SimulationError(
-            f"{problem}, and the hand's have to rest in one; leave one of the groups 0 to {NUM_GROUPS - 1} free"
-        )
-    return groups[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-import mujoco
 import torch
 
 from tgdsl.errors import SimulationError
@@ -33,9 +32,3 @@ def refuse_beyond_memory(what: str, num_bytes: int) -> None:
         return
     if num_bytes > there > 0:
         raise SimulationError(f"{what} need about {num_bytes / 1e9:.3g} GB, and this computer has {there / 1e9:.3g} GB")
-
-
-def bytes_per_env(model: mujoco.MjModel) -> int:
-    """Return what the state of one environment takes: MuJoCo's own, poses, velocities and sensors."""
-    state = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)
-    return 8 * (state + model.nbody * (3 + 4 + 6 + 3) + model.nsensordata)

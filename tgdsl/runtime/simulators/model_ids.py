@@ -26,10 +26,7 @@ _ELEMENTS = {
 def element_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     """Return the index of an element by name, or by the end of its name after a slash if just one ends so.
 
-    Args:
-        model: The model.
-        kind: MuJoCo's accessor: "body", "site", "geom", "joint", "actuator", "key" or "sensor".
-        name: The element's name.
+    `kind` is MuJoCo's accessor: "body", "site", "geom", "joint", "actuator", "key" or "sensor".
 
     Raises:
         SimulationError: If there is none of that name, or several names end in it.

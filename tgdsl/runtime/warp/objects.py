@@ -60,9 +60,6 @@ class WorldObjects:
 
     Types of geoms are shared by all environments: of the geoms that an object has in any variant, those that an environment
     lacks weigh nothing and do not collide.
-
-    Attributes:
-        model: The model that all environments share.
     """
 
     def __init__(self, chosen: EnvObjects, inputs: Inputs):

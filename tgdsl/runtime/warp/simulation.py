@@ -155,9 +155,6 @@ class WarpSimulation(Simulation):
         captures; the graph is captured again when the module holds other tensors than before: when it was moved, compiled,
         freed, or given another dt.
 
-        Args:
-            control: As for `step`.
-
         Raises:
             SimulationError: As from `step`, or if the module is on another device than physics.
         """

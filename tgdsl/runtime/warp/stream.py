@@ -27,12 +27,7 @@ def libraries() -> tuple[Any, Any]:
 
 
 class WarpStream:
-    """A device, and on a GPU the stream that Warp and torch share there.
-
-    Attributes:
-        device: The device.
-        is_captured: Whether repeated calls are captured as CUDA graphs.
-    """
+    """A device, and on a GPU the stream that Warp and torch share there."""
 
     def __init__(self, device: str, graph: bool = True):
         self._warp = libraries()[0]
@@ -42,8 +37,7 @@ class WarpStream:
             self._warp.init()
         self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._warp_stream = self._warp.stream_from_torch(self._stream) if self._stream else None
-        self.is_in_own_graph = False
-        """Whether the present work goes into a graph of `capture`."""
+        self.is_in_own_graph = False  # whether the present work goes into a graph of `capture`
 
     @property
     def is_capturing(self) -> bool:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -34,8 +35,12 @@ from tgdsl.runtime.xhand1.wire.protocol import (
     encode_command,
 )
 
+MAX_AGE_S = 0.1  # largest age of a reading that is returned [s], unless replies may take longer
+READ_TIMEOUT_S = 0.08  # how long a call waits for a new reading [s], unless replies may take longer
 _RECONNECT_S = 0.02
 _LAST_TRIES = 6
+_PATIENCE_S = 1.0
+_CLOSE_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,33 +58,20 @@ class Reading:
 
 
 class HandReader(threading.Thread):
-    """Exchanges without end, and notifies `changed` of every reading and failure.
-
-    Attributes:
-        changed: Lock of all that follows.
-        reading: The newest reading, or None.
-        failure: The newest failure, and when; None if there was none.
-        ended: Why no more readings will come; None while they may.
-        motion: What may move, or None.
-        counters: What happened on the line.
-        num_connects: How often the port was reopened.
-        left_driven: Why the hand did not confirm, at the end, that it is passive; None if it did or never moved.
-    """
+    """Exchanges without end, and notifies `changed` of every reading and failure."""
 
     def __init__(self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion | None):
         super().__init__(name="xhand1", daemon=True)
-        self.changed = threading.Condition()
-        self.reading: Reading | None = None
-        self.failure: tuple[HandError, float] | None = None
-        self.ended: HandClosedError | None = None
-        self.motion = motion
-        self.counters = client.counters
-        self.num_connects = 0
-        self.left_driven: HandError | None = None
+        self.changed = threading.Condition()  # lock of all that follows
+        self.reading: Reading | None = None  # the newest
+        self.failure: tuple[HandError, float] | None = None  # the newest, and when
+        self.ended: HandClosedError | None = None  # why no more readings will come; None while they may
+        self.motion = motion  # what may move
+        self.counters = client.counters  # what happened on the line
+        self.num_connects = 0  # how often the port was reopened
+        self.left_driven: HandError | None = None  # why the hand did not confirm, at the end, that it is passive
         self._client: SerialClient | None = client
-        self._connect = connect
-        self._stopping = threading.Event()
-        self._is_driven = False
+        self._connect, self._stopping, self._is_driven = connect, threading.Event(), False
 
     def stop(self) -> None:
         """Ask the thread to make the hand passive and to end."""
@@ -102,12 +94,10 @@ class HandReader(threading.Thread):
 
     def _turn(self) -> None:
         try:
-            if self._client is None:
-                self._client = self._connect(self.counters)
-                self.num_connects += 1
+            client = self._connected()
             with self.changed:
                 joints = PASSIVE if self.motion is None else self.motion.joints(time.monotonic())
-            reply = self._exchange(self._client, joints)
+            reply = self._exchange(client, joints)
             state = _plausible(decode_state(reply.payload))
         except HandError as error:
             self._fail(error)
@@ -116,6 +106,12 @@ class HandReader(threading.Thread):
         with self.changed:
             self.reading = reading
             self.changed.notify_all()
+
+    def _connected(self) -> SerialClient:
+        if self._client is None:
+            self._client = self._connect(self.counters)
+            self.num_connects += 1
+        return self._client
 
     def _exchange(self, client: SerialClient, joints: tuple[JointCommand, ...]) -> Reply:
         is_driven = joints is not PASSIVE
@@ -141,9 +137,7 @@ class HandReader(threading.Thread):
             if not self._is_driven:
                 break
             try:
-                if self._client is None:
-                    self._client = self._connect(self.counters)
-                self._exchange(self._client, PASSIVE)
+                self._exchange(self._connected(), PASSIVE)
                 self.left_driven = None
             except HandError as error:
                 self.left_driven = error
@@ -175,19 +169,12 @@ def _plausible(state: HandState) -> HandState:
     return state
 
 
-MAX_AGE_S = 0.1  # largest age of a reading that is returned [s], unless replies may take longer
-READ_TIMEOUT_S = 0.08  # how long a call waits for a new reading [s], unless replies may take longer
-_PATIENCE_S = 1.0
-_CLOSE_TIMEOUT_S = 5.0
-
-
-@dataclass(frozen=True, eq=False)
-class Tare:
+class Tare(NamedTuple):
     """What the fingertips read while nothing touches them."""
 
     mean: Float[np.ndarray, "finger 3"]  # mean of the frames [counts]
     spread: Float[np.ndarray, "finger 3"]  # largest less least of the frames [counts]
-    num_frames: int  # how many frames
+    num_frames: int
 
 
 class XHand1:
@@ -221,19 +208,12 @@ class XHand1:
         max_age_s: float | None = None,
         open_port: Callable[[str, int], Port] = SerialPort,
     ) -> XHand1:
-        """Open a hand and wait for its first reading.
+        """Open a hand on a serial port, such as `/dev/ttyUSB0`, and wait for its first reading; without limits it is only read.
 
-        Args:
-            device: The serial port, such as `/dev/ttyUSB0`.
-            addresses: Which hand; default: the one with id 0.
-            motion: Leave to move it; default: none.
-            timing: Times of the line.
-            max_age_s: Largest age of a reading that is returned [s]; default: 0.1 s, or as long as two replies may take.
-            open_port: Opens a port, given its name and baud rate.
+        Readings that are older than `max_age_s` are not returned; default: 0.1 s, or as long as two replies may take.
 
         Raises:
-            HandDisconnectedError: If the port cannot be opened.
-            HandError: If the hand does not answer, or not as expected.
+            HandError: If the port cannot be opened, or the hand does not answer, or not as expected.
         """
         timing = timing or SerialTiming()
         addresses = addresses or Addresses()
@@ -255,31 +235,22 @@ class XHand1:
         return hand
 
     def read(self, timeout_s: float | None = None) -> Reading:
-        """Return the newest reading, each once; wait for it if need be.
-
-        Args:
-            timeout_s: How long to wait [s]; default: 0.08 s, or as long as two replies may take.
+        """Return the newest reading, each once; wait for it if need be: by default 0.08 s, or as long as two replies may take.
 
         Raises:
-            HandError: What kept a new reading from coming, by name: `HandTimeoutError`, `HandDisconnectedError` and so on.
-            HandClosedError: If the hand was closed.
+            HandError: What kept a new reading from coming, by name: `HandTimeoutError`, `HandClosedError` and so on.
         """
         reader, wait_s = self._reader, self._read_timeout_s if timeout_s is None else timeout_s
         with reader.changed:
             reader.changed.wait_for(lambda: self._is_new(reader.reading) or reader.ended, wait_s)
-            if reader.ended is not None:
-                raise reader.ended
             reading = reader.reading
-            if reading is None or not self._is_new(reading):
+            if reader.ended is not None or reading is None or not self._is_new(reading):
                 raise self._why_no_reading()
             self._last_sequence = reading.sequence
             return reading
 
     def command(self, target: Sequence[float] | Float[np.ndarray, " joint"]) -> None:
-        """Set where the joints shall go; to be called again within the watchdog's time, also to stay there.
-
-        Args:
-            target: Joint angles in the order of the joints' ids [rad].
+        """Set the joint angles to go to [rad]; to be called again within the watchdog's time, also to stay there.
 
         Raises:
             MotionError: If the hand was opened for reading alone, was made passive, or a target is outside its range.
@@ -335,9 +306,6 @@ class XHand1:
     def tare(self, num_frames: int = 20) -> Tare:
         """Return what the fingertips read now, while nothing touches them. Nothing is sent to the hand for it.
 
-        Args:
-            num_frames: How many readings to take, at least 5.
-
         Raises:
             HandError: If a reading fails, a force is at the end of its range, or fewer than 5 frames are asked for.
         """
@@ -357,11 +325,9 @@ class XHand1:
         """
         self._leave()
         if self._reader.is_alive():
-            raise HandError(
-                f"the hand's reader did not end within {_CLOSE_TIMEOUT_S:g} s: switch the hand's power off if it moves"
-            )
-        if self._reader.left_driven is not None:
-            error = self._reader.left_driven
+            problem = f"the hand's reader did not end within {_CLOSE_TIMEOUT_S:g} s"
+            raise HandError(f"{problem}: switch the hand's power off if it moves")
+        if (error := self._reader.left_driven) is not None:
             raise HandError(f"the hand did not confirm that it is passive: switch its power off ({error})") from error
 
     def __enter__(self) -> XHand1:

@@ -6,6 +6,7 @@ No clock and no I/O here: time is passed in. A hand that was stopped, for whatev
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -34,11 +35,7 @@ class MotionLimits:
     watchdog_s: float = 0.1  # the hand is made passive if no command comes for this long [s]
 
     def __post_init__(self) -> None:
-        """Refuse limits that limit nothing.
-
-        Raises:
-            MotionError: If there are not 12 of each, a range is empty, or a limit is not finite or not positive.
-        """
+        """Refuse limits that limit nothing."""
         for name in ("lower", "upper", "speed", "current_limit"):
             values = getattr(self, name)
             if len(values) != NUM_JOINTS or not np.isfinite(values).all():
@@ -64,24 +61,13 @@ class MotionLimits:
         kd: int = 0,
         watchdog_s: float = 0.1,
     ) -> MotionLimits:
-        """Return limits with the joint ranges of a robot file, and one speed and current for all joints.
-
-        Args:
-            model: The robot, right or left, with the vendor's joint names.
-            speed: How fast set-points may move [rad/s].
-            current_limit: Largest motor current [mA].
-            kp: Proportional gain [hand's unit].
-            ki: Integral gain [hand's unit].
-            kd: Derivative gain [hand's unit].
-            watchdog_s: The hand is made passive if no command comes for this long [s].
+        """Return limits with the joint ranges of a robot file, and one speed [rad/s] and current [mA] for all joints.
 
         Raises:
-            MotionError: If the robot lacks a joint, or one has no range.
+            MotionError: If the robot lacks a joint of the vendor's names, right or left, or one has no range.
         """
-        ranges = model.jnt_range[joint_ids(model)]
-        lower, upper = (tuple(map(float, ranges[:, i])) for i in (0, 1))
-        speeds, currents = (speed,) * NUM_JOINTS, (current_limit,) * NUM_JOINTS
-        return cls(lower, upper, speeds, currents, kp, ki, kd, watchdog_s)
+        lower, upper = (tuple(map(float, ends)) for ends in model.jnt_range[joint_ids(model)].T)
+        return cls(lower, upper, (speed,) * NUM_JOINTS, (current_limit,) * NUM_JOINTS, kp, ki, kd, watchdog_s)
 
 
 def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
@@ -98,8 +84,7 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
     return np.array(results)[:, 0]
 
 
-@dataclass(frozen=True, eq=False)
-class JointControls:
+class JointControls(NamedTuple):
     """Controls of a model that are the hand's joint angles."""
 
     actuator_id: Int[np.ndarray, " joint"]  # actuator of each joint
@@ -141,27 +126,17 @@ def _actuator(model: mujoco.MjModel, name: str, joint: int) -> int:
 
 
 class Motion:
-    """The set-points of a hand that may move. The first starts from where the joints are; each moves at a limited speed.
-
-    Attributes:
-        limits: How far it may move.
-        stopped: Why the hand was made passive; None if it was not.
-    """
+    """The set-points of a hand that may move. The first starts from where the joints are; each moves at a limited speed."""
 
     def __init__(self, limits: MotionLimits):
         self.limits = limits
-        self.stopped: HandError | None = None
+        self.stopped: HandError | None = None  # why the hand was made passive; None if it was not
         self._target: JointArray | None = None
         self._setpoint = np.zeros(NUM_JOINTS)
         self._commanded_at = self._stepped_at = 0.0
 
     def command(self, target: JointArray, now: float, measured: JointArray | None) -> None:
-        """Take a new target.
-
-        Args:
-            target: Joint angles to go to [rad].
-            now: Time [s].
-            measured: Where the joints are [rad]; None if that is not known.
+        """Take joint angles to go to [rad] at a time [s]; `measured` is where the joints are, if that is known.
 
         Raises:
             MotionError: If a target is outside its range, or it is not known where the joints are. The hand is then passive.
@@ -188,10 +163,10 @@ class Motion:
         self._watch(now)
         if self._target is None:
             return PASSIVE
-        reach = np.array(self.limits.speed) * min(max(now - self._stepped_at, 0.0), _LONGEST_STEP_S)
+        limits = self.limits
+        reach = np.array(limits.speed) * min(max(now - self._stepped_at, 0.0), _LONGEST_STEP_S)
         self._setpoint = np.clip(self._target, self._setpoint - reach, self._setpoint + reach)
         self._stepped_at = now
-        limits = self.limits
         return tuple(
             JointCommand(float(position), limits.kp, limits.ki, limits.kd, current, Mode.POSITION)
             for position, current in zip(self._setpoint, limits.current_limit, strict=True)

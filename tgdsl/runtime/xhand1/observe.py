@@ -7,7 +7,7 @@ simulation counts taxels. A sensor's `rate` and `history` are those of the modul
 `joint_pos` is what the hand says, `joint_vel` its difference in time (see `velocity`). `last_action` is what the policy last
 gave, whether or not the hand was allowed to follow; before that, the angles at which the joints were.
 
-Shapes: `env` one, `finger`, `joint` and `taxel` as in `payloads`, `feature` numbers of an observation.
+Shapes: `env` one, `finger`, `joint` and `taxel` as in `protocol`, `feature` numbers of an observation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,10 +27,10 @@ from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedObservation, PlannedSensor
 from tgdsl.runtime.connection import Connection
-from tgdsl.runtime.source import Control
+from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import ROUNDING, JointControls, MotionLimits, joint_ids
-from tgdsl.runtime.xhand1.source import HandSample, HandSource, is_chosen
+from tgdsl.runtime.xhand1.source import HandSample, HandSource, control_array, is_chosen
 from tgdsl.runtime.xhand1.wire.errors import MotionError
 from tgdsl.runtime.xhand1.wire.protocol import FINGERS, JOINTS
 from tgdsl.scene.scene import scene_model
@@ -51,7 +50,7 @@ _KEPT = ("stack", "last")
 class HandTerm:
     """One observation that a hand can give."""
 
-    planned: PlannedObservation  # the observation
+    planned: PlannedObservation
     fingers: tuple[int, ...] = ()  # fingertips that it is of, in the order of the sensor's links
     axes: tuple[int, ...] = ()  # axes of an aggregate force, in order
     steps: int = 1  # how many control steps are stacked, the oldest first
@@ -108,12 +107,12 @@ def _hand_term(plan: Plan, planned: PlannedObservation, contact_threshold: float
         raise ObservationError("it has no such reading of links and taxels as the robot file has them")
     assert planned.reading is not None
     sensor = plan.sensor_of(planned.reading)
-    fingers = _fingers(plan, sensor)
+    fingers, history = _fingers(plan, sensor), sensor.history
     if planned.type == "agg_bool" and contact_threshold is None:
         raise ObservationError("its calibration has no `contact_threshold`, the force above which a fingertip is in contact")
-    if sensor.history is not None and sensor.history.reduce not in _KEPT:
-        raise ObservationError(f"`history` with `reduce: {sensor.history.reduce}` is not done; expected {' or '.join(_KEPT)}")
-    steps = sensor.history.length if sensor.history is not None and sensor.history.reduce == "stack" else 1
+    if history is not None and history.reduce not in _KEPT:
+        raise ObservationError(f"`history` with `reduce: {history.reduce}` is not done; expected {' or '.join(_KEPT)}")
+    steps = history.length if history is not None and history.reduce == "stack" else 1
     return HandTerm(planned, fingers, tuple("xyz".index(axis) for axis in planned.axes), steps, sensor.period)
 
 
@@ -126,22 +125,20 @@ def _joint_term(plan: Plan, planned: PlannedObservation, is_log: bool) -> HandTe
     rows = plan.inputs.actuators if planned.type == "last_action" else plan.inputs.joints
     if planned.constants:
         rows = tuple(rows[i] for i in plan.arrays[f"observations/{planned.group}/{planned.index}/rows"])
-    if planned.type != "last_action":
-        return HandTerm(planned, joints=tuple(_joint_of(name) for name in rows))
-    model = scene_model(plan.scene)
-    try:
-        actuator_id = JointControls.of_model(model).actuator_id.tolist()
-    except MotionError as error:
-        raise ObservationError(str(error)) from error
-    return HandTerm(planned, joints=tuple(actuator_id.index(model.actuator(name).id) for name in rows))
-
-
-def _joint_of(name: str) -> int:
-    """Return which of the hand's joints one of the robot file is."""
-    results = [i for i, joint in enumerate(JOINTS) if name == joint or name.endswith(f"_hand_{joint}")]
-    if not results:
-        raise ObservationError(f'it has no joint "{name}"')
-    return results[0]
+    if planned.type == "last_action":
+        model = scene_model(plan.scene)
+        try:
+            actuator_id = JointControls.of_model(model).actuator_id.tolist()
+        except MotionError as error:
+            raise ObservationError(str(error)) from error
+        return HandTerm(planned, joints=tuple(actuator_id.index(model.actuator(name).id) for name in rows))
+    joints = []
+    for name in rows:
+        of_hand = [i for i, joint in enumerate(JOINTS) if name == joint or name.endswith(f"_hand_{joint}")]
+        if not of_hand:
+            raise ObservationError(f'it has no joint "{name}"')
+        joints.append(of_hand[0])
+    return HandTerm(planned, joints=tuple(joints))
 
 
 def _fingers(plan: Plan, sensor: PlannedSensor) -> tuple[int, ...]:
@@ -161,11 +158,7 @@ def _fingers(plan: Plan, sensor: PlannedSensor) -> tuple[int, ...]:
 
 
 class HandObserver:
-    """Observes one hand for a module.
-
-    Attributes:
-        terms: The observations.
-    """
+    """Observes one hand for a module."""
 
     def __init__(self, touch: TactileModule, calibration: Calibration, control_step: float, *, is_log: bool = False):
         self.terms = hand_terms(touch.plan, calibration.contact_threshold, is_log)
@@ -176,11 +169,10 @@ class HandObserver:
         self._controls = JointControls.of_model(scene_model(touch.plan.scene)) if wants_action else None
         self._action: Tensor | None = None
 
-    def note(self, control: Tensor | np.ndarray | None) -> None:
+    def note(self, control: Control) -> None:
         """Take note of controls that were given, by actuator, (actuator,) or (1, actuator) [rad]; None: the last still hold."""
         if control is not None and self._controls is not None:
-            values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
-            self._action = torch.from_numpy(self._controls.targets(values)).unsqueeze(0)
+            self._action = torch.from_numpy(self._controls.targets(control_array(control))).unsqueeze(0)
 
     def observe(self, sample: HandSample) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups. To be called once per control step, as sensors may remember their last samples."""
@@ -188,7 +180,7 @@ class HandObserver:
         if self._action is None:
             self._action = sample.joint_pos
         for term, past in zip(self.terms, self._pasts, strict=True):
-            features = _features(term, sample, self._threshold, self._action).to(self._like)
+            features = self._features(term, sample, self._action).to(self._like)
             groups.setdefault(term.planned.group, []).append(past.push(features))
         return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 
@@ -198,23 +190,22 @@ class HandObserver:
         for past in self._pasts:
             past.reset()
 
-
-def _features(term: HandTerm, sample: HandSample, threshold: float | None, action: Float[Tensor, "env joint"]) -> Tensor:
-    type_, fingers, joints = term.planned.type, list(term.fingers), list(term.joints)
-    if type_ in ("joint_pos", "joint_vel"):
-        return (sample.joint_pos if type_ == "joint_pos" else sample.joint_vel)[:, joints]
-    if type_ == "last_action":
-        return action[:, joints]
-    if type_ == "agg_force":
-        return sample.tip_force[:, fingers][:, :, list(term.axes)].transpose(1, 2).flatten(1)
-    if type_ == "agg_bool":
-        assert threshold is not None
-        return sample.tip_force[:, fingers].norm(dim=-1) > threshold
-    if type_ == "taxel_counts":
-        return sample.taxel_counts.permute(0, 3, 1, 2).flatten(1)
-    if type_ == "taxel_saturated":
-        return sample.is_taxel_saturated.flatten(1)
-    return sample.tip_force.new_empty((len(sample.tip_force), 0))
+    def _features(self, term: HandTerm, sample: HandSample, action: Float[Tensor, "env joint"]) -> Tensor:
+        type_, fingers, joints = term.planned.type, list(term.fingers), list(term.joints)
+        if type_ in ("joint_pos", "joint_vel"):
+            return (sample.joint_pos if type_ == "joint_pos" else sample.joint_vel)[:, joints]
+        if type_ == "last_action":
+            return action[:, joints]
+        if type_ == "agg_force":
+            return sample.tip_force[:, fingers][:, :, list(term.axes)].transpose(1, 2).flatten(1)
+        if type_ == "agg_bool":
+            assert self._threshold is not None
+            return sample.tip_force[:, fingers].norm(dim=-1) > self._threshold
+        if type_ == "taxel_counts":
+            return sample.taxel_counts.permute(0, 3, 1, 2).flatten(1)
+        if type_ == "taxel_saturated":
+            return sample.is_taxel_saturated.flatten(1)
+        return sample.tip_force.new_empty((len(sample.tip_force), 0))
 
 
 class _Past:
@@ -276,8 +267,7 @@ class HandConnection(Connection):
         """
         target = None
         if control is not None and self._actuators is not None:
-            values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
-            target = self._actuators.targets(values)
+            target = self._actuators.targets(control_array(control))
         elif control is not None and self._name:
             problem = f"{self._name} was connected for reading alone: its controls go nowhere"
             warnings.warn(f"{problem}; to move it, connect with motion=MotionLimits(...)", stacklevel=3)

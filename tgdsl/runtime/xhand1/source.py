@@ -1,6 +1,6 @@
 """The hand as a source: stepped like a simulation of one environment, but in its own time, and with what a hand can know.
 
-Shapes: `env` one, `joint`, `finger` and `taxel` as in `payloads`.
+Shapes: `env` one, `joint`, `finger` and `taxel` as in `protocol`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from torch import Tensor
 
 from tgdsl.errors import StateError
 from tgdsl.module.state import SceneState
-from tgdsl.runtime.source import Control
+from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError
-from tgdsl.tensors.env_ids import EnvIds
+from tgdsl.tensors.env_ids import EnvIds, env_indices
 
 
 class VelocityFilter:
@@ -33,11 +33,7 @@ class VelocityFilter:
     """
 
     def __init__(self, time_constant_s: float):
-        """Start at rest.
-
-        Args:
-            time_constant_s: The filter's time constant τ [s]; 0: plain differences.
-        """
+        """Start at rest, with a time constant τ [s]; 0: plain differences."""
         self._time_constant_s = time_constant_s
         self.reset()
 
@@ -84,35 +80,33 @@ class HandSample:
     @classmethod
     def of(cls, reading: Reading, calibration: Calibration, velocity: VelocityFilter, time_s: float) -> HandSample:
         """Return what a reading says; the filter takes note of it, at the time when the joints were there [s]."""
+
+        def row(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+            plain = values.astype(np.float64 if np.issubdtype(values.dtype, np.floating) else np.int64)
+            return torch.from_numpy(plain).to(dtype).unsqueeze(0)
+
         state = reading.state
-        speeds = velocity.update(time_s, state.position.astype(np.float64))
         return cls(
-            joint_pos=_row(state.position, torch.float32),
-            joint_vel=_row(speeds, torch.float32),
-            tip_force=_row(calibration.apply(state.total_force), torch.float32),
-            is_tip_saturated=_row(np.asarray(state.is_total_saturated.any(axis=-1)), torch.bool),
-            taxel_counts=_row(state.taxel_force, torch.int16),
-            is_taxel_saturated=_row(np.asarray(state.is_taxel_saturated.any(axis=-1)), torch.bool),
-            joint_temperature=_row(state.joint_temperature & 0xFF, torch.int16),
-            tip_temperature=_row(state.total_temperature, torch.int16),
-            joint_error=_row(state.joint_error, torch.int32),
+            joint_pos=row(state.position, torch.float32),
+            joint_vel=row(velocity.update(time_s, state.position.astype(np.float64)), torch.float32),
+            tip_force=row(calibration.apply(state.total_force), torch.float32),
+            is_tip_saturated=row(np.asarray(state.is_total_saturated.any(axis=-1)), torch.bool),
+            taxel_counts=row(state.taxel_force, torch.int16),
+            is_taxel_saturated=row(np.asarray(state.is_taxel_saturated.any(axis=-1)), torch.bool),
+            joint_temperature=row(state.joint_temperature & 0xFF, torch.int16),
+            tip_temperature=row(state.total_temperature, torch.int16),
+            joint_error=row(state.joint_error, torch.int32),
             units=calibration.units,
             reading=reading,
         )
 
 
 class HandSource(ABC):
-    """A hand, or the log of one, that steps as one environment.
-
-    Attributes:
-        calibration: What its counts mean.
-        num_envs: One: there is one hand.
-        num_late_steps: Steps that began after they should have ended.
-    """
+    """A hand, or the log of one, that steps as one environment."""
 
     NAME: str
     num_envs = 1
-    num_late_steps = 0
+    num_late_steps = 0  # steps that began after they should have ended
 
     def __init__(self, calibration: Calibration | None, velocity_time_constant: float):
         self.calibration = calibration or Calibration.none()
@@ -142,11 +136,7 @@ class HandSource(ABC):
         """Return what the hand said at the end of the last step, or after a reset."""
 
     def state(self) -> SceneState:
-        """Refuse: a hand does not know where objects are, so no taxel reading can be computed from it.
-
-        Raises:
-            StateError: Always; it lists what the hand can give.
-        """
+        """Refuse: a hand does not know where objects are, so no taxel reading can be computed from it."""
         able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
         raise StateError(f"{self.NAME} cannot give the poses and contacts of a SceneState; its sample() gives {able}")
 
@@ -155,13 +145,6 @@ class HandSource(ABC):
 
         Nothing moves a hand to where it started, and a log goes on in time. A hand that was stopped by an error stays so until
         `resume`.
-
-        Args:
-            env_ids: Indices, or a boolean mask over environments, of which there is one; default: it.
-
-        Raises:
-            HandError: If no new reading comes, or there are no such environments.
-            ReplayOverError: If a log is at its end.
         """
         if env_ids is None or is_chosen(env_ids):
             self._velocity.reset()
@@ -181,11 +164,7 @@ class HandSource(ABC):
 
 
 class XHand1Source(HandSource):
-    """A hand that steps at a fixed rate. After a step that begins late, the next ones are counted from there.
-
-    Attributes:
-        hand: The hand.
-    """
+    """A hand that steps at a fixed rate. After a step that begins late, the next ones are counted from there."""
 
     NAME = "a real XHand1"
 
@@ -198,26 +177,20 @@ class XHand1Source(HandSource):
         velocity_time_constant: float = 0.02,
         read_timeout_s: float | None = None,
     ):
-        """Take an open hand.
+        """Take an open hand, which `close` closes.
 
         Args:
-            hand: The hand; `close` closes it.
+            hand: The hand.
             control_step: Duration of one control step [s].
             calibration: What its counts mean; default: they stay counts.
             velocity_time_constant: Time constant of the filter of joint speeds [s].
             read_timeout_s: How long to wait for a new reading after a step [s]; default: as `hand.read`.
-
-        Raises:
-            HandError: If the control step is not positive, or no new reading comes.
-            MotionError: If the hand may move, and its watchdog bites between two steps.
         """
         if not 0 < control_step < math.inf:
             raise HandError(f"a control step of {control_step:g} s, expected a finite time above 0")
         refuse_beyond_watchdog(control_step, hand.watchdog_s)
         super().__init__(calibration, velocity_time_constant)
-        self.hand = hand
-        self._control_step = control_step
-        self._read_timeout_s = read_timeout_s
+        self.hand, self._control_step, self._read_timeout_s = hand, control_step, read_timeout_s
         self._step_ends_at = time.monotonic()
         self._target: np.ndarray | None = None
         self._sample: HandSample | None = self._read(-math.inf)
@@ -229,26 +202,20 @@ class XHand1Source(HandSource):
     def step(self, control: Control = None) -> None:
         """Command the joints, wait until the control step is over, and read the hand.
 
-        Args:
-            control: Joint angles to go to by joint id, (joint,) or (1, joint) [rad]; default: as they were.
+        `control` is joint angles to go to by joint id, (joint,) or (1, joint) [rad]; default: as they were.
 
         Raises:
-            MotionError: If the hand may not go there, or not move at all.
-            HandError: If no new reading comes.
+            HandError: If the hand may not go there, or no new reading comes.
         """
         if control is not None:
-            values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
+            values = control_array(control)
             self._target = values[0] if values.ndim == 2 and len(values) == 1 else values
         self._sample = None
         self._command()
         self._sample = self._read(self._wait())
 
     def sample(self) -> HandSample:
-        """Return what the hand said at the end of the last step, or after a reset.
-
-        Raises:
-            HandTimeoutError: If that step or reset failed: what was said before is not returned as if it were new.
-        """
+        """Return what the hand said at the end of the last step, or after a reset; if that failed, an error says so."""
         if self._sample is None:
             raise HandTimeoutError("the last step or reset gave no reading; step or reset again")
         return self._sample
@@ -292,6 +259,11 @@ class XHand1Source(HandSource):
         return HandSample.of(reading, self.calibration, self._velocity, self._time_of(reading))
 
 
+def control_array(control: Tensor | np.ndarray) -> np.ndarray:
+    """Return controls as an array on the host."""
+    return control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
+
+
 def refuse_beyond_watchdog(control_step: float, watchdog_s: float | None) -> None:
     """Raise an error unless commands, one per control step, come before a watchdog bites."""
     if watchdog_s is not None and control_step >= watchdog_s:
@@ -300,20 +272,5 @@ def refuse_beyond_watchdog(control_step: float, watchdog_s: float | None) -> Non
 
 
 def is_chosen(env_ids: EnvIds) -> bool:
-    """Return whether the one environment that a hand is, 0, is among indices or in a mask.
-
-    Raises:
-        HandError: If there are no such environments.
-    """
-    ids = np.asarray(torch.as_tensor(env_ids).cpu())
-    if ids.dtype == bool and ids.shape == (1,):
-        return bool(ids[0])
-    if ids.size and (ids.dtype.kind not in "iu" or ids.any()):
-        raise HandError(f"env_ids: found {ids.tolist()}, expected index 0, or a mask of 1")
-    return bool(ids.size)
-
-
-def _row(values: np.ndarray, dtype: torch.dtype) -> Tensor:
-    is_float = np.issubdtype(values.dtype, np.floating)
-    plain = values.astype(np.float64 if is_float else np.int64)
-    return torch.from_numpy(plain).to(dtype).unsqueeze(0)
+    """Return whether the one environment that a hand is, 0, is among indices or in a mask."""
+    return bool(len(env_indices(env_ids, 1, HandError)))

@@ -13,7 +13,7 @@ from first_order_hands import first_order_hand
 from hand_logs import assert_same_reading, random_readings, write_log
 
 from tgdsl.errors import StateError, TgdslError
-from tgdsl.runtime.source import Source
+from tgdsl.runtime.connection import Source
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import TipForces

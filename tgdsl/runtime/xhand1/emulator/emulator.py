@@ -1,6 +1,6 @@
 """An emulated hand: it takes frames and gives frames, on a pseudo-terminal that opens like a serial port. POSIX only.
 
-Its body says how joints move and what fingertips feel. Shapes: `joint`, `finger` and `taxel` as in `payloads`.
+Its body says how joints move and what fingertips feel. Shapes: `joint`, `finger` and `taxel` as in `protocol`.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ import time
 import tty
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -49,10 +48,12 @@ from tgdsl.runtime.xhand1.wire.protocol import (
 VERSION = b"tgdsl emulator"
 _ROOM_TEMPERATURE = 25
 _COUNTS_PER_TURN = 4096
+_IDLE_S = 0.05
+_KEPT_REQUESTS = 20_000
+_CHUNK = 124  # bytes that come out of the line at a time: 0.4 ms at 3 Mbaud
 
 
-@dataclass(frozen=True, eq=False)
-class TipForces:
+class TipForces(NamedTuple):
     """What the fingertips feel [counts]; rounded and cut to a byte, as a sensor would."""
 
     total: Float[np.ndarray, "finger 3"]  # force of each fingertip
@@ -64,25 +65,14 @@ class TipForces:
         return cls(np.zeros((len(FINGERS), 3)), np.zeros((len(FINGERS), NUM_TAXELS, 3)))
 
 
-@runtime_checkable
-class Body(Protocol):
-    """Joints and fingertips."""
+class Body:
+    """Joints and fingertips; these stay at zero and feel nothing."""
 
     def command(self, time_s: float, joints: Sequence[JointCommand]) -> None:
         """Take the joints' commands at a time [s]."""
-        ...
 
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
         """Return the joint angles [rad] and the fingertips' forces at that time [s]; called once per state."""
-        ...
-
-
-class StillBody:
-    """Joints that stay at zero, and fingertips that feel nothing."""
-
-    def command(self, time_s: float, joints: Sequence[JointCommand]) -> None: ...
-
-    def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
         return np.zeros(NUM_JOINTS), TipForces.zero()
 
 
@@ -92,22 +82,15 @@ def is_driven(joint: JointCommand) -> bool:
 
 
 class EmulatedHand:
-    """The hand behind the line.
-
-    Attributes:
-        address: Its address.
-        commands: The last commands of its joints.
-        position: Joint angles that it last sent [rad].
-        registers: Contents of its registers, by number.
-    """
+    """The hand behind the line."""
 
     def __init__(self, hand_id: int = 0, body: Body | None = None):
-        """Switch it on, with a `StillBody` by default."""
-        self.commands: tuple[JointCommand, ...] = PASSIVE
+        """Switch it on."""
         self.address = hand_address(hand_id)
-        self.position: Float[np.ndarray, " joint"] = np.zeros(NUM_JOINTS)
+        self.commands: tuple[JointCommand, ...] = PASSIVE  # the last ones of its joints
+        self.position: Float[np.ndarray, " joint"] = np.zeros(NUM_JOINTS)  # joint angles that it last sent [rad]
         self.registers: dict[int, bytes] = {Register.HAND_ID: bytes([hand_id]), Register.NAME: b"emulated"}
-        self._body: Body = StillBody() if body is None else body
+        self._body = body or Body()
 
     @property
     def is_passive(self) -> bool:
@@ -161,23 +144,13 @@ def _counts(force: Float[np.ndarray, "*batch 3"]) -> np.ndarray:
     return np.clip(np.round(force), FORCE_MIN, FORCE_MAX).astype(np.int16)
 
 
-_IDLE_S = 0.05
-_KEPT_REQUESTS = 20_000
-_CHUNK = 124  # bytes that come out of the line at a time: 0.4 ms at 3 Mbaud
-
-
 class EmulatedLine:
-    """The line between a host and an emulated hand: bytes in, bytes out at the speed of its baud rate. Time is passed in.
-
-    Attributes:
-        hand: The hand.
-        requests: The latest requests that arrived, with their times [s].
-    """
+    """The line between a host and an emulated hand: bytes in, bytes out at the speed of its baud rate. Time is passed in."""
 
     def __init__(self, hand: EmulatedHand, *, baud: int = BAUD, turnaround_s: float = 0.0002):
         """Connect a hand that answers `turnaround_s` after a request's last byte [s], on a line of `baud` bits per second."""
         self.hand = hand
-        self.requests: deque[tuple[float, Frame]] = deque(maxlen=_KEPT_REQUESTS)
+        self.requests: deque[tuple[float, Frame]] = deque(maxlen=_KEPT_REQUESTS)  # the latest that arrived, and when [s]
         self._byte_s, self._turnaround_s = 10 / baud, turnaround_s
         self.cut()
 
@@ -226,33 +199,23 @@ class EmulatedLine:
 
 
 class Emulator:
-    """A thread that lets an emulated hand answer on a pseudo-terminal, as fast as a line of its baud rate would.
-
-    Attributes:
-        line: The hand's line.
-        device: The serial port's name.
-        num_lost_bytes: Bytes that nobody read in time.
-        failure: The error that ended its thread, or None. The port is then gone, and every call raises it.
-    """
+    """A thread that lets an emulated hand answer on a pseudo-terminal, as fast as a line of its baud rate would."""
 
     def __init__(self, hand: EmulatedHand | None = None, *, line: EmulatedLine | None = None):
         """Plug a hand in, by default one with id 0 that feels nothing, or a line with a hand, and switch it on."""
         self.line = line or EmulatedLine(hand or EmulatedHand())
-        self.num_lost_bytes = 0
-        self.failure: Exception | None = None
+        self.num_lost_bytes = 0  # that nobody read in time
+        self.failure: Exception | None = None  # the error that ended its thread; the port is then gone
         self._folder = tempfile.TemporaryDirectory(prefix="xhand1-")
         self.device = str(Path(self._folder.name) / "ttyXHAND1")
         self._ends: tuple[int, int] | None = None
-        self._lock = threading.Lock()
-        self._wake_read, self._wake_write = os.pipe()
-        self._is_serving = True
+        self._lock, self._is_serving = threading.Lock(), True
         self._plug()
         self._thread = threading.Thread(target=self._run, name="xhand1-emulator", daemon=True)
         self._thread.start()
 
     @property
     def hand(self) -> EmulatedHand:
-        """The hand."""
         return self.line.hand
 
     @property
@@ -261,27 +224,16 @@ class Emulator:
         return self.line.requests
 
     def check(self) -> None:
-        """Look whether the emulator still answers.
-
-        Raises:
-            HandError: If its thread has ended, and why.
-        """
+        """Raise the error that ended its thread, if one did."""
         if self.failure is not None:
             raise HandError(f"the emulator's thread ended: {self.failure!r}") from self.failure
 
     def close(self) -> None:
-        """Switch the hand off and remove the port.
-
-        Raises:
-            HandError: If the emulator's thread had ended before, and why.
-        """
+        """Switch the hand off and remove the port; raise the error that ended its thread before, if one did."""
         if self._is_serving:
             self._is_serving = False
-            os.write(self._wake_write, b"!")
             self._thread.join()
             self._unplug()
-            for end in (self._wake_read, self._wake_write):
-                os.close(end)
             self._folder.cleanup()
             self.check()
 
@@ -323,16 +275,14 @@ class Emulator:
                 self._unplug()
 
     def _turn(self) -> None:
-        """Wait until bytes come or are due, or something was changed; then take and give them."""
+        """Wait until bytes come or are due; then take and give them."""
         with self._lock:
             ends, next_due = self._ends, self.line.next_due()
         wait = _IDLE_S if next_due is None else max(next_due - time.monotonic(), 0.0)
         ready: list[int] = []
         with contextlib.suppress(OSError):  # the cable was pulled meanwhile
-            ready = select.select([self._wake_read, *(ends or ())[:1]], [], [], min(wait, _IDLE_S))[0]
+            ready = select.select([*(ends or ())[:1]], [], [], min(wait, _IDLE_S))[0]
         with self._lock:
-            if self._wake_read in ready:
-                os.read(self._wake_read, 1)
             if self._ends is None:
                 return
             if self._ends[0] in ready:

@@ -14,7 +14,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -27,11 +27,11 @@ from tgdsl.observations import observations
 from tgdsl.observations.observations import HAND_ONLY
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedObservation
-from tgdsl.runtime.source import Control
+from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
-from tgdsl.runtime.xhand1.emulator.emulator import EmulatedHand, Emulator, TipForces, is_driven
+from tgdsl.runtime.xhand1.emulator.emulator import Body, EmulatedHand, Emulator, TipForces, is_driven
 from tgdsl.runtime.xhand1.motion import JointControls, MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.observe import HandTerm
 from tgdsl.runtime.xhand1.source import XHand1Source
@@ -45,8 +45,7 @@ _POLL_S = 0.001
 _LATE_S = 0.2  # physics that is later than this is not made up for [s]
 
 
-@dataclass(frozen=True)
-class _Place:
+class _Place(NamedTuple):
     """Where a finger's force stands among the features of an observation."""
 
     term: HandTerm
@@ -68,11 +67,7 @@ class SimulatedTips:
     """Forces on the fingertips: the aggregate forces that a module observes in its own scene."""
 
     def __init__(self, touch: TactileModule, terms: Sequence[HandTerm]):
-        """Find the observation of each fingertip's force.
-
-        Raises:
-            ObservationError: If the emulator cannot give some, as no observation has the force on their fingertips.
-        """
+        """Find the observation of each fingertip's force; an error names those that the emulator cannot give."""
         self._touch = touch
         self._places: dict[int, _Place] = {}
         for term in terms:
@@ -107,19 +102,13 @@ class SimulatedTips:
             raise ObservationError(f"{problem}; give them the same `scale` and sensor")
 
 
-class SimulatedBody:
-    """A hand in a simulation of one environment. It moves when `step` is called; `run` calls it in real time.
-
-    Attributes:
-        time: Time of the simulation, since its start or reset [s].
-        clipped: Fingertips that felt more than their bytes can hold.
-        failure: The error that ended `run`, or None.
-    """
+class SimulatedBody(Body):
+    """A hand in a simulation of one environment. It moves when `step` is called; `run` calls it in real time."""
 
     def __init__(self, scene: SteppedScene, tips: SimulatedTips, calibration: Calibration):
-        self.time = 0.0
-        self.clipped: set[str] = set()
-        self.failure: Exception | None = None
+        self.time = 0.0  # of the simulation, since its start or reset [s]
+        self.clipped: set[str] = set()  # fingertips that felt more than their bytes can hold
+        self.failure: Exception | None = None  # the error that ended `run`
         self._scene, self._tips, self._calibration = scene, tips, calibration
         self._controls = JointControls.of_model(scene.sim.model)
         self._names = [scene.sim.model.joint(int(i)).name for i in joint_ids(scene.sim.model)]
@@ -142,7 +131,7 @@ class SimulatedBody:
 
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
         with self._lock:
-            return self._position.copy(), replace(TipForces.zero(), total=self._counts)
+            return self._position.copy(), TipForces.zero()._replace(total=self._counts)
 
     def goes_to(self, target: Float[np.ndarray, " joint"]) -> bool:
         """Return whether the last command sends all joints just there, as far as the wire's floats can say it."""
@@ -198,12 +187,7 @@ class SimulatedBody:
 
 
 class EmulatedSource(XHand1Source):
-    """A hand whose body is simulated, behind a pseudo-terminal and read as a real hand is.
-
-    Attributes:
-        emulator: The device.
-        body: The simulation.
-    """
+    """A hand whose body is simulated, behind a pseudo-terminal and read as a real hand is."""
 
     def __init__(
         self,
@@ -232,12 +216,7 @@ class EmulatedSource(XHand1Source):
         return None if self._is_lockstep else super().age_s
 
     def step(self, control: Control = None) -> None:
-        """Step as a hand does.
-
-        Raises:
-            SimulationError: If the simulation ended, as it diverged.
-            HandError: As with a real hand, or if the emulator ended.
-        """
+        """Step as a hand does; raise the error that ended the simulation or the emulator, if one did."""
         try:
             super().step(control)
         finally:

@@ -12,7 +12,7 @@ Arrays of the file, readable with `numpy.load`:
 An hour at the highest rate that the wire allows, 119 readings a second, is 430,000 records of 4 kB: too much to keep. They are
 appended to a spool beside the file, and put into the file when all is over; a few MB are in memory at a time.
 
-Shapes: `reading` the readings, `fault` the failures; others as in `payloads`.
+Shapes: `reading` the readings, `fault` the failures; others as in `protocol`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -45,15 +45,13 @@ from tgdsl.runtime.xhand1.wire.ports import HandIdentity
 from tgdsl.runtime.xhand1.wire.protocol import STATE_SIZE, HandState, decode_state
 
 FORMAT = 1
-TIMES = ("sequence", "requested_at", "received_at")
-_ZERO = decode_state(bytes(STATE_SIZE))
+TIMES = {"sequence": "<i8", "requested_at": "<f8", "received_at": "<f8"}
 STATE = tuple(field.name for field in fields(HandState))
-RECORD = np.dtype(
-    [*zip(TIMES, ("<i8", "<f8", "<f8"), strict=True)]
-    + [(name, getattr(_ZERO, name).dtype, getattr(_ZERO, name).shape) for name in STATE]
-)
+_ZERO = decode_state(bytes(STATE_SIZE))
+RECORD = np.dtype([*TIMES.items(), *((name, getattr(_ZERO, name).dtype, getattr(_ZERO, name).shape) for name in STATE)])
 """One reading: the arrays of a log, row by row."""
 CHUNK = 256  # readings that are in memory at a time: 1 MB of them
+_COMPRESSION = 1
 _DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zlib.error, zipfile.BadZipFile, struct.error)
 """Errors that a damaged archive raises."""
 
@@ -62,8 +60,7 @@ class LogError(TgdslError):
     """A log that cannot be read or written: damaged, cut, of another format, or holding nothing."""
 
 
-@dataclass(frozen=True)
-class Fault:
+class Fault(NamedTuple):
     """A failure: when no reading came, and why."""
 
     time: float  # when it was noticed, on the clock of the readings [s]
@@ -87,19 +84,18 @@ class Fault:
 class HandLog:
     """A log that was checked from end to end. Times and failures are in memory; readings are read from the file on demand."""
 
-    path: Path  # the file
-    identity: HandIdentity | None  # the hand; None if it was not asked
+    path: Path
+    identity: HandIdentity | None  # None if it was not asked
     calibration: Calibration | None  # what its counts meant when it was recorded; None if nothing was known
     started_at: float  # time of day at the start [s since 1970], for people
     sequence: Int[np.ndarray, " reading"]  # number of the exchange of each reading
     requested_at: Float[np.ndarray, " reading"]  # when each was asked for [s]
     received_at: Float[np.ndarray, " reading"]  # when each was here [s]
-    faults: tuple[Fault, ...] = field(repr=False)  # the failures, in order
+    faults: tuple[Fault, ...] = field(repr=False)  # in order
     fault_reading: Int[np.ndarray, " fault"]  # how many readings had come before each
 
     @property
     def num_readings(self) -> int:
-        """Number of readings."""
         return len(self.sequence)
 
     @property
@@ -122,11 +118,15 @@ class HandLog:
                 np.lib.format.read_array_header_1_0(member)
             for first in range(0, self.num_readings, CHUNK):
                 last = min(first + CHUNK, self.num_readings)
-                chunk = {name: _rows(member, name, last - first) for name, member in members.items()}
+                chunk = {
+                    name: np.frombuffer(member.read((last - first) * RECORD[name].itemsize), RECORD[name].base).reshape(
+                        last - first, *RECORD[name].shape
+                    )
+                    for name, member in members.items()
+                }
                 for i in range(first, last):
                     state = HandState(**{name: rows[i - first] for name, rows in chunk.items()})
-                    times = float(self.requested_at[i]), float(self.received_at[i])
-                    yield Reading(int(self.sequence[i]), *times, state)
+                    yield Reading(int(self.sequence[i]), float(self.requested_at[i]), float(self.received_at[i]), state)
 
 
 def is_hand_log(path: Path) -> bool:
@@ -153,40 +153,27 @@ def open_log(path: str | Path) -> HandLog:
             about = json.loads(str(_array(archive, "about")))
             if about["format"] != FORMAT:
                 raise LogError(f"{path}: a log of format {about['format']}, this version of tgdsl reads format {FORMAT}")
-            return _log(path, archive, about)
+            for name in STATE:
+                archive.getinfo(f"{name}.npy")
+            parts = [_array(archive, f"fault_{name}") for name in ("time", "kind", "message")]
+            return HandLog(
+                path,
+                None if about["hand"] is None else HandIdentity.from_json(about["hand"]),
+                None if about["calibration"] is None else parse_calibration(about["calibration"], "calibration"),
+                float(about["started_at"]),
+                *(_array(archive, name) for name in TIMES),
+                faults=tuple(Fault(float(t), str(kind), str(text)) for t, kind, text in zip(*parts, strict=True)),
+                fault_reading=_array(archive, "fault_reading"),
+            )
     except _DAMAGE as error:
         if isinstance(error, FileNotFoundError | IsADirectoryError | PermissionError):
             raise LogError(f"{path}: cannot read this log: {error.strerror}") from error
         raise LogError(f"{path}: this log is damaged, cut, or no .npz file: {error}") from error
 
 
-def _log(path: Path, archive: zipfile.ZipFile, about: dict[str, Any]) -> HandLog:
-    for name in STATE:
-        archive.getinfo(f"{name}.npy")
-    times, kinds, messages, places = (_array(archive, f"fault_{name}") for name in ("time", "kind", "message", "reading"))
-    faults = zip(times, kinds, messages, strict=True)
-    return HandLog(
-        path,
-        None if about["hand"] is None else HandIdentity.from_json(about["hand"]),
-        None if about["calibration"] is None else parse_calibration(about["calibration"], "calibration"),
-        float(about["started_at"]),
-        *(_array(archive, name) for name in TIMES),
-        faults=tuple(Fault(float(time), str(kind), str(message)) for time, kind, message in faults),
-        fault_reading=places,
-    )
-
-
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     with archive.open(f"{name}.npy") as member:
         return np.lib.format.read_array(member, allow_pickle=False)
-
-
-def _rows(member: IO[bytes], name: str, num_rows: int) -> np.ndarray:
-    data = member.read(num_rows * RECORD[name].itemsize)
-    return np.frombuffer(data, RECORD[name].base).reshape(num_rows, *RECORD[name].shape)
-
-
-_COMPRESSION = 1
 
 
 def events(hand: XHand1, seconds: float) -> Iterator[Reading | Fault]:
@@ -209,19 +196,10 @@ class LogWriter:
     """Writes a log. Use it as a context manager, or call `close`; the file appears whole, at the end, or not at all.
 
     What was added is written also if the block that adds it fails.
-
-    Attributes:
-        num_readings: How many readings were added.
-        num_faults: How many failures were added.
     """
 
     def __init__(self, path: str | Path, *, identity: HandIdentity | None = None, calibration: Calibration | None = None):
-        """Make the spool.
-
-        Args:
-            path: The file; one that is there is replaced.
-            identity: The hand.
-            calibration: What its counts mean.
+        """Make the spool; a file that is there is replaced at the end.
 
         Raises:
             OSError: If the folder cannot be written to.
@@ -233,8 +211,7 @@ class LogWriter:
             "calibration": None if calibration is None else calibration.text(),
             "started_at": time.time(),
         }
-        self._faults: list[Fault] = []
-        self._fault_readings: list[int] = []
+        self._faults: list[tuple[Fault, int]] = []  # and how many readings had come before
         self.num_readings = 0
         self._spool: IO[bytes] | None = tempfile.TemporaryFile(dir=self._path.parent)  # noqa: SIM115  closed by `close`
 
@@ -244,20 +221,17 @@ class LogWriter:
         return len(self._faults)
 
     def add(self, event: Reading | Fault) -> None:
-        """Add a reading or a failure.
-
-        Raises:
-            LogError: If the log is closed.
-            FileError: If it cannot be written.
-        """
+        """Add a reading or a failure."""
         if self._spool is None:
             raise LogError(f"{self._path}: this log is closed")
         if isinstance(event, Fault):
-            self._fault_readings.append(self.num_readings)
-            self._faults.append(event)
+            self._faults.append((event, self.num_readings))
             return
+        record = np.zeros((), RECORD)
+        for name in RECORD.names or ():
+            record[name] = getattr(event if name in TIMES else event.state, name)
         with as_file_error(self._path):
-            self._spool.write(_record(event).tobytes())
+            self._spool.write(record.tobytes())
         self.num_readings += 1
 
     def close(self) -> None:
@@ -265,7 +239,6 @@ class LogWriter:
 
         Raises:
             LogError: If there is not one reading to write.
-            FileError: If it cannot be written.
         """
         spool, self._spool = self._spool, None
         if spool is None:
@@ -288,12 +261,13 @@ class LogWriter:
             self.close()
 
     def _write(self, file: IO[bytes], spool: IO[bytes]) -> None:
-        texts = {"fault_kind": [f.kind for f in self._faults], "fault_message": [f.message for f in self._faults]}
+        faults = [fault for fault, _ in self._faults]
         arrays = {
             "about": np.array(json.dumps(self._about, sort_keys=True)),
-            "fault_reading": np.array(self._fault_readings[: len(self._faults)], dtype="<i8"),
-            "fault_time": np.array([fault.time for fault in self._faults], dtype=np.float64),
-            **{name: np.array(values, dtype=np.str_) for name, values in texts.items()},
+            "fault_reading": np.array([num for _, num in self._faults], dtype="<i8"),
+            "fault_time": np.array([fault.time for fault in faults], dtype=np.float64),
+            "fault_kind": np.array([fault.kind for fault in faults], dtype=np.str_),
+            "fault_message": np.array([fault.message for fault in faults], dtype=np.str_),
         }
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION) as archive:
             for name, values in arrays.items():
@@ -311,12 +285,3 @@ class LogWriter:
         for first in range(0, self.num_readings, CHUNK):
             data = spool.read(min(CHUNK, self.num_readings - first) * RECORD.itemsize)
             member.write(np.ascontiguousarray(np.frombuffer(data, RECORD)[name]).tobytes())
-
-
-def _record(reading: Reading) -> np.ndarray:
-    record = np.zeros((), RECORD)
-    record["sequence"], record["requested_at"] = reading.sequence, reading.requested_at
-    record["received_at"] = reading.received_at
-    for name in STATE:
-        record[name] = getattr(reading.state, name)
-    return record

@@ -15,7 +15,7 @@ from typing import NoReturn
 import numpy as np
 
 from tgdsl.errors import TgdslError
-from tgdsl.runtime.source import Control
+from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S, Reading
 from tgdsl.runtime.xhand1.log.log import Fault, open_log
@@ -33,9 +33,6 @@ class ReplaySource(HandSource):
     With a control step, a step delivers what the live source would have had: the newest reading that had arrived when the step
     was over, or the first one within 80 ms after; else the failure of that time is raised again. Without one, each step
     delivers the next reading or failure of the log, so that a log made of a source's own readings gives the very samples again.
-
-    Attributes:
-        log: The log.
     """
 
     NAME = "the log of an XHand1"
@@ -61,10 +58,6 @@ class ReplaySource(HandSource):
             velocity_time_constant: Time constant of the filter of joint speeds [s].
             clock: Seconds that only go forward.
             sleep: Waits for some seconds.
-
-        Raises:
-            LogError: If the log cannot be read.
-            TgdslError: If the control step or the speed is not positive.
         """
         if not speed > 0 or not (control_step is None or 0 < control_step < math.inf):
             raise TgdslError(f"a speed of {speed:g} and a control step of {control_step} s, expected more than 0 of each")
@@ -73,8 +66,8 @@ class ReplaySource(HandSource):
         self._speed, self._control_step = speed, control_step
         self._clock, self._sleep = clock, sleep
         self._fault_times = np.array([fault.time for fault in self.log.faults])
-        self._end = self._start = float(self.log.received_at[0])
-        self._end += self.log.seconds
+        self._start = float(self.log.received_at[0])
+        self._end = self._start + self.log.seconds
         self.rewind()
 
     @property
@@ -102,10 +95,7 @@ class ReplaySource(HandSource):
         return self._now >= self._end
 
     def step(self, control: Control = None) -> None:
-        """Advance by one control step, and wait until it is over unless the replay is as fast as possible.
-
-        Args:
-            control: Ignored: what was done was done.
+        """Advance by one control step, and wait until it is over, unless as fast as possible; `control` is ignored.
 
         Raises:
             ReplayOverError: If the log is at its end.
@@ -174,8 +164,7 @@ class ReplaySource(HandSource):
             self.num_late_steps += 1
             self._due = now
         due = self._due
-        received_at = self.log.received_at
-        newest = int(np.searchsorted(received_at, due, side="right")) - 1
+        newest = int(np.searchsorted(self.log.received_at, due, side="right")) - 1
         if newest >= self._next_reading and due - self.log.requested_at[newest] <= MAX_AGE_S:
             self._wait_until(due)
             self._take(newest)
@@ -194,7 +183,7 @@ class ReplaySource(HandSource):
         """Return why there was no reading after the newest one up to a time: the last failure, or that none came."""
         last = int(np.searchsorted(self._fault_times, now, side="right")) - 1
         if last >= 0 and self._fault_times[last] > self.log.received_at[newest]:
-            return Fault(now, self.log.faults[last].kind, self.log.faults[last].message)
+            return self.log.faults[last]._replace(time=now)
         age = 1e3 * (now - float(self.log.requested_at[newest]))
         return Fault.of(HandTimeoutError(f"no new reading came in time; the newest is {age:.0f} ms old"), now)
 

@@ -68,11 +68,7 @@ class PortInfo(NamedTuple):
 
 
 def list_ports() -> tuple[PortInfo, ...]:
-    """Return the serial ports of this computer, whatever is behind them.
-
-    Raises:
-        HandError: If pyserial is not installed.
-    """
+    """Return the serial ports of this computer, whatever is behind them."""
     ports = _pyserial().tools.list_ports.comports()
     return tuple(sorted(PortInfo(port.device, port.description or "", port.serial_number or "") for port in ports))
 
@@ -81,12 +77,7 @@ class SerialPort:
     """A serial port of this process alone: 8 data bits, no parity, 1 stop bit, no flow control."""
 
     def __init__(self, device: str, baud: int = BAUD):
-        """Open it by its name, such as `/dev/ttyUSB0`; one of `/dev/serial/by-id` stays the same when others are plugged in.
-
-        Raises:
-            HandDisconnectedError: If it cannot be opened.
-            HandError: If pyserial is not installed.
-        """
+        """Open it by its name, such as `/dev/ttyUSB0`; one of `/dev/serial/by-id` stays the same when others are plugged in."""
         self._device = device
         self._errors = (_pyserial().SerialException, OSError)
         try:
@@ -244,13 +235,9 @@ class SerialClient:
         self._tells_version: bool | None = None if addresses else False
 
     def exchange(self, command: Command, payload: bytes = b"", reply_size: int | None = None, hand_id: int = 0) -> Reply:
-        """Send a request and return its reply.
+        """Send a request and return its reply, whose payload has `reply_size` bytes if that is known.
 
-        Args:
-            command: The command.
-            payload: The request's bytes.
-            reply_size: Length of the reply's payload, if it is known.
-            hand_id: Whom to ask where the client has no addresses.
+        Without addresses the hand `hand_id` is asked.
 
         Raises:
             HandTimeoutError: If no reply came in time, a damaged one or another hand's, or the line does not fall silent.
@@ -263,11 +250,7 @@ class SerialClient:
         return self._ask(command, payload, reply_size, hand_id)
 
     def post(self, command: Command, payload: bytes) -> None:
-        """Send a request at once and wait for nothing; its reply is discarded by the next exchange.
-
-        Raises:
-            HandDisconnectedError: If the port went away.
-        """
+        """Send a request at once and wait for nothing; its reply is discarded by the next exchange."""
         self._silent_since = self._clock()
         self._write(self._request(command, payload, 0))
 

@@ -34,12 +34,7 @@ def find_hands(
     timing: SerialTiming | None = None,
     open_port: _OpenPort = SerialPort,
 ) -> tuple[FoundHand, ...]:
-    """Ask each id on a port for its version and return those that answer.
-
-    Raises:
-        HandDisconnectedError: If the port cannot be opened, or went away.
-        HandRefusedError: If a hand answers with its error command.
-    """
+    """Ask each id on a port for its version and return those that answer."""
     timing = timing or SerialTiming()
     client = SerialClient(open_port(device, timing.baud), None, timing)
     results = []
@@ -68,16 +63,7 @@ class AskedPort(NamedTuple):
 
 
 def ask_ports(device: str | None = None, hand_id: int | None = None) -> tuple[AskedPort, ...]:
-    """Ask all serial ports, or one, for hands: a version request per id, which holds no set-point.
-
-    Args:
-        device: The only port to ask; default: all.
-        hand_id: The only id to ask for; default: 0 to 7.
-
-    Raises:
-        HandDisconnectedError: If the port that was named cannot be opened.
-        HandError: If pyserial is not installed.
-    """
+    """Ask all serial ports, or one, for all hands, or one: a version request per id, which holds no set-point."""
     ids, timing = (range(8), _PATIENT) if hand_id is None else ((hand_id,), _MORE_PATIENT)
     ports = {port.device: port for port in list_ports()}
     if device is not None:
@@ -141,11 +127,7 @@ class HandIdentity:
 
 
 def identify(hand: FoundHand, *, timing: SerialTiming | None = None, open_port: _OpenPort = SerialPort) -> HandIdentity:
-    """Ask a hand that was found for its registers.
-
-    Raises:
-        HandDisconnectedError: If the port cannot be opened, or went away.
-    """
+    """Ask a hand that was found for its registers."""
     timing = timing or SerialTiming()
     client = SerialClient(open_port(hand.device, timing.baud), hand.addresses, timing)
 

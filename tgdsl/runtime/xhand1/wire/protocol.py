@@ -36,24 +36,13 @@ FIRMWARE_COMMANDS = frozenset({0xA1, 0xA2, 0xA3, 0xA4, 0xB0})  # they write firm
 
 
 class Command(IntEnum):
-    """Commands by name."""
+    """Commands that are sent or answered, by name."""
 
     ERROR = 0x00
     EXCHANGE = 0x02
-    READ_PARAMETERS = 0x03
-    WRITE_PARAMETERS = 0x04
-    SAVE = 0x05
-    READ_LOOP_PARAMETERS = 0x06
-    WRITE_LOOP_PARAMETERS = 0x07
-    SET_MODE = 0x08
-    READ_MODE = 0x09
-    QUERY_PRESSURE = 0x11
-    CLEAR_PRESSURE = 0x12
     VERSION = 0x13
     RESET = 0x14
     READ_REGISTER = 0x15
-    WRITE_REGISTER = 0x16
-    CALIBRATE = 0x17
 
 
 class Register(IntEnum):
@@ -91,7 +80,7 @@ def encode_frame(frame: Frame) -> bytes:
     """Return a frame's bytes.
 
     Raises:
-        ProtocolError: If a number does not fit a byte, the payload is too long, or the command writes firmware.
+        ProtocolError: If a number does not fit its field, or the command writes firmware.
     """
     for name, value in (("source", frame.source), ("destination", frame.destination), ("command", frame.command)):
         if not 0 <= value <= 0xFF:
@@ -114,14 +103,11 @@ class FrameParser:
     The frames depend on the bytes alone, not on how they were cut. A header that leads to no frame costs one byte: the
     search goes on right behind it, so that it finds a frame inside what looked like another. At most one frame of the
     largest size and one slice of 4 KiB are kept.
-
-    Attributes:
-        num_discarded: Bytes so far that belonged to no frame.
-        num_trailing: Those of them that came after the last frame.
     """
 
     def __init__(self) -> None:
-        self.num_discarded = self.num_trailing = 0
+        self.num_discarded = 0  # bytes so far that belonged to no frame
+        self.num_trailing = 0  # those of them that came after the last frame
         self._buffer = bytearray()
 
     @property
@@ -213,11 +199,7 @@ PASSIVE = (JointCommand(),) * NUM_JOINTS  # mode 0, no gain, no current: the req
 
 
 def encode_command(joints: Sequence[JointCommand]) -> bytes:
-    """Return the exchange's request, 288 bytes, of one command per joint in the order of their ids.
-
-    Raises:
-        ProtocolError: If there are not 12, or a value is not finite or does not fit its field.
-    """
+    """Return the exchange's request, 288 bytes, of one command per joint in the order of their ids."""
     if len(joints) != NUM_JOINTS:
         raise ProtocolError(f"{len(joints)} joint commands, expected {NUM_JOINTS}")
     parts = []
