@@ -46,7 +46,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan
-from tgdsl.tensors.graphed import Graphed
+from tgdsl.module.calls import Graphed
 
 ROTATED = 160e6
 """Bytes that the sets of buffers have together: the L2 of an H200 holds 60 MB."""

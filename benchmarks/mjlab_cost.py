@@ -22,7 +22,7 @@ from collections.abc import Callable
 
 import torch
 
-from tgdsl.tensors.graphed import captured
+from tgdsl.module.calls import captured
 
 
 def environment(num_envs: int, device: str, has_touch: bool):

@@ -14,7 +14,7 @@ import torch
 
 import tgdsl
 from tgdsl.errors import FileError, SimulationError, StateError, TgdslError
-from tgdsl.module.memory.clock import Clock
+from tgdsl.module.memory import Clock
 from tgdsl.tensors.env_ids import env_mask
 
 REPOSITORY = Path(__file__).parents[1]

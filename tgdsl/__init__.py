@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from tgdsl.module.artifact import save as save
     from tgdsl.module.module import TactileModule
     from tgdsl.module.state import SceneState
-    from tgdsl.module.taxels.identity import check_taxels as check_taxels
+    from tgdsl.module.taxels import check_taxels as check_taxels
     from tgdsl.rl.env import TouchEnv
     from tgdsl.runtime.batch.simulation import BatchSimulation
     from tgdsl.runtime.by_name import Geoms as Geoms
@@ -67,7 +67,7 @@ _PLACES = {
     "bodies_by_name": "runtime.by_name",
     "calibrate": "calibration.fit",
     "compare": "calibration.compare",
-    "check_taxels": "module.taxels.identity",
+    "check_taxels": "module.taxels",
     "compile": "tuning.compile",
     "connect": "runtime.connect",
     "contacts_by_pair": "runtime.by_name",

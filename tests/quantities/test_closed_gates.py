@@ -5,7 +5,7 @@ import pytest
 import torch
 from pressed_pads import PAD, compiled
 
-from tgdsl.module.example import example_state
+from tgdsl.module.state import example_state
 from tgdsl.quantities import contact_depth
 
 ITEMS = '<body name="item"><freejoint/><geom size=".02"/></body><body name="cube"><freejoint/><geom type="box" size=".02 .02 .02"/></body>'

@@ -4,7 +4,7 @@ import pytest
 import torch
 from pressed_pads import compiled
 
-from tgdsl.module.example import example_state
+from tgdsl.module.state import example_state
 from tgdsl.quantities.contacts import contacts_of, pair_contacts
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from pressed_pads import PAD, compiled
 
-from tgdsl.module.example import example_state
+from tgdsl.module.state import example_state
 from tgdsl.quantities import geoms as geoms_room
 
 ITEM = '<body name="item"><freejoint/><geom size=".02"/></body>'

@@ -9,7 +9,7 @@ import torch
 from pressed_pads import compiled
 from searches import paired
 
-from tgdsl.module.example import example_state
+from tgdsl.module.state import example_state
 from tgdsl.quantities import depth_search
 from tgdsl.quantities.depth_search import DEEPEST, Probes, Target, deepest, is_searchable, measure, penetration, search
 from tgdsl.quantities.geoms import Geoms

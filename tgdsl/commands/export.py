@@ -28,7 +28,7 @@ class Export:
     def run(self) -> None:
         """Write the file, and print what goes in and comes out."""
         from tgdsl.files.write import check_writable, with_folder
-        from tgdsl.module.export.formats import ENDINGS, format_of
+        from tgdsl.module.export.program import ENDINGS, format_of
 
         out = check_writable(self.out or in_working_folder(self.document, ENDINGS[self.to]))
         format_of(out, self.to)

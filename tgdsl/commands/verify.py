@@ -27,7 +27,7 @@ class Verify:
     def run(self) -> None:
         """Compare, and print the largest differences."""
         from tgdsl.errors import ArtifactError
-        from tgdsl.module.export.signature import read_signature
+        from tgdsl.module.export.program import read_signature
         from tgdsl.module.export.verify import TOLERANCE, verify
 
         signature = read_signature(self.file)

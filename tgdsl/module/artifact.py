@@ -10,8 +10,7 @@ import torch
 
 from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
-from tgdsl.module.plan_file import load_plan, save_plan
-from tgdsl.module.taxels.identity import Taxels, check_taxels
+from tgdsl.module.taxels import Taxels, check_taxels, load_plan, save_plan
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds, quantities_of
 from tgdsl.tensors.devices import device_of, dtype_of

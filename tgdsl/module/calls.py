@@ -8,29 +8,80 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from tgdsl.module.state import CHOICES
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.base import Quantity
 from tgdsl.tensors import torch_internals
-from tgdsl.tensors.graphed import Graphed
 
+Tensors = dict[str, Tensor]
 Step = Callable[..., Any]  # a bound method of a module that takes tensors and memory by name, and returns tensors by name
+Replay = Callable[[], Any]
+WARM_CALLS = 2  # calls before the one that is captured: they compile and load kernels
+
+
+def captured(call: Callable[[], Tensors]) -> tuple[Replay, Tensors]:
+    """Capture a call as a CUDA graph; return what replays it, and the tensors that each replay writes."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(WARM_CALLS):
+            call()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+        outputs = call()
+    return graph.replay, outputs
+
+
+class Graphed:
+    """A function of inputs and of memory that it changes in place, captured as a graph at the first call and replayed after it.
+
+    The host's work for a call is a copy of the inputs and one launch. It is captured again when shapes or dtypes of the inputs
+    change, or memory lies elsewhere. What it returns is in the same tensors at each call.
+    """
+
+    def __init__(self, function: Step, capture: Callable[[Callable[[], Tensors]], tuple[Replay, Tensors]] = captured):
+        self._function, self._capture = function, capture
+        self._key: object = None
+
+    def __call__(self, tensors: Tensors, memory: Tensors) -> Tensors:
+        """Return what the function does of these tensors."""
+        shapes = [(name, value.shape, value.dtype) for name, value in tensors.items()]
+        key = shapes, [(name, value.data_ptr(), value.shape) for name, value in memory.items()]
+        if key != self._key:
+            self._start(tensors, memory)
+            self._key = key
+        for own, names in self._groups:
+            torch_internals.copy_each(own, [tensors[name] for name in names])
+        self._replay()
+        return dict(self._made)
+
+    def forget(self) -> None:
+        """Capture again at the next call: constants lie elsewhere."""
+        self._key = None
+
+    def _start(self, tensors: Tensors, memory: Tensors) -> None:
+        """Capture a call on inputs of its own; memory is then as it was before."""
+        with torch.inference_mode(False), torch.no_grad():
+            inputs = {name: value.clone() for name, value in tensors.items()}
+            old_memory = {name: value.clone() for name, value in memory.items()}
+            self._replay, self._made = self._capture(lambda: self._function(inputs, memory))
+            for name, value in old_memory.items():
+                memory[name].copy_(value)
+        dtypes = {value.dtype for value in inputs.values()}
+        names = [[name for name, value in inputs.items() if value.dtype == dtype] for dtype in dtypes]
+        self._groups = [([inputs[name] for name in group], group) for group in names]
 
 
 class Calls:
-    """How a module's steps are to be called. A copy of a module compiles its own.
-
-    Attributes:
-        compiled: Compiled steps, by their names; none of a module that is eager. Another dictionary after each `compile`.
-        graphed: The same as CUDA graphs, if those are wanted.
-    """
+    """How a module's steps are to be called. A copy of a module compiles its own."""
 
     def __init__(self) -> None:
-        """Have all steps eager."""
         self._wanted: tuple[bool, dict[str, Any]] | None = None
-        self.compiled: dict[str, Step] = {}
-        self.graphed: dict[str, Graphed] = {}
+        self.compiled: dict[str, Step] = {}  # compiled steps, by their names; another dictionary after each `compile`
+        self.graphed: dict[str, Graphed] = {}  # the same as CUDA graphs, if those are wanted
 
     def compile(self, graph: bool, **options: Any) -> None:
         """Have steps compiled when they are first called, and calls without derivatives replayed as CUDA graphs if wanted."""
@@ -61,11 +112,11 @@ class Calls:
 def inductor_options(plan: Plan, quantities: Sequence[Quantity], device: torch.device) -> dict[str, Any]:
     """Return what is asked of Inductor for a plan and the quantities that it asks for.
 
-    Kernels look at each index whether it is in range only where some index is given by the user: a variant's or a material's
-    number. Where taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and
-    taxels: what there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more
-    to find a tile takes too many registers. Where nothing but patches is asked for, kernels on a CPU are as large as can be: on
-    a GPU one kernel takes twice the time of three.
+    Kernels check that indices are in range only where some index is given by the user: a variant's or a material's number.
+    Where taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels:
+    what there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to find
+    a tile takes too many registers. Where nothing but patches is asked for, kernels on a CPU are as large as can be: on a GPU
+    one kernel takes twice the time of three.
     """
     is_slight = (
         all(quantity.is_light(plan.quantities[quantity.name]) for quantity in quantities)

@@ -12,9 +12,9 @@ from jaxtyping import Shaped
 
 from tgdsl.geometry.bvh import query_operations
 from tgdsl.layout.unfelt import unfelt_ids
-from tgdsl.module.example import example_state
-from tgdsl.module.memory.memory import Memory
+from tgdsl.module.memory import Memory
 from tgdsl.module.outputs import outputs_of
+from tgdsl.module.state import example_state
 from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
@@ -24,30 +24,13 @@ from tgdsl.sensors.noise.spec import quantity
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.torch_internals import TorchDispatchMode
 
-_FREE = frozenset(
-    [
-        "view",
-        "select",
-        "slice",
-        "t",
-        "transpose",
-        "permute",
-        "unsafe_view",
-        "as_strided",
-        "split",
-        "split_with_sizes",
-        "unsqueeze",
-        "squeeze",
-        "detach",
-        "alias",
-        "expand",
-        "clone",
-        "unbind",
-        "to_copy",
-    ]
-)
-"""Operations that compute nothing."""
+# operations that compute nothing
+_FREE = frozenset([
+    "view", "select", "slice", "t", "transpose", "permute", "unsafe_view", "as_strided", "split", "split_with_sizes",
+    "unsqueeze", "squeeze", "detach", "alias", "expand", "clone", "unbind", "to_copy",
+])  # fmt: skip
 _FFT = 2.5  # operations of a real fast Fourier transform of n numbers: this by n log2 n
+_CLOCK_BYTES = 24  # three int64 of the clock for each environment, in addition to the ages of calls
 
 
 class OperationCounter(TorchDispatchMode):
@@ -74,9 +57,7 @@ class OperationCounter(TorchDispatchMode):
 
     def _operations(self, func: Any, args: Any, kwargs: Any, result: Any) -> int:
         name = func.__name__.split(".")[0].lstrip("_")
-        written = [
-            output for output in (result if isinstance(result, (tuple, list)) else [result]) if isinstance(output, torch.Tensor)
-        ]
+        written = [x for x in (result if isinstance(result, (tuple, list)) else [result]) if isinstance(x, torch.Tensor)]
         if name in _FREE or not written:
             return 0
         if func._overloadpacket in self._products:
@@ -89,10 +70,6 @@ class OperationCounter(TorchDispatchMode):
         return written[0].numel()
 
 
-Core = Callable[[dict[str, torch.Tensor], dict[str, torch.Tensor]], Any]
-"""Computes readings and the new state: `TactileModule.core`."""
-
-
 class Explained(NamedTuple):
     """A module, as far as an account of it goes."""
 
@@ -100,7 +77,7 @@ class Explained(NamedTuple):
     quantities: tuple[Quantity, ...]
     constants: Constants
     memory: Memory
-    core: Core
+    core: Callable[[dict[str, torch.Tensor], dict[str, torch.Tensor]], Any]  # `TactileModule.core`
 
 
 def operations_per_env(touch: Explained) -> int:
@@ -124,15 +101,13 @@ def explain(touch: Explained) -> str:
     plan = touch.plan
     lines = [f"{plan.origin.robot}{plan.origin.at_resolution}, {plan.layout.num_taxels} taxels"]
     lines += [f"taxels_id {plan.taxels_id}", ""] if plan.layout.num_taxels else [""]
-    lines += _links(touch) + [""]
-    lines += ["sensors"]
-    lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
+    lines += [*_links(plan), "", "sensors", *(f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor))]
     for asked in touch.quantities:
         for headline, account in asked.account(plan.quantities[asked.name], plan.objects).items():
             lines += ["", headline, *(f"  {line}" for line in account)]
-    lines += [""] + _observations(touch) + _inputs(touch)
-    lines += ["left out"] + [f"  {name}: {why}" for name, why in plan.dropped] if plan.dropped else []
-    lines += [""] if plan.dropped else []
+    lines += ["", *_observations(plan), *_inputs(plan)]
+    if plan.dropped:
+        lines += ["left out", *(f"  {name}: {why}" for name, why in plan.dropped), ""]
     if plan.unfelt:
         lines += [f"{len(unfelt_ids(plan.unfelt))} taxels cannot feel", *(f"  {taxels}" for taxels in plan.unfelt), ""]
     return "\n".join(lines + _costs(touch))
@@ -150,15 +125,14 @@ def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:
     return lines
 
 
-def _links(touch: Explained) -> list[str]:
-    plan = touch.plan
+def _links(plan: Plan) -> list[str]:
     layout = plan.layout
     if not layout.links:
         return [f"bodies  {', '.join(dict.fromkeys(link.body for sensor in plan.sensors for link in sensor.links))}"]
     counts = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(layout.links)}
-    lines = ["taxels per link"] + [f"  {name:<34}{count:>6}" for name, count in counts.items()]
-    lines += ["taxels per group"]
-    return lines + [f"  {group:<34}{sum(counts[name] for name in names):>6}" for group, names in plan.layout.groups.items()]
+    groups = {group: sum(counts[name] for name in names) for group, names in layout.groups.items()}
+    tables = {"taxels per link": counts, "taxels per group": groups}
+    return [line for title, rows in tables.items() for line in (title, *(f"  {name:<34}{n:>6}" for name, n in rows.items()))]
 
 
 def _sensor(touch: Explained, sensor: PlannedSensor) -> list[str]:
@@ -243,36 +217,27 @@ def _value(value: Shaped[np.ndarray, "*end row"]) -> str:
     return ends[0] if len(ends) == 1 else f"[{', '.join(ends)}]"
 
 
-def _observations(touch: Explained) -> list[str]:
+def _observations(plan: Plan) -> list[str]:
     groups: dict[str, list[str]] = {}
-    for term in touch.plan.observations:
+    for term in plan.observations:
         of = f" of {term.reading}" if term.reading not in (None, *PROPRIOCEPTION) else ""
-        problem = f"{term.type}{of} ({term.num_features})" if term.reading else term.type
-        groups.setdefault(term.group, []).append(problem)
-    if not groups:
-        return []
-    return ["observations"] + [f"  {group}: {', '.join(terms)}" for group, terms in groups.items()] + [""]
+        groups.setdefault(term.group, []).append(f"{term.type}{of} ({term.num_features})" if term.reading else term.type)
+    return ["observations", *(f"  {group}: {', '.join(terms)}" for group, terms in groups.items()), ""] if groups else []
 
 
-def _inputs(touch: Explained) -> list[str]:
-    inputs = touch.plan.inputs
-    lines = ["inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"]
-    if inputs.pairs:
-        lines.append(f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}")
-    for name, parts in [*inputs.contacts_of.items(), *inputs.link_parts.items()]:
-        lines.append(f"  contacts with {name} are those on {', '.join(f'{part.kind} {part.name}' for part in parts)}")
-    if inputs.slots:
-        lines.append(f"  slots   {inputs.slots} contacts of each pair")
-    if inputs.heated:
-        lines.append(f"  heated  {', '.join(inputs.heated)}")
-    if inputs.joints:
-        lines.append(f"  joints  {', '.join(inputs.joints)}")
-    if inputs.actuators:
-        lines.append(f"  actuators  {', '.join(inputs.actuators)}")
-    return [*lines, ""]
-
-
-_CLOCK_BYTES = 24  # what the clock holds of each environment in addition to the ages of calls: three int64, see `clock.Clock`
+def _inputs(plan: Plan) -> list[str]:
+    inputs = plan.inputs
+    contacts = {**inputs.contacts_of, **inputs.link_parts}
+    parts = [(name, ", ".join(f"{part.kind} {part.name}" for part in own)) for name, own in contacts.items()]
+    names = {"heated": inputs.heated, "joints": inputs.joints, "actuators": inputs.actuators}
+    return [
+        *("inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"),
+        *([f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}"] if inputs.pairs else []),
+        *(f"  contacts with {name} are those on {geoms}" for name, geoms in parts),
+        *([f"  slots   {inputs.slots} contacts of each pair"] if inputs.slots else []),
+        *(f"  {what}  {', '.join(own)}" for what, own in names.items() if own),
+        "",
+    ]
 
 
 def _costs(touch: Explained) -> list[str]:

@@ -1,4 +1,4 @@
-"""What comes in with a call: the fields of a state that are wanted, looked at before anything is computed.
+"""The fields of a state that a call reads: validated before anything is computed, with warnings of what is odd about them.
 
 Shapes: `env` environments.
 """
@@ -14,6 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from tgdsl.errors import StateError, listed
+from tgdsl.module.memory import EVERY
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
@@ -23,22 +24,19 @@ from tgdsl.tensors.env_ids import EnvIds, env_mask, is_out_of_sight
 from tgdsl.tensors.on_host import HostCopy
 
 TOLERANCE = 1e-3  # part of a pair's force that slots may lack unnoticed: far above what single precision makes of a sum
-
-
-EVERY = 16  # on a GPU one state in so many is looked at: a dozen small kernels take as long to launch as a module's own
+SAME_TIME = 1e-9  # relative difference up to which two times are one: rounding, where a call's time is divided by its substeps
 
 
 class SlotWatch:
-    """Looks at states for contacts beyond the slots. Each pair is warned of once."""
+    """Warns, once for each pair, of contacts beyond the slots."""
 
     def __init__(self, inputs: Inputs):
-        """Begin; no state has come yet."""
         self._inputs = inputs
         fields = {"contact_found", "contact_force", "contact_netforce"}
         self._num_pairs = len(inputs.pairs) if inputs.slots and fields <= set(inputs.fields) else 0
         self._warned: set[int] = set()
         self._num_calls = 0
-        self._wanted: Tensor | None = None
+        self._wanted: Tensor | None = None  # slots that each pair would need; 0: it has enough
         self._copy = HostCopy()
 
     @property
@@ -47,7 +45,7 @@ class SlotWatch:
         return len(self._warned) >= self._num_pairs
 
     def note(self, tensors: Mapping[str, Tensor]) -> None:
-        """Look at a state, on its device."""
+        """Check a state, on its device; on a GPU one in `EVERY`, as a dozen small kernels take as long as a module's own."""
         whole, force, count = (tensors[f"contact_{name}"] for name in ("netforce", "force", "found"))
         self._num_calls += 1
         if whole.is_cuda and self._num_calls % EVERY != 1 and not torch.cuda.is_current_stream_capturing():
@@ -58,40 +56,31 @@ class SlotWatch:
                 self._copy = HostCopy()
         with torch.no_grad():
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
-            size = whole.abs().amax(dim=-1) + force.abs().amax(dim=(2, 3))
+            largest = force.abs().amax(dim=(2, 3))
             slots = count.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
-            is_crowded = (count > self._inputs.slots) & (force.abs().amax(dim=(2, 3)) > 0)
-            slots = torch.where((lacking > TOLERANCE * size) | is_crowded, slots, 0.0)
+            is_crowded = (count > self._inputs.slots) & (largest > 0)
+            slots = torch.where((lacking > TOLERANCE * (whole.abs().amax(dim=-1) + largest)) | is_crowded, slots, 0.0)
             self._wanted.copy_(torch.cat([self._wanted[None], slots]).amax(dim=0))
 
     def warn(self) -> None:
         """Warn of what has been noted. A GPU is not waited for: what it notes may be seen a call or more later."""
         num_contacts = None if self._wanted is None else self._copy.poll(self._wanted)
-        if num_contacts is None:
-            return
-        new = [i for i, number in enumerate(num_contacts.tolist()) if number and i not in self._warned]
+        numbers = [] if num_contacts is None else num_contacts.tolist()
+        new = [i for i, number in enumerate(numbers) if number and i not in self._warned]
         if not new:
             return
         self._warned.update(new)
-        slots, most = self._inputs.slots, max(float(num_contacts[i]) for i in new)
+        slots, most = self._inputs.slots, max(numbers[i] for i in new)
         which = listed([f"{self._inputs.pairs[i].link} – {self._inputs.pairs[i].object}" for i in new])
         enough = f"slots: {int(most)}" if most > slots + 0.5 else "more slots"
-        warnings.warn(
-            f"contacts of {which} are more than `slots: {slots}`: what the others carry acts at the centre of those shown; "
-            f"`{enough}` would do",
-            stacklevel=6,
-        )
-
-
-SAME_TIME = 1e-9
-"""Relative difference up to which two times are one: what is left when a call's time is divided by its substeps."""
+        problem = f"contacts of {which} are more than `slots: {slots}`: what the others carry acts at the centre of those shown"
+        warnings.warn(f"{problem}; `{enough}` would do", stacklevel=6)
 
 
 class Incoming:
     """Takes states apart for a module, and warns once of what is odd about them."""
 
     def __init__(self, plan: Plan, kinds: Mapping[str, Kind], constants: Constants):
-        """Begin; nothing has come in."""
         self._plan, self._kinds, self._constants = plan, kinds, constants
         self._timesteps = {sensor.name: sensor.timestep for sensor in plan.sensors if sensor.timestep}
         self._dt: tuple[float, Tensor] | None = None
@@ -100,14 +89,14 @@ class Incoming:
 
     @property
     def held_dt(self) -> object:
-        """Stands for the time that calls are apart, as a tensor: another object after it was written again."""
+        """Stands for the time between calls as a tensor: another object after it was written again."""
         return self._dt
 
     def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
-        """Return the fields of a state that are wanted, by name; those of earlier substeps as `substep/<i>/<field>`.
+        """Return the fields of a state that are read, by name; those of earlier substeps as `substep/<i>/<field>`.
 
         Raises:
-            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
+            StateError: If a field that is read is missing, or is not of the right shape, dtype or device.
         """
         inputs = self._plan.inputs
         if not isinstance(state, SceneState):
@@ -121,7 +110,7 @@ class Incoming:
             self.slot_watch.warn()
         # Our simulators, which say the time, notice faults themselves.
         if state.time is None and "poses" not in self._warned and not is_out_of_sight(tensors["body_pos"]):
-            self._look_at_poses(tensors)
+            self._check_poses(tensors)
         if inputs.substeps > 1:
             tensors |= self._substeps(state, device, len(tensors["body_pos"]))
         return tensors
@@ -157,7 +146,7 @@ class Incoming:
                 result[f"substep/{i}/{name}"] = value
         return result
 
-    def _look_at_poses(self, tensors: Mapping[str, Tensor]) -> None:
+    def _check_poses(self, tensors: Mapping[str, Tensor]) -> None:
         """Warn of environments with a pose that is not finite, the first time."""
         poses = [tensors[name].detach().sum(dim=(1, 2)) for name in ("body_pos", "body_quat") if name in tensors]
         is_bad = ~sum(poses).isfinite()  # type: ignore[union-attr]
@@ -172,7 +161,7 @@ class Incoming:
         if not 0 < dt < math.inf:
             raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
         if self._dt is None or self._dt[0] != dt:
-            self._look_at_rates(dt)
+            self._check_rates(dt)
             self._retime(dt)
         if self._dt is None or self._dt[0] != dt or self._dt[1].device != device or self._dt[1].dtype != dtype:
             with torch.inference_mode(False):
@@ -180,7 +169,7 @@ class Incoming:
         return self._dt[1]
 
     def _retime(self, dt: float) -> None:
-        """Make constants again that are made for another time between the calls of a kind, and warn of it the first time."""
+        """Recompute constants that are made for another time between the calls of a kind, and warn of it the first time."""
         for sensor in (sensor for sensor in self._plan.sensors if sensor.name in self._timesteps):
             step_dt, retimed = dt / max(sensor.substeps, 1), self._kinds[sensor.name].retimed
             if math.isclose(step_dt, self._timesteps[sensor.name], rel_tol=SAME_TIME):
@@ -195,7 +184,7 @@ class Incoming:
             for name, value in ({} if retimed is None else retimed(sensor.constants, step_dt)).items():
                 self._constants.overwrite(f"sensors/{sensor.name}/{name}", value)
 
-    def _look_at_rates(self, dt: float) -> None:
+    def _check_rates(self, dt: float) -> None:
         """Warn of sensors that would take samples more often than they are called, the first time."""
         for sensor in self._plan.sensors:
             if 0 < sensor.period < (1 - 1e-6) * dt and sensor.sensor not in self._warned:

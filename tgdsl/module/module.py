@@ -22,16 +22,14 @@ from torch import Tensor
 from tgdsl.console.tables import TaxelTable, TaxelTables
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
-from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
-from tgdsl.module.export.signature import Signature
+from tgdsl.module.export.program import EXAMPLE_ENVS, Signature, Step, export_step, format_of
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory.memory import Memory, chosen_rows, few_rows, kept, read_rows, rows_of, store, stored
+from tgdsl.module.memory import Memory, chosen_rows, few_rows, kept, read_rows, store, stored
 from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, observe, outputs_of
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
-from tgdsl.module.state import SceneState
-from tgdsl.module.taxels.identity import SavedTaxels
-from tgdsl.module.taxels.tables import images_of, row_tables, taxel_table
+from tgdsl.module.state import SceneState, example_state
+from tgdsl.module.taxels import SavedTaxels, images_of, row_tables, taxel_table
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
@@ -281,9 +279,6 @@ class TactileModule(HookedModule):
             TgdslError: If a sensor cannot be exported, the format is none, or what writes it is not installed.
             FileError: If the file cannot be written.
         """
-        from tgdsl.module.export.formats import format_of, write
-        from tgdsl.module.export.program import EXAMPLE_ENVS, FlatStep, Step, signature_of, traced
-
         file = Path(path)
         file_format = format_of(file, to)
         dt = (dt or self.inputs.dt or None) if "dt" in self.inputs.fields else None
@@ -296,10 +291,7 @@ class TactileModule(HookedModule):
         memory = touch.initial_memory(EXAMPLE_ENVS, dt)
         observed = partial(observe, touch.plan, touch.constants)
         step = Step(touch.plan, touch.constants, touch.pure_step, observed, tensors, memory, dt)
-        flat = FlatStep(step)
-        signature = signature_of(flat, step, source, overrides)
-        write(traced(flat, touch.plan), signature, file, file_format, touch.inductor_options())
-        return signature
+        return export_step(step, file, file_format, touch.inductor_options(), source, overrides)
 
     def free(self) -> None:
         """Let go of all that sensors remember, and of the number of environments; the seed is kept.
@@ -322,7 +314,8 @@ class TactileModule(HookedModule):
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
         rows = few_rows(tensors["mask"]) if name == "advance_some" else None
         if rows is not None:
-            return read_rows(self.calls.of(self.flat_core), rows, rows_of(tensors, rows), memory)
+            some = {name: value[rows] if value.ndim else value for name, value in tensors.items() if name != "mask"}
+            return read_rows(self.calls.of(self.flat_core), rows, some, memory)
         result = self.calls.of(getattr(self, name))(tensors, memory)
         return {name: result[name] for name in self.plan.readings()}
 
@@ -339,10 +332,10 @@ class TactileModule(HookedModule):
         return readings
 
     def flat_core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the readings of `core` as `reading/<name>`, and the new state as `state/<name>`."""
+        """Return the new state of `core` as `state/<name>`, and its readings as `reading/<name>`."""
         readings, updated = self.core(tensors, memory)
-        outputs = {f"reading/{name}": readings[name] for name in self.plan.readings()}
-        return outputs | {f"state/{name}": value for name, value in updated.items()}
+        outputs = {f"state/{name}": value for name, value in updated.items()}
+        return outputs | {f"reading/{name}": readings[name] for name in self.plan.readings()}
 
     def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and leave the state as it is."""

@@ -16,9 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, listed
-from tgdsl.module.memory.clock import Clock
-from tgdsl.module.memory.history import pushed, reduced
-from tgdsl.module.memory.memory import WINDOW
+from tgdsl.module.memory import WINDOW, Clock, pushed, reduced
 from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor

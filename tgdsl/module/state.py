@@ -8,7 +8,7 @@ pair, `object` objects of its `inputs.objects`, `heated` objects of its `inputs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -115,29 +115,22 @@ class SceneState:
         return SceneState(**moved)
 
     def checked(self, inputs: Inputs, device: torch.device, with_dt: bool = True) -> dict[str, Tensor]:
-        """Return the tensors that a module wants, after a look at their shapes.
-
-        Args:
-            inputs: What the module wants.
-            device: Where it is.
-            with_dt: Whether a time must be there, if it is wanted.
+        """Return the tensors that a module on a device reads; `with_dt`: whether a time must be there, if it is read.
 
         Raises:
-            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
+            StateError: If a field that is read is missing, or is not of the right shape, dtype or device.
         """
         tensors: dict[str, Tensor] = {}
         for name in inputs.fields:
             value = getattr(self, name)
-            if value is None and name == "dt" and not with_dt:
-                continue
-            if value is None:
+            if value is None and (name != "dt" or with_dt):
                 raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(inputs.fields)}")
             if name != "dt":
                 tensors[name] = _checked(name, value, inputs, device)
-        num_envs = {name: value.shape[0] for name, value in tensors.items()}
-        for name, count in num_envs.items():
-            if count != num_envs["body_pos"]:
-                raise StateError(f"SceneState.{name} holds {count} environments, body_pos {num_envs['body_pos']}")
+        num_envs = tensors["body_pos"].shape[0]
+        for name, value in tensors.items():
+            if value.shape[0] != num_envs:
+                raise StateError(f"SceneState.{name} holds {value.shape[0]} environments, body_pos {num_envs}")
         if device.type == "cpu":  # a look at a GPU's numbers would wait for it; there the kernel asserts
             _check_choices("variant", tensors, inputs.objects, inputs.num_variants)
             _check_choices("object_material", tensors, inputs.heated, inputs.num_materials)
@@ -148,8 +141,8 @@ def _check_choices(field: str, tensors: Mapping[str, Tensor], names: Sequence[st
     for i, (name, num) in enumerate(zip(names, counts, strict=True) if field in tensors else ()):
         column = tensors[field][:, i]
         if ((column < 0) | (column >= num)).any():
-            invalid = sorted({int(v) for v in column.tolist() if not 0 <= v < num})
-            raise StateError(f"SceneState.{field} of object {name} is {invalid[0]}, expected 0 to {num - 1}")
+            invalid = min(int(v) for v in column.tolist() if not 0 <= v < num)
+            raise StateError(f"SceneState.{field} of object {name} is {invalid}, expected 0 to {num - 1}")
 
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
@@ -167,9 +160,59 @@ def _checked(name: str, value: Any, inputs: Inputs, device: torch.device) -> Ten
         raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected}){names}")
     if value.device != device:
         raise StateError(f"SceneState.{name} is on {value.device}, the module on {device}")
-    if name in CHOICES:
-        if value.dtype not in (torch.int64, torch.int32):
-            raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.int64 or torch.int32")
-    elif name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
-        raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.float32 or torch.float64")
+    dtypes = (torch.int64, torch.int32) if name in CHOICES else (torch.float32, torch.float64)
+    if name != "contact_found" and value.dtype not in dtypes:
+        raise StateError(f"SceneState.{name} is {value.dtype}, expected {' or '.join(map(str, dtypes))}")
     return value
+
+
+def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, spread: float) -> SceneState:
+    """Return a random state of all wanted fields, with bodies close enough to touch: see `TactileModule.example_state`.
+
+    Contacts lie around their links, with unit normals and forces inside a friction cone of 0.5; every third slot is unused, and
+    the net force is the slots' sum.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    values: dict[str, Any] = {}
+    for name in (name for name in inputs.fields if name in SHAPES):
+        value = torch.randn((num_envs, *shape_of(name, inputs)), generator=generator, dtype=dtype)
+        if name == "body_pos":
+            value = spread * value
+        elif name == "body_quat":
+            value = value / value.norm(dim=-1, keepdim=True)
+        elif name == "contact_found":
+            value = value > -1.0
+        elif name in CHOICES:
+            counts = inputs.num_variants if name == "variant" else inputs.num_materials
+            value = torch.arange(num_envs)[:, None] % torch.tensor(counts)
+        elif name == "object_size":
+            value = 0.015 + 0.01 * value.clamp(-1, 1)
+        elif name == "object_temperature":
+            value = 30.0 + 15.0 * value.clamp(-1, 1)
+        values[name] = value
+    if "contact_force" in values:
+        values |= _contacts(values, inputs, spread)
+    if "dt" in inputs.fields:
+        values["dt"] = inputs.dt or 0.01
+    if inputs.substeps > 1:
+        one = replace(inputs, substeps=1, fields=tuple(name for name in inputs.fields if name != "dt"))
+        seeds = torch.randint(2**62, (inputs.substeps - 1,), generator=generator).tolist()
+        values["substeps"] = tuple(example_state(one, num_envs, substep_seed, dtype, spread) for substep_seed in seeds)
+    return SceneState(**values)
+
+
+def _contacts(values: Mapping[str, Tensor], inputs: Inputs, spread: float) -> dict[str, Tensor]:
+    """Turn random numbers into contacts that a solver could have found."""
+    is_used = (torch.arange(inputs.slots) % 3 != 2)[:, None]
+    links = values["body_pos"][:, [inputs.bodies.index(pair.link) for pair in inputs.pairs], None]
+    normal = values["contact_normal"] / values["contact_normal"].norm(dim=-1, keepdim=True)
+    along = (values["contact_force"] * normal).sum(dim=-1, keepdim=True)
+    tangential = values["contact_force"] - along * normal
+    result = {
+        "contact_pos": links + spread * values["contact_pos"],
+        "contact_force": along.abs() * (normal + 0.5 * tangential / (tangential.norm(dim=-1, keepdim=True) + 1.0)),
+        "contact_torque": 1e-3 * along * normal,
+        "contact_normal": normal,
+    }
+    result = {name: torch.where(is_used, value, 0.0) for name, value in result.items()}
+    return {**result, "contact_netforce": result["contact_force"].sum(dim=2)}

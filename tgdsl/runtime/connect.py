@@ -18,7 +18,7 @@ from typing import Any, Literal, Unpack, overload
 from tgdsl.errors import HandError, SimulationError, TgdslError, did_you_mean, listed
 from tgdsl.files.plugins import known
 from tgdsl.module.module import TactileModule
-from tgdsl.module.taxels.identity import Taxels, check_taxels
+from tgdsl.module.taxels import Taxels, check_taxels
 from tgdsl.observations.observations import HAND_ONLY, hand_only_error
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connection import Connection, SimulationConnection, SimulatorKind, SourceKind, keyword_options
@@ -78,7 +78,7 @@ def connect(
         lockstep: Nothing runs in real time: the emulator's scene moves when stepped, a log is read as fast as possible. A
             simulation is always so, a real hand never.
         taxels: The taxels that the module shall have, such as those that a policy learned with: another module, its tables, an
-            artefact, a rollout or an id, see `module.taxels.identity.check_taxels`.
+            artefact, a rollout or an id, see `module.taxels.check_taxels`.
         scene: A scene, such as a task's, that a simulation or an emulator steps instead of the module's; it is
             closed with the connection, and starts where it says, not at the keyframe.
         **options: Options of this kind of source alone, such as the `nconmax` and `njmax` of `warp`. Those above are left out

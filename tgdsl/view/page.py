@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tgdsl.errors import TgdslError
-from tgdsl.module.memory.history import last_step
+from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.simulators.simulation import Simulation

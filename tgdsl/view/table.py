@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable
-from tgdsl.module.memory.history import last_step
+from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.view.markers import THRESHOLDS

@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tgdsl.module.memory.history import last_step
+from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.view.markers import magnitude

@@ -19,7 +19,7 @@ import tgdsl
 from tgdsl.commands.export import Export
 from tgdsl.commands.verify import Verify
 from tgdsl.errors import ArtifactError, TgdslError
-from tgdsl.module.export.signature import read_signature
+from tgdsl.module.export.program import read_signature
 from tgdsl.module.export.verify import verify
 
 ROOT = Path(__file__).parents[3]

@@ -1,52 +1,126 @@
-"""A module's step as a graph of torch's own operations, with flat inputs and outputs and any number of environments.
+"""A module's step as a file that runs without tgdsl: torch.export's, AOTInductor's or ONNX.
+
+A step is a graph of torch's own operations with flat inputs and outputs and any number of environments. Its signature says what
+goes in and comes out, in order: text beside the program in the same file.
 
 Shapes: `env` environments.
 """
 
 from __future__ import annotations
 
+import json
+import logging
+import warnings
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from tgdsl.errors import TgdslError, listed
-from tgdsl.module.export.signature import Port, Signature
-from tgdsl.module.memory.clock import SHARED
+from tgdsl.errors import ArtifactError, TgdslError, listed
+from tgdsl.files.write import atomic_path
+from tgdsl.module.memory import SHARED
 from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
-from tgdsl.tensors.torch_internals import ASSERT_DTYPE, assert_dtype
+from tgdsl.tensors.torch_internals import ASSERT_DTYPE, assert_dtype, write_package
 
 Tensors = Mapping[str, Tensor]
+File = Literal["pt2", "aoti", "onnx"]
+ENDINGS: dict[File, str] = {"pt2": ".pt2", "aoti": ".aoti.pt2", "onnx": ".onnx"}
+ENTRY = "tgdsl.json"  # the text in a .pt2 file, below `extra/`; in an ONNX file it is metadata of the name without the ending
+FORMAT = 1
+OPSET = 20
 EXAMPLE_ENVS = 3
 """Environments of the tensors that are traced: no size of a module's, and neither 0 nor 1, which torch takes for constants."""
+# operations of tgdsl that run in Python alone, with the reason
 ON_HOST = {
     "tgdsl::mesh_distance": "`query: raycast` searches triangles with NVIDIA Warp, which runs in Python; expected `query: sdf`",
 }
-"""Operations of tgdsl that run in Python alone, with the reason."""
+
+
+@dataclass(frozen=True)
+class Port:
+    """A tensor that goes in or comes out: its shape after `env`, and its dtype, such as "float32".
+
+    Its name is a field of `SceneState`, `substep/<i>/<field>`, `reset`, `memory/<name>`; `reading/<name>`,
+    `observation/<group>`, `next/<name>`. `rest` is what all numbers of a memory are before the first call.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    rest: float | None = None
+
+
+@dataclass(frozen=True)
+class Signature:
+    """All inputs and outputs of a step, in order; each `next/<name>` goes in as `memory/<name>` at the next one."""
+
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    dt: float | None  # time between steps that the program is made for [s]; None if nothing depends on it
+    taxels_id: str  # see `TactileModule.taxels_id`
+    source: str  # document or artefact that it was exported from; empty if it was a module in memory
+    overrides: tuple[str, ...]  # what was overridden of the document
+    version: str  # of tgdsl
+    format: int = FORMAT
+
+    def to_json(self) -> str:
+        """Return the text."""
+        return json.dumps(asdict(self), indent=1)
+
+
+def read_signature(path: Path) -> Signature:
+    """Return the signature of an exported file.
+
+    Raises:
+        ArtifactError: If the file is none that tgdsl exported.
+    """
+    try:
+        if path.suffix == ".onnx":
+            import onnx
+
+            properties = onnx.load(str(path), load_external_data=False).metadata_props
+            text = next(entry.value for entry in properties if entry.key == Path(ENTRY).stem)
+        else:
+            with zipfile.ZipFile(path) as archive:
+                name = next(name for name in archive.namelist() if name.endswith(f"/extra/{ENTRY}"))
+                text = archive.read(name).decode()
+        values: dict[str, Any] = json.loads(text)
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # what parsers of protobuf and zip raise has no common base
+        raise ArtifactError(f"{path}: expected a file that `tgdsl export` wrote (.pt2, .onnx)") from error
+    if values.get("format") != FORMAT:
+        raise ArtifactError(f"{path}: found format {values.get('format')}, expected {FORMAT}; export it again")
+    for side in ("inputs", "outputs"):
+        values[side] = tuple(Port(**{**port, "shape": tuple(port["shape"])}) for port in values[side])
+    return Signature(**{**values, "overrides": tuple(values["overrides"])})
 
 
 class Step(NamedTuple):
     """What is exported of a module."""
 
-    plan: Plan  # its plan
-    module: nn.Module  # holds its constants
-    # `TactileModule.pure_step`
+    plan: Plan
+    constants: nn.Module
     pure_step: Callable[[Tensors, Tensors, Tensor | None], tuple[dict[str, Tensor], dict[str, Tensor]]]
-    observe: Callable[[Tensors], dict[str, Tensor]]  # `observing.observe` of this plan
+    observe: Callable[[Tensors], dict[str, Tensor]]
     tensors: dict[str, Tensor]  # fields of a state of `EXAMPLE_ENVS` environments
     memory: dict[str, Tensor]  # memory of as many
     dt: float | None  # time between steps [s], if fields have it
 
 
 class FlatStep(nn.Module):
-    """The step, of tensors in the order of `ports`; what all environments share is part of it."""
+    """The step, of tensors in the order of its ports; what all environments share is part of it."""
 
     def __init__(self, step: Step):
         super().__init__()
-        self._step, self.touch = step, step.module
+        self._step, self.touch = step, step.constants
         self._memory = [name for name in step.memory if name not in SHARED]
         self._fields = [name for name in step.tensors if name != "dt"]
         self._shared = {name: f"shared_{i}" for i, name in enumerate([*SHARED, "dt"]) if name in step.memory | step.tensors}
@@ -81,35 +155,80 @@ class FlatStep(nn.Module):
         return result | {f"next/{name}": after[name].clone() for name in self._memory}
 
 
-def signature_of(flat: FlatStep, step: Step, source: str, overrides: Sequence[str]) -> Signature:
-    """Return what goes into a step and comes out of it."""
-    inputs = flat.example
+def export_step(step: Step, path: Path, to: File, options: dict[str, Any], source: str, overrides: Sequence[str]) -> Signature:
+    """Write a step; `options` are for Inductor. See `TactileModule.export`."""
+    flat = FlatStep(step)
     with torch.no_grad():
-        outputs = flat.outputs(inputs)
+        outputs = flat.outputs(flat.example)
 
-    def port(name: str, tensor: Tensor, rest: float | None = None) -> Port:
+    def port(name: str, tensor: Tensor) -> Port:
+        rest = next(iter(tensor.flatten().tolist()), 0.0) if name.startswith("memory/") else None
         return Port(name, tuple(tensor.shape[1:]), str(tensor.dtype).removeprefix("torch."), rest)
 
-    def rest(name: str, tensor: Tensor) -> float | None:
-        return next(iter(tensor.flatten().tolist()), 0.0) if name.startswith("memory/") else None
+    inputs, results = (tuple(port(name, tensor) for name, tensor in side.items()) for side in (flat.example, outputs))
+    taxels, of_tgdsl = step.plan.taxels_id, version("tgdsl")
+    signature = Signature(inputs, results, step.dt, taxels, source, tuple(overrides), of_tgdsl)
+    program, text = _traced(flat, step.plan), {Path(ENTRY).stem: signature.to_json()}
+    with atomic_path(path) as temporary:
+        if to == "onnx":
+            names = ([port.name for port in ports] for ports in (inputs, results))
+            write_onnx(_without_strides(program), *names, text, temporary)
+        elif to == "pt2":
+            torch.export.save(program, str(temporary), extra_files={ENTRY: signature.to_json()})
+        else:
+            write_package(program, temporary, {**options, "aot_inductor.metadata": text})
+            with zipfile.ZipFile(temporary, "a") as archive:
+                folder = archive.namelist()[0].partition("/")[0]
+                archive.writestr(f"{folder}/extra/{ENTRY}", signature.to_json())
+    return signature
 
-    return Signature(
-        tuple(port(name, tensor, rest(name, tensor)) for name, tensor in inputs.items()),
-        tuple(port(name, tensor) for name, tensor in outputs.items()),
-        step.dt,
-        step.plan.taxels_id,
-        source,
-        tuple(overrides),
-        version("tgdsl"),
-    )
 
-
-def traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
-    """Return the step as a graph.
+def format_of(path: Path, to: str | None) -> File:
+    """Return the format of a file, by its name's ending if it is not given.
 
     Raises:
-        TgdslError: If some sensor computes by an operation that is none of torch's own.
+        TgdslError: If there is no such format, the name has another ending, or what writes it is not installed.
     """
+    result = to or next((name for name in reversed(ENDINGS) if path.name.endswith(ENDINGS[name])), None)
+    if result not in ENDINGS:
+        expected = f"expected one of {', '.join(ENDINGS)}, or a file's name with .pt2 or .onnx"
+        raise TgdslError(f"found {to or path.name!r}, {expected}")
+    if path.suffix != (ending := ".onnx" if result == "onnx" else ".pt2"):
+        raise TgdslError(f"{path}: the format {result} has the ending {ending}")
+    if result == "onnx" and not (find_spec("onnx") and find_spec("onnxscript")):
+        raise TgdslError('ONNX files need onnx and onnxscript: pip install "tgdsl[export]"')
+    return result
+
+
+def write_onnx(
+    program: torch.export.ExportedProgram,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    metadata: dict[str, str],
+    path: Path,
+) -> None:
+    """Write a graph as ONNX, with names of its inputs and outputs in order, and texts by name as metadata."""
+    import onnx
+
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # that torchvision is not installed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch's own use of a part of torch that it has deprecated
+        converted: Any = torch.onnx.export(
+            program,
+            input_names=inputs,
+            output_names=outputs,
+            opset_version=OPSET,
+            dynamo=True,
+            optimize=False,  # it takes x + 1e-24 for x
+            verbose=False,
+        )
+    model = converted.model_proto
+    onnx.helper.set_model_props(model, metadata)
+    onnx.save(model, str(path))
+
+
+def _traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
+    """Return the step as a graph; operations that are none of torch's own are errors."""
     example = flat.example
     env = torch.export.Dim.DYNAMIC
     with torch.no_grad():
@@ -118,30 +237,25 @@ def traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
         if node.target is torch.ops.aten.unbind.int and not node.users:  # of no rows: torch writes it and cannot read it
             program.graph.erase_node(node)
         elif getattr(node.target, "namespace", "aten") not in ("aten", "prims"):
-            raise _refused(node.target.name().split(".")[0], plan)
+            operation = node.target.name().split(".")[0]
+            if operation not in ON_HOST:
+                problem = f"found the operation {operation}, which is none of torch's own"
+                raise TgdslError(f"{problem}: no exported file can have it")
+            names = [
+                sensor.sensor for sensor in plan.sensors if any(_is_on_host(plan.quantities[name]) for name in sensor.uses)
+            ]
+            raise TgdslError(f"{listed(list(dict.fromkeys(names)))} cannot be exported: {ON_HOST[operation]}")
     return program
-
-
-def _refused(operation: str, plan: Plan) -> TgdslError:
-    if operation in ON_HOST:
-        names = [sensor.sensor for sensor in plan.sensors if any(_is_on_host(plan.quantities[name]) for name in sensor.uses)]
-        return TgdslError(f"{listed(list(dict.fromkeys(names)))} cannot be exported: {ON_HOST[operation]}")
-    return TgdslError(f"found the operation {operation}, which is none of torch's own: no exported file can have it")
 
 
 def _is_on_host(part: Any) -> bool:
     """Return whether triangles are searched for some use of a quantity."""
-    found = []
-
-    def is_host(record: Any) -> bool:
-        found.extend([record] if getattr(record, "stays_on_host", False) else [])
-        return False
-
-    tree.mapped(part, lambda array: array, is_host)
-    return bool(found)
+    found: list[bool] = []
+    tree.mapped(part, lambda array: array, lambda record: bool(found.append(getattr(record, "stays_on_host", False))))
+    return any(found)
 
 
-def without_strides(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:
+def _without_strides(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:
     """Return a graph less views by strides of whole tensors, hints for Inductor, and less asserts: ONNX has neither."""
     for node in list(program.graph.nodes):
         if node.target is torch.ops.aten.as_strided.default and node.args[0].meta["val"].shape == node.meta["val"].shape:

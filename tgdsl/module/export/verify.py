@@ -20,7 +20,7 @@ import torch
 
 from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.module.export import standalone
-from tgdsl.module.export.signature import Signature, read_signature
+from tgdsl.module.export.program import Signature, read_signature
 from tgdsl.module.module import TactileModule
 
 BATCHES, NUM_CALLS, RESET_EVERY = (1, 7, 64), 100, 9

@@ -36,7 +36,7 @@ from tgdsl.files.write import atomic_path, atomic_write
 from tgdsl.layout.identity import Columns
 from tgdsl.module.export.formats import write_onnx
 from tgdsl.module.module import TactileModule
-from tgdsl.module.taxels.identity import HasPlan, check_taxels, plan_tables
+from tgdsl.module.taxels import HasPlan, check_taxels, plan_tables
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.rollout import Actor

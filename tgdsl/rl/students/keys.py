@@ -12,7 +12,7 @@ import numpy as np
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.layout.layout import Layout
-from tgdsl.module.taxels.tables import image_indices
+from tgdsl.module.taxels import image_indices
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.policy import ACTOR_GROUPS

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
-from tgdsl.module.memory.memory import few_rows
+from tgdsl.module.memory import few_rows
 from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import ObservationError, SimulationError
-from tgdsl.module.memory.history import last_step
+from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.observations import observations
 from tgdsl.observations.observations import HAND_ONLY

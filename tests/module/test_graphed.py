@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tgdsl.tensors.graphed import WARM_CALLS, Graphed
+from tgdsl.module.calls import WARM_CALLS, Graphed
 
 
 class Recorder:

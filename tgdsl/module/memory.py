@@ -1,0 +1,548 @@
+"""What a module carries from one call to the next: buffers of each sensor, windows over last readings, and its clock.
+
+Shapes: `env` environments, `call` calls that a ring remembers, `step` calls of a window, oldest first, `row` taxels or bodies,
+`channel` numbers per row.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.errors import StateError, TgdslError, listed
+from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
+from tgdsl.sensors.base import UNTIMED, Context, Kind
+from tgdsl.sensors.noise.random import Stream, kind_stream, sensor_key, streams
+from tgdsl.sensors.noise.stage import Now
+from tgdsl.tensors.env_ids import broadcast_over, few_ids
+from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.on_host import HostCopy
+from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
+
+Tensors = dict[str, Tensor]
+Window = Float[Tensor, "env step channel row"]
+WINDOW, KEPT = "history/", "kept/"  # buffers `history/<reading>`, a window; `kept/<reading>`, the last reading
+ENV = "clock/env"  # numbers of the environments that are read, counted from this module's first; only where not all are
+SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")  # what all environments have in common
+EVERY = 16  # on a GPU one call in so many is checked: a small kernel takes as long to launch as a module's own
+_INT64 = 2**63
+
+
+class Clock(HookedModule):
+    """Counts calls and episodes of each environment. It holds nothing until `start`, nor if no sensor asks for it.
+
+    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); per environment,
+    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset); and of the module's dtype `ages`
+    (env, call), how long before the last call each one was [s], itself first, and `time` (env,), of the last call since the
+    reset [s].
+    """
+
+    def __init__(self, sensors: Sequence[PlannedSensor]):
+        super().__init__()
+        self._sensors = [sensor for sensor in sensors if sensor.wants_clock]
+        self._has_history = any(sensor.windows for sensor in sensors)
+        noisy = dict.fromkeys(sensor.sensor for sensor in self._sensors if sensor.noise is not None and sensor.noise.streams)
+        self._drawing = list(noisy)
+        self._keyed = list(noisy | dict.fromkeys(sensor.sensor for sensor in self._sensors if sensor.is_random))
+        self._seed, self._first_env = 0, None
+        self.home = torch.empty(0)  # has device and dtype of counts that are loaded before the start
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether any sensor reads it."""
+        return len(self._sensors) > 0 or self._has_history
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments; None before the start."""
+        return len(self.get_buffer("age")) if hasattr(self, "age") else None
+
+    def start(self, num_envs: int, calls: int, like: Tensor) -> None:
+        """Begin to count; some ring remembers so many calls before the present one. `like`: the module's device and dtype."""
+        whole = {"device": like.device, "dtype": torch.int64}
+        for name in ("seed", "first_env"):
+            self.register_buffer(name, torch.zeros((), **whole))
+        for name in ("step", "episode", "age"):
+            self.register_buffer(name, torch.zeros(num_envs, **whole))
+        if any(sensor.is_timed for sensor in self._sensors):
+            self.register_buffer("time", like.new_zeros(num_envs))
+        if calls:
+            self.register_buffer("ages", like.new_zeros(num_envs, calls))
+        # No number of a plan is read in `nows`: compiled code would be made twice, as it may be another at the next call.
+        self.register_buffer("periods", like.new_tensor([sensor.period for sensor in self._sensors]), persistent=False)
+        if self._keyed:
+            self.register_buffer("keys", like.new_zeros(len(self._keyed), 2, dtype=torch.int32), persistent=False)
+        self._restart()
+
+    def free(self) -> None:
+        """Hold nothing again; the seed is kept."""
+        _drop(self, "")
+
+    def seed_with(self, seed: int, first_env: int | None) -> None:
+        """Choose other random numbers, from the next call on; environments are counted from `first_env`.
+
+        Raises:
+            TgdslError: If they are no integers, or `first_env` is negative or no int64.
+        """
+        if not isinstance(seed, Integral):
+            raise TgdslError(f"seed is {seed!r}, expected an integer")
+        if first_env is not None and not (isinstance(first_env, Integral) and 0 <= first_env < _INT64):
+            raise TgdslError(f"first_env is {first_env!r}, expected an integer from 0 to 2**63 - 1")
+        # An int64 in the state dict: whoever loads it draws the same numbers.
+        self._seed, self._first_env = (int(seed) + _INT64) % (2 * _INT64) - _INT64, first_env
+        if self.num_envs is not None:
+            self._restart()
+
+    def copy_seed(self, other: Clock) -> None:
+        """Draw the random numbers that another clock draws after `seed`."""
+        self._seed, self._first_env = other._seed, other._first_env
+
+    def reset(self, chosen: Tensor) -> None:
+        """Begin a new episode in the environments of a mask."""
+        if self.num_envs is not None:
+            self.get_buffer("episode").add_(chosen)
+            self.get_buffer("age").masked_fill_(chosen, 0)
+
+    def tensors(self) -> Tensors:
+        """Return the buffers as `clock/<name>`."""
+        return {f"clock/{name}": buffer for name, buffer in held_buffers(self).items()}
+
+    def nows(self, memory: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Now]:
+        """Return when each sensor that reads the clock is called, by its name; `dt`: time since the last call [s].
+
+        `memory` has the clock's tensors, and for each sensor with a rate `<sensor>:sample/phase` (env,), the time since its
+        last sample was due [s].
+        """
+        if not self.is_wanted:
+            return {}
+        step, age = memory["clock/step"][:, None], memory["clock/age"][:, None]
+        ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
+        drawn: dict[str, Mapping[int, Stream]] = {}
+        if self._drawing:
+            streams_now = streams(memory["clock/keys"][: len(self._drawing)], _env(memory), step[:, 0], memory["clock/episode"])
+            drawn = dict(zip(self._drawing, streams_now, strict=True))
+        nows = {}
+        for i, sensor in enumerate(self._sensors):
+            phase, is_due, period = memory.get(f"{sensor.name}:sample/phase"), None, None
+            if phase is not None and dt is not None:
+                period = memory["clock/periods"][i]
+                is_due = (phase[:, None] + 1.5 * dt >= period) | (age == 0)
+            nows[sensor.name] = Now(dt, step, age, ages, is_due, period, drawn.get(sensor.sensor, {}))
+        return nows
+
+    def context(self, sensor: PlannedSensor, memory: Mapping[str, Tensor], dt: Tensor | None, substep: int = 0) -> Context:
+        """Return when a sensor's kind is called at one of its substeps; nothing of it if the kind does not read it."""
+        if not sensor.is_timed:
+            return UNTIMED
+        assert dt is not None
+        count = max(sensor.substeps, 1)
+        age, step_dt = memory["clock/age"][:, None], dt / count if count > 1 else dt
+        time = torch.where(age == 0, 0.0, memory["clock/time"][:, None] + (substep + 1) * step_dt)
+        is_first = (age == 0) & (substep == 0)
+        stream = None
+        if sensor.is_random:
+            key = memory["clock/keys"][self._keyed.index(sensor.sensor)]
+            stream = kind_stream(key, _env(memory), memory["clock/step"] * count + substep)
+        return Context(step_dt, memory["clock/step"][:, None], substep, time, is_first, stream)
+
+    @staticmethod
+    def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> Tensors:
+        """Return the counts after a call."""
+        counts = {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
+        if "clock/time" in clock and dt is not None:
+            counts["clock/time"] = torch.where(clock["clock/age"] == 0, 0.0, clock["clock/time"] + dt)
+        if "clock/ages" in clock and dt is not None:
+            ages = clock["clock/ages"]
+            counts["clock/ages"] = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1] + dt], dim=1)
+        return counts
+
+    def _restart(self) -> None:
+        """Write the seed and what follows from it, and start all counts from 0, in place: captured graphs go on with them."""
+        assert self.num_envs is not None
+        distributed = torch.distributed
+        rank = distributed.get_rank() if distributed.is_available() and distributed.is_initialized() else 0
+        with torch.no_grad():
+            self.get_buffer("seed").fill_(self._seed)
+            self.get_buffer("first_env").fill_(rank * self.num_envs if self._first_env is None else self._first_env)
+            for name in ("step", "episode", "age"):
+                self.get_buffer(name).zero_()
+        self._set_keys()
+
+    def _set_keys(self) -> None:
+        if self._keyed:
+            keys = [sensor_key(int(self.get_buffer("seed")), sensor) for sensor in self._keyed]
+            self.get_buffer("keys").copy_(torch.tensor(keys, dtype=torch.int32))
+
+    def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
+        """Make room for the counts that are loaded, and go on with their seed; do nothing if `Memory` has found errors."""
+        if errors:
+            return
+        age, ages = state_dict.get(f"{prefix}age"), state_dict.get(f"{prefix}ages")
+        if self.is_wanted and isinstance(age, Tensor):
+            calls = ages.shape[-1] if isinstance(ages, Tensor) else 0
+            held = self.get_buffer("ages").shape[-1] if hasattr(self, "ages") else 0
+            if (len(age), calls) != (self.num_envs, held):  # else captured graphs go on with what is there
+                with torch.inference_mode(False):
+                    self.start(len(age), calls, self.home)
+        load()
+        if self.num_envs is not None:
+            self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))
+            self._set_keys()
+
+
+def _env(memory: Mapping[str, Tensor]) -> Tensor:
+    """Return the numbers of the environments that are read, (env,), counted over all processes."""
+    age = memory["clock/age"]
+    return (memory[ENV] if ENV in memory else torch.arange(age.shape[0], device=age.device)) + memory["clock/first_env"]
+
+
+def _drop(module: HookedModule, prefix: str) -> None:
+    for name in [name for name in held_buffers(module) if name.startswith(prefix)]:
+        delattr(module, name)
+
+
+class StateWatch:
+    """Warns, once, of state that kinds warn of, see `Kind.warns`: it sees what the calls before have left."""
+
+    def __init__(self, sensors: Sequence[PlannedSensor], kinds: Mapping[str, Kind]):
+        rows = {sensor.name: [f"{sensor.sensor}[{i}]" for i in range(sensor.readings[0].num_rows)] for sensor in sensors}
+        self._watched = [
+            (f"{sensor.name}:{state}", sensor, tuple(row for name in sensor.upstream for row in rows[name]), warn, HostCopy())
+            for sensor in sensors
+            for state, warn in (kinds[sensor.name].warns if sensor.name in kinds else ())
+        ]
+        self._said: set[str] = set()
+        self._num_calls = 0
+
+    def look(self, memory: Mapping[str, Tensor]) -> None:
+        """Warn of what is new. What a GPU holds may be seen some calls later."""
+        if not self._watched or torch.compiler.is_compiling():
+            return
+        self._num_calls += 1
+        for path, sensor, rows, warn, copy in self._watched:
+            if memory[path].is_cuda and self._num_calls % EVERY != 1:
+                continue
+            largest = copy.poll(memory[path].detach().amax(dim=0))
+            for message in () if largest is None else warn(sensor.sensor, sensor.constants, rows, largest.numpy()):
+                if message not in self._said:
+                    self._said.add(message)
+                    warnings.warn(message, stacklevel=6)
+
+
+class Memory(HookedModule):
+    """Buffers `sensor:name`, (env, …) or (env, call, …), and `history/<reading>`; none before the first call."""
+
+    def __init__(
+        self,
+        sensors: Sequence[PlannedSensor],
+        readings: Mapping[str, PlannedReading],
+        kinds: Mapping[str, Kind] | None = None,
+    ):
+        """Plan the buffers; `kinds` by sensor, where their warnings are wanted."""
+        super().__init__()
+        self._watch = StateWatch(sensors, kinds or {})
+        self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
+        windows = [(s.history, reading) for s in sensors if s.history is not None for reading in s.windows]
+        for history, reading in windows:
+            shape = (history.length, len(reading.channels), reading.num_rows)
+            self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
+        self._restarted = {f"{s.name}:{n}": part.rest for s in sensors for n, part in s.state.items() if "/" not in n}
+        self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
+        stacks = {reading.name for _, reading in windows if reading.steps}  # their windows hold them already
+        self._kept = {
+            name: (*((reading.steps,) if reading.steps else ()), len(reading.channels), reading.num_rows)
+            for name, reading in readings.items()
+            if name not in stacks
+        }
+        self._views = [reading.name for history, reading in windows if history.view]
+        self._last: dict[str, tuple[Tensor, int]] = {}
+        self._is_filled = False  # whether the stored readings were handed out
+        # Whether the last readings are stored from the first call on, and not only once some environments are read alone, which
+        # needs them: code that is compiled for the first call then serves all later ones.
+        self.keeps_last = False
+        self.clock = Clock(sensors)
+        self.home = torch.empty(0)  # has device and dtype of state that is loaded before the first call
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether any sensor carries something."""
+        return bool(self._planned) or self.clock.is_wanted
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments whose state is held; None before the first call."""
+        sizes = (buffer.shape[0] for name, buffer in held_buffers(self).items() if not name.startswith(KEPT))
+        return next(sizes, self.clock.num_envs)
+
+    @property
+    def num_kept(self) -> int | None:
+        """Number of environments whose last readings it stores; None if it stores none."""
+        return next((buffer.shape[0] for name, buffer in held_buffers(self).items() if name.startswith(KEPT)), None)
+
+    def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> Tensors:
+        """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
+
+        Raises:
+            StateError: If dt is so short that a ring is too short.
+        """
+        with torch.inference_mode(False):
+            if self.is_wanted and self.num_envs is None:
+                for path, planned in self._planned.items():
+                    shape = (num_envs, *_calls(planned, dt), *planned.shape)
+                    self.register_buffer(path, torch.full(shape, planned.rest, dtype=dtype, device=device))
+                if self.clock.is_wanted:
+                    calls = max((_calls(part, dt)[0] for _, part in self._rings.values()), default=0)
+                    self.clock.start(num_envs, calls, torch.empty(0, dtype=dtype, device=device))
+            if self.keeps_last and self.num_kept is None:
+                for name, shape in self._kept.items():
+                    room = torch.zeros(num_envs, *shape, dtype=dtype, device=device)
+                    self.register_buffer(f"{KEPT}{name}", room, persistent=False)
+        held = held_buffers(self)
+        self._check_rings(held, dt)
+        self._watch.look(held)
+        return held | self.clock.tensors()
+
+    def check(self, memory: Mapping[str, Tensor], num_envs: int, dt: float | None) -> None:
+        """Refuse memory of another module.
+
+        Raises:
+            StateError: If some of it is missing, of another shape or number of environments, or its rings are too short for dt.
+        """
+        clock = ("clock/age", "clock/step") if self.clock.is_wanted else ()
+        if missing := [name for name in (*self._planned, *clock) if name not in memory]:
+            raise StateError(f'memory: found no "{missing[0]}"; expected `initial_memory`, or what the step before returned')
+        for name, planned in self._planned.items():
+            shape, rest = tuple(memory[name].shape), (*(("call",) if planned.past else ()), *planned.shape)
+            if shape[0] != num_envs or len(shape) != len(rest) + 1 or shape[len(shape) - len(planned.shape) :] != planned.shape:
+                expected = ", ".join(map(str, (num_envs, *rest)))
+                raise StateError(f'memory: "{name}" has shape {shape}, expected ({expected})')
+        self._check_rings(memory, dt)
+
+    def _check_rings(self, memory: Mapping[str, Tensor], dt: float | None) -> None:
+        for path, (sensor, planned) in self._rings.items():
+            if _calls(planned, dt)[0] > memory[path].shape[1]:
+                problem = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
+                raise StateError(f"{problem} {planned.past:g} s of so many calls; begin with the shortest dt")
+
+    def cache_readings(self, readings: Mapping[str, Tensor]) -> None:
+        """Note the readings that a call returns, (env, row, channel): where they lie, or once they are kept, that they are."""
+        self._is_filled = self.num_kept is not None
+        found = {} if self._is_filled else readings
+        self._last = {name: (reading.detach(), num_writes(reading)) for name, reading in found.items()}
+
+    def with_views(self, readings: Tensors) -> Tensors:
+        """Put the memory itself in the place of stacks that are declared as views."""
+        return readings | {name: self.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in self._views}
+
+    def keep_last(self, num_envs: int) -> None:
+        """From now on keep what calls return, for the environments that a masked call leaves out.
+
+        Raises:
+            StateError: If nothing was returned yet, or of another number of environments.
+        """
+        if not (self._is_filled or self._last):
+            raise StateError("nothing was handed out yet for the environments left out: read all of them first")
+        if not self._is_filled:
+            if changed := [name for name, (reading, version) in self._last.items() if num_writes(reading) != version]:
+                problem = f"the readings {listed(changed)} that were handed out last have been written into since"
+                raise StateError(f"{problem}, and the environments left out are to have them: write into clones")
+            with torch.inference_mode(False), torch.no_grad():
+                for name, (reading, _) in self._last.items():
+                    if name in self._kept:
+                        copy = reading.transpose(-2, -1).clone(memory_format=torch.contiguous_format)
+                        self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
+            self._is_filled = True
+        if self.num_kept not in (None, num_envs):
+            raise StateError(f"readings of {self.num_kept} environments were handed out before, the scene has {num_envs}")
+
+    def keep_no_other(self, num_envs: int) -> None:
+        """Keep readings no longer if they are of another number of environments, which a module without state may change."""
+        if self.num_kept not in (None, num_envs):
+            self._is_filled = False
+            _drop(self, KEPT)
+
+    def free(self) -> None:
+        """Hold nothing again, as before the first call."""
+        _drop(self, "")
+        self._last, self._is_filled = {}, False
+        self.clock.free()
+
+    def reset(self, chosen: Tensor) -> None:
+        """Begin a new episode in the environments of a mask; what noise and history remember restarts by its age."""
+        for path, rest in self._restarted.items():
+            buffer = self.get_buffer(path)
+            buffer.masked_fill_(broadcast_over(chosen, buffer), rest)
+        self.clock.reset(chosen)
+
+    def restarted(self, memory: Mapping[str, Tensor], chosen: Tensor) -> Tensors:
+        """Return what `reset` makes of memory that is not held here."""
+        result = dict(memory)
+        for path, rest in self._restarted.items():
+            result[path] = memory[path].masked_fill(broadcast_over(chosen, memory[path]), rest)
+        if "clock/age" in memory:
+            result["clock/episode"] = memory["clock/episode"] + chosen
+            result["clock/age"] = memory["clock/age"].masked_fill(chosen, 0)
+        return result
+
+    def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
+        """Move or cast all buffers; the last readings lie elsewhere."""
+        self._last = {}
+        move()
+
+    def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
+        """Make room for the state that is loaded, in the module's own dtype; part of a state is no state.
+
+        Buffers that have the shape already stay where they are: captured graphs go on with them.
+        """
+        loaded = {
+            path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)
+        }
+        age = state_dict.get(f"{prefix}clock.age")
+        if loaded or age is not None:
+            errors.extend(self._misfits(loaded, age, prefix))
+        if errors:
+            return  # nothing is loaded, nor by the clock
+        with torch.inference_mode(False):
+            for path, value in loaded.items():
+                if path not in (held := held_buffers(self)) or held[path].shape != value.shape:
+                    self.register_buffer(path, torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device))
+        self._last, self._is_filled = {}, False  # what is replaced has returned them
+        load()
+
+    def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:
+        """Return what is wrong with state that is to be loaded: parts that lack, or are not of the planned shape."""
+        missing = [path for path in self._planned if path not in found]
+        missing += ["clock.age"] if self.clock.is_wanted and age is None else []
+        wrong = [f'"{prefix}{path}" is missing beside other state' for path in missing]
+        counts = {len(value) for value in [*found.values(), *([] if age is None else [age])] if value.ndim}
+        if len(counts) > 1:
+            wrong.append(f'the parts of "{prefix}" are of {sorted(counts)} environments')
+        for path, value in found.items():
+            shape, expected = tuple(value.shape), tuple(self._planned[path].shape)
+            if shape[value.ndim - len(expected) :] != expected:
+                wrong.append(f'"{prefix}{path}" has shape {shape}, expected (env, …, {", ".join(map(str, expected))})')
+        return wrong
+
+
+def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:
+    """Return how many calls before the present one a ring holds; nothing if it is none."""
+    if planned.past == 0 or dt is None:
+        return ()
+    return (max(math.ceil(planned.past / dt - 1e-6), 1),)
+
+
+def pushed(window: Window, reading: Float[Tensor, "env row channel"], age: Int[Tensor, " env"]) -> Window:
+    """Return a window after a call; `age`: calls since each environment's reset, before this one.
+
+    Before there are enough calls since a reset, the first one stands for the missing. The reading's gradients are kept.
+    """
+    newest = reading.transpose(1, 2)[:, None]
+    moved = torch.cat([window[:, 1:], newest], dim=1)
+    return torch.where((age == 0)[:, None, None, None], newest, moved)
+
+
+def reduced(window: Window, reduce: str) -> Float[Tensor, "env *step row channel"]:
+    """Return what is read of a window: all of it (`stack`), or the `mean` or `median` of each number."""
+    if reduce == "stack":
+        return window.transpose(2, 3)
+    if reduce == "mean":
+        return window.mean(dim=1).transpose(1, 2)
+    ordered, count = window.sort(dim=1).values, window.shape[1]  # of an even number the mean of both middle ones
+    return (0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])).transpose(1, 2)
+
+
+def last_step(reading: Float[Tensor, "env *step row channel"]) -> Float[Tensor, "env row channel"]:
+    """Return the last one of stacked calls, or a reading that is of one call."""
+    return reading[:, -1] if reading.ndim == 4 else reading
+
+
+def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
+    """Put new state in the place of the old one; of a ring, this call's entry."""
+    with torch.no_grad():
+        for name, value in updated.items():
+            if value.ndim < memory[name].ndim:
+                memory[name].index_put_(_entry_of(memory, name), value.detach())
+        for name, value in updated.items():
+            if value.ndim == memory[name].ndim:
+                memory[name].copy_(value.detach())
+
+
+def stored(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> Tensors:
+    """Return memory with new state in the place of the old one, as `store` writes it; derivatives go through it."""
+    result = {**memory, **updated}
+    for name, value in updated.items():
+        if value.ndim < memory[name].ndim:
+            result[name] = memory[name].index_put(_entry_of(memory, name), value)
+    return result
+
+
+def kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> Tensors:
+    """Return what is kept of readings that a call returns, if anything is."""
+    return {f"{KEPT}{name}": reading.transpose(-2, -1) for name, reading in readings.items() if f"{KEPT}{name}" in memory}
+
+
+def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
+    """Return the places of this call's entries in a ring: environment, and which of its calls."""
+    place = materialised(memory["clock/step"] % memory[name].shape[1])
+    return torch.arange(place.shape[0], device=place.device), place
+
+
+def chosen_rows(
+    mask: Bool[Tensor, " env"], readings: Tensors, updated: Tensors, memory: Mapping[str, Tensor]
+) -> tuple[Tensors, Tensors]:
+    """Return readings and new state of the environments of a mask; of the others, what they had and last read."""
+    selected, result = {}, dict(readings)
+    for name, value in updated.items():
+        old = memory[name] if value.ndim == memory[name].ndim else memory[name][_entry_of(memory, name)]
+        selected[name] = torch.where(broadcast_over(mask, value), value, old)
+    for name, reading in readings.items():
+        if f"{KEPT}{name}" in memory:
+            last = memory[f"{KEPT}{name}"]
+            result[name] = torch.where(broadcast_over(mask, reading), reading.transpose(-2, -1), last).transpose(-2, -1)
+        elif f"{WINDOW}{name}" in memory:
+            result[name] = reduced(selected[f"{WINDOW}{name}"], "stack")
+    return result, selected
+
+
+def few_rows(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
+    """Return the environments of a mask, if they are on a CPU and few enough to be read as a batch of their own.
+
+    One alone is read twice: compiled code that serves every batch from two on is then not made again for it.
+    """
+    rows = None if torch.is_grad_enabled() else few_ids(mask)
+    if rows is None or not len(rows):
+        return None
+    return rows if len(rows) > 1 else rows.repeat(2)
+
+
+def read_rows(
+    core: Callable[[Tensors, Tensors], Tensors],
+    rows: Int[Tensor, " n"],
+    tensors: Mapping[str, Tensor],
+    memory: Mapping[str, Tensor],
+) -> Tensors:
+    """Read some environments, put their new state in the place of the old one, and return the readings of all.
+
+    `core` returns new state as `state/<name>`, and then readings as `reading/<name>`.
+    """
+    held = {name: value if name in SHARED else value[rows] for name, value in memory.items()}
+    readings: Tensors = {}
+    for path, value in core(dict(tensors), held | {ENV: rows}).items():
+        part, _, name = path.partition("/")
+        if part == "state" and value.ndim < memory[name].ndim:
+            memory[name].index_put_((rows, held["clock/step"] % memory[name].shape[1]), value)
+        elif part == "state":
+            memory[name][rows] = value
+        elif f"{KEPT}{name}" in memory:
+            memory[f"{KEPT}{name}"][rows] = value.transpose(-2, -1)
+            readings[name] = memory[f"{KEPT}{name}"].clone().transpose(-2, -1)
+        else:
+            readings[name] = reduced(memory[f"{WINDOW}{name}"].clone(), "stack")
+    return readings
