@@ -42,11 +42,11 @@ from gpu_scenes import CASES, DT, Case, artefact, bytes_of, make_artefacts, stat
 from torch import Tensor
 
 from tgdsl.module.artifact import load_plan
+from tgdsl.module.calls import Graphed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan
-from tgdsl.module.calls import Graphed
 
 ROTATED = 160e6
 """Bytes that the sets of buffers have together: the L2 of an H200 holds 60 MB."""

@@ -4,6 +4,7 @@ import math
 import re
 from typing import Annotated
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -204,3 +205,17 @@ def test_the_schema_of_a_range_is_a_quantity_or_two():
     one, two = Span.json_schema()["anyOf"]
     assert one["anyOf"][0] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
     assert two == {"type": "array", "items": one, "minItems": 2, "maxItems": 2}
+
+
+@pytest.mark.parametrize(
+    "text", ["1" * 10**6 + "!", "1" + " " * 10**6 + "!", "1." + "1" * 10**6 + "!", "1 " + "m*" * 10**6 + "!"]
+)
+def test_a_quantity_is_read_once_over(text):
+    """A pattern that tries every way to part a run of digits would take days."""
+    with pytest.raises(ValueError, match="is not a quantity"):
+        units.parse(text, "length")
+
+
+@pytest.mark.parametrize("text", ["4 mm", "4mm", " -4.e-3 m ", "+.004", "4e-3m", "4E-3"])
+def test_quantities_are_read_as_before(text):
+    assert abs(units.parse(text, "length")) == pytest.approx(0.004, rel=np.finfo(float).eps)

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from tgdsl.errors import SpecError
-from tgdsl.schema.load import load
-from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.load import Loaded, load
 
 DOCUMENT = """\
 tgdsl: 1

@@ -11,7 +11,7 @@ from hand_colliders import ROOT, fit, written
 from tgdsl.compiler.pipeline import compile_document
 from tgdsl.formats.robot import load_model
 from tgdsl.scene.colliders import with_colliders
-from tgdsl.schema.colliders import load_colliders
+from tgdsl.schema.load import load_colliders
 
 
 @dataclass(frozen=True)

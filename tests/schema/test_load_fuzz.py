@@ -80,7 +80,7 @@ LINES = DOCUMENT.splitlines(keepends=True)
 PIECES = st.one_of(
     st.sampled_from(LINES),
     st.sampled_from(["  ", "\t", ": ", "- ", "[", "]", "{", "}", "&a ", "*a", "<<: ", "? ", "!!int ", "!!set ", "|\n"]),
-    st.sampled_from(['"\\ud800"', "!!timestamp ", "!!binary ", "%YAML 1.1\n", "---\n", "=", "0x", "1e400", ".nan"]),
+    st.sampled_from(["!!timestamp ", "!!binary ", "%YAML 1.1\n", "---\n", "=", "0x", "1e400", ".nan"]),
     st.text(max_size=4),
 )
 

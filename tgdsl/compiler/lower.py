@@ -39,7 +39,7 @@ from tgdsl.plan.sensors import (
     PlannedSensor,
 )
 from tgdsl.quantities.base import Planning, Quantity, Request, heated_objects
-from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind

@@ -16,7 +16,7 @@ from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.quantities.base import Request
-from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import select
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind

@@ -19,7 +19,7 @@ from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders
 from tgdsl.placement.sample.poisson import Pool
 from tgdsl.placement.sample.sample import Samples, sample
-from tgdsl.schema.loaded import Loaded, LoadedLayout
+from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement, Points
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path

@@ -26,8 +26,7 @@ from tgdsl.layout.unfelt import Unfelt
 from tgdsl.placement.reach import unfelt
 from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable
-from tgdsl.schema.load import load
-from tgdsl.schema.loaded import GIVEN, Loaded
+from tgdsl.schema.load import GIVEN, Loaded, load
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds

@@ -27,8 +27,7 @@ from tgdsl.placement.reach import Colliders, Reach, reach
 from tgdsl.plan.scene import Collider, SceneObject
 from tgdsl.scene.colliders import with_colliders
 from tgdsl.scene.contact_bits import bits_that_meet
-from tgdsl.schema.colliders import load_colliders
-from tgdsl.schema.loaded import GIVEN, Loaded, LoadedLayout
+from tgdsl.schema.load import GIVEN, Loaded, LoadedLayout, load_colliders
 from tgdsl.schema.select import select
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors.base import SensorSpec

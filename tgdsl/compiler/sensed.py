@@ -12,7 +12,7 @@ from tgdsl.formats.joints import RobotJoints
 from tgdsl.formats.model import Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.inputs import ContactPart
-from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.load import Loaded
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec, TemperaturePerEnv
 from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path

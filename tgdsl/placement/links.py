@@ -14,8 +14,7 @@ from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mea
 from tgdsl.files.find import robot_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
-from tgdsl.schema.load import load_layout
-from tgdsl.schema.loaded import LoadedLayout
+from tgdsl.schema.load import LoadedLayout, load_layout
 from tgdsl.schema.select import select
 
 _HEADER = ("body", "joints", "geoms", "area [cm²]", "mass [g]", "groups")

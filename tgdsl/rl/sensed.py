@@ -22,7 +22,7 @@ from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.spec import SENSED
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.schema.load import load
-from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.compile import compile as compile_document

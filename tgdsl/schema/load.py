@@ -4,97 +4,101 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel
 
-from tgdsl.errors import Problem, SpecError, TgdslError
+from tgdsl.errors import LowerError, Problem, SpecError, TgdslError, did_you_mean
 from tgdsl.fields.materials import Material
 from tgdsl.fields.models import Usual
 from tgdsl.files import find
-from tgdsl.schema import yaml
-from tgdsl.schema.document import document_model
-from tgdsl.schema.loaded import GIVEN, Loaded, LoadedLayout
+from tgdsl.observations.proprioception import PROPRIOCEPTION
+from tgdsl.plan.scene import Collider
+from tgdsl.schema.document import Spec, document_model
+from tgdsl.schema.objects import CollidersSpec
 from tgdsl.schema.placement import LayoutSpec
-from tgdsl.schema.references import reference_problems
 from tgdsl.schema.validation import validate
-from tgdsl.schema.yaml import Path as Place
-from tgdsl.schema.yaml import Source
+from tgdsl.schema.yaml import Path, Source, from_mapping, parse
 from tgdsl.sensors import KINDS, Kind
-
-
-def warn_of_unusual(source: Source, spec: BaseModel) -> None:
-    """Warn of each unusual value, at its place.
-
-    Args:
-        source: A document, or a file of its own, as found.
-        spec: What it was read as.
-    """
-    found = {}
-    for path, usual, value in _marked(spec, ()):
-        if (problem := usual.doubt(value)) is not None:
-            path = _place(source, path)
-            found[path, problem] = str(source.problem(path, *problem))
-    for message in found.values():
-        warnings.warn(message, stacklevel=4)
-
-
-def _place(source: Source, path: Place) -> Place:
-    """Return where a value stands in the file: a number may stand for a range, and a region for a list of one."""
-    shorter = [path[:i] + path[i + 1 :] for i, part in enumerate(path) if isinstance(part, int)]
-    for place in (path, *reversed(shorter)):
-        if source.get(place) is not None:
-            return place
-    while path and source.get(path) is None:
-        path = path[:-1]
-    return path
-
-
-def _marked(value: object, path: Place) -> Iterator[tuple[Place, Usual, float]]:
-    """Yield the numbers of all fields that are marked, their places and marks."""
-    if isinstance(value, (BaseModel, Material)):
-        for name, metadata in _fields(value):
-            inner = getattr(value, name)
-            usual = next((part for part in metadata if isinstance(part, Usual)), None)
-            if usual is None or isinstance(inner, BaseModel):
-                yield from _marked(inner, (*path, name))
-            else:
-                yield from ((place, usual, number) for place, number in _numbers(inner, (*path, name)))
-    elif isinstance(value, (tuple, list)):
-        for i, part in enumerate(value):
-            yield from _marked(part, (*path, i))
-    elif isinstance(value, Mapping):
-        for name, part in value.items():
-            yield from _marked(part, (*path, name))
-
-
-def _fields(value: BaseModel | Material) -> Iterator[tuple[str, Sequence[object]]]:
-    """Yield the fields of a model, or of a material that it was read as, and what is said of each."""
-    if isinstance(value, BaseModel):
-        yield from ((name, field.metadata) for name, field in type(value).model_fields.items())
-    else:
-        hints = get_type_hints(type(value), include_extras=True)
-        yield from ((name, getattr(hint, "__metadata__", ())) for name, hint in hints.items())
-
-
-def _numbers(value: object, path: Place) -> Iterator[tuple[Place, float]]:
-    if isinstance(value, (int, float)):
-        yield path, float(value)
-    elif isinstance(value, (tuple, list)):
-        for i, part in enumerate(value):
-            yield from _numbers(part, (*path, i))
-
+from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
+from tgdsl.sensors.noise.pipeline import knobs_of
 
 S = TypeVar("S", bound=BaseModel)
+GIVEN = "<scene>"  # the robot's model of a document that names none, where a scene is given
 ROBOT = "a robot or scene file, which a document names: `robot: {model: …}`"
+# what files are that are no YAML documents, by their endings
 NO_DOCUMENTS = {
     ".safetensors": "an artefact, which `tgdsl.load` reads",
     ".pt": "a policy or checkpoint",
     **dict.fromkeys((".xml", ".mjcf", ".urdf", ".xacro", ".usd", ".usda", ".usdc", ".usdz"), ROBOT),
 }
-"""What files are that are no YAML documents, by their endings."""
+
+
+@dataclass(kw_only=True)
+class Section:
+    """A document, or its layout, as read, and its mistakes so far."""
+
+    source: Source  # its text's values and places
+    folder: FilePath  # folder that file names in it are relative to
+    problems: list[Problem]  # mistakes found so far, of the document and its layout; later stages add theirs
+    prefix: Path = ()  # where its paths start in the source: of a layout in line, where that stands in its document
+
+    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
+        """Return a mistake at a path."""
+        return self.source.problem((*self.prefix, *path), what, hint, on_key)
+
+    def note(self, path: Path, what: str | LowerError, hint: str = "", on_key: bool = False) -> None:
+        """Note a mistake at a path; a `LowerError` at the field of it that the error names."""
+        if isinstance(what, LowerError):
+            path, what, hint = (*path, *([what.field] if what.field else [])), what.what, what.hint
+        self.problems.append(self.problem(path, what, hint, on_key))
+
+    def raw(self, path: Path) -> Any:
+        """Return the plain value at a path, or None."""
+        return self.source.get((*self.prefix, *path))
+
+
+@dataclass(kw_only=True)
+class LoadedLayout(Section):
+    """A layout, as read."""
+
+    spec: LayoutSpec
+
+
+@dataclass(kw_only=True)
+class Loaded(Section):
+    """A document, as read. With `problems`, faulty entries are left out of `spec`."""
+
+    spec: Spec
+    layout: LoadedLayout | None = None  # None if it could not be read, or if the document `is_without_layout`
+
+    @property
+    def robot_file(self) -> FilePath | None:
+        """The robot's model file, if it exists."""
+        return find.robot_file(self.spec.robot.model, self.folder)
+
+    @property
+    def is_without_layout(self) -> bool:
+        """Whether it has no layout and needs none: none of its sensors reads taxels, and all are on bodies of the robot."""
+        sensors = self.spec.sensors.values()
+        is_none = self.layout is None and self.spec.robot.layout is None and bool(sensors)
+        return is_none and not any(sensor.needs_taxels for sensor in sensors)
+
+    @property
+    def resolution(self) -> str | None:
+        """The resolution that is compiled: the one named, or the only one."""
+        if self.spec.resolution is not None or self.layout is None:
+            return self.spec.resolution
+        names = list(self.layout.spec.resolutions)
+        return names[0] if len(names) == 1 else None
+
+    def raise_problems(self) -> None:
+        """Raise all mistakes found so far, if any."""
+        if self.problems:
+            raise SpecError(self.problems)
 
 
 def load(
@@ -125,30 +129,26 @@ def load(
     if not isinstance(document, (str, PathLike, Mapping)):
         raise TgdslError(f"a document is a YAML file's name or a mapping, found {type(document).__name__}")
     if isinstance(document, Mapping):
-        source, folder = yaml.from_mapping(document, "<mapping>"), Path.cwd()
+        source, folder = from_mapping(document, "<mapping>"), FilePath.cwd()
     else:
-        source, folder = _read_file(Path(document), str(document)), Path(document).parent
-    if source.value is None:
-        raise SpecError(source.problems)
+        source, folder = read_source(FilePath(document), str(document)), FilePath(document).parent
     if isinstance(source.value, dict) and "task" in source.value and "sensors" not in source.value:
-        problem = "this is a task's document, expected one of sensors"
         hint = f"its own is {source.value['document']}" if "document" in source.value else ""
-        raise SpecError([source.problem(("task",), problem, hint, on_key=True)])
+        raise SpecError([source.problem(("task",), "this is a task's document, expected one of sensors", hint, on_key=True)])
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
     if has_scene and source.get(("robot", "model")) is None:
         source.set("robot.model", GIVEN)
     if sensors is not None:
-        source.keep("sensors", _with_upstream(source.value.get("sensors"), sensors, kinds))
-    model = document_model(kinds, needs_sensors)
+        source.keep("sensors", _with_upstream(source.get(("sensors",)), sensors, kinds))
     problems = list(source.problems)
     required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
-    spec = validate(source, (), model, problems, required)
+    spec = validate(source, (), document_model(kinds, needs_sensors), problems, required)
     if spec is None:
         raise SpecError(problems)
-    loaded = Loaded(spec=spec, source=source, folder=folder, problems=problems)  # type: ignore[arg-type]
+    loaded = Loaded(spec=spec, source=source, folder=folder, problems=problems)
     loaded.layout = _layout(loaded)
-    problems += reference_problems(loaded, kinds)
+    _check_references(loaded, kinds)
     warn_of_unusual(source, spec)
     if loaded.layout is not None and loaded.layout.source is not source:
         warn_of_unusual(loaded.layout.source, loaded.layout.spec)
@@ -173,23 +173,40 @@ def _with_upstream(written: Any, wanted: Collection[str], kinds: Sequence[Kind])
     return list(result)
 
 
-def load_layout(path: Path) -> LoadedLayout:
-    """Read a layout file by itself.
+def read_source(path: FilePath, name: str = "") -> Source:
+    """Read a file's values and where they stand, as YAML; `name` stands for it in messages, by default its path.
 
     Raises:
-        SpecError: All its mistakes.
+        SpecError: If it cannot be read, or is no YAML.
     """
-    spec, source = read_spec(path, LayoutSpec, ("resolutions",))
-    return LoadedLayout(spec=spec, source=source, folder=path.parent, problems=[])
+    return _source(_content(path, name or str(path)), name or str(path))
 
 
-def read_spec(document: Path | Mapping[str, Any], model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
-    """Read a file that holds one model and nothing else, and where its values stand.
+def _content(path: FilePath, name: str) -> bytes:
+    if "\n" in name:
+        problem = "found YAML text, expected a file's name, or a mapping: `yaml.safe_load(text)`"
+        raise SpecError([Problem("<text>", 0, 0, "", problem)])
+    if path.suffix.lower() in NO_DOCUMENTS:
+        raise SpecError([Problem(name, 0, 0, "", f"this is {NO_DOCUMENTS[path.suffix.lower()]}, expected a YAML document")])
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SpecError([Problem(name, 0, 0, "", f"cannot read this file: {error.strerror}")]) from error
 
-    Args:
-        document: The file, or the same as a mapping.
-        model: What it holds.
-        required: Keys that it must have.
+
+def _source(content: bytes, name: str) -> Source:
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise SpecError([Problem(name, 0, 0, "", f"not UTF-8 text: byte {error.start} is {error.reason}")]) from error
+    source = parse(text, name)
+    if source.value is None:
+        raise SpecError(source.problems or [Problem(name, 1, 1, "", "the document is empty")])
+    return source
+
+
+def read_spec(document: FilePath | Mapping[str, Any], model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
+    """Read a file, or a mapping, that holds one model with the `required` keys, and where its values stand.
 
     Raises:
         SpecError: All its mistakes, each at its place.
@@ -205,53 +222,34 @@ def parse_spec(content: bytes | Mapping[str, Any], name: str, model: type[S], re
     Raises:
         SpecError: All its mistakes, each at its place.
     """
-    source = yaml.from_mapping(content, name) if isinstance(content, Mapping) else _source(content, name)
+    source = from_mapping(content, name) if isinstance(content, Mapping) else _source(content, name)
     problems = list(source.problems)
     spec = validate(source, (), model, problems, required=required)
-    if problems or not isinstance(spec, model):
+    if problems or spec is None:
         raise SpecError(problems)
     return spec, source
 
 
-def read_source(path: Path) -> Source:
-    """Read a file's values and where they stand, as YAML; what they mean is not looked at.
+def load_layout(path: FilePath) -> LoadedLayout:
+    """Read a layout file by itself.
 
     Raises:
-        SpecError: If it cannot be read, or is no YAML.
+        SpecError: All its mistakes.
     """
-    return _read_file(path, str(path))
+    spec, source = read_spec(path, LayoutSpec, ("resolutions",))
+    return LoadedLayout(spec=spec, source=source, folder=path.parent, problems=[])
 
 
-def _read_file(path: Path, name: str) -> Source:
-    return _source(_content(path, name), name)
+def load_colliders(file: FilePath) -> tuple[Collider, ...]:
+    """Return the primitive colliders of a robot's links, those of one body after another, from a file beside its model.
 
-
-def _content(path: Path, name: str) -> bytes:
-    """Return what is in a file, or as much of it as shows that it is too large."""
-    if "\n" in name:
-        raise SpecError(
-            [Problem("<text>", 0, 0, "", "found YAML text, expected a file's name, or a mapping: `yaml.safe_load(text)`")]
-        )
-    if path.suffix.lower() in NO_DOCUMENTS:
-        raise SpecError([Problem(name, 0, 0, "", f"this is {NO_DOCUMENTS[path.suffix.lower()]}, expected a YAML document")])
-    try:
-        with path.open("rb") as file:
-            return file.read(yaml.MAX_BYTES + 1)
-    except OSError as error:
-        raise SpecError([Problem(name, 0, 0, "", f"cannot read this file: {error.strerror}")]) from error
-
-
-def _source(content: bytes, name: str) -> Source:
-    if large := yaml.too_large(content, name):
-        raise SpecError([large])
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise SpecError([Problem(name, 0, 0, "", f"not UTF-8 text: byte {error.start} is {error.reason}")]) from error
-    source = yaml.parse(text, name)
-    if source.value is None:
-        raise SpecError(source.problems or [Problem(name, 1, 1, "", "the document is empty")])
-    return source
+    Raises:
+        SpecError: All its mistakes, each at its place.
+    """
+    spec, _ = read_spec(file, CollidersSpec, ("tgdsl", "bodies"))
+    return tuple(
+        Collider(body, own.type, own.size, own.pos, own.quat, own.core) for body, parts in spec.bodies.items() for own in parts
+    )
 
 
 def _layout(loaded: Loaded) -> LoadedLayout | None:
@@ -261,34 +259,159 @@ def _layout(loaded: Loaded) -> LoadedLayout | None:
         path = _layout_file(loaded, wanted)
         if path is None:
             return None
+        # In messages it has the name that a user would type from where the document's name counts.
+        name = str(path) if wanted is None else str(FilePath(loaded.source.file).parent / wanted)
         try:
-            source, prefix, folder = _read_file(path, _display_name(path, loaded, wanted)), (), path.parent
+            source, prefix, folder = read_source(path, name), (), path.parent
         except SpecError as error:
             loaded.problems += error.problems
             return None
         loaded.problems += source.problems
     spec = validate(source, prefix, LayoutSpec, loaded.problems, required=("resolutions",))
-    if not isinstance(spec, LayoutSpec):
+    if spec is None:
         return None
     return LoadedLayout(spec=spec, source=source, folder=folder, problems=loaded.problems, prefix=prefix)
 
 
-def _layout_file(loaded: Loaded, wanted: str | None) -> Path | None:
+def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
     if wanted is not None:
         path = loaded.folder / wanted
         if find.is_file(path):
             return path
-        hint = "paths are relative to this document"
-        loaded.note(("robot", "layout"), f'there is no file "{wanted}"', hint)
+        loaded.note(("robot", "layout"), f'there is no file "{wanted}"', "paths are relative to this document")
         return None
     known = find.robot_names().get(loaded.spec.robot.model)
     if known is not None and (path := find.layout_file(known)) is not None:
         return path
-    if loaded.is_without_layout:
-        return None
-    loaded.note(("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True)
+    if not loaded.is_without_layout:
+        loaded.note(("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True)
     return None
 
 
-def _display_name(path: Path, loaded: Loaded, wanted: str | None) -> str:
-    return str(path) if wanted is None else str(Path(loaded.source.file).parent / wanted)
+def _check_references(loaded: Loaded, kinds: tuple[Kind, ...]) -> None:
+    """Note references within the document that lead nowhere, and knobs that a kind does not have."""
+    by_name, objects = {kind.name: kind for kind in kinds}, _names(loaded, "objects")
+    for name, sensor in loaded.spec.sensors.items():
+        for i, target in enumerate(sensor.objects):
+            path: Path = ("sensors", name, "feels", i)
+            if objects is not None and target not in objects:
+                loaded.note(path, f'unknown object "{target}"', did_you_mean(target, objects, "objects"))
+            elif target in sensor.objects[:i]:
+                loaded.note(path, f'object "{target}" is listed twice', "name it once")
+        _check_noise(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
+    _check_observations(loaded)
+    _check_resolution(loaded)
+
+
+def _names(loaded: Loaded, key: str) -> list[str] | None:
+    """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
+    result = loaded.source.value.get(key, {})
+    return list(result) if isinstance(result, dict) else None
+
+
+def _check_observations(loaded: Loaded) -> None:
+    """Note sensors that have the name of a reading that none makes, and observations of sensors that are not there."""
+    sensors = _names(loaded, "sensors") or []
+    for name in PROPRIOCEPTION.keys() & set(sensors):
+        problem = f'"{name}" is the name of a reading that no sensor makes'
+        loaded.note(("sensors", name), problem, "give the sensor another name", on_key=True)
+    for group in _names(loaded, "observations") or []:
+        terms = loaded.raw(("observations", group))
+        for i, term in enumerate(terms if isinstance(terms, list) else []):
+            target = term.get("of") if isinstance(term, dict) else None
+            if isinstance(target, str) and target.split("/")[0] not in sensors:
+                hint = did_you_mean(target, sensors, "sensors")
+                if target in PROPRIOCEPTION:
+                    hint = f"no sensor makes it: {{type: {target}}} observes it"
+                loaded.note(("observations", group, i, "of"), f'unknown sensor "{target}"', hint)
+
+
+def _check_resolution(loaded: Loaded) -> None:
+    """Note that the resolution is not one of the layout's, or that one must be named."""
+    named, path = loaded.resolution, ("resolution",)
+    if loaded.is_without_layout and named is not None:
+        problem = f'there is no layout, which could have a resolution "{named}"'
+        loaded.note(path, problem, "leave it out, or give the robot a layout")
+    elif loaded.layout is not None:
+        resolutions = list(loaded.layout.raw(("resolutions",)) or {})
+        if named is None and loaded.raw(path) is None:
+            loaded.note((), 'missing key "resolution"', f"the layout has {', '.join(resolutions)}", on_key=True)
+        elif named is not None and named not in resolutions:
+            loaded.note(path, f'unknown resolution "{named}"', did_you_mean(named, resolutions, "resolutions"))
+
+
+def _check_noise(loaded: Loaded, name: str, noise: str | NoiseSpec, kind: Kind | None) -> None:
+    """Note what is wrong with a sensor's noise: profiles that do not exist, and knobs that its kind does not have."""
+    path: Path = ("sensors", name, "noise")
+    chain = _profiles(loaded, path, noise)
+    if chain is None or kind is None:
+        return
+    own = noise if isinstance(noise, NoiseSpec) else None
+    base, links = resolve_noise(noise, kind.name, loaded.spec.noise)
+    known = knobs_of(kind.knobs)
+    for pattern, knobs in [("", base), *links]:
+        for knob in (knob for knob in knobs.active() if knob not in known):
+            what, hint = f'"{kind.name}" has no knob "{knob}"', f"it has {', '.join(sorted(known)) or 'none'}"
+            if own is not None and (pattern in own.links if pattern else knob in own.model_fields_set):
+                loaded.note((*path, "links", pattern, knob) if pattern else (*path, knob), what, hint)
+            else:
+                loaded.note(path, f"{what} (in the profile {' → '.join(chain)})", hint)
+
+
+def _profiles(loaded: Loaded, path: Path, noise: str | NoiseSpec) -> list[str] | None:
+    """Return the profiles that a sensor's noise leads to, one after the other; None if there is a mistake, which is noted."""
+    written, chain = _names(loaded, "noise"), []
+    place, name = (path, noise) if isinstance(noise, str) else ((*path, "like"), noise.like)
+    while True:
+        if name in chain:
+            loaded.note(place, "noise profiles lead in a circle", " → ".join([*chain, name]))
+            return None
+        chain.append(name)
+        if name not in loaded.spec.noise:
+            if name in PROFILES and (written is None or name not in written):
+                return chain
+            if written is not None and name not in written:
+                hint = did_you_mean(name, [*written, *PROFILES], "noise profiles")
+                loaded.note(place, f'unknown noise profile "{name}"', hint)
+            return None
+        place, name = ("noise", name, "like"), loaded.spec.noise[name].like
+
+
+def warn_of_unusual(source: Source, spec: BaseModel) -> None:
+    """Warn of each unusual value of a document that was read as `spec`, at its place."""
+    found = {}
+    for path, usual, value in _marked(spec, (), None):
+        if (problem := usual.doubt(value)) is not None:
+            path = _place(source, path)
+            found[path, problem] = str(source.problem(path, *problem))
+    for message in found.values():
+        warnings.warn(message, stacklevel=4)
+
+
+def _place(source: Source, path: Path) -> Path:
+    """Return where a value stands in the file: a number may stand for a range, and a region for a list of one."""
+    shorter = [path[:i] + path[i + 1 :] for i, part in enumerate(path) if isinstance(part, int)]
+    nearer = [path[:i] for i in range(len(path) - 1, 0, -1)]
+    return next((place for place in (path, *reversed(shorter), *nearer) if source.get(place) is not None), ())
+
+
+def _marked(value: object, path: Path, mark: Usual | None) -> Iterator[tuple[Path, Usual, float]]:
+    """Yield the numbers of all fields that are marked, their places and marks."""
+    if isinstance(value, (int, float)) and mark is not None:
+        yield path, mark, float(value)
+    elif isinstance(value, BaseModel):
+        for name, field in type(value).model_fields.items():
+            yield from _marked(getattr(value, name), (*path, name), _mark(field.metadata))
+    elif isinstance(value, Material):
+        for name, hint in get_type_hints(type(value), include_extras=True).items():
+            yield from _marked(getattr(value, name), (*path, name), _mark(getattr(hint, "__metadata__", ())))
+    elif isinstance(value, (tuple, list)):
+        for i, part in enumerate(value):
+            yield from _marked(part, (*path, i), mark)
+    elif isinstance(value, Mapping):
+        for name, part in value.items():
+            yield from _marked(part, (*path, name), mark)
+
+
+def _mark(metadata: Sequence[object]) -> Usual | None:
+    return next((part for part in metadata if isinstance(part, Usual)), None)

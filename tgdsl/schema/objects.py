@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, StrictBool, StrictInt, Tag, model_validator
 
 from tgdsl.fields.materials import MaterialField
 from tgdsl.fields.models import Number, Position, Positive, PositiveLength, SpecModel, Temperature, Usual
@@ -20,33 +20,53 @@ def _oriented(quat: tuple[float, float, float, float]) -> tuple[float, float, fl
     return quat
 
 
+Quat = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_oriented)]
+
+
 class _PlacedGeom(SpecModel):
     pos: Annotated[Position, Usual("length", high=10.0)] = (0.0, 0.0, 0.0)
     """Origin of its frame in the body's frame [m]."""
-    quat: tuple[Number, Number, Number, Number] = (1.0, 0.0, 0.0, 0.0)
+    quat: Quat = (1.0, 0.0, 0.0, 0.0)
     """Orientation of its frame in the body's frame, w, x, y, z."""
     density: Annotated[Positive, Usual("number", low=5.0, high=25000.0)] = 1000.0
     """Its density [kg/m³]; counts unless the body's inertia is given in the scene."""
 
-    @model_validator(mode="after")
-    def _check_quat(self) -> _PlacedGeom:
-        _oriented(self.quat)
-        return self
 
-
-class PrimitiveGeom(_PlacedGeom):
-    """A primitive."""
-
+class _Primitive(SpecModel):
     type: Literal["sphere", "capsule", "cylinder", "ellipsoid", "box"]
     """Its type, by MuJoCo's name."""
     size: Annotated[tuple[PositiveLength, ...], Field(min_length=1, max_length=3), Usual("length", low=1e-4, high=5.0)]
     """Its size as MuJoCo defines it: radius; radius and half-length; half-lengths along x, y, z [m]."""
 
     @model_validator(mode="after")
-    def _check_size(self) -> PrimitiveGeom:
+    def _check_size(self) -> Self:
         if len(self.size) != NUM_SIZES[self.type]:
             raise ValueError(f"a {self.type} has {NUM_SIZES[self.type]} sizes, found {len(self.size)}")
         return self
+
+
+class PrimitiveGeom(_Primitive, _PlacedGeom):
+    """A primitive."""
+
+
+class ColliderSpec(_Primitive):
+    """A primitive that a link collides with."""
+
+    pos: Position = (0.0, 0.0, 0.0)
+    """Origin of its frame in the body's frame [m]."""
+    quat: Quat = (1.0, 0.0, 0.0, 0.0)
+    """Orientation of its frame in the body's frame, w, x, y, z."""
+    core: StrictBool = False
+    """Whether links that have primitive colliders meet it too; the others meet what is no such link alone."""
+
+
+class CollidersSpec(SpecModel):
+    """The primitive colliders of a robot, in a file of their own beside its model."""
+
+    tgdsl: Literal[1]
+    """Version of the grammar."""
+    bodies: Annotated[dict[str, Annotated[tuple[ColliderSpec, ...], Field(min_length=1)]], Field(min_length=1)]
+    """Colliders by the name of the body whose colliding geoms they stand in for."""
 
 
 class MeshGeom(_PlacedGeom):
@@ -135,7 +155,7 @@ class ObjectSpec(SpecModel):
     """`per_env` if its size is part of the state: see `SceneState.object_size`. It (and each variant) is then one primitive."""
     pos: Annotated[Position | None, Usual("length", high=10.0)] = None
     """Where a body of its own starts, in the world [m]; default: the origin."""
-    quat: tuple[Number, Number, Number, Number] | None = None
+    quat: Quat | None = None
     """How it is turned there, w, x, y, z; default: not at all."""
     joint: Literal["free", "fixed"] | None = None
     """Whether a body of its own moves freely (the default) or is fixed to the world."""
@@ -186,8 +206,6 @@ class ObjectSpec(SpecModel):
             raise ValueError(f'`{own[0]}` is for a body of its own; of body "{self.body}" the scene says it')
         if self.compounds and self.surface not in ("collision", "visual"):
             raise ValueError(f'surface "{self.surface}" names a geom; with geoms of its own it is `collision` or `visual`')
-        if self.quat is not None:
-            _oriented(self.quat)
         return self
 
     @property

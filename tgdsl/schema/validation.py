@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -14,6 +14,7 @@ from tgdsl.errors import Problem, did_you_mean
 from tgdsl.schema import yaml
 from tgdsl.schema.yaml import Path, Source
 
+M = TypeVar("M", bound=BaseModel)
 ENTRY_DEPTH = {"sensors": 2, "objects": 2, "noise": 2, "groups": 2, "observations": 3, "resolutions": 3}
 """How deep an entry sits under each of these keys: a faulty entry is left out, and the rest is still checked."""
 
@@ -21,11 +22,9 @@ DISCRIMINATORS = ("kind", "method", "type")
 """Keys whose value says as what a mapping is read: pydantic's error locations hold that value as if it were a key."""
 
 
-def validate(
-    source: Source, prefix: Path, model: type[BaseModel], problems: list[Problem], required: tuple[str, ...]
-) -> BaseModel | None:
+def validate(source: Source, prefix: Path, model: type[M], problems: list[Problem], required: tuple[str, ...]) -> M | None:
     """Read a mapping as a model; note every mistake, leave faulty entries out, and read what is left."""
-    value = source.get(prefix) if prefix else source.value
+    value = source.get(prefix)
     known: dict[int, type[BaseModel]] = {}
     try:
         return model.model_validate(value, context=known)
@@ -40,7 +39,7 @@ def validate(
     return _rest(value, model, entries, required) if isinstance(value, dict) else None
 
 
-def _rest(value: dict, model: type[BaseModel], entries: set[Path], required: tuple[str, ...]) -> BaseModel | None:
+def _rest(value: dict, model: type[M], entries: set[Path], required: tuple[str, ...]) -> M | None:
     """Read what is left without some entries, nor those that are faulty without them."""
     rest = copy.deepcopy(value)
     for entry in sorted(entries, key=lambda path: [f"{part:>9}" for part in path], reverse=True):
@@ -92,8 +91,6 @@ def _entry(path: Path) -> Path:
 
 def _remove(value: Any, path: Path) -> None:
     """Remove an entry, and its list with it if that becomes empty."""
-    if not path:
-        return
     try:
         for part in path[:-1]:
             parent, key, value = value, part, value[part]
@@ -134,26 +131,21 @@ def _problem(
         if key == "kind" and hint.startswith("known"):
             hint += "; kinds of other packages are known once these are installed"
         return source.problem((*full, key), f'unknown {key} "{context["tag"]}"', hint)
-    if kind == "literal_error":
-        return source.problem(full, f"found {_brief(found)}, expected {context['expected']}")
     if kind == "value_error":
         return source.problem(full, str(context["error"]))
     if kind == "region":
         return source.problem(full, error["msg"])
-    if kind == "too_short":
-        return source.problem(full, f"found {_brief(found)}, expected at least {context['min_length']} entry")
-    if kind == "too_long":
-        return source.problem(full, f"found {_brief(found)}, expected {context['max_length']} entries")
-    if _wanted(kind):
-        return source.problem(full, f"found {_brief(found)}, expected {_wanted(kind)}")
-    message = error["msg"][0].lower() + error["msg"][1:]
-    return source.problem(full, f"found {_brief(found)}: {message}")
-
-
-def _wanted(kind: str) -> str:
-    if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return "a mapping"
-    return {"tuple_type": "a list", "string_type": "a string"}.get(kind, "")
+    expected = {
+        **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "a mapping"),
+        "tuple_type": "a list",
+        "string_type": "a string",
+        "literal_error": context.get("expected"),
+        "too_short": f"at least {context.get('min_length')} entry",
+        "too_long": f"{context.get('max_length')} entries",
+    }
+    if kind in expected:
+        return source.problem(full, f"found {_brief(found)}, expected {expected[kind]}")
+    return source.problem(full, f"found {_brief(found)}: {error['msg'][0].lower()}{error['msg'][1:]}")
 
 
 def _brief(found: Any) -> str:

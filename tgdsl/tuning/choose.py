@@ -23,8 +23,7 @@ from tgdsl.files.cache import cached
 from tgdsl.files.find import is_file
 from tgdsl.module.accuracy.variants import bare, is_taken
 from tgdsl.module.module import TactileModule
-from tgdsl.schema.load import load
-from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.load import Loaded, load
 from tgdsl.schema.objects import query_alternatives
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
