@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -38,7 +38,7 @@ from tgdsl.plan.sensors import (
     PlannedReading,
     PlannedSensor,
 )
-from tgdsl.quantities.base import Planning, Quantity, Request, heated_objects
+from tgdsl.quantities.base import Planning, Quantity, heated_objects
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path
@@ -46,92 +46,173 @@ from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Axis, Channel, body_axis
 from tgdsl.sensors.known import quantities_of
 
+SHOWN = 8  # links and reasons that the warning names; the account of the module names all
+# fields of the state that quantities read, in the order in which a module reads them
+FIELDS = (
+    *("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found"),
+    *("contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce", "variant", "object_size"),
+    *("object_temperature", "object_material", "joint_pos", "joint_vel", "joint_effort", "last_action"),
+)
 
-@dataclass(frozen=True)
-class Observed:
-    """What a document observes."""
 
-    terms: tuple[PlannedObservation, ...]  # the observation terms, in the document's order
-    proprioception: tuple[PlannedReading, ...]  # readings of joints and actuators that some of them want
+def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin, progress: Progress = silent) -> Plan:
+    """Return the Plan of a document, its scene still empty.
+
+    Raises:
+        SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
+            should.
+    """
+    sensors, quantities = lowered_sensors(loaded, resolved, kinds, progress), quantities_of(kinds)
+    joints = _joints_read(loaded, resolved)
+    pruned = passes.prune(sensors, resolved.objects, resolved.link_bodies, resolved.scene)
+    _report_hopeless(loaded, pruned)
+    object_parts, link_parts = _object_parts(loaded, resolved, sensors, pruned), _link_parts(loaded, resolved, sensors, pruned)
+    joined = passes.join(sensors)
+    shared = passes.share(sensors, joined, resolved.layout, quantities)
+    numbered = passes.number(pruned, resolved.objects, shared.uses, quantities)
+    asked = tuple(quantity for quantity in quantities if quantity.name in shared.uses)
+    parts = _quantity_parts(loaded, resolved, pruned, numbered, shared, asked, joints.joints, progress)
+    loaded.raise_problems()
+    planned = tuple(_sensor(sensor, joined, shared, parts, asked) for sensor in sensors)
+    terms = _observations(loaded, planned, {sensor.name: sensor.layout for sensor in sensors}, joints)
+    loaded.raise_problems()
+    unfelt = unfelt_taxels(resolved, sensors, pruned)
+    _warn_of_unfelt(loaded.source.file, unfelt, resolved.layout.num_taxels)
+    proprioception = _proprioception({term.type for term in terms}, joints, resolved.joints)
+
+    read = {reading.name for reading in proprioception} | {"body_pos", "body_quat"}.union(
+        *(quantity.fields(parts[quantity.name]) for quantity in asked)
+    )
+    varied = sorted((target for target in numbered.objects if target.varied >= 0), key=lambda target: target.varied)
+    read |= {"variant"} if any(target.num_variants > 1 for target in varied) else set()
+    read |= {"object_size"} if any(target.is_sized for target in varied) else set()
+    heated = heated_objects(numbered.objects, resolved.objects) if {"object_temperature", "object_material"} & read else ()
+    heats = [heat for name in heated if (heat := resolved.objects[name].heat) is not None]
+    body_of = {target.name: target.body for target in numbered.objects}
+    inputs = Inputs(
+        fields=(*(name for name in FIELDS if name in read), *(["dt"] if any(map(_is_timed, sensors)) else [])),
+        bodies=numbered.bodies,
+        pairs=pruned.contact_pairs,
+        bodies_of={pair.object: body_of[pair.object] for pair in pruned.contact_pairs},
+        slots=max((use.request.num_slots for uses in shared.uses.values() for use in uses), default=0),
+        objects=tuple(target.name for target in varied),
+        num_variants=tuple(target.num_variants for target in varied),
+        heated=heated,
+        num_materials=tuple(len(heat.materials) for heat in heats),
+        start_temperatures=tuple(heat.temperature if heat.is_per_env else None for heat in heats),
+        joints=joints.joints,
+        actuators=joints.actuators,
+        contacts_of=object_parts,
+        link_parts=link_parts,
+        substeps=max((sensor.lowered.substeps for sensor in sensors), default=0) or 1,
+        dt=max((sensor.lowered.timestep * max(sensor.lowered.substeps, 1) for sensor in sensors), default=0.0),
+    )
+    never = [(f"pair {pair.link} – {pair.object}", "they can never be in contact") for pair in pruned.dropped]
+    result = Plan(
+        origin=origin,
+        inputs=inputs,
+        layout=resolved.layout,
+        objects=numbered.objects,
+        pairs=numbered.table,
+        quantities=parts,
+        sensors=planned,
+        proprioception=proprioception,
+        observations=terms,
+        dropped=(*resolved.unused, *never),
+        unfelt=unfelt,
+        scene=SceneFile("", {}, ()),
+    )
+    return tree.mapped(result, tree.frozen)
 
 
-@dataclass(frozen=True)
-class Wanted:
+class JointsRead(NamedTuple):
     """The joints and actuators that a document reads."""
 
-    # those of each observation term of joints, by group and number, in its order
-    rows: Mapping[tuple[str, int], tuple[str, ...]]
-    joints: tuple[str, ...]  # names of all joints that are read, by observations and sensors, in the robot's order
-    actuators: tuple[str, ...]  # names of all actuators that are read
-
-
-def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
-    """Return the joints and actuators that a document reads."""
-    all_joints, selected = resolved.joints, {}
-    requested: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
-    for group, i, spec in _terms(loaded):
-        if isinstance(spec, JointObservation):
-            selected[group, i] = _rows(loaded, ("observations", group, i), spec, all_joints)
-            requested[PROPRIOCEPTION[spec.type].rows].update(selected[group, i])
-    joints = tuple(name for name in all_joints.joints if name in requested["joint"])
-    actuators = tuple(actuator.name for actuator in all_joints.actuators if actuator.name in requested["actuator"])
-    return Wanted(selected, joints, actuators)
+    terms: Mapping[tuple[str, int], tuple[str, ...]]  # of each observation term of joints, by group and number, in its order
+    joints: tuple[str, ...]  # all that observations and sensors read, in the robot's order
+    actuators: tuple[str, ...]
 
 
 def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
     return [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
 
 
-def observed(
-    loaded: Loaded,
-    resolved: Resolved,
-    sensors: Sequence[PlannedSensor],
-    layouts: Mapping[str, Layout],
-    read: Wanted,
-) -> Observed:
-    """Return a document's observations; what is wrong with one is noted among the document's problems."""
-    specs, all_joints, joints, actuators = _terms(loaded), resolved.joints, read.joints, read.actuators
+def _joints_read(loaded: Loaded, resolved: Resolved) -> JointsRead:
+    robot, selected = resolved.joints, {}
+    read: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
+    for group, i, spec in _terms(loaded):
+        if isinstance(spec, JointObservation):
+            selected[group, i] = _rows(loaded, ("observations", group, i), spec, robot)
+            read[PROPRIOCEPTION[spec.type].rows].update(selected[group, i])
+    actuators = tuple(actuator.name for actuator in robot.actuators if actuator.name in read["actuator"])
+    return JointsRead(selected, tuple(name for name in robot.joints if name in read["joint"]), actuators)
+
+
+def _rows(loaded: Loaded, path: Path, spec: JointSpec, robot: RobotJoints) -> tuple[str, ...]:
+    """Return the joints, or for a `last_action` the actuators, that an observation is of, in its order."""
+    is_of_joints = PROPRIOCEPTION[spec.type].rows == "joint"
+    selected: dict[str, None] = {}
+    if spec.joints is None:
+        names = robot.joints[: robot.num_actuated] if is_of_joints else tuple(actuator.name for actuator in robot.actuators)
+        selected = dict.fromkeys(names)
+        if not names:
+            hint = 'name them: joints: ["*"]' if is_of_joints and robot.joints else ""
+            loaded.note(path, f"the robot has no actuated joints, so there is no {spec.type} of them", hint)
+    for k, pattern in enumerate(spec.joints or ()):
+        hits = joints_matching(loaded, (*path, "joints", k), pattern, robot)
+        if not is_of_joints and hits:
+            joints, hits = hits, [actuator.name for actuator in robot.actuators if set(actuator.joints) & set(hits)]
+            if not hits:
+                problem = f"no actuator acts on {', '.join(joints)}"
+                loaded.note((*path, "joints", k), problem, "so there is no last action of it")
+        selected |= dict.fromkeys(hits)
+    if "" in selected:
+        problem = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
+        loaded.note(path, problem, "name it in the robot's file")
+    return tuple(selected)
+
+
+def _observations(
+    loaded: Loaded, sensors: Sequence[PlannedSensor], layouts: Mapping[str, Layout], read: JointsRead
+) -> tuple[PlannedObservation, ...]:
+    """Return the observation terms, in the document's order; what is wrong with one is noted."""
     reading_of = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
     terms: list[PlannedObservation] = []
-    for group, i, spec in specs:
+    for group, i, spec in _terms(loaded):
         if isinstance(spec, OfReading):
             terms += _of_reading(loaded, group, i, spec, reading_of)
         elif isinstance(spec, JointObservation):
-            rows = joints if PROPRIOCEPTION[spec.type].rows == "joint" else actuators
-            terms.append(_of_joints(group, i, spec, read.rows[group, i], rows))
+            chosen, every = read.terms[group, i], read.joints if PROPRIOCEPTION[spec.type].rows == "joint" else read.actuators
+            constants = {} if chosen == every else {"rows": np.array([every.index(n) for n in chosen], dtype=np.int64)}
+            terms.append(PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants))
         else:
             count = observations.HAND_ONLY.get(spec.type, 0)
             terms.append(PlannedObservation(group, i, spec.type, None, (), count, {}))
-    return Observed(tuple(terms), _proprioception({spec.type for _, _, spec in specs}, joints, actuators, all_joints))
+    return tuple(terms)
 
 
 def _of_reading(
-    loaded: Loaded,
-    group: str,
-    i: int,
-    spec: ReadingSpec,
-    found: Mapping[str, tuple[PlannedReading, Layout]],
+    loaded: Loaded, group: str, i: int, spec: ReadingSpec, readings: Mapping[str, tuple[PlannedReading, Layout]]
 ) -> list[PlannedObservation]:
     """Return the observation of a sensor's reading, or nothing if it is wrong."""
     path: Path = ("observations", group, i)
-    if spec.of not in found:
-        loaded.note((*path, "of"), f'there is no reading "{spec.of}"', did_you_mean(spec.of, found, "readings"))
+    if spec.of not in readings:
+        loaded.note((*path, "of"), f'there is no reading "{spec.of}"', did_you_mean(spec.of, readings, "readings"))
         return []
-    reading, layout = found[spec.of]
+    reading, layout = readings[spec.of]
     if isinstance(spec, ReadingObservation):
-        channel_names = _channels(loaded, path, spec, reading)
+        channel_names: Sequence[str] = _channels(loaded, path, spec, reading)
     else:
         channel_names, rows = observations.WANTED[spec.type]
         if reading.rows != rows or not set(channel_names) <= set(reading.channels):
             problem = f'"{spec.type}" needs {", ".join(channel_names)} of each {rows}, which "{spec.of}" does not read'
             loaded.note(path, problem, f"it reads {', '.join(reading.channels)} of each {reading.rows}")
             return []
-    constants = observations.lower(spec, layout)
+    constants = dict(sorted(observations.lower(spec, layout).items()))
     channels = tuple(reading.channels.index(channel) for channel in channel_names)
     per_call = observations.num_features(spec.type, len(channels), reading.num_rows, len(layout.links))
     axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
-    count = max(reading.steps, 1) * per_call
-    return [PlannedObservation(group, i, spec.type, spec.of, channels, count, dict(sorted(constants.items())), axes)]
+    return [PlannedObservation(group, i, spec.type, spec.of, channels, max(reading.steps, 1) * per_call, constants, axes)]
 
 
 def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: PlannedReading) -> tuple[str, ...]:
@@ -146,36 +227,10 @@ def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: Pla
     return tuple(selected)
 
 
-def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tuple[str, ...]:
-    """Return the joints, or for a `last_action` the actuators, that an observation is of, in its order."""
-    is_of_joints = PROPRIOCEPTION[spec.type].rows == "joint"
-    selected: dict[str, None] = {}
-    if spec.joints is None:
-        names = own.joints[: own.num_actuated] if is_of_joints else tuple(actuator.name for actuator in own.actuators)
-        selected = dict.fromkeys(names)
-        if not names:
-            hint = 'name them: joints: ["*"]' if is_of_joints and own.joints else ""
-            loaded.note(path, f"the robot has no actuated joints, so there is no {spec.type} of them", hint)
-    for k, pattern in enumerate(spec.joints or ()):
-        hits = joints_matching(loaded, (*path, "joints", k), pattern, own)
-        if not is_of_joints and hits:
-            joints, hits = hits, [actuator.name for actuator in own.actuators if set(actuator.joints) & set(hits)]
-            if not hits:
-                problem = f"no actuator acts on {', '.join(joints)}"
-                loaded.note((*path, "joints", k), problem, "so there is no last action of it")
-        selected |= dict.fromkeys(hits)
-    if "" in selected:
-        problem = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
-        loaded.note(path, problem, "name it in the robot's file")
-    return tuple(selected)
-
-
-def _proprioception(
-    types: Collection[str], joints: Sequence[str], actuators: Sequence[str], own: RobotJoints
-) -> tuple[PlannedReading, ...]:
+def _proprioception(types: Collection[str], read: JointsRead, robot: RobotJoints) -> tuple[PlannedReading, ...]:
     """Return the readings of joints and actuators that are observed, in the order of `PROPRIOCEPTION`."""
-    num_rows = {"joint": len(joints), "actuator": len(actuators)}
-    is_slide = [name in own.slides for name in joints]
+    num_rows = {"joint": len(read.joints), "actuator": len(read.actuators)}
+    is_slide = [name in robot.slides for name in read.joints]
     readings = []
     for name, quantity in PROPRIOCEPTION.items():
         if name in types:
@@ -183,21 +238,6 @@ def _proprioception(
             unit = hinge if hinge == slide or not any(is_slide) else slide if all(is_slide) else f"{hinge} or {slide}"
             readings.append(PlannedReading(name, quantity.rows, num_rows[quantity.rows], (quantity.channel,), (unit,)))
     return tuple(readings)
-
-
-def _of_joints(
-    group: str,
-    i: int,
-    spec: JointSpec,
-    chosen: Sequence[str],
-    wanted: Sequence[str],
-) -> PlannedObservation:
-    is_all = list(chosen) == list(wanted)
-    constants = {} if is_all else {"rows": np.array([wanted.index(name) for name in chosen], dtype=np.int64)}
-    return PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants)
-
-
-SHOWN = 8  # links and reasons that the warning names; the account of the module names all
 
 
 def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> tuple[Unfelt, ...]:
@@ -231,64 +271,15 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
     return unfelt(resolved.colliders, layout, within)
 
 
-def warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
+def _warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
     """Warn once of all taxels that cannot feel, by link and reason."""
     if found:
         problem = f"{len(unfelt_ids(found))} of {num_taxels} taxels cannot feel: {'; '.join(map(str, found[:SHOWN]))}"
         problem += f"; and {len(found) - SHOWN} more, see `explain`" if len(found) > SHOWN else ""
-        hints = {BURIED: "`surface: collision`", COVERED: "`exposed: true`"}
-        matching_hints = [hint for reason, hint in hints.items() if any(taxels.reason == reason for taxels in found)]
-        problem += f"; in the layout {' and '.join(matching_hints)} would place them elsewhere" if matching_hints else ""
+        ways = {BURIED: "`surface: collision`", COVERED: "`exposed: true`"}
+        hints = [hint for reason, hint in ways.items() if any(taxels.reason == reason for taxels in found)]
+        problem += f"; in the layout {' and '.join(hints)} would place them elsewhere" if hints else ""
         warnings.warn(f"{file}: {problem}", UnfeltWarning, stacklevel=3)
-
-
-Parts = Mapping[str, Any]  # the part of the Plan of each quantity, by its name
-FIELDS = (
-    *("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found"),
-    *("contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce", "variant", "object_size"),
-    *("object_temperature", "object_material", "joint_pos", "joint_vel", "joint_effort", "last_action"),
-)
-"""Fields of the state that quantities read, in the order in which a module wants them."""
-
-
-def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin, progress: Progress = silent) -> Plan:
-    """Return the Plan of a document, its scene still empty.
-
-    Raises:
-        SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
-            should.
-    """
-    sensors, read = lowered_sensors(loaded, resolved, kinds, progress), wanted(loaded, resolved)
-    pruned = passes.prune(sensors, resolved.objects, resolved.link_bodies, resolved.scene)
-    _report_hopeless(loaded, pruned)
-    touched = _contact_parts(loaded, resolved, sensors, pruned)
-    joined, quantities = passes.join(sensors), quantities_of(kinds)
-    shared = passes.share(sensors, joined, resolved.layout, quantities)
-    numbered = passes.number(pruned, resolved.objects, shared.uses, quantities)
-    requested = tuple(quantity for quantity in quantities if quantity.name in shared.uses)
-    parts = _quantities(loaded, resolved, pruned, numbered, shared, requested, read, progress)
-    loaded.raise_problems()
-    planned = tuple(_sensor(sensor, joined, shared, parts, requested) for sensor in sensors)
-    seen = observed(loaded, resolved, planned, {sensor.name: sensor.layout for sensor in sensors}, read)
-    loaded.raise_problems()
-    unfelt = unfelt_taxels(resolved, sensors, pruned)
-    warn_of_unfelt(loaded.source.file, unfelt, resolved.layout.num_taxels)
-    never = [(f"pair {pair.link} – {pair.object}", "they can never be in contact") for pair in pruned.dropped]
-    result = Plan(
-        origin=origin,
-        inputs=_inputs(resolved, sensors, pruned, numbered, shared, parts, requested, touched, seen, read),
-        layout=resolved.layout,
-        objects=numbered.objects,
-        pairs=numbered.table,
-        quantities=parts,
-        sensors=planned,
-        proprioception=seen.proprioception,
-        observations=seen.terms,
-        dropped=(*resolved.unused, *never),
-        unfelt=unfelt,
-        scene=SceneFile("", {}, ()),
-    )
-    return tree.mapped(result, tree.frozen)
 
 
 def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
@@ -304,30 +295,28 @@ def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
         loaded.note(path, problem, hint)
 
 
-class ContactParts(NamedTuple):
-    """Which geoms' contacts are an object's and a link's, by name, where they are not just those of its body."""
-
-    objects: dict[str, tuple[ContactPart, ...]]
-    links: dict[str, tuple[ContactPart, ...]]
+Parts = dict[str, tuple[ContactPart, ...]]  # which geoms' contacts count, by name, where they are not just those of a body
 
 
-def _contact_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> ContactParts:
-    """Return which geoms' contacts are an object's and a link's; what cannot be told apart is a mistake."""
+def _object_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> Parts:
+    """Return which geoms' contacts are an object's; what cannot be told apart is a mistake."""
     objects = {}
     for name in sorted({pair.object for pair in pruned.contact_pairs}):
         felt = resolved.objects[name]
         report = partial(loaded.note, ("objects", name, "surface"))
         parts = contact_parts(resolved.scene, felt.bodies, felt.touched, report)
         objects |= {name: parts} if parts != (ContactPart("body", felt.body),) else {}
-    for sensor in sensors:
-        for request in (request for request in sensor.requests if request.wants_contacts):
-            _check_shared(loaded, resolved, sensor, request)
-    return ContactParts(objects, _link_parts(loaded, resolved, sensors, pruned))
+    for name, request in ((s.sensor, r) for s in sensors for r in s.requests if r.wants_contacts):
+        for (_, first), (i, second) in itertools.combinations(enumerate(request.objects), 2):
+            one, two = resolved.objects[first].touched, resolved.objects[second].touched
+            if one & two and not (one <= two or two <= one):
+                problem = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
+                path: Path = ("sensors", name, "feels", i)
+                loaded.note(path, problem, "give each a sensor of its own, or surfaces apart")
+    return objects
 
 
-def _link_parts(
-    loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned
-) -> dict[str, tuple[ContactPart, ...]]:
+def _link_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> Parts:
     """Return which geoms' contacts are a link's; what cannot be told apart is a mistake."""
     parts = {}
     for link in sorted({pair.link for pair in pruned.contact_pairs}):
@@ -341,27 +330,17 @@ def _link_parts(
     return parts
 
 
-def _check_shared(loaded: Loaded, resolved: Resolved, sensor: LoweredSensor, request: Request) -> None:
-    """Note objects of a request that share some geoms, but not all of one of them."""
-    for (_, first), (i, second) in itertools.combinations(enumerate(request.objects), 2):
-        one, two = resolved.objects[first].touched, resolved.objects[second].touched
-        if one & two and not (one <= two or two <= one):
-            problem = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
-            path: Path = ("sensors", sensor.sensor, "feels", i)
-            loaded.note(path, problem, "give each a sensor of its own, or surfaces apart")
-
-
-def _quantities(
+def _quantity_parts(
     loaded: Loaded,
     resolved: Resolved,
     pruned: Pruned,
     numbered: Numbered,
     shared: Shared,
     asked: Sequence[Quantity],
-    read: Wanted,
+    joints: tuple[str, ...],
     progress: Progress,
-) -> Parts:
-    """Return the part of the Plan of each quantity; mistakes are noted."""
+) -> dict[str, Any]:
+    """Return the part of the Plan of each quantity, by its name; mistakes are noted."""
     planning = Planning(
         layout=resolved.layout,
         sensed=resolved.objects,
@@ -372,75 +351,25 @@ def _quantities(
         geoms_of=resolved.geoms_of,
         report=loaded.note,
         progress=progress,
-        joints=read.joints,
-        anchors={name: resolved.anchor_of(name) for name in read.joints if name},
+        joints=joints,
+        anchors={name: resolved.anchor_of(name) for name in joints if name},
     )
     parts = {}
     for quantity in asked:
+        uses = shared.uses[quantity.name]
         try:
-            parts[quantity.name] = quantity.plan(planning, shared.uses[quantity.name])
-        except LowerError as error:
-            loaded.note(("sensors", shared.uses[quantity.name][0].sensors[0]), error)
-        except BakeError as error:
-            loaded.note(("sensors", shared.uses[quantity.name][0].sensors[0]), str(error))
-    if not loaded.problems:
-        _check_parts(parts, asked)
-    return parts
-
-
-def _check_parts(parts: Parts, asked: Sequence[Quantity]) -> None:
-    """Refuse what is no part of its quantity, or reads fields that a state does not have."""
-    for quantity in asked:
-        part = parts[quantity.name]
+            part = quantity.plan(planning, uses)
+        except (LowerError, BakeError) as error:
+            loaded.note(("sensors", uses[0].sensors[0]), error if isinstance(error, LowerError) else str(error))
+            continue
         if not isinstance(part, quantity.part):
             problem = f"`plan` returns {type(part).__name__}, expected its part, {quantity.part.__name__}"
             raise TgdslError(f'quantity "{quantity.name}": {problem}')
         if unknown := sorted(set(quantity.fields(part)) - set(FIELDS)):
             hint = did_you_mean(unknown[0], FIELDS, "fields")
             raise TgdslError(f'quantity "{quantity.name}" reads the field {unknown[0]}; {hint}')
-
-
-def _inputs(
-    resolved: Resolved,
-    sensors: Sequence[LoweredSensor],
-    pruned: Pruned,
-    numbered: Numbered,
-    shared: Shared,
-    parts: Parts,
-    asked: Sequence[Quantity],
-    touched: ContactParts,
-    seen: Observed,
-    wanted: Wanted,
-) -> Inputs:
-    """Return what the module wants of a scene."""
-    read = {reading.name for reading in seen.proprioception} | {"body_pos", "body_quat"}.union(
-        *(quantity.fields(parts[quantity.name]) for quantity in asked)
-    )
-    varied = sorted((target for target in numbered.objects if target.varied >= 0), key=lambda target: target.varied)
-    read |= {"variant"} if any(target.num_variants > 1 for target in varied) else set()
-    read |= {"object_size"} if any(target.is_sized for target in varied) else set()
-    heated = heated_objects(numbered.objects, resolved.objects) if {"object_temperature", "object_material"} & read else ()
-    heats = [heat for name in heated if (heat := resolved.objects[name].heat) is not None]
-    body_of = {target.name: target.body for target in numbered.objects}
-    fields = [name for name in FIELDS if name in read]
-    return Inputs(
-        fields=(*fields, *(["dt"] if any(_is_timed(sensor) for sensor in sensors) else [])),
-        bodies=numbered.bodies,
-        pairs=pruned.contact_pairs,
-        bodies_of={pair.object: body_of[pair.object] for pair in pruned.contact_pairs},
-        slots=max((use.request.num_slots for uses in shared.uses.values() for use in uses), default=0),
-        objects=tuple(target.name for target in varied),
-        num_variants=tuple(target.num_variants for target in varied),
-        heated=heated,
-        num_materials=tuple(len(heat.materials) for heat in heats),
-        start_temperatures=tuple(heat.temperature if heat.is_per_env else None for heat in heats),
-        joints=wanted.joints,
-        actuators=wanted.actuators,
-        contacts_of=touched.objects,
-        link_parts=touched.links,
-        substeps=max((sensor.lowered.substeps for sensor in sensors), default=0) or 1,
-        dt=max((sensor.lowered.timestep * max(sensor.lowered.substeps, 1) for sensor in sensors), default=0.0),
-    )
+        parts[quantity.name] = part
+    return parts
 
 
 def _is_timed(sensor: LoweredSensor) -> bool:
@@ -448,7 +377,7 @@ def _is_timed(sensor: LoweredSensor) -> bool:
 
 
 def _sensor(
-    sensor: LoweredSensor, joined: Joined, shared: Shared, parts: Parts, asked: Sequence[Quantity]
+    sensor: LoweredSensor, joined: Joined, shared: Shared, parts: Mapping[str, Any], asked: Sequence[Quantity]
 ) -> PlannedSensor[np.ndarray]:
     """Return a sensor as the Plan has it."""
     lowered, spec, bodies = sensor.lowered, sensor.spec, body_axis(sensor.layout)
@@ -504,7 +433,7 @@ def _axis(rows: Axis) -> PlannedAxis:
 
 
 def _state(
-    sensor: LoweredSensor, shared: Shared, parts: Parts, asked: Sequence[Quantity], shape: tuple[int, int]
+    sensor: LoweredSensor, shared: Shared, parts: Mapping[str, Any], asked: Sequence[Quantity], shape: tuple[int, int]
 ) -> dict[str, PlannedMemory]:
     """Return what a sensor carries from one call to the next; `shape` is that of its signal."""
     memory = {}

@@ -14,7 +14,7 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, TgdslError, did_you_mean, listed
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
-from tgdsl.layout.layout import Layout, Link
+from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Request
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import select
@@ -22,109 +22,10 @@ from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import AnySensorSpec, Axis, Fitting, Lowered, ReadSensor, body_axis, taxel_axis
 from tgdsl.sensors.known import check_lowered
-from tgdsl.sensors.noise import Knobs, NoiseSpec, built_in, resolve_noise
+from tgdsl.sensors.noise import Knobs, built_in, resolve_noise
 from tgdsl.sensors.noise.pipeline import LoweredNoise, lower_noise
 from tgdsl.sensors.noise.spec import quantity
 from tgdsl.surfaces.surface import Surface
-
-
-def measured_spec(spec: AnySensorSpec, knobs: Sequence[Knobs]) -> AnySensorSpec:
-    """Return the spec of the measured reading: knobs may set what is a field of the sensor's own.
-
-    Raises:
-        LowerError: If such a knob does not fit the sensor.
-    """
-    released = [knob.release_threshold for knob in knobs if knob.release_threshold is not None]
-    if not released:
-        return spec
-    lowest, highest = min(low for low, _ in released), max(high for _, high in released)
-    threshold = getattr(spec, "threshold", None)
-    if threshold is None:
-        raise LowerError("release_threshold is of a sensor with a threshold, and this one has none", "noise", "leave it out")
-    if highest > threshold:
-        problem = f"release_threshold {highest:g} m is above the sensor's threshold {threshold:g} m"
-        raise LowerError(problem, field="noise", hint="expected at most that")
-    return spec.model_copy(update={"release_threshold": min(lowest, np.nextafter(threshold, 0.0))})
-
-
-def knobs_of(loaded: Loaded, resolved: Resolved, name: str, layout: Layout, kind: Kind) -> list[Knobs]:
-    """Return the knobs of each link that carries a sensor; a pattern that matches none is a mistake."""
-    spec = loaded.spec.sensors[name]
-    base, apart = resolve_noise(spec.noise, kind.name, loaded.spec.noise)
-    of_links = [base] * len(layout.links)
-    for pattern, knobs in apart:
-        for i in _matching(loaded, resolved, name, layout.links, pattern):
-            of_links[i] = knobs.over(of_links[i])
-    return of_links
-
-
-def _matching(loaded: Loaded, resolved: Resolved, name: str, links: Sequence[Link], pattern: str) -> list[int]:
-    assert loaded.layout is not None
-    spec = loaded.spec.sensors[name]
-    in_line = not isinstance(spec.noise, str) and pattern in spec.noise.links
-    missing: list[tuple[str, str]] = []
-    among = links if in_line else resolved.layout.links
-
-    def chosen(candidates: Sequence[Link], report: list[tuple[str, str]]) -> list[int]:
-        assert loaded.layout is not None
-        names = [[link.name, link.body] for link in candidates]
-        groups = loaded.layout.spec.groups
-        return select(Selection(include=(pattern,)), names, groups, lambda _, what, hint: report.append((what, hint)))
-
-    chosen(among, missing)
-    for problem, hint in missing:
-        path = ("sensors", name, "noise", "links", pattern) if in_line else ("sensors", name, "noise")
-        loaded.note(path, problem if in_line else f'in the profile "{spec.noise}": {problem}', hint)
-    return chosen(links, [])
-
-
-def imperfections(
-    name: str,
-    spec: AnySensorSpec,
-    kind: Kind,
-    knobs: Sequence[Knobs],
-    lowered: Lowered,
-    rows: Axis,
-    layout: Layout,
-    named: Mapping[str, NoiseSpec],
-) -> LoweredNoise | None:
-    """Return the lowered noise of a sensor whose links have `knobs`; None if all of them are neutral.
-
-    Raises:
-        LowerError: If a knob names a quantity that the sensor does not read.
-    """
-    if not any(knob.active() for knob in knobs):
-        if built_in(spec.noise, named) == "noisy":
-            warnings.warn(f'sensor "{name}": the profile "noisy" has no knobs for {kind.name}, so it reads clean', stacklevel=2)
-        return None
-    different = list(dict.fromkeys(knob.model_dump_json() for knob in knobs))
-    of_link = np.array([different.index(knob.model_dump_json()) for knob in knobs])
-    sets = [knobs[int(np.flatnonzero(of_link == i)[0])] for i in range(len(different))]
-    if any(knob.release_threshold is not None for knob in sets):
-        release = getattr(spec, "release", 0.0)
-        sets = [
-            Knobs.model_validate({"release_threshold": release}).over(knob) if knob.release_threshold is None else knob
-            for knob in sets
-        ]
-    if rows.link_id is None and len(different) > 1:
-        problem = f"its rows are on no link (they are of a {rows.name} each), so noise cannot differ between links"
-        raise LowerError(problem, field="noise", hint="leave `links` of the noise out")
-    which = of_link[rows.link_id] if rows.link_id is not None else np.zeros(rows.size, dtype=np.int64)
-    if rows.name != "taxel" and any(knob.crosstalk is not None for knob in knobs):
-        problem = f"crosstalk mixes neighbouring taxels, and what this sensor reads is of a {rows.name} each"
-        raise LowerError(problem, field="noise", hint="leave `crosstalk` out")
-    channels = [channel.name for channel in lowered.signal or lowered.channels]
-    sets = [_without_idle(name, kind, knob) for knob in sets]
-    noise = lower_noise(sets, which, channels, layout)
-    return noise if noise.terms else None
-
-
-def _without_idle(name: str, kind: Kind, knobs: Knobs) -> Knobs:
-    """Return knobs without those that change nothing in what the kind reads, of which a warning says so."""
-    idle = [knob for knob in knobs.active() if knob in kind.idle_knobs]
-    for knob in idle:
-        warnings.warn(f'sensor "{name}": {knob} changes nothing in what {kind.name} reads', stacklevel=2)
-    return knobs.plain.model_validate({knob: knobs.defaults()[knob] for knob in idle}).over(knobs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,20 +63,21 @@ class LoweredSensor:
         return rows_of(self.lowered, self.layout, self.spec)
 
 
+@dataclass(frozen=True, eq=False)
 class Surfaces:
     """The triangles of a document's links and objects: a `sensors.base.SurfaceOf`."""
 
-    def __init__(self, loaded: Loaded, resolved: Resolved, progress: Progress):
-        """Be those of a document; `progress` is told what kinds do with them that takes long."""
-        self._loaded, self._resolved, self.progress = loaded, resolved, progress
+    loaded: Loaded
+    resolved: Resolved
+    progress: Progress
 
     def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame [m]."""
-        return self._resolved.surface_of(link, region)
+        return self.resolved.surface_of(link, region)
 
     def of_object(self, name: str) -> Surface:
         """Return the triangles of an object's geoms in its body's frame [m]."""
-        return self._resolved.surface_of_object(name)
+        return self.resolved.surface_of_object(name)
 
     def taxels(self, resolution: str, layout: Layout) -> Layout:
         """Return the taxels that another resolution of the layout puts on a sensor's links.
@@ -183,19 +85,19 @@ class Surfaces:
         Raises:
             LowerError: If there is no such resolution, or it has none on one of the links.
         """
-        assert self._loaded.layout is not None
-        names = self._loaded.layout.spec.resolutions
+        assert self.loaded.layout is not None
+        names, layouts = self.loaded.layout.spec.resolutions, self.resolved.layouts
         if resolution not in names:
             hint = did_you_mean(resolution, names, "resolutions")
             raise LowerError(f'the layout has no resolution "{resolution}"', "markers", hint)
-        if resolution not in self._resolved.layouts:
-            spec = self._loaded.spec.model_copy(update={"resolution": resolution})
-            models = Models(self._resolved.robot, self._resolved.scene)
-            self._resolved.layouts[resolution] = taxels_of_all_links(dataclasses.replace(self._loaded, spec=spec), models)
-        every, links = self._resolved.layouts[resolution], [link.name for link in layout.links]
+        if resolution not in layouts:
+            spec = self.loaded.spec.model_copy(update={"resolution": resolution})
+            models = Models(self.resolved.robot, self.resolved.scene)
+            layouts[resolution] = taxels_of_all_links(dataclasses.replace(self.loaded, spec=spec), models)
+        every, links = layouts[resolution], tuple(link.name for link in layout.links)
         if missing := [name for name in links if name not in {link.name for link in every.links}]:
             raise LowerError(f'the resolution "{resolution}" has no taxels on {listed(missing)}', "markers")
-        return every.take(every.taxels_of(tuple(links)))
+        return every.take(every.taxels_of(links))
 
 
 def rows_of(lowered: Lowered, layout: Layout, spec: AnySensorSpec) -> Axis:
@@ -220,13 +122,117 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
         except LowerError as error:
             loaded.note(("sensors", name), error)
     loaded.raise_problems()
-    sensors = fitted(loaded, sensors, resolved.scene.compiled.opt.timestep)
-    _check_blocks(loaded, sensors)
+    sensors = _fit_all(loaded, sensors, resolved.scene.compiled.opt.timestep)
+    blocks = [sensor for sensor in sensors if sensor.lowered.substeps]
+    for sensor in blocks[1:]:
+        first, substeps = blocks[0], sensor.lowered.substeps
+        if substeps != first.lowered.substeps:
+            problem = f'it is advanced at {substeps} physics steps of a call, "{first.sensor}" at {first.lowered.substeps}'
+            loaded.note(("sensors", sensor.sensor), problem, "expected as many of all")
     loaded.raise_problems()
     return tuple(sensors)
 
 
-def fitted(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) -> list[LoweredSensor]:
+def ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: Progress) -> list[LoweredSensor]:
+    """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
+    spec = loaded.spec.sensors[name]
+    if getattr(spec, "timestep", 0.0) is None:
+        spec = spec.model_copy(update={"timestep": float(resolved.scene.compiled.opt.timestep)})
+    taxels, layout = resolved.layout_on(name)
+    surfaces = Surfaces(loaded, resolved, progress)
+    clean = kind.lower(spec, layout, surfaces)
+    check_lowered(kind, clean, spec)
+    _check_accuracy(loaded, name, clean)
+    _check_places(kind, clean, layout, spec, resolved)
+    if spec.readout == "clean":
+        return [LoweredSensor(name, kind, spec, taxels, layout, clean, (name,), None)]
+    knobs = _knobs_of(loaded, resolved, name, layout, kind)
+    loaded.raise_problems()
+    noisy = _measured_spec(spec, knobs)
+    lowered = clean if noisy is spec else kind.lower(noisy, layout, surfaces)
+    is_noisy = built_in(spec.noise, loaded.spec.noise) == "noisy"
+    noise = _imperfections(name, spec, kind, knobs, lowered, layout, is_noisy)
+    again, both = f"{name}/clean", spec.readout == "both"
+    apart = both and noise is not None and (noise.radius > 0 or kind.decide is not None or kind.gains_depth)
+    readings = (name, again) if both and not apart else (name,)
+    measured = LoweredSensor(name, kind, spec, taxels, layout, lowered, readings, noise)
+    without = dataclasses.replace(clean, reports={})
+    return [measured, *([LoweredSensor(again, kind, spec, taxels, layout, without, (again,), None)] if apart else [])]
+
+
+def _knobs_of(loaded: Loaded, resolved: Resolved, name: str, layout: Layout, kind: Kind) -> list[Knobs]:
+    """Return the knobs of each link that carries a sensor; a pattern that matches none is a mistake."""
+    written = loaded.spec.sensors[name].noise
+    base, apart = resolve_noise(written, kind.name, loaded.spec.noise)
+    of_links = [base] * len(layout.links)
+    for pattern, knobs in apart:
+        assert loaded.layout is not None
+        groups, selection = loaded.layout.spec.groups, Selection(include=(pattern,))
+        in_line = not isinstance(written, str) and pattern in written.links
+        missing: list[tuple[str, str]] = []
+        own, every = ([[link.name, link.body] for link in part.links] for part in (layout, resolved.layout))
+        select(selection, own if in_line else every, groups, lambda _, what, hint, found=missing: found.append((what, hint)))
+        for problem, hint in missing:
+            path = ("sensors", name, "noise", "links", pattern) if in_line else ("sensors", name, "noise")
+            loaded.note(path, problem if in_line else f'in the profile "{written}": {problem}', hint)
+        for i in select(selection, own, groups, lambda *_: None):
+            of_links[i] = knobs.over(of_links[i])
+    return of_links
+
+
+def _measured_spec(spec: AnySensorSpec, knobs: Sequence[Knobs]) -> AnySensorSpec:
+    """Return the spec of the measured reading: knobs may set fields of the sensor."""
+    released = [knob.release_threshold for knob in knobs if knob.release_threshold is not None]
+    if not released:
+        return spec
+    lowest, highest = min(low for low, _ in released), max(high for _, high in released)
+    threshold = getattr(spec, "threshold", None)
+    if threshold is None:
+        raise LowerError("release_threshold is of a sensor with a threshold, and this one has none", "noise", "leave it out")
+    if highest > threshold:
+        problem = f"release_threshold {highest:g} m is above the sensor's threshold {threshold:g} m"
+        raise LowerError(problem, field="noise", hint="expected at most that")
+    return spec.model_copy(update={"release_threshold": min(lowest, np.nextafter(threshold, 0.0))})
+
+
+def _imperfections(
+    name: str, spec: AnySensorSpec, kind: Kind, knobs: Sequence[Knobs], lowered: Lowered, layout: Layout, is_noisy: bool
+) -> LoweredNoise | None:
+    """Return the lowered noise of a sensor whose links have `knobs`; None if all of them are neutral.
+
+    `is_noisy`: whether its noise is the built-in profile "noisy".
+    """
+    if not any(knob.active() for knob in knobs):
+        if is_noisy:
+            warnings.warn(f'sensor "{name}": the profile "noisy" has no knobs for {kind.name}, so it reads clean', stacklevel=2)
+        return None
+    rows, different = rows_of(lowered, layout, spec), list(dict.fromkeys(knob.model_dump_json() for knob in knobs))
+    of_link = np.array([different.index(knob.model_dump_json()) for knob in knobs])
+    sets = [knobs[int(np.flatnonzero(of_link == i)[0])] for i in range(len(different))]
+    if any(knob.release_threshold is not None for knob in sets):
+        released = Knobs.model_validate({"release_threshold": getattr(spec, "release", 0.0)})
+        sets = [released.over(knob) if knob.release_threshold is None else knob for knob in sets]
+    if rows.link_id is None and len(different) > 1:
+        problem = f"its rows are on no link (they are of a {rows.name} each), so noise cannot differ between links"
+        raise LowerError(problem, field="noise", hint="leave `links` of the noise out")
+    which = of_link[rows.link_id] if rows.link_id is not None else np.zeros(rows.size, dtype=np.int64)
+    if rows.name != "taxel" and any(knob.crosstalk is not None for knob in knobs):
+        problem = f"crosstalk mixes neighbouring taxels, and what this sensor reads is of a {rows.name} each"
+        raise LowerError(problem, field="noise", hint="leave `crosstalk` out")
+    channels = [channel.name for channel in lowered.signal or lowered.channels]
+    noise = lower_noise([_without_idle(name, kind, knob) for knob in sets], which, channels, layout)
+    return noise if noise.terms else None
+
+
+def _without_idle(name: str, kind: Kind, knobs: Knobs) -> Knobs:
+    """Return knobs without those that change nothing in what the kind reads, of which a warning says so."""
+    idle = [knob for knob in knobs.active() if knob in kind.idle_knobs]
+    for knob in idle:
+        warnings.warn(f'sensor "{name}": {knob} changes nothing in what {kind.name} reads', stacklevel=2)
+    return knobs.plain.model_validate({knob: knobs.defaults()[knob] for knob in idle}).over(knobs)
+
+
+def _fit_all(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) -> list[LoweredSensor]:
     """Return sensors, each fitted to the scene's time step [s] and to those that it reads; mistakes are noted."""
     reading = {sensor.name: _upstream_of(loaded, sensor, sensors) for sensor in sensors}
     loaded.raise_problems()
@@ -307,52 +313,6 @@ def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: AnySensorS
         raise TgdslError(f'kind "{kind.name}": {problem}')
 
 
-def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
-    """Note sensors that are advanced at another number of physics steps than those before them."""
-    blocks = [sensor for sensor in sensors if sensor.lowered.substeps]
-    for sensor in blocks[1:]:
-        first, substeps = blocks[0], sensor.lowered.substeps
-        if substeps != first.lowered.substeps:
-            problem = f'it is advanced at {substeps} physics steps of a call, "{first.sensor}" at {first.lowered.substeps}'
-            loaded.note(("sensors", sensor.sensor), problem, "expected as many of all")
-
-
-def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
-    """Return a spec with the scene's time step, if it has a field `timestep` that is left out."""
-    field = "timestep"
-    if field not in type(spec).model_fields or getattr(spec, field) is not None:
-        return spec
-    return spec.model_copy(update={field: float(resolved.scene.compiled.opt.timestep)})
-
-
-def ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: Progress) -> list[LoweredSensor]:
-    """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
-    spec = _with_timestep(loaded.spec.sensors[name], resolved)
-    taxels, layout = resolved.layout_on(name)
-    surfaces = Surfaces(loaded, resolved, progress)
-    clean = kind.lower(spec, layout, surfaces)
-    check_lowered(kind, clean, spec)
-    _check_accuracy(loaded, name, clean)
-    _check_places(kind, clean, layout, spec, resolved)
-    if spec.readout == "clean":
-        return [LoweredSensor(name, kind, spec, taxels, layout, clean, (name,), None)]
-    knobs = knobs_of(loaded, resolved, name, layout, kind)
-    loaded.raise_problems()
-    noisy = measured_spec(spec, knobs)
-    lowered = clean if noisy is spec else kind.lower(noisy, layout, surfaces)
-    rows = rows_of(lowered, layout, spec)
-    noise = imperfections(name, spec, kind, knobs, lowered, rows, layout, loaded.spec.noise)
-    both = spec.readout == "both"
-    apart = noise is not None and (noise.radius > 0 or kind.decide is not None or kind.gains_depth)
-    readings = (name, f"{name}/clean") if both and not apart else (name,)
-    ways = [LoweredSensor(name, kind, spec, taxels, layout, lowered, readings, noise)]
-    if both and apart:
-        again = f"{name}/clean"
-        without = dataclasses.replace(clean, reports={})
-        ways.append(LoweredSensor(again, kind, spec, taxels, layout, without, (again,), None))
-    return ways
-
-
 def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
     """Note a sensor's `accuracy` that is not of what it reads."""
     accuracy = loaded.spec.sensors[name].accuracy
@@ -365,12 +325,8 @@ def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
         path = (*at, key) if key else at
         if key and key not in units:
             loaded.note(path, f'the reading has no quantity "{key}"', did_you_mean(key, units, "quantities"), on_key=True)
-        wrong = [
-            quantity
-            for quantity in ([key] if key in units else [] if key else units)
-            if bound.unit not in ("", units[quantity])
-        ]
-        if wrong:
+        of = [key] if key in units else [] if key else units
+        if any(bound.unit not in ("", units[quantity]) for quantity in of):
             loaded.note(path, f'"{bound.text}" is in {bound.unit}, and the reading has {quantities}', _hint(units))
     missing = [quantity for quantity in units if accuracy.of(quantity) is None]
     if missing:
