@@ -54,12 +54,7 @@ class TactileModule(HookedModule):
     """
 
     def __init__(self, plan: Plan, kinds: Sequence[Kind] = KINDS, dtype: torch.dtype = torch.float32):
-        """Build a module.
-
-        Args:
-            plan: What to compute.
-            kinds: The kinds that the plan's sensors are of.
-            dtype: Dtype of constants, state and readings, float32 or float64.
+        """Build a module from a plan, the kinds of its sensors, and the dtype of constants, state and readings.
 
         Raises:
             TgdslError: If the plan uses a kind that is not given, or the dtype is another one.
@@ -182,15 +177,7 @@ class TactileModule(HookedModule):
         self.memory.cache_readings(readings)
 
     def peek(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
-        """Return what a call would read, and advance nothing: the next call draws the same random numbers.
-
-        Args:
-            state: The scene, at one instant.
-
-        Raises:
-            StateError: As a call does.
-            TgdslError: As a call does.
-        """
+        """Return what a call would read, with its errors, and advance nothing: the next call draws the same random numbers."""
         tensors, num_envs = self._tensors(state)
         is_first = self.has_state and self.num_envs is None
         memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
@@ -201,17 +188,12 @@ class TactileModule(HookedModule):
                 self.free()
 
     def initial_memory(self, num_envs: int, dt: float | None = None) -> dict[str, Tensor]:
-        """Return what sensors remember before their first call, for `step`.
+        """Return what sensors remember before their first call, for `step`, (env, …) but for `memory.SHARED`.
 
-        Args:
-            num_envs: Number of environments.
-            dt: Shortest time between steps [s], if `inputs.fields` has it: delays keep so many calls.
-
-        Returns:
-            Tensors by name, (env, …), but for the random numbers' keys and what else all environments share, `clock.SHARED`.
+        `dt` is the shortest time between steps [s], needed if `inputs.fields` has it: delays keep so many calls.
 
         Raises:
-            StateError: If the time is wanted.
+            StateError: If the time is missing.
         """
         if "dt" in self.inputs.fields and dt is None:
             raise StateError("initial_memory: expected `dt`, the time between steps [s]: this module reads SceneState.dt")
@@ -224,15 +206,8 @@ class TactileModule(HookedModule):
     ) -> tuple[dict[str, Float[Tensor, "env *step row channel"]], dict[str, Tensor]]:
         """Read all sensors as a call does, as a function: nothing is held, and nothing changes in place.
 
-        Derivatives go through the memory from step to step.
-
-        Args:
-            state: The scene, at one instant.
-            memory: What sensors remember: `initial_memory`, or the result of the step before.
-            reset: Environments that begin an episode at this step; default: none.
-
-        Returns:
-            Readings by name, and the memory after the step.
+        Derivatives go through the memory from step to step. `memory` is `initial_memory`, or that of the step before; `reset`
+        has the environments that begin an episode at this step. Returns readings by name, and the memory after the step.
 
         Raises:
             StateError: As a call does, or if the memory is another module's or of another number of environments.
@@ -372,14 +347,10 @@ class TactileModule(HookedModule):
     def images(
         self, name: str, readings: Mapping[str, Tensor]
     ) -> tuple[dict[str, Float[Tensor, "env channel row column"]], dict[str, Bool[Tensor, "row column"]]]:
-        """Return a reading of taxels as one image per link, and where its pixels are taxels, for convolutions.
+        """Return the reading `name` of taxels as one image per link, and where its pixels are taxels, for convolutions.
 
         Cells of a link's grid that missed its surface, and inactive probes, are 0 in the image and False in the mask. Links
         without a grid are left out. Of stacked calls it is the last one.
-
-        Args:
-            name: The reading.
-            readings: All readings.
 
         Raises:
             TgdslError: If there is no such reading, if it is not one of taxels, or none of its links has a grid.
@@ -387,14 +358,10 @@ class TactileModule(HookedModule):
         return images_of(self.plan, name, readings)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Begin a new episode in some environments (default: all); the others are left untouched.
+        """Begin a new episode in some environments (default: all), by indices or a mask; the others are left untouched.
 
         State is at rest again, filters start from the next reading's true value, and gains, dead taxels and what else is drawn
-        per episode are redrawn.
-
-        Args:
-            env_ids: Indices, or a boolean mask over environments. Indices that lie on a GPU are not looked at, as that would
-                wait for it: there the kernel asserts.
+        per episode are redrawn. Indices that lie on a GPU are checked by the kernel, which asserts.
 
         Raises:
             StateError: If there are no such environments.
@@ -416,9 +383,6 @@ class TactileModule(HookedModule):
             first_env: Number of this module's first environment among those of all processes; default: where torch runs
                 distributed, the process's rank times the number of its environments, else 0.
 
-        Returns:
-            The module.
-
         Raises:
             TgdslError: If they are no integers, or `first_env` is none that an environment can have.
         """
@@ -433,9 +397,6 @@ class TactileModule(HookedModule):
                 then has little to do, and readings lie in the same memory at each call, so copy what is to be kept.
             **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`, one graph for every batch ≥ 2, and
                 `options=inductor_options()`.
-
-        Returns:
-            The module.
 
         Raises:
             TgdslError: If graphs are wanted of a module that is not on a GPU.
@@ -458,33 +419,22 @@ class TactileModule(HookedModule):
     def example_state(
         self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03
     ) -> SceneState:
-        """Return a valid random state of all wanted fields, with bodies close enough to touch.
+        """Return a valid random state of all fields in `inputs`, with bodies close enough to touch.
 
-        Args:
-            num_envs: Number of environments.
-            seed: Seed of the draw.
-            dtype: Dtype of the tensors.
-            spread: Standard deviation of the bodies' positions, and of contacts from their links [m].
+        `spread` is the standard deviation of the bodies' positions, and of contacts from their links [m].
         """
         return example_state(self.inputs, num_envs, seed, dtype, spread).to(self.device)
 
     def explain(self) -> str:
         """Return an account of what is computed, what was dropped and why, and what it costs."""
-        return explain(self._explained())
+        return explain(Explained(self.plan, self._quantities, self.constants, self.memory, self.core))
 
     def operations_per_env(self) -> int:
         """Return how many elementary operations one environment takes, counted in an eager run."""
-        return operations_per_env(self._explained())
-
-    def _explained(self) -> Explained:
-        return Explained(self.plan, self._quantities, self.constants, self.memory, self.core)
+        return operations_per_env(Explained(self.plan, self._quantities, self.constants, self.memory, self.core))
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
-        """Move or cast all tensors; a captured graph has read the old ones.
-
-        Raises:
-            TgdslError: If they are to be neither float32 nor float64.
-        """
+        """Move or cast all tensors to float32 or float64; a captured graph has read the old ones."""
         check_dtype(fn(torch.empty(0, dtype=self.dtype, device=self.device)).dtype)
         move()
         self.calls.forget_graphs()

@@ -22,7 +22,7 @@ from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered, Quantity, Scene
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
+from tgdsl.quantities.pairs import PairTable, gates, relate
 from tgdsl.sensors.base import UNTIMED, Context, Kind, state_by_name
 from tgdsl.sensors.noise.pipeline import StageType, disturb, draw
 from tgdsl.sensors.noise.stage import NO_CLOCK, Now, Stage
@@ -31,6 +31,7 @@ from tgdsl.sensors.upstream import Upstream
 from tgdsl.tensors.fusion import materialised
 
 Tree = Mapping[str, Any]  # what `parts` returns, with tensors for arrays
+Tensors = dict[str, Tensor]
 
 
 def parts(plan: Plan) -> dict[str, Any]:
@@ -63,7 +64,87 @@ def _stays_on_host(record: Any) -> bool:
 
 
 def _is_prepared(record: Any) -> bool:
-    return _stays_on_host(record) and record.prepared is not None
+    return _stays_on_host(record) and record.prepared is not None  # made here: no compiler traces that
+
+
+class Sensing(NamedTuple):
+    """What a plan is computed with."""
+
+    plan: Plan
+    kinds: Mapping[str, Kind]  # the kind of each sensor, by the sensor's name
+    quantities: tuple[Quantity, ...]  # the quantities that some sensor asks for
+    stages: Mapping[str, Sequence[StageType]]  # the stages of each sensor's noise, by the sensor's name
+    clock: Clock  # says when sensors are read
+    order: tuple[PlannedSensor, ...]  # the sensors, each after those that it reads
+
+
+def in_order(sensors: Sequence[PlannedSensor]) -> tuple[PlannedSensor, ...]:
+    """Return sensors so that each is after those that it reads; else as they are given."""
+    ordered: dict[str, PlannedSensor] = {}
+    while len(ordered) < len(sensors):
+        ready = [s for s in sensors if s.name not in ordered and all(name in ordered for name in s.upstream)]
+        if not ready:
+            raise TgdslError("not a plan: sensors read one another in a circle, or read some that are not there")
+        ordered |= {sensor.name: sensor for sensor in ready}
+    return tuple(ordered.values())
+
+
+def sense(
+    sensing: Sensing, own: Tree, tensors: Mapping[str, Tensor], memory: Mapping[str, Tensor], dtype: torch.dtype
+) -> tuple[Tensors, Tensors]:
+    """Return the readings of all sensors, and their new state: a pure function, traceable in one graph.
+
+    Args:
+        sensing: What to compute with.
+        own: The plan's parts, bound to constants.
+        tensors: The fields of `SceneState` that `inputs` names; those of earlier substeps as `substep/<i>/<field>`.
+        memory: State by `sensor:name`, each (env, …), and the clock's.
+        dtype: Dtype of the readings.
+
+    Returns:
+        Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
+        what is new: (env, …). A kernel may write new state over the old, which is then not returned.
+    """
+    plan, dt = sensing.plan, tensors.get("dt")
+    nows = sensing.clock.nows(memory, dt)
+    noise = {name: draw(sensing.stages[name], constants, nows.get(name, NO_CLOCK)) for name, constants in own["noise"].items()}
+    fields = [name for name in plan.inputs.fields if name != "dt"]
+    substeps = [{name: tensors[f"substep/{i}/{name}"] for name in fields} for i in range(plan.inputs.substeps - 1)]
+    scenes = [scene_of(plan, own, part, nows, noise, dtype) for part in (*substeps, tensors)]
+    *earlier, gathered = [_gathered(sensing, own, scene) for scene in scenes]
+    readings: Tensors = {}
+    joined: dict[tuple[str, ...], Tensor] = {}
+    answers: dict[str, list[Tensors]] = {}
+    updated = sensing.clock.after(memory, dt)
+    for sensor in sensing.order:
+        kind, constants = sensing.kinds[sensor.name], own["sensors"][sensor.name]
+        if sensor.substeps:
+            contexts = [sensing.clock.context(sensor, memory, dt, i) for i in range(sensor.substeps)]
+            each = [*(part[sensor.name] for part in earlier), gathered[sensor.name]]
+            each = [_with_upstream(sensor, part, answers, i) for i, part in enumerate(each)]
+            outputs, new, answered = _block(sensor, kind, each, contexts, constants, memory)
+        else:
+            signal, inputs = None, _with_upstream(sensor, gathered[sensor.name], answers, -1)
+            if sensor.joined:
+                if sensor.joined not in joined:
+                    joined[sensor.joined] = _joined_signal(sensing, own, sensor, gathered[sensor.name])
+                signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
+            context = sensing.clock.context(sensor, memory, dt)
+            now, stages = nows.get(sensor.name, NO_CLOCK), noise.get(sensor.name, ())
+            outputs, new, answer = _read(sensor, kind, inputs, context, constants, stages, memory, now, signal)
+            answered = [answer]
+        if sensor.provides:
+            answers[sensor.name] = answered
+        updated |= new
+        for reading in sensor.windows:
+            assert sensor.history is not None
+            window = pushed(memory[f"{WINDOW}{reading.name}"], outputs[reading.name], memory["clock/age"])
+            updated[f"{WINDOW}{reading.name}"] = window
+            outputs[reading.name] = reduced(window, sensor.history.reduce)
+        readings |= outputs
+    for reading in plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
+        readings[reading.name] = tensors[reading.name].to(dtype, copy=True).unsqueeze(2)
+    return readings, updated
 
 
 def scene_of(
@@ -75,51 +156,45 @@ def scene_of(
     dtype: torch.dtype,
 ) -> Scene:
     """Return what quantities are gathered from; stages of noise may disturb the taxels' radii."""
-    shifts = {}
+    shifts, pairs = {}, None
     for sensor in plan.sensors:
         for stage in noise.get(sensor.name, ()):
             if isinstance(stage, Radius):
                 probes = stage.radius_noise.new_empty(sensor.rows[1] - sensor.rows[0])
                 shifts[sensor.name] = stage.shift(nows[sensor.name], probes)
-    return Scene(tensors, plan.objects, _pairs(own["pairs"], tensors, dtype) if plan.objects else None, shifts, dtype)
+    if plan.objects:
+        table: PairTable[Tensor] = own["pairs"]
+        gate = gates(tensors["contact_found"], table.gate, dtype) if "contact_found" in tensors else None
+        motion = tensors.get("body_linvel"), tensors.get("body_angvel")
+        pairs = relate(tensors["body_pos"], tensors["body_quat"], table.link, table.object, dtype, *motion, gate)
+    return Scene(tensors, plan.objects, pairs, shifts, dtype)
 
 
-def gather(quantities: Sequence[Quantity], own: Tree, scene: Scene) -> dict[str, tuple[Any, ...]]:
-    """Return the values of all uses of each quantity, by its name."""
-    values_of = {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
-    for name, values in values_of.items():
-        if not isinstance(values, (tuple, list)):
-            problem = f"expected a tuple with a value for each use, found {type(values).__name__}"
-            raise TgdslError(f'`gather` of the quantity "{name}": {problem}')
-    return values_of
+def _gathered(sensing: Sensing, own: Tree, scene: Scene) -> dict[str, Gathered]:
+    """Return what each sensor asked for."""
+    values = [(quantity, quantity.gather(own["quantities"][quantity.name], scene)) for quantity in sensing.quantities]
+    return {
+        sensor.name: Gathered({q.request: of[sensor.uses[q.name]] for q, of in values if q.name in sensor.uses})
+        for sensor in sensing.plan.sensors
+    }
 
 
-def gathered_of(sensor: PlannedSensor, quantities: Sequence[Quantity], values: Mapping[str, tuple[Any, ...]]) -> Gathered:
-    """Return what a sensor asked for."""
-    used = [quantity for quantity in quantities if quantity.name in sensor.uses]
-    for name in (quantity.name for quantity in used):
-        if sensor.uses[name] >= len(values[name]):
-            problem = f'{len(values[name])} values, and sensor "{sensor.name}" has use {sensor.uses[name]} (from 0)'
-            raise TgdslError(f'`gather` of the quantity "{name}" returns {problem}; expected one for each use')
-    return Gathered({quantity.request: values[quantity.name][sensor.uses[quantity.name]] for quantity in used})
+def _with_upstream(sensor: PlannedSensor, gathered: Gathered, answers: Mapping[str, list[Tensors]], substep: int) -> Gathered:
+    if not sensor.upstream:
+        return gathered
+    return gathered.replaced(Upstream, {name: answers[name][substep] for name in sensor.upstream})
 
 
-def _pairs(table: PairTable[Tensor], tensors: Mapping[str, Tensor], dtype: torch.dtype) -> Pairs:
-    gate = gates(tensors["contact_found"], table.gate, dtype) if "contact_found" in tensors else None
-    motion = tensors.get("body_linvel"), tensors.get("body_angvel")
-    return relate(tensors["body_pos"], tensors["body_quat"], table.link, table.object, dtype, *motion, gate)
-
-
-Tensors = dict[str, Tensor]
-
-
-def joined_signal(
-    kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Any]
+def _joined_signal(
+    sensing: Sensing, own: Tree, sensor: PlannedSensor, gathered: Gathered
 ) -> Float[Tensor, "env channel taxel"]:
     """Return the signals of sensors that are computed as one, one sensor's taxels after the other's."""
+    by_name, kind = {other.name: other for other in sensing.plan.sensors}, sensing.kinds[sensor.joined[0]]
+    sensors = [by_name[name] for name in sensor.joined]
     of_taxels: Tensors = {}
     if names := tuple(sensors[0].constants):
-        counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
+        counts = [end - first for first, end in (other.rows for other in sensors)]
+        constants = [own["sensors"][other.name] for other in sensors]
         value = operator.getitem if kind.constants is None else getattr
         rows = [
             torch.cat([value(values, name).expand(n) for values, n in zip(constants, counts, strict=True)]) for name in names
@@ -129,7 +204,7 @@ def joined_signal(
     return _stacked(result, "signal", sensors[0].signal)
 
 
-def read(
+def _read(
     sensor: PlannedSensor,
     kind: Kind,
     gathered: Gathered,
@@ -178,7 +253,7 @@ def read(
     return readings, new, result
 
 
-def block(
+def _block(
     sensor: PlannedSensor,
     kind: Kind,
     gathered: Sequence[Gathered],
@@ -228,13 +303,10 @@ def _check_answer(sensor: PlannedSensor, kind: Kind, answer: Any, state: Tensors
         if outputs[name].shape[-1] != num_rows:
             shape = tuple(outputs[name].shape)
             raise TgdslError(f"{where} {name} of shape {shape}, expected {num_rows} rows as its reading has, (env, {num_rows})")
-    for name, value in new.items():
+    for name in new:
         if name not in state:
             state_names = listed(list(state)) or "none"
             raise TgdslError(f'{where} the state "{name}", which `Lowered.state` does not have: {state_names}')
-        if value.shape != state[name].shape:
-            shapes = f"{tuple(value.shape)}, expected {tuple(state[name].shape)}"
-            raise TgdslError(f'{where} the state "{name}" of shape {shapes} as the old one')
 
 
 def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env *sample channel row"]:
@@ -251,118 +323,3 @@ def _phase(phase: Float[Tensor, " env"], period: Tensor, now: Now) -> Float[Tens
     since = phase + now.dt
     whole = torch.floor((since + 0.5 * now.dt) / period).clamp(min=0)
     return torch.where(now.age[:, 0] == 0, 0.0, since - whole * period)
-
-
-class Sensing(NamedTuple):
-    """What a plan is computed with."""
-
-    plan: Plan  # the plan
-    kinds: Mapping[str, Kind]  # the kind of each sensor, by the sensor's name
-    quantities: tuple[Quantity, ...]  # the quantities that some sensor asks for
-    stages: Mapping[str, Sequence[StageType]]  # the stages of each sensor's noise, by the sensor's name
-    clock: Clock  # says when sensors are read
-    order: tuple[PlannedSensor, ...]  # the sensors, each after those that it reads
-
-
-def in_order(sensors: Sequence[PlannedSensor]) -> tuple[PlannedSensor, ...]:
-    """Return sensors so that each is after those that it reads; else as they are given."""
-    ordered: dict[str, PlannedSensor] = {}
-    while len(ordered) < len(sensors):
-        ready = [s for s in sensors if s.name not in ordered and all(name in ordered for name in s.upstream)]
-        if not ready:
-            raise TgdslError("not a plan: sensors read one another in a circle, or read some that are not there")
-        ordered |= {sensor.name: sensor for sensor in ready}
-    return tuple(ordered.values())
-
-
-def sense(
-    sensing: Sensing, own: Tree, tensors: Mapping[str, Tensor], memory: Mapping[str, Tensor], dtype: torch.dtype
-) -> tuple[Tensors, Tensors]:
-    """Return the readings of all sensors, and their new state: a pure function, traceable in one graph.
-
-    Args:
-        sensing: What to compute with.
-        own: The plan's parts, bound to constants.
-        tensors: The fields of `SceneState` that `inputs` names; those of earlier substeps as `substep/<i>/<field>`.
-        memory: State by `sensor:name`, each (env, …), and the clock's.
-        dtype: Dtype of the readings.
-
-    Returns:
-        Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
-        what is new: (env, …). A kernel may write new state over the old, which is then not returned.
-    """
-    plan, dt = sensing.plan, tensors.get("dt")
-    nows = sensing.clock.nows(memory, dt)
-    noise = {name: draw(sensing.stages[name], constants, nows.get(name, NO_CLOCK)) for name, constants in own["noise"].items()}
-    gathered = _gathered(sensing, own, tensors, nows, noise, dtype)
-    earlier = [_gathered(sensing, own, part, nows, noise, dtype) for part in _substeps(plan, tensors)]
-    readings: Tensors = {}
-    joined: dict[tuple[str, ...], Tensor] = {}
-    answers: dict[str, list[Tensors]] = {}
-    updated = sensing.clock.after(memory, dt)
-    for sensor in sensing.order:
-        kind, constants = sensing.kinds[sensor.name], own["sensors"][sensor.name]
-        if sensor.substeps:
-            contexts = [sensing.clock.context(sensor, memory, dt, i) for i in range(sensor.substeps)]
-            each = [*(part[sensor.name] for part in earlier), gathered[sensor.name]]
-            each = [_with_upstream(sensor, part, answers, i) for i, part in enumerate(each)]
-            outputs, new, answered = block(sensor, kind, each, contexts, constants, memory)
-        else:
-            signal, inputs = None, _with_upstream(sensor, gathered[sensor.name], answers, -1)
-            if sensor.joined:
-                if sensor.joined not in joined:
-                    joined[sensor.joined] = _joined(sensing, own, sensor, gathered[sensor.name])
-                signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
-            context = sensing.clock.context(sensor, memory, dt)
-            now, stages = nows.get(sensor.name, NO_CLOCK), noise.get(sensor.name, ())
-            outputs, new, answer = read(sensor, kind, inputs, context, constants, stages, memory, now, signal)
-            answered = [answer]
-        if sensor.provides:
-            answers[sensor.name] = answered
-        updated |= new
-        readings |= _with_history(sensor, outputs, memory, updated)
-    for reading in plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
-        readings[reading.name] = tensors[reading.name].to(dtype, copy=True).unsqueeze(2)
-    return readings, updated
-
-
-def _with_upstream(sensor: PlannedSensor, gathered: Gathered, answers: Mapping[str, list[Tensors]], substep: int) -> Gathered:
-    if not sensor.upstream:
-        return gathered
-    return gathered.replaced(Upstream, {name: answers[name][substep] for name in sensor.upstream})
-
-
-def _gathered(
-    sensing: Sensing,
-    own: Tree,
-    tensors: Mapping[str, Tensor],
-    nows: Mapping[str, Now],
-    noise: Mapping[str, Sequence[Stage]],
-    dtype: torch.dtype,
-) -> dict[str, Gathered]:
-    scene = scene_of(sensing.plan, own, tensors, nows, noise, dtype)
-    values = gather(sensing.quantities, own, scene)
-    return {sensor.name: gathered_of(sensor, sensing.quantities, values) for sensor in sensing.plan.sensors}
-
-
-def _substeps(plan: Plan, tensors: Mapping[str, Tensor]) -> list[Tensors]:
-    names = [name for name in plan.inputs.fields if name != "dt"]
-    return [{name: tensors[f"substep/{i}/{name}"] for name in names} for i in range(plan.inputs.substeps - 1)]
-
-
-def _joined(sensing: Sensing, own: Tree, sensor: PlannedSensor, gathered: Gathered) -> Tensor:
-    """Return the signals of sensors that are computed as one."""
-    by_name = {other.name: other for other in sensing.plan.sensors}
-    sensors = [by_name[name] for name in sensor.joined]
-    constants = [own["sensors"][other.name] for other in sensors]
-    return joined_signal(sensing.kinds[sensor.joined[0]], sensors, gathered, constants)
-
-
-def _with_history(sensor: PlannedSensor, found: Tensors, memory: Mapping[str, Tensor], updated: Tensors) -> Tensors:
-    """Return readings, stacked with those of the last calls where a history is read; the history goes to `updated`."""
-    for reading in sensor.windows:
-        assert sensor.history is not None
-        path = f"{WINDOW}{reading.name}"
-        updated[path] = pushed(memory[path], found[reading.name], memory["clock/age"])
-        found[reading.name] = reduced(updated[path], sensor.history.reduce)
-    return found
