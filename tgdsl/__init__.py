@@ -13,29 +13,27 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tgdsl import testing
+    from tgdsl import testing as testing
     from tgdsl.calibration.compare import compare as compare
     from tgdsl.calibration.fit import calibrate as calibrate
     from tgdsl.compiler.scene import instrument as instrument
-    from tgdsl.errors import (
-        ArtifactError,
-        FileError,
-        HandError,
-        ObservationError,
-        RobotError,
-        SimulationError,
-        SpecError,
-        StateError,
-        TaxelError,
-        TgdslError,
-    )
+    from tgdsl.errors import ArtifactError as ArtifactError
+    from tgdsl.errors import FileError as FileError
+    from tgdsl.errors import HandError as HandError
+    from tgdsl.errors import ObservationError as ObservationError
+    from tgdsl.errors import RobotError as RobotError
+    from tgdsl.errors import SimulationError as SimulationError
+    from tgdsl.errors import SpecError as SpecError
+    from tgdsl.errors import StateError as StateError
+    from tgdsl.errors import TaxelError as TaxelError
+    from tgdsl.errors import TgdslError as TgdslError
     from tgdsl.module.artifact import load as load
     from tgdsl.module.artifact import save as save
-    from tgdsl.module.module import TactileModule
-    from tgdsl.module.state import SceneState
+    from tgdsl.module.module import TactileModule as TactileModule
+    from tgdsl.module.state import SceneState as SceneState
     from tgdsl.module.taxels import check_taxels as check_taxels
-    from tgdsl.rl.env import TouchEnv
-    from tgdsl.runtime.batch.simulation import BatchSimulation
+    from tgdsl.rl.env import TouchEnv as TouchEnv
+    from tgdsl.runtime.batch.simulation import BatchSimulation as BatchSimulation
     from tgdsl.runtime.by_name import Geoms as Geoms
     from tgdsl.runtime.by_name import bodies_by_name as bodies_by_name
     from tgdsl.runtime.by_name import contacts_by_pair as contacts_by_pair
@@ -43,7 +41,7 @@ if TYPE_CHECKING:
     from tgdsl.runtime.connect import simulate as simulate
     from tgdsl.runtime.read import read_mujoco as read_mujoco
     from tgdsl.runtime.read import read_warp as read_warp
-    from tgdsl.runtime.warp import WarpSimulation
+    from tgdsl.runtime.warp import WarpSimulation as WarpSimulation
     from tgdsl.tuning.compile import compile as compile
     from tgdsl.view.page import show as show
 
@@ -80,39 +78,7 @@ _PLACES = {
     "simulate": "runtime.connect",
 }
 
-__all__ = [
-    "ArtifactError",
-    "BatchSimulation",
-    "FileError",
-    "Geoms",
-    "HandError",
-    "ObservationError",
-    "RobotError",
-    "SceneState",
-    "SimulationError",
-    "SpecError",
-    "StateError",
-    "TactileModule",
-    "TaxelError",
-    "TgdslError",
-    "TouchEnv",
-    "WarpSimulation",
-    "bodies_by_name",
-    "calibrate",
-    "check_taxels",
-    "compare",
-    "compile",
-    "connect",
-    "contacts_by_pair",
-    "instrument",
-    "load",
-    "read_mujoco",
-    "read_warp",
-    "save",
-    "show",
-    "simulate",
-    "testing",
-]
+__all__ = sorted([*_PLACES, "testing"])  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -90,29 +90,19 @@ def compile_document(
     all_kinds, tell = known_kinds(kinds), progress or silent
     loaded = load(document, {**(overrides or {}), **choice.changes}, all_kinds, sensors=sensors, has_scene=scene is not None)
     resolved = resolve(loaded, tell, None if scene is None else models_of(loaded, scene))
-    _check_chosen(loaded, choice, scene)
-    written = _written(document, overrides, all_kinds, sensors) if choice.changes else loaded
+    if names := [name for name, s in loaded.spec.sensors.items() if s.accuracy is not None and name not in choice.notes]:
+        problem = f"{listed(names)}: `accuracy` takes a run of the scene"
+        way = "compile with `tgdsl.compile`" if scene is None else "compile without `scene=`"
+        raise TgdslError(f"{loaded.source.file}: {problem}; {way}, or set it to null")
+    written = loaded
+    if choice.changes:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # these were given when the document was loaded
+            written = load(document, overrides, all_kinds, sensors=sensors)
     plan = lower.plan(loaded, resolved, all_kinds, _origin(written, scene), tell)
     tell("compiling the scene")
     file = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
     return Compiled(loaded, resolved, choice.noted(dataclasses.replace(plan, scene=file)))
-
-
-def _check_chosen(loaded: Loaded, choice: Choice, scene: Model | None) -> None:
-    """Refuse a document some `accuracy` of which nobody has looked at."""
-    names = [name for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None and name not in choice.notes]
-    if names:
-        problem = f"{listed(names)}: `accuracy` takes a run of the scene"
-        way = "compile with `tgdsl.compile`" if scene is None else "compile without `scene=`"
-        raise TgdslError(f"{loaded.source.file}: {problem}; {way}, or set it to null")
-
-
-def _written(
-    document: Document, overrides: Mapping[str, Any] | None, kinds: tuple[Kind, ...], sensors: Collection[str] | None
-) -> Loaded:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
-        return load(document, overrides, kinds, sensors=sensors)
 
 
 class Placed(NamedTuple):

@@ -24,7 +24,7 @@ from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders, Reach, reach
-from tgdsl.plan.scene import Collider, SceneObject
+from tgdsl.plan.scene import Collider
 from tgdsl.scene.colliders import with_colliders
 from tgdsl.scene.contact_bits import bits_that_meet
 from tgdsl.schema.load import GIVEN, Loaded, LoadedLayout, load_colliders
@@ -76,17 +76,14 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
     is_forced = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     low = int(compiler.inertiagrouprange[0])
     group = low if is_forced and low > 0 else 0
-    contype, conaffinity = bits_that_meet(scene.spec.geoms)
     for name, target in loaded.spec.objects.items():
         if target.body is None and name in scene.bodies:
             problem = f'the scene has a body "{name}" already'
             loaded.note(("objects", name), problem, f"`body: {name}` gives that one these geoms")
         elif target.body is None:
             pos, quat = target.pos or (0.0, 0.0, 0.0), target.quat or (1.0, 0.0, 0.0, 0.0)
-            bits = [
-                default if given_bits is None else given_bits
-                for given_bits, default in ((target.contype, contype), (target.conaffinity, conaffinity))
-            ]
+            own, default = (target.contype, target.conaffinity), bits_that_meet(scene.spec.geoms)
+            bits = [bit if given is None else given for given, bit in zip(own, default, strict=True)]
             new.append(NewBody(name, pos, quat, target.joint != "fixed", group, *bits))
     return tuple(new)
 
@@ -94,7 +91,7 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
 def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, SensedObject]:
     """Return the objects that some sensor feels."""
     felt = {name for sensor in loaded.spec.sensors.values() for name in sensor.objects}
-    with_geoms: dict[str, SceneObject] = {target.name: target for target in own.objects if target.types}
+    with_geoms = {target.name: target for target in own.objects if target.types}
     is_faulty = bool(loaded.problems)
     objects: dict[str, SensedObject] = {}
     for name, target in loaded.spec.objects.items():
@@ -102,13 +99,10 @@ def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, S
         body = target.body_of(name)
         if body not in scene.bodies:
             loaded.note(path, f'no body is named "{body}"', did_you_mean(body, scene.bodies, "bodies"))
-            continue
-        if (target.compounds or target.size == "per_env") and is_faulty:
-            continue  # what is wrong with its geoms is known already
-        variants = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else []
-        sensed = sensed_object(name, body, target, scene, variants, _others(loaded, body), partial(loaded.note, path))
-        if name in felt:
-            objects[name] = sensed
+        elif not (is_faulty and (target.compounds or target.size == "per_env")):  # else its mistakes are known already
+            variants = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else []
+            sensed = sensed_object(name, body, target, scene, variants, _others(loaded, body), partial(loaded.note, path))
+            objects |= {name: sensed} if name in felt else {}
     return objects
 
 
@@ -234,7 +228,7 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
             patches = patches_of(loaded, loaded.layout, robot, placements)
             links = _sensor_links(loaded, loaded.layout.spec.groups, robot, patches, on_links)
     if robot is not None and scene is not None:
-        _check_bodies(loaded, robot, scene, patches)
+        _check_bodies(loaded, scene, patches)
         scene, new_objects = own_objects(loaded, scene, {patch.link.body for patch in patches})
         primitives = _primitives(loaded, scene)
         scene = scene.changed(lambda spec: with_colliders(spec, primitives)) if primitives else scene
@@ -296,30 +290,23 @@ def _unlisted(robot: Model, scene: Model, listed: Collection[str], rigid: Collec
 def models_of(loaded: Loaded, given: Model | None = None) -> Models:
     """Load the robot, and the scene if there is one; a file that does not exist is a mistake of the document.
 
-    Args:
-        loaded: The document.
-        given: The scene. The models that the document names must be those in it.
+    If a scene is `given`, the models that the document names must be those in it.
     """
-    model_name = loaded.spec.robot.model
+    model_name, relative = loaded.spec.robot.model, "paths are relative to this document"
     robot = scene = None
     if given is not None and model_name == GIVEN:
         robot = given
     elif loaded.robot_file is None:
-        hint = (
-            did_you_mean(model_name, robot_names(), "robots")
-            if "/" not in model_name
-            else "paths are relative to this document"
-        )
+        hint = relative if "/" in model_name else did_you_mean(model_name, robot_names(), "robots")
         loaded.note(("robot", "model"), f'there is no file or robot "{model_name}"', hint)
     else:
         robot = load_model(loaded.robot_file)
     if loaded.spec.scene is None:
-        is_faulty = loaded.raw(("scene",)) is not None  # and its mistake is reported already
-        scene = None if is_faulty else robot
+        scene = None if loaded.raw(("scene",)) is not None else robot  # a faulty scene is reported already
     elif is_file(loaded.folder / loaded.spec.scene.model):
         scene = load_model(loaded.folder / loaded.spec.scene.model)
     else:
-        loaded.note(("scene", "model"), f'there is no file "{loaded.spec.scene.model}"', "paths are relative to this document")
+        loaded.note(("scene", "model"), f'there is no file "{loaded.spec.scene.model}"', relative)
     if given is None:
         return Models(robot, scene)
     for key, model in {"robot": robot, "scene": scene if scene is not robot else None}.items():
@@ -331,27 +318,28 @@ def models_of(loaded: Loaded, given: Model | None = None) -> Models:
 
 def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
     """Return the primitive colliders that the document asks for: those of a file beside the robot's."""
-    place = ("robot", "collision")
-    if loaded.spec.robot.collision == "primitive" and loaded.spec.robot.model == GIVEN:
+    robot, note = loaded.spec.robot, partial(loaded.note, ("robot", "collision"))
+    if robot.collision != "primitive":
+        return ()
+    if robot.model == GIVEN:
         problem = "colliders lie beside a robot's file, and this document names none"
-        loaded.note(place, problem, "expected `collision: mesh`, or `robot: {model: …}`")
-    if loaded.spec.robot.collision != "primitive" or loaded.robot_file is None:
+        note(problem, "expected `collision: mesh`, or `robot: {model: …}`")
+    if loaded.robot_file is None:
         return ()
     file = colliders_file(loaded.robot_file)
     if file is None:
         beside = loaded.robot_file.with_name("colliders.yaml")
-        problem = f'"{loaded.spec.robot.model}" has no primitive colliders: there is no file {beside}'
-        loaded.note(place, problem, "expected `collision: mesh`, or such a file")
+        problem = f'"{robot.model}" has no primitive colliders: there is no file {beside}'
+        note(problem, "expected `collision: mesh`, or such a file")
         return ()
     try:
         result = load_colliders(file)
     except SpecError as error:
         loaded.problems += error.problems
         return ()
-    unknown = [collider.body for collider in result if collider.body not in scene.bodies]
-    if unknown:
+    if unknown := [collider.body for collider in result if collider.body not in scene.bodies]:
         problem = f'{file.name} has colliders of "{unknown[0]}", which is no body of the scene'
-        loaded.note(place, problem, did_you_mean(unknown[0], scene.bodies, "bodies"))
+        note(problem, did_you_mean(unknown[0], scene.bodies, "bodies"))
         return ()
     return result
 
@@ -371,9 +359,10 @@ def _sensor_links(
     loaded: Loaded, groups: Mapping[str, Selection], robot: Model, patches: list[Patch], on_links: Set[str]
 ) -> dict[str, tuple[str, ...]]:
     """Return the names of each sensor's links: of those with taxels, or of bodies if it is `on_links`."""
-    candidates = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
-    on_robot = names_of(robot)
-    link_names = [name for names in (*on_robot, *candidates) for name in names]
+    with_taxels = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
+    on_robot, bodies = names_of(robot), [body for body in robot.bodies if body != "world"]
+    of_bodies = [[body, *(n for g in robot.geoms if g.body == body for n in g.names)] for body in bodies]
+    link_names = [name for names in (*on_robot, *with_taxels) for name in names]
     links: dict[str, tuple[str, ...]] = {}
     for name, sensor in loaded.spec.sensors.items():
         path: Path = ("sensors", name, "links")
@@ -381,39 +370,29 @@ def _sensor_links(
             links[name] = ()
             continue
         check_regions(loaded, sensor, path[:-1], robot, loaded.problems)
-        if name in on_links:
-            links[name] = _links_chosen(loaded, groups, robot, name)
-            continue
         missing: list[Problem] = []
-        selected = select(sensor.links, candidates, groups, reporter(loaded, path, missing), elsewhere=link_names)
-        if missing:
-            # A name that the robot has but the layout does not is another mistake than a name nobody has.
-            unknown: list[Problem] = []
-            select(sensor.links, on_robot, groups, reporter(loaded, path, unknown), elsewhere=link_names)
-            problem = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
-            hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
-            loaded.problems += unknown or [loaded.problem(path, problem, hint)]
-        elif not selected:
+        report = reporter(loaded, path, missing)
+        if name in on_links:
+            selected = select(sensor.links, of_bodies, groups, report)
+            links[name] = tuple(bodies[i] for i in selected)
+            loaded.problems += missing
+        else:
+            selected = select(sensor.links, with_taxels, groups, report, elsewhere=link_names)
+            links[name] = tuple(patches[i].link.name for i in selected)
+            if missing:
+                # A name that the robot has but the layout does not is another mistake than a name nobody has.
+                unknown: list[Problem] = []
+                select(sensor.links, on_robot, groups, reporter(loaded, path, unknown), elsewhere=link_names)
+                problem = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
+                hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
+                loaded.problems += unknown or [loaded.problem(path, problem, hint)]
+        if not selected and not missing:
             loaded.note(path, "`exclude` leaves no link")
-        links[name] = tuple(patches[i].link.name for i in selected)
     return links
 
 
-def _links_chosen(loaded: Loaded, groups: Mapping[str, Selection], robot: Model, name: str) -> tuple[str, ...]:
-    """Return the bodies of a sensor that has a place on each link."""
-    path: Path = ("sensors", name, "links")
-    bodies = [body for body in robot.bodies if body != "world"]
-    body_names = [[body, *(n for g in robot.geoms if g.body == body for n in g.names)] for body in bodies]
-    num_problems = len(loaded.problems)
-    selected = select(loaded.spec.sensors[name].links, body_names, groups, reporter(loaded, path, loaded.problems))
-    if not selected and len(loaded.problems) == num_problems:
-        loaded.note(path, "`exclude` leaves no link")
-    return tuple(bodies[i] for i in selected)
-
-
-def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patch]) -> None:
-    missing = [patch.link.body for patch in patches if patch.link.body not in scene.bodies]
-    if missing:
+def _check_bodies(loaded: Loaded, scene: Model, patches: list[Patch]) -> None:
+    if missing := [patch.link.body for patch in patches if patch.link.body not in scene.bodies]:
         problem = f'the scene has no body "{missing[0]}", which the robot has'
         hint = did_you_mean(missing[0], scene.bodies, "bodies")
         loaded.note(("scene", "model"), problem, f"a scene keeps the robot's names; {hint}")

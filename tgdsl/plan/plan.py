@@ -50,35 +50,21 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """All a module is built from.
+    """All a module is built from."""
 
-    Attributes:
-        origin: What it was made from.
-        inputs: What it reads.
-        layout: The taxels of all sensors.
-        objects: What taxels feel.
-        pairs: The (link, object) pairs that may meet, in the order of the objects.
-        quantities: What sensors ask of the scene: each quantity's own part, by its name, in their order.
-        sensors: Sensors, in the document's order.
-        proprioception: Readings of joints and actuators, which are fields of the state, handed out by the same names.
-        observations: Observation terms, in the document's order.
-        dropped: What the scene or the document has and the module does not need, and why.
-        unfelt: Taxels that cannot feel what their sensors are to feel, and why.
-        scene: The instrumented scene.
-    """
-
-    origin: Origin
-    inputs: Inputs
-    layout: Layout
-    objects: tuple[PairedObject, ...]
-    pairs: PairTable[np.ndarray]
-    quantities: Mapping[str, Any]
-    sensors: tuple[PlannedSensor[np.ndarray], ...]
+    origin: Origin  # what it was made from
+    inputs: Inputs  # what it reads
+    layout: Layout  # the taxels of all sensors
+    objects: tuple[PairedObject, ...]  # what taxels feel
+    pairs: PairTable[np.ndarray]  # the (link, object) pairs that may meet, in the order of the objects
+    quantities: Mapping[str, Any]  # what sensors ask of the scene: each quantity's own part, by its name, in their order
+    sensors: tuple[PlannedSensor[np.ndarray], ...]  # sensors, in the document's order
+    # readings of joints and actuators, which are fields of the state, handed out by the same names
     proprioception: tuple[PlannedReading, ...]
-    observations: tuple[PlannedObservation[np.ndarray], ...]
-    dropped: tuple[tuple[str, str], ...]
-    unfelt: tuple[Unfelt, ...]
-    scene: SceneFile
+    observations: tuple[PlannedObservation[np.ndarray], ...]  # observation terms, in the document's order
+    dropped: tuple[tuple[str, str], ...]  # what the scene or the document has and the module does not need, and why
+    unfelt: tuple[Unfelt, ...]  # taxels that cannot feel what their sensors are to feel, and why
+    scene: SceneFile  # the instrumented scene
 
     @cached_property
     def arrays(self) -> dict[str, np.ndarray]:
