@@ -104,32 +104,18 @@ class BakeError(TgdslError):
 
 
 class SampleError(TgdslError):
-    """A placement that a surface cannot satisfy.
-
-    Attributes:
-        what: The actual and the expected value, in words.
-        hint: What would be right, or empty.
-    """
+    """A placement that a surface cannot satisfy: the actual and the expected value in words, and what would be right."""
 
     def __init__(self, what: str, hint: str = ""):
-        self.what = what
-        self.hint = hint
+        self.what, self.hint = what, hint
         super().__init__(f"{what}; {hint}" if hint else what)
 
 
 class LowerError(TgdslError):
-    """What a kind of sensor cannot do on the links that it was put on.
-
-    Attributes:
-        what: The actual and the expected value, in words.
-        field: The field of the sensor's spec that is at fault, or empty.
-        hint: What would be right, or empty.
-    """
+    """What a kind of sensor cannot do on the links that it was put on; `field` of its spec is at fault, if given."""
 
     def __init__(self, what: str, field: str = "", hint: str = ""):
-        self.what = what
-        self.field = field
-        self.hint = hint
+        self.what, self.field, self.hint = what, field, hint
         super().__init__(f"{what}; {hint}" if hint else what)
 
 

@@ -101,16 +101,9 @@ def cached(
     pack: Callable[[T], Mapping[str, np.ndarray]],
     unpack: Callable[[Mapping[str, np.ndarray]], T],
 ) -> T:
-    """Return what a cache file holds, or else make it and write one.
+    """Return what the cache file `key` holds, or else make it and write one.
 
-    Args:
-        key: Name of the file.
-        make: Computes the value.
-        pack: Returns its arrays.
-        unpack: Returns the value of its arrays; raises ValueError, KeyError, IndexError or TypeError if they are none.
-
-    Raises:
-        TgdslError: If `TGDSL_CACHE_BYTES` is no number of bytes.
+    `unpack` returns the value of arrays that `pack` returned, or raises ValueError, KeyError, IndexError or TypeError.
     """
     file, limit = folder() / f"{key}.npz", max_bytes()
     try:

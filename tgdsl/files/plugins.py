@@ -19,14 +19,15 @@ def known(
 ) -> tuple[Thing, ...]:
     """Return all things of a sort: those of tgdsl, of installed packages by package and name, and those that are given.
 
-    An installed one that cannot be had is left out, with a warning, the first time.
+    An installed one that cannot be had is left out, with a warning, the first time. Of those given an installed package may
+    bring some too.
 
     Args:
         group: Group of the entry points.
         what: What one is called: "kind".
         argument: Name of the argument by which a caller gives some: "kinds".
         own: Those of tgdsl; each has a `name`.
-        given: The caller's. One that an installed package brings too may be among them.
+        given: The caller's.
         wrong: Says what is no such thing.
 
     Raises:

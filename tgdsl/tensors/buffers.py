@@ -22,16 +22,7 @@ class Constants(HookedModule):
     """
 
     def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype, bind: Callable[[Callable[[str], Tensor]], Any]):
-        """Make a buffer of each array, floats in `dtype`.
-
-        Args:
-            arrays: The arrays by name.
-            dtype: Dtype of the floats.
-            bind: Makes of a function from names to tensors what is read at run time.
-
-        Raises:
-            TgdslError: If no module can be of that dtype.
-        """
+        """Make a buffer of each array, floats in `dtype`; `bind` makes of a function from names to tensors what calls read."""
         check_dtype(dtype)
         super().__init__()
         with torch.inference_mode(False):  # whoever builds a module there may want derivatives later

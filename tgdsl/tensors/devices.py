@@ -8,26 +8,16 @@ import torch
 
 from tgdsl.errors import TgdslError
 
-DTYPES = (torch.float32, torch.float64)
-"""What a module can be of. A narrower float knows places on a hand to a tenth of a millimetre, too coarse for a depth."""
-
 
 def check_dtype(dtype: torch.dtype) -> None:
-    """Refuse a dtype that no module can be of.
-
-    Raises:
-        TgdslError: If it is not one of `DTYPES`.
-    """
-    if dtype not in DTYPES:
+    """Refuse a dtype that no module can have: a narrower float knows places on a hand to 0.1 mm, too coarse for a depth."""
+    if dtype not in (torch.float32, torch.float64):
         hint = "readings can be cast afterwards, a module computes depths that a narrower float cannot hold"
         raise TgdslError(f"a module cannot be of {dtype}, expected torch.float32 or torch.float64; {hint}")
 
 
 def dtype_of(dtype: torch.dtype | str) -> torch.dtype:
-    """Return a dtype by its name.
-
-    Args:
-        dtype: A dtype, or its name, "float32" or "torch.float32".
+    """Return a dtype by its name, "float32" or "torch.float32".
 
     Raises:
         TgdslError: If there is none of that name, or no module can be of it.

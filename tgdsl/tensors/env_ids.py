@@ -17,23 +17,18 @@ FEW = 0.5  # with more of the environments than this share, something is done fo
 
 
 def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] = SimulationError) -> Int[np.ndarray, " n"]:
-    """Return environments as indices, in the order in which they are named.
-
-    Args:
-        env_ids: Indices, or a boolean mask over environments; None: all.
-        num_envs: Number of environments.
-        error: What is raised.
+    """Return environments (default: all) as indices, in the order in which they are named.
 
     Raises:
         TgdslError: Of the type `error`, if there are no such environments.
     """
     if env_ids is None:
         return np.arange(num_envs)
+    expected = f"expected indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
     try:
         found = np.asarray(torch.as_tensor(env_ids).cpu())
     except (TypeError, ValueError, RuntimeError) as wrong:
-        problem = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
-        raise error(f"env_ids: found {env_ids!r}, expected {problem}") from wrong
+        raise error(f"env_ids: found {env_ids!r}, {expected}") from wrong
     if found.dtype == bool and found.shape == (num_envs,):
         return np.flatnonzero(found)
     # Numbers of 8 bits are a mask that is not boolean rather than indices.
@@ -41,10 +36,9 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
         found.dtype.kind in "iu" and found.dtype.itemsize > 1 and found.ndim == 1 and ((found >= 0) & (found < num_envs)).all()
     )
     if found.size and not is_index:
-        problem = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
         is_mask = found.dtype == bool
         seen = f"a mask of {' x '.join(map(str, found.shape))}" if is_mask else listed([str(value) for value in found.ravel()])
-        raise error(f"env_ids: found {seen}, expected {problem}")
+        raise error(f"env_ids: found {seen}, {expected}")
     return found.reshape(-1).astype(np.int64)
 
 
@@ -61,14 +55,9 @@ def env_mask(
     error: type[TgdslError] = SimulationError,
     waits: bool = True,
 ) -> Bool[Tensor, " env"]:
-    """Return environments as a mask on a device. A mask that is there already is taken as it is, and nothing waits for the GPU.
+    """Return environments (default: all) as a mask on a device. A mask that is there already is taken as it is.
 
-    Args:
-        env_ids: Indices, or a boolean mask over environments; None: all.
-        num_envs: Number of environments.
-        device: Where the mask is wanted.
-        error: What is raised.
-        waits: Whether to wait for a GPU to look at indices that lie there; if not, its kernel asserts that they exist.
+    Indices on a GPU are checked on the host, which `waits` for them, or by the kernel, which asserts that they exist.
 
     Raises:
         TgdslError: Of the type `error`, if there are no such environments.

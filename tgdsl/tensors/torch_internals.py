@@ -30,22 +30,13 @@ class HookedModule(nn.Module):
     """
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
-        """Move or cast all tensors, as in `to`, `cuda` and `double`; a subclass may do more.
-
-        Args:
-            fn: What is done to each tensor.
-            move: Does it.
-        """
+        """Move or cast all tensors, as in `to`, `cuda` and `double`: `move` does `fn` to each; a subclass may do more."""
         move()
 
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
-        """Load the module's own buffers from a state dict; a subclass may make room for them first, or leave them.
+        """Load the module's own buffers from below `prefix`; a subclass may make room for them first, or leave them.
 
-        Args:
-            state_dict: Holds them below `prefix`.
-            prefix: The module's path, with a dot at its end.
-            errors: What is wrong with the state dict so far; `load_state_dict` raises all of it at its end.
-            load: Loads them.
+        `errors` has what is wrong with the state dict so far; `load_state_dict` raises all of it at its end.
         """
         load()
 
@@ -152,26 +143,21 @@ def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:
     return MethodType(copy, method.__self__)
 
 
-MOST_FUSED = 1024  # operations of a kernel that is to be as large as can be
-
-
 def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> dict[str, Any]:
     """Return options for torch.compile, which are names of Inductor's private configuration.
 
-    Args:
-        checks_indices: Whether kernels assert that indices read from tensors are in range.
-        has_tiles: Whether kernels on a GPU have tiles of 32 × 32 of two axes, instead of blocks of one flat axis whose size is
-            chosen by timing. Of a kernel that takes 10 µs that is the time of its launch: one tile is as likely as another.
-            From Hopper on, each such kernel is launched while the one before it ends (programmatic dependent launch).
-        is_fused: Whether kernels have as many operations as can be, instead of 64 at most.
+    Kernels may assert that indices read from tensors are in range; on a GPU have tiles of 32 × 32 of two axes, not blocks of
+    one flat axis; and have as many operations as can be, instead of 64 at most.
     """
+    # Sizes of blocks are chosen by timing, but of a kernel that takes 10 µs that is the time of its launch. From Hopper on each
+    # kernel with tiles is launched while the one before it ends (programmatic dependent launch).
     options: dict[str, Any] = {
         "assert_indirect_indexing": checks_indices,
         "triton.prefer_nd_tiling": has_tiles,
         "triton.autotune_pointwise": not has_tiles,
         "triton.enable_pdl": has_tiles,
     }
-    return options | {"max_fusion_size": MOST_FUSED} if is_fused else options
+    return options | {"max_fusion_size": 1024} if is_fused else options
 
 
 def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:

@@ -33,8 +33,7 @@ from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.known import quantities_of
 from tgdsl.tensors.torch_internals import num_compiled_graphs
-from tgdsl.testing.known_reference import KnownReference, answers_of
-from tgdsl.testing.reference import assert_agrees
+from tgdsl.testing.reference import KnownReference, answers_of, assert_agrees
 
 FLOAT32_TOLERANCE = 1e-5
 """Largest error of a float32 module over the largest magnitude of the channel: some 80 roundings of 2⁻²⁴."""
