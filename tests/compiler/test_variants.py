@@ -10,7 +10,7 @@ from torch._dynamo.utils import counters
 
 import tgdsl
 from tgdsl.compiler.pipeline import compile_document
-from tgdsl.compiler.variants import aligned
+from tgdsl.compiler.scene import aligned
 from tgdsl.errors import SimulationError, SpecError, StateError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState

@@ -3,7 +3,7 @@
 import io
 
 from tgdsl.console import live as module
-from tgdsl.console.live import LiveTable
+from tgdsl.console.progress import LiveTable
 
 
 class Terminal(io.StringIO):

@@ -9,8 +9,7 @@ import pytest
 from mujoco.introspect import structs
 
 from tgdsl.compiler.pipeline import compile_document
-from tgdsl.compiler.scene import instrument, scene_file
-from tgdsl.compiler.variants import NewBody, OwnObjects, with_bodies
+from tgdsl.compiler.scene import NewBody, OwnObjects, instrument, scene_file, with_bodies
 from tgdsl.errors import RobotError
 from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import load_plan, save_plan

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tgdsl.tensors.threads import one_thread
+from tgdsl.tensors.on_host import one_thread
 
 
 @pytest.fixture

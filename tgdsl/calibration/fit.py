@@ -86,7 +86,7 @@ class Fit:
             TgdslError: If the document is a mapping, or the file would be in another folder, where its paths lead nowhere.
         """
         from tgdsl.files.write import atomic_write
-        from tgdsl.schema.rewrite import with_values
+        from tgdsl.schema.yaml import with_values
 
         source = self.problem.model.document
         if isinstance(source, Mapping):

@@ -102,7 +102,7 @@ class Play:
         """Make all steps, and return what the first environment's taxels read; None if no taxel is read."""
         from tqdm import tqdm
 
-        from tgdsl.console.live import LiveTable
+        from tgdsl.console.progress import LiveTable
         from tgdsl.rl.playing.record import Tally
         from tgdsl.rl.playing.rollout import rollout
         from tgdsl.view.picture import chosen_output

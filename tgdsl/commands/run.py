@@ -98,7 +98,7 @@ class Run:
         """Make all steps, and return the last readings."""
         from tqdm import tqdm
 
-        from tgdsl.console.live import LiveTable
+        from tgdsl.console.progress import LiveTable
         from tgdsl.runtime.rollout import rollout
         from tgdsl.view.table import table
 

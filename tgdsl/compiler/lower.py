@@ -14,8 +14,8 @@ import numpy as np
 from tgdsl.compiler import passes
 from tgdsl.compiler.lowered import LoweredSensor, lowered_sensors
 from tgdsl.compiler.passes import Joined, Numbered, Pruned, Shared
+from tgdsl.compiler.patches import contact_parts, joints_matching, link_parts
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.compiler.sensed import contact_parts, joints_matching, link_parts
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import BakeError, LowerError, TgdslError, UnfeltWarning, did_you_mean
 from tgdsl.formats.joints import RobotJoints

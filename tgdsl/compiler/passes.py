@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tgdsl.compiler.lowered import LoweredSensor
-from tgdsl.compiler.sensed import LinkBodies
+from tgdsl.compiler.patches import LinkBodies
 from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout

@@ -10,9 +10,22 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.compiler.patches import Patch, Pools, check_regions, matched, names_of, patches_of, reporter, sampled
-from tgdsl.compiler.sensed import LinkBodies, check_named_bodies, link_bodies, sensed_object, sensor_joints
-from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
+from tgdsl.compiler.patches import (
+    LinkBodies,
+    Patch,
+    Pools,
+    check_named_bodies,
+    check_regions,
+    link_bodies,
+    matched,
+    names_of,
+    patches_of,
+    reporter,
+    sampled,
+    sensed_object,
+    sensor_joints,
+)
+from tgdsl.compiler.scene import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, RobotError, SampleError, SpecError, did_you_mean, listed
 from tgdsl.fields.models import Selection

@@ -24,11 +24,10 @@ from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.export.program import EXAMPLE_ENVS, Signature, Step, export_step, format_of
-from tgdsl.module.incoming import Incoming
 from tgdsl.module.memory import Memory, chosen_rows, few_rows, kept, read_rows, store, stored
 from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, observe, outputs_of
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
-from tgdsl.module.state import SceneState, example_state
+from tgdsl.module.state import Incoming, SceneState, example_state
 from tgdsl.module.taxels import SavedTaxels, images_of, row_tables, taxel_table
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan

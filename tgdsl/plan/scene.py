@@ -33,7 +33,7 @@ class SceneObject:
 
     name: str  # its name in the document
     body: str  # its body in the scene
-    types: tuple[str, ...]  # muJoCo's types of the geoms that it has instead of the scene's own; none if only its size differs
+    types: tuple[str, ...]  # MuJoCo's types of the geoms that it has instead of the scene's own; none if only its size differs
     # which of these geoms each variant has, and how; None where it lacks one
     variants: tuple[tuple[SceneGeom | None, ...], ...]
     is_sized: bool  # whether the size of its geom is chosen per environment
@@ -45,7 +45,7 @@ class Collider:
     """A primitive that a link of the robot collides with instead of the scene's geoms."""
 
     body: str  # the link's body in the scene
-    type: str  # muJoCo's type
+    type: str  # MuJoCo's type
     size: tuple[float, ...]  # its size as MuJoCo defines it [m]
     pos: tuple[float, float, float]  # its frame's origin in the body's frame [m]
     quat: tuple[float, float, float, float]  # its orientation there, w, x, y, z

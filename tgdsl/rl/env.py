@@ -38,7 +38,7 @@ from tgdsl.rl.task import Now, checked
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_be_nonempty
 from tgdsl.tensors.fused import FusedCall
-from tgdsl.tensors.threads import one_thread
+from tgdsl.tensors.on_host import one_thread
 from tgdsl.tensors.torch_internals import below_autograd
 
 SINGLE_THREAD_MAX_TAXELS = 2**16

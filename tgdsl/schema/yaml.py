@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pathlib
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import StringIO
 from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
@@ -197,3 +200,20 @@ class _Reader:
             elif found is not Unreadable:
                 self.note(part, path, "only a mapping can be merged in")
         return result
+
+
+def with_values(file: pathlib.Path, values: Mapping[tuple[str, ...], tuple[Any, str]]) -> str:
+    """Return a document's text with other values, each with a comment, by path; its own comments and order are kept."""
+    yaml = YAML(typ="rt")
+    yaml.preserve_quotes, yaml.width = True, 1000
+    root = yaml.load(file.read_text(encoding="utf-8"))
+    for path, (value, comment) in values.items():
+        parent = root
+        for part in path[:-1]:
+            parent = parent.setdefault(part, CommentedMap())
+        parent[path[-1]] = value
+        if not parent.fa.flow_style():
+            parent.yaml_add_eol_comment(comment, path[-1])
+    out = StringIO()
+    yaml.dump(root, out)
+    return out.getvalue()

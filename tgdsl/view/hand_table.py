@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tgdsl.console.live import LiveTable
+from tgdsl.console.progress import LiveTable
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading
 from tgdsl.runtime.xhand1.log.log import Fault
