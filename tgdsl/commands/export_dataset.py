@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
-from zipfile import BadZipFile
 
 import tyro
 
@@ -93,24 +92,21 @@ class ExportDataset:
         print(f"{out}: {num} episodes, {frames} frames at {header.fps:g} Hz; {touch}")
 
     def _recorded(self) -> tuple[Header, Iterator[Episode]]:
-        import numpy as np
-
+        from tgdsl.files.arrays import read_arrays
         from tgdsl.rl.datasets.sources import of_log, of_run
         from tgdsl.runtime.xhand1.calibration import load_calibration
 
-        expected = "expected a recording of tgdsl run, or a log of tgdsl hand record"
+        expected = "a recording of tgdsl run, or a log of tgdsl hand record"
         if self.policy is not None:
             raise TgdslError(f"--policy {self.policy}: a recording has its actions; a policy acts on a task: see --source")
-        try:
-            with self.input.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                names, document = archive.files, str(archive["document"]) if "document" in archive.files else ""
-        except (OSError, EOFError, ValueError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
-            raise TgdslError(f"{self.input}: {expected}: {error}") from error
+        arrays = read_arrays(self.input, expected)
+        names, document = list(arrays), str(arrays.get("document", ""))
         if "about" in names:
             return of_log(self.input, self.fps, load_calibration(self.calibration) if self.calibration else None, self.side)
         if not document:
             contents = ", ".join([*names[:6], *(["…"] if len(names) > 6 else [])]) or "no array"
-            raise TgdslError(f"{self.input}: found {contents}; {expected}; to export what a policy does, name its task")
+            hint = "to export what a policy does, name its task"
+            raise TgdslError(f"{self.input}: found {contents}; expected {expected}; {hint}")
         with StatusLine() as progress:
             touch = module_of(Path(document), self.set, progress)
         return of_run(self.input, touch, self.fps, self.reading)

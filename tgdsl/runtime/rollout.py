@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SimulationError
+from tgdsl.files.arrays import read_arrays
 from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
@@ -128,11 +128,10 @@ def recorded_controls(path: Path) -> Controls:
     Raises:
         SimulationError: If the file cannot be read or holds no such array, or a number in it is not finite.
     """
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            controls = archive["ctrl"]
-    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
-        raise SimulationError(f"{path}: expected an .npz file with an array `ctrl`: {error}") from error
+    arrays = read_arrays(path, expected := "an .npz file with an array `ctrl`", SimulationError)
+    if "ctrl" not in arrays:
+        raise SimulationError(f"{path}: expected {expected}: found {', '.join(arrays) or 'none'}")
+    controls = arrays["ctrl"]
     if controls.ndim not in (2, 3) or not len(controls) or not np.issubdtype(controls.dtype, np.floating):
         expected = "expected floats (step, actuator) or (step, env, actuator)"
         raise SimulationError(f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, {expected}")

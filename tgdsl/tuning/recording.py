@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import StateError, TgdslError
+from tgdsl.files.arrays import read_arrays
 from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.accuracy.states import narrowed
 from tgdsl.module.module import TactileModule
@@ -159,11 +159,7 @@ def load_recording(path: Path) -> Recording:
     Raises:
         StateError: If the file cannot be read, is none of states, or holds too few.
     """
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, EOFError, ValueError, BadZipFile, TypeError, AttributeError) as error:
-        raise StateError(f"{path}: expected an .npz file of states: {error}") from error
+    arrays = read_arrays(path, "an .npz file of states", StateError)
     fields = [name for name in SHAPES if name in arrays]
     if "body_pos" not in fields or "names:body" not in arrays:
         raise StateError(

@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
@@ -18,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
+from tgdsl.files.arrays import read_arrays
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.connect import simulate
@@ -194,11 +194,7 @@ def read_run(path: Path) -> dict[str, Any]:
     Raises:
         SimulationError: If it is none.
     """
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, EOFError, ValueError, BadZipFile) as error:
-        raise SimulationError(f"{path}: expected a run, as `tgdsl run` writes it: {error}") from error
+    arrays = read_arrays(path, "a run, as `tgdsl run` writes it", SimulationError)
     if missing := [name for name in ("time", "qpos", "document") if name not in arrays]:
         raise SimulationError(f"{path}: expected a run, as `tgdsl run` writes it; it has no `{missing[0]}`")
     return arrays

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,6 +24,7 @@ from pydantic import Field, model_validator
 from tgdsl.calibration.hand.fit import FitError, Forces, forces_at
 from tgdsl.errors import TgdslError
 from tgdsl.fields.models import Quantity, SpecModel
+from tgdsl.files.arrays import read_arrays
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.log.log import HandLog
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
@@ -225,13 +225,8 @@ def _samples(record: TipRecord, finger: str, force: Forces) -> Samples:
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            missing = [name for name in names if name not in archive]
-            result = {} if missing else {name: archive[name] for name in names}
-            body_names = sorted(name for name in archive.files if ":" not in name)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
-        raise TgdslError(f"{path}: expected an .npz file with arrays {' and '.join(names)}: {error}") from error
-    if missing:
-        raise TgdslError(f"{path}: there is no array {' and '.join(missing)}; it holds {', '.join(body_names)}")
-    return result
+    arrays = read_arrays(path, f"an .npz file with arrays {' and '.join(names)}")
+    if missing := [name for name in names if name not in arrays]:
+        held = sorted(name for name in arrays if ":" not in name)
+        raise TgdslError(f"{path}: there is no array {' and '.join(missing)}; it holds {', '.join(held)}")
+    return {name: arrays[name] for name in names}
