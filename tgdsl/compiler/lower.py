@@ -56,12 +56,7 @@ FIELDS = (
 
 
 def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin, progress: Progress = silent) -> Plan:
-    """Return the Plan of a document, its scene still empty.
-
-    Raises:
-        SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
-            should.
-    """
+    """Return the Plan of a document, its scene still empty."""
     sensors, quantities = lowered_sensors(loaded, resolved, kinds, progress), quantities_of(kinds)
     joints = _joints_read(loaded, resolved)
     pruned = passes.prune(sensors, resolved.objects, resolved.link_bodies, resolved.scene)

@@ -80,11 +80,7 @@ class Surfaces:
         return self.resolved.surface_of_object(name)
 
     def taxels(self, resolution: str, layout: Layout) -> Layout:
-        """Return the taxels that another resolution of the layout puts on a sensor's links.
-
-        Raises:
-            LowerError: If there is no such resolution, or it has none on one of the links.
-        """
+        """Return the taxels that another resolution of the layout puts on a sensor's links."""
         assert self.loaded.layout is not None
         names, layouts = self.loaded.layout.spec.resolutions, self.resolved.layouts
         if resolution not in names:
@@ -108,11 +104,7 @@ def rows_of(lowered: Lowered, layout: Layout, spec: AnySensorSpec) -> Axis:
 
 
 def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], progress: Progress) -> tuple[LoweredSensor, ...]:
-    """Lower every sensor of a document.
-
-    Raises:
-        SpecError: If a kind cannot be on its links.
-    """
+    """Lower every sensor of a document."""
     by_name = {kind.name: kind for kind in kinds}
     sensors: list[LoweredSensor] = []
     for name, spec in loaded.spec.sensors.items():

@@ -152,9 +152,6 @@ def sampled(
     """Return the taxels of links.
 
     `objects` are bodies of the robot's file that are no links; points that are drawn on links are added to `pools`.
-
-    Raises:
-        SpecError: If a surface cannot satisfy a placement; all mistakes found so far.
     """
     parts: list[Samples] = []
     for i, patch in enumerate(patches):

@@ -151,13 +151,7 @@ def placed(
 def all_layouts(
     document: Document, overrides: Mapping[str, Any], resolutions: Sequence[str] = ()
 ) -> tuple[LayoutSpec, dict[str, Layout]]:
-    """Return a document's layout as written, and the taxels of all its links at some resolutions (default: all).
-
-    Raises:
-        SpecError: All mistakes in the document and its layout, with file, line and column.
-        RobotError: If the robot cannot be read, or holds what is not supported.
-        TgdslError: If the layout has no such resolution.
-    """
+    """Return a document's layout as written, and the taxels of all its links at some resolutions (default: all)."""
     loaded = load(document, overrides, known_kinds(()), needs_sensors=False)
     if loaded.layout is None:
         if loaded.is_without_layout:

@@ -156,11 +156,7 @@ class Resolved:
     layouts: dict[str, Layout] = field(default_factory=dict)  # taxels of all links at other resolutions that were asked for
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
-        """Return the triangles of a link, or of a region of it, in its body's frame.
-
-        Raises:
-            LowerError: If the link has no geoms, one of them has no bounded surface, or the region holds nothing of it.
-        """
+        """Return the triangles of a link, or of a region of it, in its body's frame."""
         patch = self.patches.get(link)
         geoms = self.robot.touchable(link) if patch is None else patch.geoms
         if not geoms:
@@ -179,11 +175,7 @@ class Resolved:
         return self.scene.compiled.jnt_pos[self.scene.compiled.joint(joint).id].copy()
 
     def surface_of_object(self, name: str) -> Surface:
-        """Return the triangles of an object's geoms in its body's frame [m], meshes as they are, not their hulls.
-
-        Raises:
-            LowerError: If one of its geoms has no bounded surface.
-        """
+        """Return the triangles of an object's geoms in its body's frame [m], meshes as they are, not their hulls."""
         parts = []
         for geom in self.objects[name].variants[0]:
             mesh = geom.surface if geom.mesh is None else geom.mesh
@@ -213,12 +205,7 @@ class Resolved:
 
 
 def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None = None) -> Resolved:
-    """Place a document's sensors on its robot; models of the same document that were read before may be given.
-
-    Raises:
-        SpecError: All mistakes found so far, those of reading included.
-        RobotError: If a model file cannot be read.
-    """
+    """Place a document's sensors on its robot; models of the same document that were read before may be given."""
     progress("reading robot and scene")
     models = models_of(loaded) if models is None else models
     robot, scene = models.robot, models.scene
@@ -272,11 +259,7 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
 
 
 def taxels_of_all_links(loaded: Loaded, models: Models) -> Layout:
-    """Return where a document's resolution puts taxels, on links without sensors too.
-
-    Raises:
-        SpecError: All mistakes found so far.
-    """
+    """Return where a document's resolution puts taxels, on links without sensors too."""
     robot, layout = models.robot, loaded.layout
     assert robot is not None and layout is not None
     patches = patches_of(loaded, layout, robot, layout.spec.resolutions[loaded.resolution or ""])

@@ -128,9 +128,6 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
 
     The text is that of the scene's own files, to the letter but for file names: files and assets are named by content, so
     the scene does not depend on where they lie. It is compiled again and compared, so that nothing goes missing unnoticed.
-
-    Raises:
-        RobotError: If a file is missing, or differs from the one that was loaded.
     """
     own = OwnObjects() if own is None else own
     copy = _Kept(start_qpos(own.bodies))
@@ -309,11 +306,7 @@ INERTIAL = {"pos": (0.0, 0.0, 0.0), "mass": (1.0,), "diaginertia": (1.0, 1.0, 1.
 
 
 def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
-    """Return a scene with new bodies after all of its own; in its keyframes they are where they start.
-
-    Raises:
-        RobotError: If MuJoCo cannot compile it.
-    """
+    """Return a scene with new bodies after all of its own; in its keyframes they are where they start."""
     if not bodies:
         return scene
     spec = scene.spec.copy()
@@ -403,11 +396,7 @@ def _scene_geom(
 
 
 def variant_scenes(scene: Model, target: SceneObject, contents: Mapping[str, bytes]) -> list[tuple[Model, tuple[str, ...]]]:
-    """Return the scene with each variant of an object, and the names of the geoms that the variant has.
-
-    Raises:
-        RobotError: If MuJoCo cannot compile it.
-    """
+    """Return the scene with each variant of an object, and the names of the geoms that the variant has."""
     results = []
     for variant, geoms in enumerate(target.variants):
         spec = scene.spec.copy()

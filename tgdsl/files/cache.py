@@ -39,11 +39,7 @@ def folder() -> Path:
 
 
 def max_bytes() -> int:
-    """Return the size that the folder is kept to: `TGDSL_CACHE_BYTES`, or `MAX_BYTES`.
-
-    Raises:
-        TgdslError: If that is no number of bytes.
-    """
+    """Return the size that the folder is kept to: `TGDSL_CACHE_BYTES`, or `MAX_BYTES`."""
     limit = os.environ.get("TGDSL_CACHE_BYTES", "")
     if limit and not limit.isdecimal():
         raise TgdslError(f'TGDSL_CACHE_BYTES is "{limit}", expected a number of bytes such as {MAX_BYTES}')

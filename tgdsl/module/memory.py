@@ -86,11 +86,7 @@ class Clock(HookedModule):
         _drop(self, "")
 
     def seed_with(self, seed: int, first_env: int | None) -> None:
-        """Choose other random numbers, from the next call on; environments are counted from `first_env`.
-
-        Raises:
-            TgdslError: If they are no integers, or `first_env` is negative or no int64.
-        """
+        """Choose other random numbers, from the next call on; environments are counted from `first_env`."""
         if not isinstance(seed, Integral):
             raise TgdslError(f"seed is {seed!r}, expected an integer")
         if first_env is not None and not (isinstance(first_env, Integral) and 0 <= first_env < _INT64):
@@ -287,11 +283,7 @@ class Memory(HookedModule):
         return next((buffer.shape[0] for name, buffer in held_buffers(self).items() if name.startswith(KEPT)), None)
 
     def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> Tensors:
-        """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
-
-        Raises:
-            StateError: If dt is so short that a ring is too short.
-        """
+        """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`."""
         with torch.inference_mode(False):
             if self.is_wanted and self.num_envs is None:
                 for path, planned in self._planned.items():
@@ -310,11 +302,7 @@ class Memory(HookedModule):
         return held | self.clock.tensors()
 
     def check(self, memory: Mapping[str, Tensor], num_envs: int, dt: float | None) -> None:
-        """Refuse memory of another module.
-
-        Raises:
-            StateError: If some of it is missing, of another shape or number of environments, or its rings are too short for dt.
-        """
+        """Refuse memory of another module."""
         clock = ("clock/age", "clock/step") if self.clock.is_wanted else ()
         if missing := [name for name in (*self._planned, *clock) if name not in memory]:
             raise StateError(f'memory: found no "{missing[0]}"; expected `initial_memory`, or what the step before returned')
@@ -342,11 +330,7 @@ class Memory(HookedModule):
         return readings | {name: self.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in self._views}
 
     def keep_last(self, num_envs: int) -> None:
-        """From now on keep what calls return, for the environments that a masked call leaves out.
-
-        Raises:
-            StateError: If nothing was returned yet, or of another number of environments.
-        """
+        """From now on keep what calls return, for the environments that a masked call leaves out."""
         if not (self._is_filled or self._last):
             raise StateError("nothing was handed out yet for the environments left out: read all of them first")
         if not self._is_filled:

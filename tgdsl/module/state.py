@@ -123,11 +123,7 @@ class SceneState:
         return SceneState(**moved)
 
     def checked(self, inputs: Inputs, device: torch.device, with_dt: bool = True) -> dict[str, Tensor]:
-        """Return the tensors that a module on a device reads; `with_dt`: whether a time must be there, if it is read.
-
-        Raises:
-            StateError: If a field that is read is missing, or is not of the right shape, dtype or device.
-        """
+        """Return the tensors that a module on a device reads; `with_dt`: whether a time must be there, if it is read."""
         tensors: dict[str, Tensor] = {}
         for name in inputs.fields:
             value = getattr(self, name)
@@ -296,11 +292,7 @@ class Incoming:
         return self._dt
 
     def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
-        """Return the fields of a state that are read, by name; those of earlier substeps as `substep/<i>/<field>`.
-
-        Raises:
-            StateError: If a field that is read is missing, or is not of the right shape, dtype or device.
-        """
+        """Return the fields of a state that are read, by name; those of earlier substeps as `substep/<i>/<field>`."""
         inputs = self._plan.inputs
         if not isinstance(state, SceneState):
             problem = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
@@ -320,11 +312,7 @@ class Incoming:
 
     @staticmethod
     def chosen(mask: Tensor | None, env_ids: EnvIds | None, num_envs: int, device: torch.device) -> Bool[Tensor, " env"]:
-        """Return a mask of the environments that a caller chose, by a mask or by indices.
-
-        Raises:
-            StateError: If both are given, the mask is none, or there are no such environments.
-        """
+        """Return a mask of the environments that a caller chose, by a mask or by indices."""
         if mask is not None and env_ids is not None:
             raise StateError("found both `mask` and `env_ids`, expected one of them")
         if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):

@@ -132,11 +132,7 @@ class SavedTaxels(HookedModule):
         self.register_state_dict_post_hook(_note_taxels)
 
     def on_load_metadata(self, metadata: Mapping[str, Any]) -> None:
-        """Compare the taxels that are noted with the module's own.
-
-        Raises:
-            TaxelError: As `check_taxels` does.
-        """
+        """Compare the taxels that are noted with the module's own."""
 
         def unpacked(column: list[str] | Tensor) -> np.ndarray:
             return column.cpu().numpy() if isinstance(column, Tensor) else np.array(column)
@@ -244,9 +240,6 @@ def image_indices(layout: Layout) -> Mapping[str, Int[np.ndarray, "row column"]]
     """Return which taxel is in which cell of its link's grid, by link; −1 where there is none.
 
     Inactive fillers (radius 0) are none. Links whose taxels are on no grid are left out.
-
-    Raises:
-        TgdslError: If no link's taxels are on a grid.
     """
     result: dict[str, np.ndarray] = {}
     for i, link in enumerate(layout.links):

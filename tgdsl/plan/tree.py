@@ -86,9 +86,6 @@ def restored(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         kind: The type: a dataclass, maybe generic, or what its fields may be.
         plain: What JSON held.
         arrays: The arrays by name.
-
-    Raises:
-        TypeError: As ValueError, KeyError and AttributeError, if the values are not of the type.
     """
     origin = get_origin(kind) or kind
     if plain is None:

@@ -174,11 +174,7 @@ def _with_upstream(written: Any, wanted: Collection[str], kinds: Sequence[Kind])
 
 
 def read_source(path: FilePath, name: str = "") -> Source:
-    """Read a file's values and where they stand, as YAML; `name` stands for it in messages, by default its path.
-
-    Raises:
-        SpecError: If it cannot be read, or is no YAML.
-    """
+    """Read a file's values and where they stand, as YAML; `name` stands for it in messages, by default its path."""
     return _source(_content(path, name or str(path)), name or str(path))
 
 
@@ -206,22 +202,14 @@ def _source(content: bytes, name: str) -> Source:
 
 
 def read_spec(document: FilePath | Mapping[str, Any], model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
-    """Read a file, or a mapping, that holds one model with the `required` keys, and where its values stand.
-
-    Raises:
-        SpecError: All its mistakes, each at its place.
-    """
+    """Read a file, or a mapping, that holds one model with the `required` keys, and where its values stand."""
     if isinstance(document, Mapping):
         return parse_spec(document, "<mapping>", model, required)
     return parse_spec(_content(document, str(document)), str(document), model, required)
 
 
 def parse_spec(content: bytes | Mapping[str, Any], name: str, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
-    """Read what `read_spec` reads from a file's content, or from a mapping; mistakes then go by a name.
-
-    Raises:
-        SpecError: All its mistakes, each at its place.
-    """
+    """Read what `read_spec` reads from a file's content, or from a mapping; mistakes then go by a name."""
     source = from_mapping(content, name) if isinstance(content, Mapping) else _source(content, name)
     problems = list(source.problems)
     spec = validate(source, (), model, problems, required=required)
@@ -241,11 +229,7 @@ def load_layout(path: FilePath) -> LoadedLayout:
 
 
 def load_colliders(file: FilePath) -> tuple[Collider, ...]:
-    """Return the primitive colliders of a robot's links, those of one body after another, from a file beside its model.
-
-    Raises:
-        SpecError: All its mistakes, each at its place.
-    """
+    """Return the primitive colliders of a robot's links, those of one body after another, from a file beside its model."""
     spec, _ = read_spec(file, CollidersSpec, ("tgdsl", "bodies"))
     return tuple(
         Collider(body, own.type, own.size, own.pos, own.quat, own.core) for body, parts in spec.bodies.items() for own in parts

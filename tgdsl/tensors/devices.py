@@ -17,11 +17,7 @@ def check_dtype(dtype: torch.dtype) -> None:
 
 
 def dtype_of(dtype: torch.dtype | str) -> torch.dtype:
-    """Return a dtype by its name, "float32" or "torch.float32".
-
-    Raises:
-        TgdslError: If there is none of that name, or no module can be of it.
-    """
+    """Return a dtype by its name, "float32" or "torch.float32"."""
     result = getattr(torch, dtype.removeprefix("torch."), None) if isinstance(dtype, str) else dtype
     if not isinstance(result, torch.dtype):
         raise TgdslError(f"dtype is {dtype!r}, expected torch.float32 or torch.float64")
@@ -30,11 +26,7 @@ def dtype_of(dtype: torch.dtype | str) -> torch.dtype:
 
 
 def device_of(device: torch.device | str) -> torch.device:
-    """Return a device by its name, after a look whether it is there.
-
-    Raises:
-        TgdslError: If it is not.
-    """
+    """Return a device by its name, after a look whether it is there."""
     try:
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, TypeError) as error:

@@ -58,9 +58,6 @@ def env_mask(
     """Return environments (default: all) as a mask on a device. A mask that is there already is taken as it is.
 
     Indices on a GPU are checked on the host, which `waits` for them, or by the kernel, which asserts that they exist.
-
-    Raises:
-        TgdslError: Of the type `error`, if there are no such environments.
     """
     if env_ids is None:
         return torch.ones(num_envs, dtype=torch.bool, device=device)

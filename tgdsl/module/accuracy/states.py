@@ -49,11 +49,7 @@ TOGETHER = 1e-6  # distances [m] that differ by less count as equal where a row 
 
 
 def narrowed(state: SceneState, have: Mapping[str, Sequence[str]], inputs: Inputs) -> SceneState:
-    """Return what a module wants of a state that has more; `have` is `Inputs.names` of the module that it was recorded for.
-
-    Raises:
-        StateError: If it has less.
-    """
+    """Return what a module wants of a state that has more; `have` is `Inputs.names` of the module that it was recorded for."""
     want = inputs.names
     for axis in want:
         if missing := [name for name in want[axis] if name not in have[axis]]:
@@ -114,9 +110,6 @@ def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
 
     Rows are compared with that of the same link whose place is nearest, or with the mean of several that are as near. Samples
     of a block, the last of which is at its end, are compared where both have one. Channels go by their names.
-
-    Raises:
-        StateError: If rows differ and have no places.
     """
     one, two = (next(output for output in touch.outputs if output.name == name) for touch in (own, other))
     there = _rows_at(own, other, name)

@@ -76,11 +76,7 @@ class Signature:
 
 
 def read_signature(path: Path) -> Signature:
-    """Return the signature of an exported file.
-
-    Raises:
-        ArtifactError: If the file is none that tgdsl exported.
-    """
+    """Return the signature of an exported file."""
     try:
         if path.suffix == ".onnx":
             import onnx
@@ -184,11 +180,7 @@ def export_step(step: Step, path: Path, to: File, options: dict[str, Any], sourc
 
 
 def format_of(path: Path, to: str | None) -> File:
-    """Return the format of a file, by its name's ending if it is not given.
-
-    Raises:
-        TgdslError: If there is no such format, the name has another ending, or what writes it is not installed.
-    """
+    """Return the format of a file, by its name's ending if it is not given."""
     result = to or next((name for name in reversed(ENDINGS) if path.name.endswith(ENDINGS[name])), None)
     if result not in ENDINGS:
         expected = f"expected one of {', '.join(ENDINGS)}, or a file's name with .pt2 or .onnx"

@@ -56,10 +56,6 @@ def verify(path: Path, touch: TactileModule, num_calls: int = NUM_CALLS) -> Verd
         path: The file.
         touch: The module that it was exported from, on the CPU; seeded as it was then.
         num_calls: How many calls.
-
-    Raises:
-        ArtifactError: If the file is none that tgdsl exported, is of other taxels, or cannot be run.
-        TgdslError: If onnxruntime is wanted and not installed.
     """
     signature = read_signature(path)
     if signature.taxels_id != touch.taxels_id:
