@@ -166,17 +166,12 @@ def sampled(
     loaded.raise_problems()
     if not parts:  # all sensors are on links, whatever their taxels
         return Layout.of_links((), {})
-    counts = [len(part.pos) for part in parts]
+    columns = ("pos", "normal", "tangent", "radius", "area", "cell")
     return Layout(
         links=tuple(patch.link for patch in patches),
         groups=_groups(layout, patches),
-        link_id=np.repeat(np.arange(len(patches)), counts),
-        pos=np.concatenate([part.pos for part in parts]),
-        normal=np.concatenate([part.normal for part in parts]),
-        tangent=np.concatenate([part.tangent for part in parts]),
-        radius=np.concatenate([part.radius for part in parts]),
-        area=np.concatenate([part.area for part in parts]),
-        cell=np.concatenate([part.cell for part in parts]),
+        link_id=np.repeat(np.arange(len(patches)), [len(part.pos) for part in parts]),
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in columns},
     )
 
 
@@ -190,12 +185,9 @@ def _surface(robot: Model, patch: Patch) -> Surface:
 
 def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, ...]]:
     candidates = [[patch.link.name, patch.link.body] for patch in patches]
-    groups: dict[str, tuple[str, ...]] = {}
-    for group, selection in sorted(layout.spec.groups.items()):
-        members = select(selection, candidates, layout.spec.groups, lambda where, what, hint: None)
-        if members:
-            groups[group] = tuple(patches[i].link.name for i in members)
-    return groups
+    spec = layout.spec.groups
+    members = {group: select(selection, candidates, spec, lambda *_: None) for group, selection in sorted(spec.items())}
+    return {group: tuple(patches[i].link.name for i in chosen) for group, chosen in members.items() if chosen}
 
 
 ObjectReport = Callable[[str, str], None]  # called with what is wrong with an object, and a hint
@@ -220,18 +212,14 @@ def sensed_object(
     bodies = scene.rigid_bodies(body, others)
     if target.compounds:
         touched = scene.touchable(body)
-        parts = [tuple(geom for geom in model.geoms if geom.name in names) for model, names in variants]
-        felt = [
-            _felt(variant_geoms, body, target, model, report) for variant_geoms, (model, _) in zip(parts, variants, strict=True)
-        ]
+        models = [(model, tuple(geom for geom in model.geoms if geom.name in names)) for model, names in variants]
+        parts, felt = [geoms for _, geoms in models], [_felt(geoms, body, target, model, report) for model, geoms in models]
     else:
         rigid_geoms = scene.rigid_geoms(bodies)
         selected = _chosen(rigid_geoms, body, target, report)
-        touched = tuple(geom for geom in selected if geom.is_colliding) or tuple(
-            geom for geom in rigid_geoms if geom.is_colliding
-        )
-        felt = [_felt(selected, body, target, scene, report)]
-        parts = [rigid_geoms]
+        colliding = (tuple(geom for geom in geoms if geom.is_colliding) for geoms in (selected, rigid_geoms))
+        touched = next(filter(None, colliding), ())
+        parts, felt = [rigid_geoms], [_felt(selected, body, target, scene, report)]
     if target.size == "per_env":
         for geoms in parts:
             if len(geoms) != 1 or geoms[0].shape not in NUM_SIZES:

@@ -25,7 +25,7 @@ from tgdsl.compiler.patches import (
     sensed_object,
     sensor_joints,
 )
-from tgdsl.compiler.scene import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
+from tgdsl.compiler.scene import Files, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, RobotError, SampleError, SpecError, did_you_mean, listed
 from tgdsl.fields.models import Selection
@@ -55,7 +55,7 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
 
     `links` are bodies that carry taxels.
     """
-    bodies, objects, meshes = _new_bodies(loaded, scene), [], Meshes()
+    bodies, objects, meshes = _new_bodies(loaded, scene), [], Files()
     scene = with_bodies(scene, bodies)
     body_of = {name: target.body_of(name) for name, target in loaded.spec.objects.items()}
     for name, target in loaded.spec.objects.items():

@@ -116,11 +116,7 @@ def _geoms(spec: mujoco.MjSpec, part: ContactPart) -> list[mujoco.MjsGeom]:
         raise RobotError(f'this model has no {kind} "{part.name}", which the module wants contacts of')
     if part.kind == "geom":
         return [result]
-    return [*result.geoms, *(geom for child in result.bodies if part.kind == "subtree" for geom in _below(child))]
-
-
-def _below(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
-    return [*body.geoms, *(geom for child in body.bodies for geom in _below(child))]
+    return result.find_all("geom") if part.kind == "subtree" else list(result.geoms)
 
 
 def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, colliders: tuple[Collider, ...] = ()) -> SceneFile:
@@ -130,17 +126,13 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
     the scene does not depend on where they lie. It is compiled again and compared, so that nothing goes missing unnoticed.
     """
     own = OwnObjects() if own is None else own
-    copy = _Kept(start_qpos(own.bodies))
-    copy.assets |= own.meshes.assets
-    copy.contents |= own.meshes.contents
-    if model.mjcf:
-        root = ET.fromstring(model.mjcf)
-        for mesh in root.iter("mesh"):
-            if (name := mesh.get("file", "")) in model.rewritten:
-                mesh.set("file", str(model.rewritten[name]))
-        main = copy.rewritten(root, model.file, [model.file.parent])
-    else:
-        main = copy.rewritten(ET.parse(model.file).getroot(), model.file, [model.file.parent])
+    files = Files(dict(own.meshes.assets), dict(own.meshes.contents))
+    copy = _Kept(start_qpos(own.bodies), files)
+    root = ET.fromstring(model.mjcf) if model.mjcf else ET.parse(model.file).getroot()
+    for mesh in root.iter("mesh") if model.mjcf else ():
+        if (name := mesh.get("file", "")) in model.rewritten:
+            mesh.set("file", str(model.rewritten[name]))
+    main = copy.rewritten(root, model.file, [model.file.parent])
     if own.bodies:
         main.append(as_worldbody(own.bodies))
     sensors = ET.SubElement(main, "sensor")
@@ -152,32 +144,45 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
     scene = SceneFile(
         mjcf=ET.tostring(main, encoding="unicode"),
         parts=dict(sorted(copy.parts.items())),
-        assets=tuple(sorted(copy.assets.values(), key=lambda asset: asset.key)),
+        assets=tuple(sorted(files.assets.values(), key=lambda asset: asset.key)),
         objects=own.objects,
         colliders=colliders,
     )
     try:
-        again = compiled(scene, copy.contents)
+        again = compiled(scene, files.contents)
     except ValueError as error:
         raise RobotError(f"{model.file}: MuJoCo cannot read what is kept of this scene: {error}") from error
     _compare(model, inputs, again)
     return scene
 
 
+@dataclass
+class Files:
+    """Files and other files that a scene names, by the keys that it has for them."""
+
+    assets: dict[str, Asset] = field(default_factory=dict)
+    contents: dict[str, bytes] = field(default_factory=dict)
+
+    def add(self, path: Path) -> str:
+        """Read a file and return its key."""
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        key = f"{digest[:32]}{path.suffix.lower()}"
+        self.assets[key], self.contents[key] = Asset(key, portable(path), digest), content
+        return key
+
+
 class _Kept:
     """Collects the parts and assets of a scene while its files are rewritten to name them by content."""
 
-    def __init__(self, qpos: list[float]) -> None:
-        """Begin; `qpos` is what new bodies add to the keyframes."""
-        self.qpos = "".join(f" {value!r}" for value in qpos)
+    def __init__(self, qpos: list[float], files: Files) -> None:
+        self.qpos = "".join(f" {value!r}" for value in qpos)  # what new bodies add to the keyframes
         self.parts: dict[str, str] = {}
-        self.assets: dict[str, Asset] = {}
-        self.contents: dict[str, bytes] = {}
+        self.files = files
 
     def rewritten(
         self, root: ET.Element, file: Path, folders: list[Path], settings: dict[str, str] | None = None
     ) -> ET.Element:
-        """Rewrite one file."""
         subfolders = {"mesh": "meshdir", "skin": "meshdir", "hfield": "meshdir", "texture": "texturedir"}
         settings = _folder_settings(root, file, folders) if settings is None else settings
         for compiler in root.iter("compiler"):
@@ -213,12 +218,7 @@ class _Kept:
     def _asset(self, path: Path) -> str:
         if path.suffix.lower() not in ENDINGS:
             raise RobotError(f"{path}: a mesh, texture, height field or skin has one of the endings {listed(ENDINGS)}")
-        content = path.read_bytes()
-        digest = hashlib.sha256(content).hexdigest()
-        key = f"{digest[:32]}{path.suffix.lower()}"
-        self.assets[key] = Asset(key, portable(path), digest)
-        self.contents[key] = content
-        return key
+        return self.files.add(path)
 
 
 def _folder_settings(root: ET.Element, file: Path, folders: list[Path]) -> dict[str, str]:
@@ -251,22 +251,6 @@ def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
 
 Report = Callable[[tuple[str | int, ...], str, str], None]
 """Called with the place of a mistake below the object, what it is, and a hint."""
-
-
-@dataclass
-class Meshes:
-    """Mesh files that variants name, by the keys that the scene has for them."""
-
-    assets: dict[str, Asset] = field(default_factory=dict)
-    contents: dict[str, bytes] = field(default_factory=dict)
-
-    def add(self, path: Path) -> str:
-        """Read a file and return its key."""
-        content = path.read_bytes()
-        digest = hashlib.sha256(content).hexdigest()
-        key = f"{digest[:32]}{path.suffix.lower()}"
-        self.assets[key], self.contents[key] = Asset(key, portable(path), digest), content
-        return key
 
 
 @dataclass(frozen=True)
@@ -355,10 +339,10 @@ class OwnObjects:
 
     bodies: tuple[NewBody, ...] = ()
     objects: tuple[SceneObject, ...] = ()
-    meshes: Meshes = field(default_factory=Meshes)
+    meshes: Files = field(default_factory=Files)
 
 
-def scene_object(name: str, target: ObjectSpec, folder: Path, meshes: Meshes, report: Report) -> SceneObject:
+def scene_object(name: str, target: ObjectSpec, folder: Path, meshes: Files, report: Report) -> SceneObject:
     """Return an object's variants as geoms of the scene; mesh files are looked up from the document's folder."""
     compounds = target.compounds
     types, tables = aligned([[geom.type if isinstance(geom, PrimitiveGeom) else "mesh" for geom in c] for c in compounds])
@@ -373,9 +357,7 @@ def scene_object(name: str, target: ObjectSpec, folder: Path, meshes: Meshes, re
     return SceneObject(name, target.body_of(name), types, tuple(variants), target.size == "per_env")
 
 
-def _scene_geom(
-    geom: PrimitiveGeom | MeshGeom, folder: Path, meshes: Meshes, report: Callable[[str], None]
-) -> SceneGeom | None:
+def _scene_geom(geom: PrimitiveGeom | MeshGeom, folder: Path, meshes: Files, report: Callable[[str], None]) -> SceneGeom | None:
     if isinstance(geom, PrimitiveGeom):
         return SceneGeom(geom.size, geom.pos, geom.quat, geom.density, "", 1.0)
     path = (folder / geom.mesh).resolve()

@@ -19,10 +19,7 @@ from tgdsl.tensors.devices import device_of, dtype_of
 def save(touch: TactileModule, path: str | PathLike[str]) -> int:
     """Write what a module was built from; `tgdsl.load` makes the module again. Its state is not part of it: see `state_dict`.
 
-    The same document gives the same bytes. The file appears whole or not at all.
-
-    Returns:
-        Bytes written.
+    The same document gives the same bytes. The file appears whole or not at all. Returns the bytes written.
 
     Raises:
         FileError: If the file cannot be written.
@@ -50,7 +47,7 @@ def load(
         kinds: Sensor kinds of your own, if it was compiled with any that no installed package brings.
         dtype: Dtype of the readings, float32 or float64, as for `compile`; its name will do.
         device: Where the module lives.
-        taxels: The taxels that are expected, such as those that a policy learned with: see `identity.check_taxels`.
+        taxels: The taxels that are expected, such as those that a policy learned with: see `tgdsl.check_taxels`.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged or is of another version.

@@ -109,6 +109,9 @@ class Inputs:
         Args:
             names: Names in the other scene by the names here.
             prefix: Stands before all other names there, such as "robot/"; the body "world" has none.
+
+        Raises:
+            StateError: If `names` has a name that is not among these.
         """
         names = names or {}
         parts = [part for own in (*self.contacts_of.values(), *self.link_parts.values()) for part in own]
