@@ -2,7 +2,7 @@
 
 import io
 
-from tgdsl.console import live as module
+from tgdsl.console import progress as module
 from tgdsl.console.progress import LiveTable
 
 

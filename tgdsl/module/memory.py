@@ -252,11 +252,8 @@ class Memory(HookedModule):
         self._restarted = {f"{s.name}:{n}": part.rest for s in sensors for n, part in s.state.items() if "/" not in n}
         self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
         stacks = {reading.name for _, reading in windows if reading.steps}  # their windows hold them already
-        self._kept = {
-            name: (*((reading.steps,) if reading.steps else ()), len(reading.channels), reading.num_rows)
-            for name, reading in readings.items()
-            if name not in stacks
-        }
+        shapes = {name: reading.shape for name, reading in readings.items() if name not in stacks}
+        self._kept = {name: (*shape[:-2], shape[-1], shape[-2]) for name, shape in shapes.items()}
         self._views = [reading.name for history, reading in windows if history.view]
         self._last: dict[str, tuple[Tensor, int]] = {}
         self._is_filled = False  # whether the stored readings were handed out

@@ -17,7 +17,6 @@ from tgdsl.console.tables import Observations, Outputs
 from tgdsl.errors import ObservationError, did_you_mean
 from tgdsl.observations import observations
 from tgdsl.plan.plan import Plan
-from tgdsl.plan.sensors import PlannedReading
 from tgdsl.tensors.buffers import Constants
 
 
@@ -43,25 +42,13 @@ class Output:
 
 def outputs_of(plan: Plan) -> tuple[Output, ...]:
     """Return name, shape, channels and units of each reading of a plan; a tuple that prints as a table."""
-    sensed = tuple(
-        Output(
-            reading.name,
-            sensor.sensor,
-            sensor.kind,
-            (*([reading.steps] if reading.steps else []), reading.num_rows, len(reading.channels)),
-            reading.rows,
-            plan.layout_of(sensor).bodies,
-            reading.channels,
-            reading.units,
-        )
-        for sensor in plan.sensors
-        for reading in sensor.readings
-    )
-    joints = tuple(
-        Output(r.name, r.name, r.name, (r.num_rows, len(r.channels)), r.rows, (), r.channels, r.units)
-        for r in plan.proprioception
-    )
-    return Outputs(sensed + joints)
+    own = {reading.name: sensor for sensor in plan.sensors for reading in sensor.readings}
+    outputs = []
+    for name, reading in plan.readings().items():
+        sensor, kind = (own[name].sensor, own[name].kind) if name in own else (name, name)
+        bodies = plan.layout_of(own[name]).bodies if name in own else ()
+        outputs.append(Output(name, sensor, kind, reading.shape, reading.rows, bodies, reading.channels, reading.units))
+    return Outputs(outputs)
 
 
 @dataclass(frozen=True)
@@ -119,8 +106,8 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
 
 
 def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
-    """Look at the readings that are observed, and return of how many environments they are."""
-    all_readings = plan.readings()
+    """Validate the readings that are observed, and return of how many environments they are."""
+    planned = plan.readings()
     for term in plan.observations:
         if term.type in observations.HAND_ONLY:
             raise observations.hand_only_error(term.group, term.index, term.type)
@@ -130,26 +117,21 @@ def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
         if term.reading not in readings:
             given_names = f"found {', '.join(readings)}" if readings else "found none"
             raise ObservationError(f'{where} wants the reading "{term.reading}"; {given_names}')
-        _check(where, all_readings[term.reading], readings[term.reading])
+        reading, want = readings[term.reading], planned[term.reading].shape
+        where = f'{where}: reading "{term.reading}"'
+        if not isinstance(reading, Tensor):
+            raise ObservationError(f"{where} is a {type(reading).__name__}, expected a torch tensor")
+        if tuple(reading.shape[1:]) != want:
+            expected = ", ".join(map(str, want))
+            raise ObservationError(f"{where} has shape {tuple(reading.shape)}, expected (env, {expected})")
     if not readings:
         raise ObservationError("there are no readings, so nothing says how many environments there are")
-    counts = {name: reading.shape[0] for name, reading in readings.items() if name in all_readings}
+    counts = {name: reading.shape[0] for name, reading in readings.items() if name in planned}
     if not counts:
         unknown = next(iter(readings))
-        raise ObservationError(f'this module has no reading "{unknown}"; {did_you_mean(unknown, all_readings, "readings")}')
+        raise ObservationError(f'this module has no reading "{unknown}"; {did_you_mean(unknown, planned, "readings")}')
     first = next(iter(counts))
     for name, count in counts.items():
         if count != counts[first]:
             raise ObservationError(f'reading "{name}" is of {count} environments, "{first}" of {counts[first]}')
     return counts[first]
-
-
-def _check(where: str, planned: PlannedReading, reading: object) -> None:
-    want = (*([planned.steps] if planned.steps else []), planned.num_rows, len(planned.channels))
-    if not isinstance(reading, Tensor):
-        raise ObservationError(f'{where}: reading "{planned.name}" is a {type(reading).__name__}, expected a torch tensor')
-    if reading.ndim != len(want) + 1 or tuple(reading.shape[1:]) != want:
-        expected = ", ".join(map(str, want))
-        raise ObservationError(
-            f'{where}: reading "{planned.name}" has shape {tuple(reading.shape)}, expected (env, {expected})'
-        )

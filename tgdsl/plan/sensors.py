@@ -41,6 +41,11 @@ class PlannedReading:
     units: tuple[str, ...]
     steps: int = 0
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its shape after `env`."""
+        return (*([self.steps] if self.steps else []), self.num_rows, len(self.channels))
+
 
 @dataclass(frozen=True)
 class PlannedMemory:
