@@ -21,6 +21,7 @@ from tgdsl.errors import BakeError, LowerError, TgdslError, UnfeltWarning, did_y
 from tgdsl.formats.joints import RobotJoints
 from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt, unfelt_ids
+from tgdsl.module.state import SHAPES
 from tgdsl.observations import observations
 from tgdsl.observations.observations import ObservationSpec, OfReading, ReadingObservation, ReadingSpec
 from tgdsl.observations.proprioception import PROPRIOCEPTION, JointObservation, JointSpec
@@ -47,12 +48,6 @@ from tgdsl.sensors.base import Axis, Channel, body_axis
 from tgdsl.sensors.known import quantities_of
 
 SHOWN = 8  # links and reasons that the warning names; the account of the module names all
-# fields of the state that quantities read, in the order in which a module reads them
-FIELDS = (
-    *("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found"),
-    *("contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce", "variant", "object_size"),
-    *("object_temperature", "object_material", "joint_pos", "joint_vel", "joint_effort", "last_action"),
-)
 
 
 def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin, progress: Progress = silent) -> Plan:
@@ -85,7 +80,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     heats = [heat for name in heated if (heat := resolved.objects[name].heat) is not None]
     body_of = {target.name: target.body for target in numbered.objects}
     inputs = Inputs(
-        fields=(*(name for name in FIELDS if name in read), *(["dt"] if any(map(_is_timed, sensors)) else [])),
+        fields=(*(name for name in SHAPES if name in read), *(["dt"] if any(map(_is_timed, sensors)) else [])),
         bodies=numbered.bodies,
         pairs=pruned.contact_pairs,
         bodies_of={pair.object: body_of[pair.object] for pair in pruned.contact_pairs},
@@ -360,8 +355,8 @@ def _quantity_parts(
         if not isinstance(part, quantity.part):
             problem = f"`plan` returns {type(part).__name__}, expected its part, {quantity.part.__name__}"
             raise TgdslError(f'quantity "{quantity.name}": {problem}')
-        if unknown := sorted(set(quantity.fields(part)) - set(FIELDS)):
-            hint = did_you_mean(unknown[0], FIELDS, "fields")
+        if unknown := sorted(set(quantity.fields(part)) - set(SHAPES)):
+            hint = did_you_mean(unknown[0], SHAPES, "fields")
             raise TgdslError(f'quantity "{quantity.name}" reads the field {unknown[0]}; {hint}')
         parts[quantity.name] = part
     return parts

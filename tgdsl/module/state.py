@@ -11,10 +11,10 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from tgdsl.errors import StateError, listed
@@ -26,27 +26,6 @@ from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.env_ids import EnvIds, env_mask, is_out_of_sight
 from tgdsl.tensors.on_host import HostCopy
 
-SHAPES: dict[str, tuple[str | int, ...]] = {
-    "body_pos": ("body", 3),
-    "body_quat": ("body", 4),
-    "body_linvel": ("body", 3),
-    "body_angvel": ("body", 3),
-    "contact_found": ("pair",),
-    "contact_pos": ("pair", "slot", 3),
-    "contact_force": ("pair", "slot", 3),
-    "contact_torque": ("pair", "slot", 3),
-    "contact_normal": ("pair", "slot", 3),
-    "contact_netforce": ("pair", 3),
-    "variant": ("object",),
-    "object_size": ("object", 3),
-    "object_temperature": ("heated",),
-    "object_material": ("heated",),
-    "joint_pos": ("joint",),
-    "joint_vel": ("joint",),
-    "joint_effort": ("joint",),
-    "last_action": ("actuator",),
-}
-"""Shape of each tensor of a `SceneState`, after the leading `env`."""
 CHOICES = ("variant", "object_material")  # fields that say which of several things an object is: integers
 
 
@@ -94,7 +73,7 @@ class SceneState:
     body_quat: Float[Tensor, "env body 4"] | None = None
     body_linvel: Float[Tensor, "env body 3"] | None = None
     body_angvel: Float[Tensor, "env body 3"] | None = None
-    contact_found: Tensor | None = None
+    contact_found: Shaped[Tensor, "env pair"] | None = None
     contact_pos: Float[Tensor, "env pair slot 3"] | None = None
     contact_force: Float[Tensor, "env pair slot 3"] | None = None
     contact_torque: Float[Tensor, "env pair slot 3"] | None = None
@@ -139,6 +118,15 @@ class SceneState:
             _check_choices("variant", tensors, inputs.objects, inputs.num_variants)
             _check_choices("object_material", tensors, inputs.heated, inputs.num_materials)
         return tensors
+
+
+def _axes(hint: Any) -> tuple[str | int, ...]:
+    dims = getattr(next(iter(get_args(hint)), None), "dim_str", "").split()[1:]
+    return tuple(int(dim) if dim.isdigit() else dim for dim in dims)
+
+
+# shape of each tensor of a state that modules read, after the leading `env`
+SHAPES = {name: axes for name, hint in get_type_hints(SceneState).items() if (axes := _axes(hint))}
 
 
 def _check_choices(field: str, tensors: Mapping[str, Tensor], names: Sequence[str], counts: Sequence[int]) -> None:
