@@ -30,7 +30,7 @@ from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.schema.load import load
-from tgdsl.sensors.base import Kind
+from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.known import quantities_of
 from tgdsl.tensors.torch_internals import num_compiled_graphs
 from tgdsl.testing.reference import KnownReference, answers_of, assert_agrees
@@ -154,13 +154,9 @@ class KindConformance:
         return [{"gate": gate} for gate in self.gates] or [{}]
 
     def _known(self) -> tuple[Kind, ...]:
-        from tgdsl.sensors import KINDS
-
         return (*KINDS, *self._extra())
 
     def _extra(self) -> tuple[Kind, ...]:
-        from tgdsl.sensors import KINDS
-
         return tuple(kind for kind in (self.kind, *(kind for kind, _ in self.others.values())) if kind not in KINDS)
 
     def test_something_is_felt(self, scene: Path) -> None:
