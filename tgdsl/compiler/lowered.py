@@ -33,8 +33,8 @@ class LoweredSensor:
     """One way to read a sensor, lowered."""
 
     name: str  # its name, see `plan.PlannedSensor`
-    kind: Kind  # its kind
-    spec: AnySensorSpec  # the sensor's spec
+    kind: Kind
+    spec: AnySensorSpec
     taxels: np.ndarray  # its taxels, rows of the layout
     layout: Layout  # they, or its links if it is on links
     lowered: Lowered  # what its kind says of it

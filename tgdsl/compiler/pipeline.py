@@ -38,10 +38,8 @@ Document = str | PathLike[str] | Mapping[str, Any]
 class Choice:
     """What was chosen."""
 
-    # fields that nobody wrote, by dotted path: `objects.mug.tolerance`
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    # what an account of each sensor that has an `accuracy` says of it, line by line
-    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict)  # fields by dotted path: `objects.mug.tolerance`
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # lines of `explain`, by sensor with an `accuracy`
 
     def noted(self, plan: Plan) -> Plan:
         """Return a Plan that says why its fields are what they are."""
@@ -110,8 +108,7 @@ class Placed(NamedTuple):
 
     model: mujoco.MjModel  # the model of the scene, or of the robot if there is no scene
     layouts: dict[str, Layout]  # the layouts, by resolution
-    # the taxels of each that are not collided, buried, or covered in the robot's initial state
-    unfelt: dict[str, tuple[Unfelt, ...]]
+    unfelt: dict[str, tuple[Unfelt, ...]]  # taxels that are not collided, buried, or covered in the initial state
 
 
 def placed(

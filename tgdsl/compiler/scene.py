@@ -257,13 +257,13 @@ Report = Callable[[tuple[str | int, ...], str, str], None]
 class NewBody:
     """A body that the scene is given."""
 
-    name: str  # its name
+    name: str
     pos: tuple[float, float, float]  # where it starts, in the world [m]
     quat: tuple[float, float, float, float]  # how it is turned there, w, x, y, z
     is_free: bool  # whether it moves freely, or is fixed to the world
     group: int = 0  # of its geoms: one that weighs, where the scene's compiler takes all inertias from geoms
     contype: int = 1  # MuJoCo's bits of its geoms
-    conaffinity: int = 1  # the same
+    conaffinity: int = 1
 
     @property
     def geom(self) -> dict[str, tuple[Any, ...]]:

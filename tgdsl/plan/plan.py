@@ -59,8 +59,7 @@ class Plan:
     pairs: PairTable[np.ndarray]  # the (link, object) pairs that may meet, in the order of the objects
     quantities: Mapping[str, Any]  # what sensors ask of the scene: each quantity's own part, by its name, in their order
     sensors: tuple[PlannedSensor[np.ndarray], ...]  # sensors, in the document's order
-    # readings of joints and actuators, which are fields of the state, handed out by the same names
-    proprioception: tuple[PlannedReading, ...]
+    proprioception: tuple[PlannedReading, ...]  # fields of joints and actuators that are readings too
     observations: tuple[PlannedObservation[np.ndarray], ...]  # observation terms, in the document's order
     dropped: tuple[tuple[str, str], ...]  # what the scene or the document has and the module does not need, and why
     unfelt: tuple[Unfelt, ...]  # taxels that cannot feel what their sensors are to feel, and why

@@ -34,8 +34,7 @@ class SceneObject:
     name: str  # its name in the document
     body: str  # its body in the scene
     types: tuple[str, ...]  # MuJoCo's types of the geoms that it has instead of the scene's own; none if only its size differs
-    # which of these geoms each variant has, and how; None where it lacks one
-    variants: tuple[tuple[SceneGeom | None, ...], ...]
+    variants: tuple[tuple[SceneGeom | None, ...], ...]  # the geoms of each variant; None where it lacks one
     is_sized: bool  # whether the size of its geom is chosen per environment
     others: tuple[str, ...] = ()  # bodies that are other objects: they keep their geoms where they are welded to its body
 

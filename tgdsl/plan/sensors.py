@@ -67,8 +67,7 @@ class PlannedNoise(Generic[Array]):
 
     terms: tuple[str, ...]  # the stages there are, in their order, see `sensors.noise.pipeline`
     streams: tuple[int, ...]  # what random numbers are drawn for, see `sensors.noise.random`
-    # values that they read, ([end,] channel, row), see `sensors.noise.pipeline`
-    constants: Mapping[str, Array] = field(metadata=INLINE)
+    constants: Mapping[str, Array] = field(metadata=INLINE)  # ([end,] channel, row), see `sensors.noise.pipeline`
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class PlannedSensor(Generic[Array]):
 
     name: str  # its name, `touch`, or `touch/clean` where another one is the measured sensor
     sensor: str  # the sensor's name in the document
-    kind: str  # its kind
+    kind: str
     links: tuple[Link, ...]  # the links that carry it
     taxels: Array  # its taxels, rows of the layout
     uses: Mapping[str, int]  # what it asked for: by quantity the number of the use
@@ -97,8 +96,7 @@ class PlannedSensor(Generic[Array]):
     rows: tuple[int, int]  # which of the uses' rows are its own: the first, and one beyond the last
     state: Mapping[str, PlannedMemory]  # what it carries from one call to the next: the kind's own, `noise/…` and `sample/…`
     signal: tuple[str, ...]  # channels of the signal that noise and sampling act on
-    # its readings: first its own, measured if it has noise; then the clean one, if that is read too; then reports
-    readings: tuple[PlannedReading, ...]
+    readings: tuple[PlannedReading, ...]  # its own, measured if it has noise; the clean one, if read too; reports
     axes: tuple[PlannedAxis, ...]  # what their rows are, one for each
     constants: Mapping[str, Array] = field(metadata=INLINE)  # what its kind folded
     noise: PlannedNoise[Array] | None  # its imperfections
@@ -143,8 +141,7 @@ class PlannedObservation(Generic[Array]):
     reading: str | None  # the reading that is observed; None if it is of none
     channels: tuple[int, ...]  # channels of the reading
     num_features: int  # how many features it gives
-    # what was folded for it; `rows` of joints or actuators that are observed, if not all
-    constants: Mapping[str, Array] = field(metadata=INLINE)
+    constants: Mapping[str, Array] = field(metadata=INLINE)  # `rows`: joints or actuators that are observed, if not all
     axes: Literal["", "xyz", "zyx"] = ""  # order of the link-frame axes of an aggregate force; else empty
 
     @property

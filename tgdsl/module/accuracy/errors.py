@@ -34,8 +34,7 @@ class Magnitude(NamedTuple):
     # largest difference of a channel from its median, or of one of the same quantity (`force` of `force_x`); 1 where nothing
     # ever changes
     scale: Float[np.ndarray, " channel"]
-    # where the exact reading is not at its median: elsewhere nothing is felt, as a rule
-    active: Bool[np.ndarray, "step env row channel"]
+    active: Bool[np.ndarray, "step env row channel"]  # where the exact reading is not at its median
 
     def of(self, envs: slice, channels: Sequence[int]) -> Magnitude:
         """Return that of some channels, in some environments."""

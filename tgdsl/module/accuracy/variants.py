@@ -19,8 +19,7 @@ class Variant:
     """A way to compute a sensor."""
 
     label: str  # what to call it
-    # what is other than in the document, by dotted path: `sensors.skin.operator`
-    changes: Mapping[str, Any] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict)  # changed fields by dotted path: `sensors.skin.operator`
     is_own: bool = False  # whether it is what the document says
     is_free: bool = True  # whether it may be chosen: it changes nothing that somebody wrote, nor what is read
     is_exact: bool = False  # whether it is exact but for rounding

@@ -32,8 +32,7 @@ SPREAD = 0.015  # standard deviation of bodies' positions [m]: many taxels touch
 class Verdict:
     """How far an exported file is from the module."""
 
-    # by batch size and output, the largest difference over the largest magnitude of its channel
-    differences: Mapping[int, Mapping[str, float]]
+    differences: Mapping[int, Mapping[str, float]]  # largest, over the largest magnitude of the channel, by batch and output
     refuses_other_dtypes: bool  # whether tensors of a wrong dtype are refused
 
     @property
