@@ -91,7 +91,7 @@ class Common(NamedTuple):
     there: Sequence[Int[np.ndarray, " row"]] | None  # rows of the other's whose mean is at each of these; None: the same
     channels: (
         Int[np.ndarray, " channel"] | None
-    )  # channel of the other for each of the one; -1: none, read as 0; None: the same
+    )  # channel of the other for each; -1: none, read as 0; None: the same
 
     def of_one(self, readings: Shaped[np.ndarray, "step env row channel"]) -> np.ndarray:
         """Return the one's reading where there is one of the other's too."""
