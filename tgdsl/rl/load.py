@@ -21,7 +21,7 @@ from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
 from tgdsl.rl.terms import TERMS, CurriculumTerm, ObservationTerm, RewardTerm, Term, event_term
-from tgdsl.schema.conditional import conditional
+from tgdsl.schema.document import conditional
 from tgdsl.schema.load import read_source
 from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Path as Place

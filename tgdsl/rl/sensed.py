@@ -21,8 +21,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.spec import SENSED
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.schema.load import load
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.load import Loaded, load
 from tgdsl.schema.select import matching
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.compile import compile as compile_document

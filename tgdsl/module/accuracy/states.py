@@ -89,9 +89,7 @@ class Common(NamedTuple):
 
     here: Int[np.ndarray, " row"] | None  # rows of the one's reading that the other has too; None: all
     there: Sequence[Int[np.ndarray, " row"]] | None  # rows of the other's whose mean is at each of these; None: the same
-    channels: (
-        Int[np.ndarray, " channel"] | None
-    )  # channel of the other for each; -1: none, read as 0; None: the same
+    channels: Int[np.ndarray, " channel"] | None  # channel of the other for each; -1: none, read as 0; None: the same
 
     def of_one(self, readings: Shaped[np.ndarray, "step env row channel"]) -> np.ndarray:
         """Return the one's reading where there is one of the other's too."""

@@ -34,7 +34,7 @@ from torch import Tensor
 from tgdsl.errors import TaxelError, TgdslError, did_you_mean
 from tgdsl.files.write import atomic_path, atomic_write
 from tgdsl.layout.identity import Columns
-from tgdsl.module.export.formats import write_onnx
+from tgdsl.module.export.program import write_onnx
 from tgdsl.module.module import TactileModule
 from tgdsl.module.taxels import HasPlan, check_taxels, plan_tables
 from tgdsl.rl.env import TouchEnv
