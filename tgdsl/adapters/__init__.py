@@ -15,11 +15,7 @@ Document = str | PathLike[str] | Mapping[str, Any]
 
 
 def module_of(document: Document, host: str, scene: Any = None) -> TactileModule:
-    """Compile a document, of a scene that is built already if one is given, or load an artefact (`.safetensors`).
-
-    Raises:
-        SimulationError: If the module is advanced at each physics step.
-    """
+    """Compile a document, of a scene that is built already if one is given, or load an artefact (`.safetensors`)."""
     is_artifact = not isinstance(document, Mapping) and str(document).endswith(".safetensors")
     touch = load(document) if is_artifact else compile(document, scene=scene)  # pyright: ignore[reportArgumentType]
     if touch.inputs.substeps > 1:

@@ -27,38 +27,24 @@ from tgdsl.runtime.read import read_warp
 
 @dataclass
 class TouchSensorCfg(SensorCfg):
-    """A module's readings as a sensor of a scene.
+    """A module's readings as a sensor of a scene, `env.scene[name]`."""
 
-    Attributes:
-        name: Name of the sensor: `env.scene[name]`.
-        document: The document, or an artefact (`.safetensors`).
-        prefix: Stands before all names in mjlab's scene, such as "robot/"; needed only where several names end alike.
-        names: Names in mjlab's scene by those in the document, where they differ otherwise.
-        scene_fn: Returns the scene that the document is of, robot and objects under its names; default: what it names itself.
-    """
-
-    document: Document = field(kw_only=True)
-    prefix: str = ""
-    names: Mapping[str, str] = field(default_factory=dict)
+    document: Document = field(kw_only=True)  # or an artefact (`.safetensors`)
+    prefix: str = ""  # before all names in mjlab's scene, such as "robot/"; needed only where several names end alike
+    names: Mapping[str, str] = field(default_factory=dict)  # in mjlab's scene by those in the document, where they differ
+    # returns the scene that the document is of, robot and objects under its names; default: what it names itself
     scene_fn: Callable[[], mujoco.MjSpec] | None = None
 
     def build(self) -> TouchSensor:
-        """Compile the document, or load the artefact.
-
-        Raises:
-            SimulationError: If the module is advanced at each physics step.
-        """
+        """Compile the document, or load the artefact."""
         return TouchSensor(self, module_of(self.document, "mjlab", self.scene_fn and self.scene_fn()))
 
 
 class TouchSensor(Sensor):
-    """The readings of all environments by name, `data`.
+    """The readings of all environments by name, `data`, of the module `touch`.
 
     They advance once a control step, whatever asks first, and are of the instant that mjlab's derived arrays then have: for
     observations of now, for rewards a physics step earlier. An environment that is reset is read again.
-
-    Attributes:
-        touch: The module.
     """
 
     data: Mapping[str, Float[Tensor, "env *step row channel"]]
@@ -72,11 +58,7 @@ class TouchSensor(Sensor):
         """Leave the scene as it is: contacts are read without sensors."""
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Look up the document's names in the compiled scene.
-
-        Raises:
-            SimulationError: If the scene lacks one, or several names match it.
-        """
+        """Look up the document's names in the compiled scene."""
         self.touch.to(device)
         inputs = self.touch.inputs.renamed(self._cfg.names, prefix=self._cfg.prefix)
         self._scene = (mj_model, model.struct, data.struct, inputs)
@@ -126,11 +108,7 @@ class TouchSensor(Sensor):
 
 
 def reading(env: Any, sensor: str, name: str) -> Float[Tensor, "env feature"]:
-    """Return a reading, flattened: `ObservationTermCfg(func=reading, params={"sensor": "touch", "name": "tips"})`.
-
-    Raises:
-        TgdslError: If the document declares no such reading.
-    """
+    """Return a reading, flattened: `ObservationTermCfg(func=reading, params={"sensor": "touch", "name": "tips"})`."""
     data = env.scene[sensor].data
     if name not in data:
         raise TgdslError(f'the sensor "{sensor}" has no reading "{name}"; {did_you_mean(name, data, "readings")}')
@@ -138,11 +116,7 @@ def reading(env: Any, sensor: str, name: str) -> Float[Tensor, "env feature"]:
 
 
 def observation(env: Any, sensor: str, group: str = "policy") -> Float[Tensor, "env feature"]:
-    """Return an observation group of the document: `ObservationTermCfg(func=observation, params={"sensor": "touch"})`.
-
-    Raises:
-        TgdslError: If the document declares no such group.
-    """
+    """Return an observation group of the document: `ObservationTermCfg(func=observation, params={"sensor": "touch"})`."""
     touch = env.scene[sensor].touch
     if group not in touch.observations:
         raise TgdslError(f'the sensor "{sensor}" has no group "{group}"; {did_you_mean(group, touch.observations, "groups")}')

@@ -86,15 +86,7 @@ DOCUMENT = {
 
 
 class Turning:
-    """How far the cube of each environment has turned since it was put down.
-
-    Attributes:
-        angle: Angle about the vertical [rad].
-        rate: How fast it turned in the last control step [rad/s].
-        tilt: Its tilt [rad].
-        reached: Goals that were reached.
-        is_reached: Whether one was in the last step.
-    """
+    """How far the cube of each environment has turned since it was put down: `angle`, `rate`, `tilt`, and goals `reached`."""
 
     def __init__(self, env: Any):
         self._env, pose = env, pose_of(env)

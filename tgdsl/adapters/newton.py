@@ -32,12 +32,6 @@ class SensorTactile:
     """The readings of all worlds of a model.
 
     Contacts are of the step that led to the state, and move on with its bodies; their torque is not read.
-
-    Attributes:
-        touch: The module.
-        readings: The readings by name, as `touch.outputs` lists them; empty before the first `update`.
-        is_new: The worlds that were reset since the last update of all: they have no contacts.
-        solver_observable_kinds: The kinds for `solver.observables`; empty if no sensor reads contacts.
     """
 
     def __init__(self, model: Any, document: Document, *, prefix: str = "", names: Mapping[str, str] | None = None):
@@ -52,13 +46,15 @@ class SensorTactile:
         Raises:
             SimulationError: If a name is missing or ambiguous, or worlds differ.
         """
-        self.readings: dict[str, Tensor] = {}
+        self.readings: dict[str, Tensor] = {}  # by name, as `touch.outputs` lists them; empty before the first `update`
         self.touch = module_of(document, "SensorTactile").to(wp.device_to_torch(model.device))
         self._inputs = self.touch.inputs.renamed(names, prefix=prefix)
+        # The kinds for `solver.observables`; empty if no sensor reads contacts.
         self.solver_observable_kinds = frozenset({SolverBase.ObservableKind.CONTACT_F} if self._inputs.pairs else ())
         of_kinds = [_by_world(model, kind) for kind in ("body", "shape", "joint")]
         (bodies, self._labels), (shapes, shape_labels), (joints, joint_labels) = of_kinds
         self._bodies, self._com = self._tensor(bodies), wp.to_torch(model.body_com)[self._tensor(bodies)]
+        # The worlds that were reset since the last update of all: they have no contacts.
         self.is_new = torch.zeros(len(bodies), dtype=torch.bool, device=self.touch.device)
         self._shape_body = wp.to_torch(model.shape_body).long()  # −1: the world's
         self._shape_world = wp.to_torch(model.shape_world).long().clamp(min=0 if len(bodies) == 1 else -1)

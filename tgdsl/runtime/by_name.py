@@ -22,13 +22,9 @@ from tgdsl.quantities.contacts import SLOT_FIELDS
 
 
 def index_of(name: str, known: Sequence[str], one: str, several: str) -> int:
-    """Return the index of a name, or of the only one that ends in it after a slash.
+    """Return the index of a name, or of the only one that ends in it after a slash, as "robot/palm" does in "palm".
 
-    Args:
-        name: The name, such as "palm", which is the end of "robot/palm".
-        known: Names of the scene's elements; equal ones count once.
-        one: What one element is called, such as "body".
-        several: What several are called.
+    `one` and `several` are what elements are called, such as "body" and "bodies"; equal names count once.
 
     Raises:
         SimulationError: If there is none of that name, or several names end in it.
@@ -112,11 +108,7 @@ class Geoms(NamedTuple):
     parents: tuple[tuple[str, str], ...] = ()
 
     def of_part(self, part: ContactPart) -> Int[np.ndarray, " geom"]:
-        """Return the indices of the geoms of a part of an object or link, ascending.
-
-        Raises:
-            SimulationError: If the scene lacks it, or the names that it takes to find it were not given.
-        """
+        """Return the indices of the geoms of a part of an object or link, ascending."""
         if part.kind == "geom":
             return np.array([index_of(part.name, self.names, "geom", "geoms")])
         parents = dict(self.parents)
@@ -145,11 +137,7 @@ class PairRows(NamedTuple):
 
 
 def pair_rows(inputs: Inputs, geoms: Geoms) -> PairRows:
-    """Look up the geoms of a module's pairs.
-
-    Raises:
-        SimulationError: If the scene lacks a body or geom of a pair, or several names match it.
-    """
+    """Look up the geoms of a module's pairs."""
     return _pair_rows(tuple((inputs.parts_of(pair.object), inputs.parts_of_link(pair.link)) for pair in inputs.pairs), geoms)
 
 

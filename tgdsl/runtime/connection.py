@@ -80,12 +80,10 @@ class Connection(ABC):
 
     @property
     def num_envs(self) -> int:
-        """Number of environments; of a hand or a log, 1."""
         return self.source.num_envs
 
     @property
     def control_step(self) -> float:
-        """Duration of one control step [s]."""
         return self.source.control_step
 
     @property
@@ -128,11 +126,7 @@ class Connection(ABC):
         return dict(self._groups)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Restart some environments (default: all): a simulation from its keyframe, a hand where it is, passive.
-
-        Raises:
-            HandError: If a hand gives no new reading.
-        """
+        """Restart some environments (default: all): a simulation from its keyframe, a hand where it is, passive."""
         if env_ids is not None and not self.concerns(env_ids):
             return
         self._groups, self._is_read = None, False

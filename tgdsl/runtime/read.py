@@ -31,7 +31,7 @@ def read_mujoco(
     *,
     inputs: Inputs | None = None,
 ) -> SceneState:
-    """Return the state of a scene that is stepped by `mujoco.mj_step`.
+    """Return the state of a scene that is stepped by `mujoco.mj_step`, (env, …), float64, on the module's device.
 
     Poses, velocities and contacts are those of MuJoCo's last evaluation, joints and controls are of now: call `mj_forward`
     first, as `mj_step` leaves the former a step behind. What MuJoCo does not know, such as `dt` or `variant`, is left None.
@@ -42,9 +42,6 @@ def read_mujoco(
         data: Its data, or the data of several environments.
         inputs: `touch.inputs.renamed(…)` where names differ; by default a name may also be the end of one name in the scene
             after a slash, as "palm" is of "robot/palm".
-
-    Returns:
-        The state, (env, …), float64, on the module's device.
 
     Raises:
         SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one.
@@ -87,12 +84,11 @@ def _contacts(inputs: Inputs, model: mujoco.MjModel, geoms: Geoms, envs: Sequenc
 def read_warp(
     touch: TactileModule, mj_model: mujoco.MjModel, model: Any, data: Any, *, inputs: Inputs | None = None
 ) -> SceneState:
-    """Return the state of a scene that is stepped by MuJoCo Warp.
+    """Return the state of a scene that is stepped by MuJoCo Warp, (env, …), float32, on the device of `data`.
 
     It is gathered from MuJoCo Warp's arrays, where they lie, in the order of torch's and Warp's current streams; from the
-    second call on it can be captured in a `torch.cuda.graph`. No contact sensors are needed. Poses, velocities and contacts are
-    those of the last evaluation, joints and controls are of now: call `mujoco_warp.forward` first, as `mujoco_warp.step` leaves
-    the former a step behind. What MuJoCo does not know, such as `dt` or `variant`, is left None.
+    second call on it can be captured in a `torch.cuda.graph`. No contact sensors are needed. As for `read_mujoco`, call
+    `mujoco_warp.forward` first.
 
     Args:
         touch: The module that will read the state, on the device of `data`.
@@ -100,9 +96,6 @@ def read_warp(
         model: MuJoCo Warp's model of it.
         data: MuJoCo Warp's data; its arrays must stay the same ones.
         inputs: As for `read_mujoco`.
-
-    Returns:
-        The state, (env, …), float32, on the device of `data`.
 
     Raises:
         SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if the module is on

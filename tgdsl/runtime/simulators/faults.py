@@ -33,18 +33,11 @@ _COUNTS = (
 
 
 class EnvFaults:
-    """The faults of each environment, on the device, from when they are noted until the environment is restarted.
+    """The faults of each environment, on the device, from when they are noted until the environment is restarted."""
 
-    Attributes:
-        on_fault: What becomes of environments with a fault.
-        counts: How many times each environment has had a fault.
-        totals: Number of faults of each kind so far.
-        restarted: Environments that the last step has restarted.
-    """
-
-    counts: Int[Tensor, " env"]
-    totals: Int[Tensor, " kind"]
-    restarted: Bool[Tensor, " env"]
+    counts: Int[Tensor, " env"]  # how many times each environment has had a fault
+    totals: Int[Tensor, " kind"]  # number of faults of each kind so far
+    restarted: Bool[Tensor, " env"]  # environments that the last step has restarted
     _held: Bool[Tensor, "kind env"]
 
     def __init__(self, num_envs: int, device: torch.device, on_fault: str = "raise"):
@@ -65,7 +58,6 @@ class EnvFaults:
         return self._held.any(dim=0) | self.restarted
 
     def note(self, kind: int, where: Bool[Tensor, " env"] | Bool[Tensor, ""]) -> None:
-        """Note a fault in some environments, or in all."""
         self._held[kind] |= where
 
     def begin_step(self) -> None:
@@ -88,7 +80,6 @@ class EnvFaults:
         self.restarted &= ~where
 
     def note_restarted(self, where: Bool[Tensor, " env"]) -> None:
-        """Note environments that a step has restarted."""
         self.restarted |= where
 
     def messages(self, diverged: str = "") -> list[str]:

@@ -80,7 +80,6 @@ class EnvObjects:
         self._tabulate()
 
     def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
-        """Choose what objects are like in some environments: see `Simulation.set_objects`."""
         for name in (*variants, *sizes):
             if name not in self._num_variants:
                 hint = did_you_mean(name, self._num_variants, "objects that do")
@@ -159,7 +158,6 @@ class EnvHeat:
         return {"heat/temperature": self.temperature, "heat/material": self.material} if self.names else {}
 
     def read(self) -> dict[str, Tensor]:
-        """Return copies for a state, by field."""
         if not self.names:
             return {}
         return {"object_temperature": self.temperature.clone(), "object_material": self.material.clone()}
@@ -176,7 +174,6 @@ class EnvHeat:
         return result
 
     def write(self, ids: Int[np.ndarray, " n"], chosen: Mapping[tuple[str, int], np.ndarray]) -> None:
-        """Write what was chosen for some environments, in place."""
         rows = torch.from_numpy(np.ascontiguousarray(ids)).to(self.material.device)
         with torch.inference_mode(False), torch.no_grad():
             for (name, column), values in chosen.items():

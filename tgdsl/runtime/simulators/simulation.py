@@ -172,13 +172,7 @@ class Simulation(ABC):
     _has_warned_of_range = False
 
     def __init__(self, touch: TactileModule, num_envs: int, *, device: str | None = None, **options: Unpack[SimOptions]):
-        """Start all environments.
-
-        Args:
-            touch: The module that reads them.
-            num_envs: Number of environments.
-            device: Where physics runs; default: `DEVICE`.
-            **options: See `SimOptions`.
+        """Start all environments of the scene that a module reads; see `SimOptions`.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
@@ -257,10 +251,7 @@ class Simulation(ABC):
 
     @cached_property
     def joints(self) -> Joints:
-        """Where each joint stands: `sim.qpos[:, sim.joints["thumb"].qpos]`, `sim.qvel[:, sim.joints["thumb"].qvel]`.
-
-        A joint without a name goes by its body's, if the body has no other.
-        """
+        """Where each joint stands: `sim.qpos[:, sim.joints["thumb"].qpos]`, `sim.qvel[:, sim.joints["thumb"].qvel]`."""
         return Joints(self.model)
 
     @property
@@ -270,10 +261,7 @@ class Simulation(ABC):
 
     @property
     def faults(self) -> Bool[Tensor, " env"]:
-        """Environments that have diverged, or whose controls or given state were not finite.
-
-        With `on_fault="reset"` those that the last step has restarted; else those that wait for a reset.
-        """
+        """Environments with a fault that wait for a reset; with `on_fault="reset"` those that the last step has restarted."""
         return self._faults.mask
 
     @property
@@ -311,20 +299,11 @@ class Simulation(ABC):
             raise fault
 
     def substates(self, control: Control = None) -> Iterator[SceneState]:
-        """Advance all environments by one control step, and yield the state after each of its physics steps.
+        """Advance all environments as `step` does, and yield the state after each physics step, with its `dt`.
 
         For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
-        simulator is where `step` would have left it once all are taken; who stops earlier has made fewer physics steps. With
+        controls are set when the first state is asked for, and who stops earlier has made fewer physics steps. With
         `on_fault="reset"` environments restart after the physics step of their fault, and make the others from there.
-
-        Args:
-            control: Actuator controls, as for `step`; they are set when the first state is asked for.
-
-        Yields:
-            What `state` returns after each physics step; its `dt` is that of one physics step.
-
-        Raises:
-            SimulationError: As `step` does, at the physics step where it happens.
         """
         self._begin_step(control)
         if self._earlier.are_wanted:
@@ -357,11 +336,7 @@ class Simulation(ABC):
         return self._touch(self.state(), env_mask(env_ids, self.num_envs, self._touch.device))
 
     def watched(self) -> Watched:
-        """Return what the option `watch` names, of the instant that `state` is of, on the physics' device.
-
-        Raises:
-            SimulationError: If nothing is watched.
-        """
+        """Return what the option `watch` names, of the instant that `state` is of, on the physics' device."""
         self._refuse_if_closed()
         if self._watch is None:
             raise SimulationError("nothing is watched: simulate(..., watch=Watch(bodies=(...), joints=(...)))")
@@ -408,10 +383,9 @@ class Simulation(ABC):
 
         Args:
             env_ids: Indices, or a boolean mask over environments.
-            **values: `qpos`, `qvel`, `ctrl`, or another of MuJoCo's arrays that an environment's future follows from (`act`,
-                `mocap_pos`, `mocap_quat`, `time`, `qacc_warmstart`, …); the others stay. Each has one row for all
-                environments alike, or with indices a row for each in their order, or else (env, …), of which the chosen rows
-                are taken. Quaternions are brought to unit length by MuJoCo's rule (`mju_normalize4`).
+            **values: MuJoCo's arrays of the state (`StateValues`); the others stay. Each has one row for all environments
+                alike, or with indices a row for each in their order, or else (env, …), of which the chosen rows are taken.
+                Quaternions are brought to unit length by MuJoCo's rule (`mju_normalize4`).
 
         Raises:
             SimulationError: If there are no such environments or arrays, a shape does not fit, or numbers on the host are not
@@ -428,9 +402,6 @@ class Simulation(ABC):
         """Evaluate poses, velocities and contacts of some environments (default: all) where they are now, as `mj_forward` does.
 
         It costs about one physics step; forces follow from the present controls.
-
-        Raises:
-            SimulationError: If there are no such environments.
         """
         self._refuse_if_closed()
         mask = env_mask(env_ids, self.num_envs, self._device)

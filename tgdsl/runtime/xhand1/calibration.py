@@ -115,7 +115,6 @@ class Calibration:
 
     @classmethod
     def none(cls) -> Calibration:
-        """Return the calibration of an unknown hand: forces stay counts."""
         num = len(FINGERS)
         zero = np.zeros((num, 3))
         return cls("counts", np.ones((num, 3)), np.tile(np.eye(3), (num, 1, 1)), zero, zero)
@@ -130,7 +129,6 @@ class Calibration:
         return np.einsum("fij,...fi->...fj", self.rotation, force - self.bias) / self.scale + self.tare
 
     def with_tare(self, tare: Tare) -> Calibration:
-        """Return the same with another tare."""
         return replace(self, tare=tare.mean)
 
     def text(self) -> str:

@@ -127,19 +127,19 @@ def test_an_empty_log_and_a_disk_that_fails_leave_nothing(tmp_path, monkeypatch)
 
 
 def test_a_long_log_takes_little_memory(tmp_path):
-    """10 MB of readings; what is in memory at a time is a few chunks of 1 MB."""
+    """60 MB of readings; what is in memory at a time is NumPy's buffer of 16 MB, as it is and as bytes."""
     reading = random_readings(np.array([1.0]))[0]
     tracemalloc.start()
     try:
         with LogWriter(tmp_path / "a.npz") as log:
-            for i in range(2500):
+            for i in range(15_000):
                 log.add(Reading(i, 0.01 * i, 0.01 * i, reading.state))
         found = sum(1 for _ in open_log(tmp_path / "a.npz").readings())
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert found == 2500
-    assert peak < 5e6
+    assert found == 15_000
+    assert peak < 40e6
 
 
 # files that are not what they should be

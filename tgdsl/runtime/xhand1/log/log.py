@@ -10,7 +10,7 @@ Arrays of the file, readable with `numpy.load`:
 - `about`: text (JSON) with the format's version, the hand's identity, its calibration's text and the time of day at the start.
 
 An hour at the highest rate that the wire allows, 119 readings a second, is 430,000 records of 4 kB: too much to keep. They are
-appended to a spool beside the file, and put into the file when all is over; a few MB are in memory at a time.
+appended to a spool beside the file, and put into the file when all is over; some MB are in memory at a time.
 
 Shapes: `reading` the readings, `fault` the failures; others as in `protocol`.
 """
@@ -30,7 +30,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -51,7 +51,6 @@ _ZERO = decode_state(bytes(STATE_SIZE))
 RECORD = np.dtype([*TIMES.items(), *((name, getattr(_ZERO, name).dtype, getattr(_ZERO, name).shape) for name in STATE)])
 """One reading: the arrays of a log, row by row."""
 CHUNK = 256  # readings that are in memory at a time: 1 MB of them
-_COMPRESSION = 1
 _DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zlib.error, zipfile.BadZipFile, struct.error)
 """Errors that a damaged archive raises."""
 
@@ -262,26 +261,14 @@ class LogWriter:
 
     def _write(self, file: IO[bytes], spool: IO[bytes]) -> None:
         faults = [fault for fault, _ in self._faults]
-        arrays = {
-            "about": np.array(json.dumps(self._about, sort_keys=True)),
-            "fault_reading": np.array([num for _, num in self._faults], dtype="<i8"),
-            "fault_time": np.array([fault.time for fault in faults], dtype=np.float64),
-            "fault_kind": np.array([fault.kind for fault in faults], dtype=np.str_),
-            "fault_message": np.array([fault.message for fault in faults], dtype=np.str_),
-        }
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION) as archive:
-            for name, values in arrays.items():
-                with archive.open(f"{name}.npy", "w") as member:
-                    np.lib.format.write_array(member, values, version=(1, 0), allow_pickle=False)
-            for name in RECORD.names or ():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    self._write_column(member, spool, name)
-
-    def _write_column(self, member: Any, spool: IO[bytes], name: str) -> None:
-        dtype = RECORD[name]
-        header = {"descr": dtype.base.str, "fortran_order": False, "shape": (self.num_readings, *dtype.shape)}
-        np.lib.format.write_array_header_1_0(member, header)
-        spool.seek(0)
-        for first in range(0, self.num_readings, CHUNK):
-            data = spool.read(min(CHUNK, self.num_readings - first) * RECORD.itemsize)
-            member.write(np.ascontiguousarray(np.frombuffer(data, RECORD)[name]).tobytes())
+        spool.flush()
+        records = np.memmap(spool, RECORD, mode="r", shape=(self.num_readings,))  # type: ignore[arg-type]
+        np.savez_compressed(
+            file,
+            about=np.array(json.dumps(self._about, sort_keys=True)),
+            fault_reading=np.array([num for _, num in self._faults], dtype="<i8"),
+            fault_time=np.array([fault.time for fault in faults], dtype=np.float64),
+            fault_kind=np.array([fault.kind for fault in faults], dtype=np.str_),
+            fault_message=np.array([fault.message for fault in faults], dtype=np.str_),
+            **{name: records[name] for name in RECORD.names or ()},  # type: ignore[arg-type]
+        )
