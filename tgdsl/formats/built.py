@@ -19,8 +19,7 @@ from tgdsl.formats.model import Model
 from tgdsl.scene.compare import ROUNDED, TINY, differing_fields
 from tgdsl.scene.mujoco_warnings import muted_mujoco
 
-FILE = Path("<scene>")
-"""What messages call the scene."""
+FILE = Path("<scene>")  # what messages call the scene
 _KEPT = (
     *("nbody", "ngeom", "njnt", "nu", "ntendon", "neq", "npair", "nflex"),
     *("body_pos", "body_quat", "geom_type", "geom_size", "geom_pos", "geom_quat", "jnt_pos", "jnt_axis"),
@@ -120,10 +119,7 @@ def _of_model(compiled: mujoco.MjModel) -> Model:
 
 
 def differences(model: Model, scene: Model) -> Iterator[str]:
-    """Yield what differs of the named bodies of a model in a scene that holds it: their geoms, joints and places.
-
-    Where the model's root bodies are in the scene does not count.
-    """
+    """Yield what differs of the named bodies of a model in a scene that holds it: their geoms, joints and places."""
     for name in model.bodies[1:]:
         if name not in scene.bodies:
             yield f'the scene has no body "{name}"'

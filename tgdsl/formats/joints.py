@@ -17,43 +17,27 @@ _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HIN
 
 @dataclass(frozen=True)
 class Actuator:
-    """An actuator of the robot.
+    """An actuator of the robot."""
 
-    Attributes:
-        name: Its name; empty if it has none.
-        id: MuJoCo's index.
-        joints: Names of the hinges and slides that it acts on: one, or those of its fixed tendon.
-    """
-
-    name: str
-    id: int
-    joints: tuple[str, ...]
+    name: str  # its name; empty if it has none
+    id: int  # MuJoCo's index
+    joints: tuple[str, ...]  # names of the hinges and slides that it acts on: one, or those of its fixed tendon
 
 
 @dataclass(frozen=True)
 class RobotJoints:
-    """A robot's joints and actuators.
+    """A robot's joints and actuators."""
 
-    Attributes:
-        joints: Names of its hinges and slides: first the actuated ones, in the order of the actuators, then the others.
-        num_actuated: How many of them have an actuator.
-        slides: Those that are slides.
-        others: Names of its ball and free joints.
-        actuators: Its actuators, in the model's order.
-    """
-
+    # names of its hinges and slides: first the actuated ones, in the order of the actuators, then the others
     joints: tuple[str, ...]
-    num_actuated: int
-    slides: frozenset[str]
-    others: tuple[str, ...]
-    actuators: tuple[Actuator, ...]
+    num_actuated: int  # how many of them have an actuator
+    slides: frozenset[str]  # those that are slides
+    others: tuple[str, ...]  # names of its ball and free joints
+    actuators: tuple[Actuator, ...]  # its actuators, in the model's order
 
 
 def robot_joints(robot: Model, scene: Model) -> RobotJoints:
-    """Return the joints of a robot's bodies as they are in a scene, and the scene's actuators that act on these bodies.
-
-    A joint without a name stands as `` in `joints` only if an actuator acts on it, for then it cannot be left out.
-    """
+    """Return the joints of a robot's bodies as they are in a scene, and the scene's actuators that act on these bodies."""
     model, bodies = scene.compiled, set(robot.bodies[1:])
     robot_ids = [i for i in range(model.njnt) if model.body(model.jnt_bodyid[i]).name in bodies]
     scalar_ids = [i for i in robot_ids if model.jnt_type[i] in (_SLIDE, _HINGE)]

@@ -19,26 +19,16 @@ from jaxtyping import Float, Int
 
 from tgdsl.errors import RobotError, listed
 
-BY_MUJOCO = (".stl", ".obj", ".msh")
-"""Endings of the mesh files that MuJoCo reads."""
-BY_TRIMESH = (".glb", ".gltf", ".dae", ".ply", ".off")
-"""Endings of those that are read here."""
-Y_UP = (".glb", ".gltf", ".dae")
-"""Endings of those whose up axis is, or may be, Y."""
+BY_MUJOCO = (".stl", ".obj", ".msh")  # endings of the mesh files that MuJoCo reads
+BY_TRIMESH = (".glb", ".gltf", ".dae", ".ply", ".off")  # endings of those that are read here
+Y_UP = (".glb", ".gltf", ".dae")  # endings of those whose up axis is, or may be, Y
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
 """How the names of glTF's extensions begin that change nothing in triangles."""
-DIGITS = 6
-"""Significant digits of coordinates: what MuJoCo writes in MJCF."""
+DIGITS = 6  # significant digits of coordinates: what MuJoCo writes in MJCF
 
 
 def triangles(file: Path) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
-    """Return the vertices and faces of a mesh file, in its own unit (COLLADA's in metres); equal vertices are one.
-
-    Coordinates are rounded to `DIGITS` significant digits, so that a model and its MJCF have the same.
-
-    Raises:
-        RobotError: If the file cannot be read, wants an extension of glTF that changes triangles, or holds none.
-    """
+    """Return the vertices and faces of a mesh file, in its own unit (COLLADA's in metres); equal vertices are one."""
     import trimesh
 
     kwargs: dict[str, Any] = {}
@@ -74,11 +64,7 @@ def put_in_line(mesh: mujoco.MjsMesh, file: Path) -> None:
 
 
 def refuse_unreadable(model_file: Path, spec: mujoco.MjSpec) -> None:
-    """Refuse MJCF that names meshes that MuJoCo does not read.
-
-    Raises:
-        RobotError: With all of them.
-    """
+    """Refuse MJCF that names meshes that MuJoCo does not read."""
     named = {mesh.file for mesh in spec.meshes if mesh.file and not mesh.content_type}
     if wrong := sorted(name for name in named if Path(name).suffix.lower() not in BY_MUJOCO):
         problem = f"MJCF's meshes are files of {listed(BY_MUJOCO)}, found {listed(wrong)}"

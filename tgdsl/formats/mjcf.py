@@ -51,11 +51,7 @@ def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
 
 
 def mjcf_of(spec: mujoco.MjSpec) -> str:
-    """Return a compiled spec as MJCF that MuJoCo compiles again.
-
-    MuJoCo writes six digits. Of a flat body, whose largest principal moment is the sum of the others, they may be those of no
-    body; the largest moment is then that sum.
-    """
+    """Return a compiled spec as MJCF that MuJoCo compiles again."""
     root = ET.fromstring(spec.to_xml())
     for inertial in root.iter("inertial"):
         moments = [float(moment) for moment in inertial.get("diaginertia", "").split()]

@@ -18,8 +18,7 @@ from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
 
-LEAST_INERTIA = 1e-9
-"""Least principal moment of a body whose inertia, as its file has it, is that of no real body [kg·m²]."""
+LEAST_INERTIA = 1e-9  # least principal moment of a body whose inertia, as its file has it, is that of no real body [kg·m²]
 SHAPE_NAMES: dict[int, str] = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
     mujoco.mjtGeom.mjGEOM_HFIELD: "hfield",
@@ -35,30 +34,18 @@ SHAPE_NAMES: dict[int, str] = {
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A robot or scene file, compiled.
+    """A robot or scene file, compiled."""
 
-    Attributes:
-        file: The file it came from.
-        spec: MuJoCo's editable model.
-        compiled: MuJoCo's compiled model.
-        is_rounded: Whether `mjcf` has six digits, as of URDF.
-        mjcf: The MJCF that it was turned into, if its file is no MJCF; else empty.
-        rewritten: Files of meshes that `spec` has in memory, in another format, by their names there.
-    """
-
-    file: Path
-    spec: mujoco.MjSpec
-    compiled: mujoco.MjModel
-    is_rounded: bool
-    mjcf: str = ""
+    file: Path  # the file it came from
+    spec: mujoco.MjSpec  # MuJoCo's editable model
+    compiled: mujoco.MjModel  # MuJoCo's compiled model
+    is_rounded: bool  # whether `mjcf` has six digits, as of URDF
+    mjcf: str = ""  # the MJCF that it was turned into, if its file is no MJCF; else empty
+    # files of meshes that `spec` has in memory, in another format, by their names there
     rewritten: Mapping[str, Path] = field(default_factory=dict)
 
     def changed(self, change: Callable[[mujoco.MjSpec], object]) -> Model:
-        """Return the model with a change of its spec, recompiled.
-
-        Raises:
-            RobotError: If MuJoCo cannot compile it, or what the change raises.
-        """
+        """Return the model with a change of its spec, recompiled."""
         spec = self.spec.copy()
         change(spec)
         try:
@@ -69,7 +56,6 @@ class Model:
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
-        """Names of all named bodies, in MuJoCo's (depth-first) order; the first is `world`."""
         names = (self.compiled.body(i).name for i in range(self.compiled.nbody))
         return tuple(name for name in names if name)
 
@@ -84,7 +70,6 @@ class Model:
 
     @cached_property
     def geoms(self) -> tuple[Geom, ...]:
-        """All geoms of named bodies."""
         result = (self.geom(i) for i in range(self.compiled.ngeom))
         return tuple(geom for geom in result if geom.body)
 
@@ -106,23 +91,14 @@ class Model:
 
     @cached_property
     def _paired(self) -> frozenset[int]:
-        """Geoms of explicit contact pairs."""
         return frozenset((*self.compiled.pair_geom1.tolist(), *self.compiled.pair_geom2.tolist()))
 
     def touchable(self, body: str) -> tuple[Geom, ...]:
-        """Return the geoms of a body that make up its touchable surface: those that collide, or else all."""
         geoms = tuple(geom for geom in self.geoms if geom.body == body)
         return tuple(geom for geom in geoms if geom.is_colliding) or geoms
 
     def rigid_bodies(self, body: str, others: Collection[str] = ()) -> tuple[int, ...]:
-        """Return the indices of a body and of those below that are welded to it: they have no joint. Parents come first.
-
-        What is fixed to the world is no part of it.
-
-        Args:
-            body: Name of the body.
-            others: Names of bodies that are none of its parts.
-        """
+        """Return the indices of a body and of those below that are welded to it: they have no joint. Parents come first."""
         model = self.compiled
         results = [int(model.body(body).id)]
         for i in range(results[0] + 1, model.nbody if results[0] else 0):
@@ -147,7 +123,6 @@ class Model:
         return tuple(results)
 
     def can_collide(self, first: str, second: str) -> bool:
-        """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
         return self.geoms_can_collide(*([geom.id for geom in self.touchable(body)] for body in (first, second)))
 
     def geoms_can_collide(self, geoms: Iterable[int], others: Iterable[int]) -> bool:
@@ -178,15 +153,7 @@ class Model:
         return bool(one == parent_two or two == parent_one)
 
     def surface(self, geoms: tuple[Geom, ...], as_collided: bool = False) -> Surface:
-        """Return the triangles of some geoms of one body, in that body's frame.
-
-        Args:
-            geoms: The geoms.
-            as_collided: Whether meshes are their convex hulls, as MuJoCo collides them.
-
-        Raises:
-            RobotError: If a geom has no bounded surface.
-        """
+        """Return the triangles of some geoms of one body, in that body's frame."""
         parts = []
         for geom in geoms:
             of_mesh = self.hull if as_collided else self.mesh

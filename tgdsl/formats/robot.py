@@ -16,8 +16,7 @@ from tgdsl.scene.mujoco_warnings import told_of
 
 Reader = Callable[[Path], Model]
 """Reads and compiles a file; `load_model` names the file in what it raises that is MuJoCo's or the system's."""
-Writer = Callable[[Model, Path], None]
-"""Writes a compiled model to a file."""
+Writer = Callable[[Model, Path], None]  # writes a compiled model to a file
 
 
 def _read_usd(path: Path) -> Model:
@@ -45,8 +44,7 @@ def _refuse_part(path: Path) -> Model:
 
 ROOTS: Mapping[str, Reader] = {"robot": read_urdf, "mujocoinclude": _refuse_part}
 """By the root element of XML; any other is MJCF's."""
-WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), _write_usd)
-"""By a file's ending."""
+WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), _write_usd)  # by a file's ending
 
 
 def load_model(path: Path) -> Model:

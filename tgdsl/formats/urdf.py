@@ -23,8 +23,7 @@ from tgdsl.formats.model import LEAST_INERTIA, Model
 EDGE = 1e-8
 """A plate's largest moment is the sum of the others. By as much of it [1] a file's rounding may miss that, either way; twice
 as much is then added, so that MuJoCo, which looks at every bit, takes it."""
-LEAST_MASS = 1e-6
-"""Mass of a moving link that has none, and no geometry that MuJoCo could infer it from [kg]."""
+LEAST_MASS = 1e-6  # mass of a moving link that has none, and no geometry that MuJoCo could infer it from [kg]
 _PREFIX = re.compile(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]")
 _ROOT = re.compile(r"<robot\b")
 
@@ -64,10 +63,7 @@ def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _overlaps_with_base(model: mujoco.MjModel) -> list[tuple[str, str]]:
-    """Return the links of the base, and links that a joint connects to it, that overlap in the initial pose.
-
-    MuJoCo lets no parent collide with its child, unless the parent is fixed to the world.
-    """
+    """Return the links of the base, and links that a joint connects to it, that overlap in the initial pose."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     weld, parent = model.body_weldid, model.body_parentid
@@ -96,16 +92,7 @@ def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> 
 
 
 def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
-    """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there.
-
-    Mesh files are found (`package://` and `model://` are looked up in the folders above the file: by the name in a
-    `package.xml`, or by their own), links on fixed joints keep their own
-    bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size. Geoms that have a name
-    which is taken get a number, as MuJoCo has each name once.
-
-    Raises:
-        RobotError: If the file is not XML, or a mesh cannot be found.
-    """
+    """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there."""
     robot = _root(path)
     _number_names(robot)
     files: dict[str, Path] = {}
@@ -132,11 +119,7 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
 
 
 def _root(path: Path) -> ET.Element:
-    """Return a URDF's root; tags of other programs, by prefixes that may not be declared, are taken out.
-
-    Raises:
-        RobotError: If the file is not XML, or is xacro.
-    """
+    """Return a URDF's root; tags of other programs, by prefixes that may not be declared, are taken out."""
     content = path.read_bytes()
     try:
         root = ET.fromstring(content)
@@ -161,10 +144,7 @@ def _root(path: Path) -> ET.Element:
 
 
 def _number_names(robot: ET.Element) -> None:
-    """Give geoms whose name another has too a number: the second `pad` is `pad_2`.
-
-    Those without a name get an empty one: MuJoCo would take that of the geom before.
-    """
+    """Give geoms whose name another has too a number: the second `pad` is `pad_2`."""
     geoms = [part for link in robot.iter("link") for part in (*link.findall("collision"), *link.findall("visual"))]
     names = {part.get("name", "") for part in geoms}
     seen: set[str] = set()
@@ -205,15 +185,7 @@ def _package_name(folder: Path) -> str | None:
 
 
 def _mend(link: ET.Element, moving: Collection[str]) -> bool:
-    """Replace the link's inertia if its principal moments are missing, not positive or break the triangle inequality.
-
-    A moving link without mass gets `LEAST_MASS`, as MuJoCo moves nothing that weighs nothing; one that has geometry and no
-    `<inertial>` takes its mass from that.
-
-    Args:
-        link: The link, changed in place.
-        moving: Names of links that a joint moves.
-    """
+    """Replace the link's inertia if its principal moments are missing, not positive or break the triangle inequality."""
     inertial, inertia = link.find("inertial"), link.find("inertial/inertia")
     if inertial is None:
         if link.get("name") not in moving or link.find("collision") is not None or link.find("visual") is not None:

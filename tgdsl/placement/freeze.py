@@ -25,14 +25,6 @@ _COLUMNS = ("link", *CELL, *REQUIRED, *TANGENT, "radius", "area")
 
 
 def frozen_files(spec: LayoutSpec, layouts: Mapping[str, Layout], out: Path, origin: str) -> dict[Path, bytes]:
-    """Return the files of a frozen layout: its tables, and last the layout.
-
-    Args:
-        spec: The layout that was sampled.
-        layouts: Its taxels by resolution, of all its links.
-        out: The layout to write.
-        origin: What the taxels are of, for people.
-    """
     tables = _table_names(layouts, out)
     files = {out.with_name(tables[name]): _table(layout).encode() for name, layout in layouts.items()}
     return {**files, out: _text(spec, layouts, tables, origin).encode()}

@@ -28,11 +28,7 @@ _JOINTS = {
 
 
 def robot_path(robot: str) -> Path:
-    """Return the file of a robot given by a path, or of one that tgdsl brings, by its name.
-
-    Raises:
-        TgdslError: If there is neither.
-    """
+    """Return the file of a robot given by a path, or of one that tgdsl brings, by its name."""
     path = robot_file(robot, Path())
     if path is None:
         raise TgdslError(f'there is no file or robot "{robot}"; {did_you_mean(robot, robot_names(), "robots")}')
@@ -40,27 +36,11 @@ def robot_path(robot: str) -> Path:
 
 
 def open_robot(robot: str) -> Model:
-    """Return the robot of a file (MJCF, URDF, USD), or one that tgdsl brings, by its name.
-
-    Raises:
-        TgdslError: If there is neither.
-        RobotError: If the file cannot be read.
-    """
     return load_model(robot_path(robot))
 
 
 def links_table(robot: Model, layout: Path | None = None) -> list[str]:
-    """Return the lines of the table: one body after another in depth-first order, children indented.
-
-    Areas are the sum over the geoms that can be touched: where these overlap, both count.
-
-    Args:
-        robot: The robot.
-        layout: A layout file whose groups are shown.
-
-    Raises:
-        SpecError: If the layout has mistakes.
-    """
+    """Return the lines of the table: one body after another in depth-first order, children indented."""
     model = robot.compiled
     groups = _groups(robot, load_layout(layout)) if layout else {}
     blocks: list[list[tuple[str, ...]]] = [[(name,) for name in _HEADER]]
@@ -148,11 +128,7 @@ def _area(robot: Model, body: int) -> str:
 
 
 def _groups(robot: Model, layout: LoadedLayout) -> dict[str, list[str]]:
-    """Return the groups that each body is in.
-
-    Raises:
-        SpecError: If a group has a pattern that matches nothing.
-    """
+    """Return the groups that each body is in."""
     candidates = [[body, *(n for geom in robot.touchable(body) for n in geom.names)] for body in robot.bodies]
     names = [name for geom in robot.geoms for name in geom.names]
     problems: list[Problem] = []

@@ -23,10 +23,8 @@ from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.rays import sphere_directions
 from tgdsl.surfaces.region import Covered
 
-INSIDE = 1e-6
-"""Depth from which a point counts as inside a solid [m]: links that touch face to face overlap by rounding."""
-DIRECTIONS = 100
-"""Directions in which it is looked whether a ball reaches out of several solids together."""
+INSIDE = 1e-6  # depth from which a point counts as inside a solid [m]: links that touch face to face overlap by rounding
+DIRECTIONS = 100  # directions in which it is looked whether a ball reaches out of several solids together
 NEVER_MET = "on a body that is never in contact with what their sensor feels, by contact alone"
 _UNBOUNDED = ("plane", "hfield", "sdf", "unknown")
 """Types of geoms that are no convex solid: the ground, and shapes that MuJoCo collides otherwise."""
@@ -34,18 +32,14 @@ _UNBOUNDED = ("plane", "hfield", "sdf", "unknown")
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """What the colliding geoms of a robot leave of each taxel.
+    """What the colliding geoms of a robot leave of each taxel."""
 
-    Attributes:
-        is_collided: Whether any geom of the taxel's body can be in a contact; of a contact sensor only these count.
-        depth: How deep the taxel is inside one geom of its own rigid link [m]; at most 0 if it is inside none.
-        is_buried: Whether its whole ball is inside its own rigid link.
-        cover: The body of another link that it is inside of, by MuJoCo's index; −1 if it is inside none.
-    """
-
+    # whether any geom of the taxel's body can be in a contact; of a contact sensor only these count
     is_collided: Bool[np.ndarray, " taxel"]
+    # how deep the taxel is inside one geom of its own rigid link [m]; at most 0 if it is inside none
     depth: Float[np.ndarray, " taxel"]
-    is_buried: Bool[np.ndarray, " taxel"]
+    is_buried: Bool[np.ndarray, " taxel"]  # whether its whole ball is inside its own rigid link
+    # the body of another link that it is inside of, by MuJoCo's index; −1 if it is inside none
     cover: Int[np.ndarray, " taxel"]
 
 
@@ -67,25 +61,17 @@ class Colliders:
         self.is_loose = np.array([self._floats(int(i)) for i in roots])
 
     def collides(self, body: int) -> bool:
-        """Return whether any geom of a body can be in a contact."""
         first, count = int(self.robot.compiled.body_geomadr[body]), int(self.robot.compiled.body_geomnum[body])
         return any(self.robot.geom(i).is_colliding for i in range(first, first + count))
 
     def in_world(self, body: int, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return points of a body's frame in the world."""
         return self.state.xpos[body] + pos @ self.state.xmat[body].reshape(3, 3).T
 
     def solids_of(self, body: int) -> Int[np.ndarray, " solid"]:
-        """Return the solids of a body's rigid link: what is welded to it moves with it; what is fixed to the world does not."""
         return np.flatnonzero(self.segment[self.body] == self.segment[body])
 
     def others(self, body: int, ignored: Collection[int] = ()) -> Int[np.ndarray, " other"]:
-        """Return the solids of other links; bodies that float by themselves are objects, and the world is no link.
-
-        Args:
-            body: The body.
-            ignored: Bodies that are no links, such as objects, by their indices.
-        """
+        """Return the solids of other links; bodies that float by themselves are objects, and the world is no link."""
         is_near = (self.robot.compiled.body_rootid == self.robot.compiled.body_rootid[body]) | ~self.is_loose
         is_link = is_near & (self.segment != self.segment[body])
         is_link[[0, *ignored]] = False
@@ -99,11 +85,7 @@ class Colliders:
     def is_buried(
         self, body: int, pos: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, " n"]
     ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return which balls about points of a body's frame are wholly inside its rigid link, and the points' depths [m].
-
-        A ball that is inside none of the solids may be inside all of them together: every one of its points that is looked
-        at is then inside one.
-        """
+        """Return which balls about points of a body's frame are wholly inside its rigid link, and the points' depths [m]."""
         solids, at = self.solids_of(body), self.in_world(body, pos)
         depths = self.depths(solids, at)
         depth = depths.max(axis=0, initial=-np.inf)
@@ -118,13 +100,7 @@ class Colliders:
         return is_buried | several, depth
 
     def cover_of(self, body: str, geoms: Sequence[Geom], ignored: Collection[int] = ()) -> Covered:
-        """Return a function that says which points of a body's frame are inside other colliding geoms, of its link or others.
-
-        Args:
-            body: The body's name.
-            geoms: Geoms that do not count: those that the points are on.
-            ignored: Bodies that are no links, such as objects, by their indices.
-        """
+        """Return a function that says which points of a body's frame are inside other colliding geoms of any link."""
         body_id = int(self.robot.compiled.body(body).id)
         solids = np.concatenate([self.solids_of(body_id), self.others(body_id, ignored)])
         solids = solids[~np.isin(self.geom[solids], [geom.id for geom in geoms])]

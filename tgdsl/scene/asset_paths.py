@@ -16,12 +16,10 @@ from pathlib import Path
 from tgdsl.errors import ArtifactError, listed
 from tgdsl.plan.scene import Asset, SceneFile
 
-ROBOTS = "robots:"
-"""How the place of a file begins that comes with tgdsl."""
+ROBOTS = "robots:"  # how the place of a file begins that comes with tgdsl
 ENDINGS = (".stl", ".obj", ".msh", ".png", ".ktx", ".skn", ".bin")
 """Endings of the files that a scene may name; `.bin`: a height field's own numbers."""
-FOLDER_ATTRIBUTES = ("assetdir", "meshdir", "texturedir")
-"""Attributes of `<compiler>` that say in which folder assets lie."""
+FOLDER_ATTRIBUTES = ("assetdir", "meshdir", "texturedir")  # attributes of `<compiler>` that say in which folder assets lie
 _KEY = re.compile(r"[0-9a-f]{32}(\.\w+)")
 _ABSOLUTE = re.compile(r"/|[A-Za-z]:/")
 
@@ -50,16 +48,7 @@ def check_scene(scene: SceneFile) -> None:
 
 
 def resolve_asset(asset: Asset, robots: Path) -> Path:
-    """Return where an asset is, a file that is in its place itself and not by a link.
-
-    Args:
-        asset: The asset, which `check_scene` has seen if it is of an artefact.
-        robots: Folder of the robots that come with tgdsl.
-
-    Raises:
-        ArtifactError: If its place is no file of this machine, or leads elsewhere.
-        OSError: If there is no such file.
-    """
+    """Return where an asset is, a file that is in its place itself and not by a link."""
     inside = asset.path.removeprefix(ROBOTS)
     is_own = inside != asset.path
     path = robots.resolve() / inside if is_own else Path(asset.path)

@@ -16,12 +16,10 @@ from tgdsl.errors import RobotError
 from tgdsl.plan.scene import Collider
 from tgdsl.scene.contact_bits import INHERITED, free_bit, meets
 
-GROUP = 3
-"""MuJoCo's group of colliders: its viewers do not show it unless they are told to."""
+GROUP = 3  # MuJoCo's group of colliders: its viewers do not show it unless they are told to
 
 
 def collider_name(body: str, i: int) -> str:
-    """Return the name of collider i of a body in the scene."""
     return f"tgdsl/{body}/collider/{i}"
 
 

@@ -17,14 +17,7 @@ INHERITED = (
 
 
 def free_bit(spec: mujoco.MjSpec, who: str, error: type[TgdslError], fields: tuple[str, ...] = ("conaffinity",)) -> int:
-    """Return a bit that no geom collides with; if there is none, an error says who needs it.
-
-    Args:
-        spec: The scene.
-        who: Who needs it.
-        error: Type of the error.
-        fields: Where the bit must be free.
-    """
+    """Return a bit that no geom collides with; if there is none, an error says who needs it."""
     used = int(np.bitwise_or.reduce([int(getattr(geom, field)) for geom in spec.geoms for field in fields]))
     free = next((1 << bit for bit in range(30, -1, -1) if not used >> bit & 1), None)
     if free is None:
@@ -43,5 +36,4 @@ def bits_that_meet(geoms: Iterable[mujoco.MjsGeom]) -> tuple[int, int]:
 
 
 def meets(contype: int, conaffinity: int, geom: mujoco.MjsGeom) -> bool:
-    """Return whether a geom with some bits collides with a geom, as far as bits say."""
     return bool((contype & geom.conaffinity) | (geom.contype & conaffinity))

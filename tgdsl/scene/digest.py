@@ -9,10 +9,7 @@ from tgdsl.plan.scene import SceneFile
 
 
 def scene_digest(scene: SceneFile) -> str:
-    """Return a hash of a scene: its files, assets, objects and colliders, without the contact sensors that a module wants.
-
-    Comments in its files do not count.
-    """
+    """Return a hash of a scene: its files, assets, objects and colliders, without the contact sensors that a module wants."""
     root = ET.fromstring(scene.mjcf)
     for sensors in root.findall("sensor"):
         for sensor in [element for element in sensors if element.get("name", "").startswith("tgdsl/")]:

@@ -16,8 +16,7 @@ import mujoco
 IRRELEVANT = "Attaching a spec with an empty prefix"
 """A robot attached under its own names is just what a scene of ours wants, and scenes are never saved by MuJoCo."""
 
-DIVERGENCE = "Nan, Inf or huge value in"
-"""How messages begin of values that simulators look at themselves."""
+DIVERGENCE = "Nan, Inf or huge value in"  # how messages begin of values that simulators look at themselves
 
 
 @contextmanager
@@ -33,7 +32,6 @@ def collected_messages() -> Iterator[list[str]]:
 
 @contextmanager
 def muted_mujoco() -> Iterator[None]:
-    """Have MuJoCo say nothing while it compiles what it has been told of already: parts of a model that was read before."""
     with collected_messages(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -58,7 +56,6 @@ def told_of(file: object, stacklevel: int = 4) -> Iterator[None]:
 
 
 def _named(message: str, file: object) -> str:
-    """Return a message of MuJoCo's on one line, with the file named; one of ours, which does so, as it is."""
     return message if message.startswith(str(file)) else f"{file}: MuJoCo: {' '.join(message.split())}"
 
 
@@ -66,7 +63,6 @@ class StepWarnings:
     """What MuJoCo warns of while it steps: each thing is told once, and of divergence nothing, of which faults tell."""
 
     def __init__(self) -> None:
-        """Nothing has been told."""
         self._told: set[str] = set()
 
     def tell(self, messages: Sequence[str]) -> None:

@@ -29,7 +29,6 @@ _MOST = 2**31 - 1  # MuJoCo's integers have 32 bits
 
 
 def option_names() -> tuple[str, ...]:
-    """Return the names of MuJoCo's options, sorted."""
     return tuple(sorted(name for name in dir(mujoco.MjOption) if not name.startswith("_") and name not in _METHODS))
 
 

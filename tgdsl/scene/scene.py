@@ -43,13 +43,7 @@ def weigh(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
 
 
 def freeze(spec: mujoco.MjSpec, new: Set[str], weighed: Set[str]) -> None:
-    """Give the scene's bodies the inertias that its compiler makes for them, and let it change none from then on.
-
-    Args:
-        spec: The scene, changed in place; untouched if its compiler changes no inertias that are given.
-        new: Names of the bodies that are not the scene's own: they do not count in its total mass.
-        weighed: Names of the bodies whose inertias will be given.
-    """
+    """Give the scene's bodies the inertias that its compiler makes for them, and let it change none from then on."""
     compiler = spec.compiler
     total = compiler.settotalmass
     if not (compiler.boundmass or compiler.boundinertia or total > 0 or compiler.inertiafromgeom == FORCED):
@@ -76,12 +70,10 @@ def _set_inertial(body: mujoco.MjsBody, model: mujoco.MjModel, id: int, factor: 
 
 _STL_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _OBJ_NAME, _OBJ_FACE = re.compile(rb"^[ \t]*[og](?:[ \t].*)?$", re.MULTILINE), re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
-OFF_CENTER = 2e-6
-"""Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
+OFF_CENTER = 2e-6  # distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin
 
 
 def compiled(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjModel:
-    """Compile a scene whose assets' contents are at hand, its objects as the scene's own text has them."""
     with muted_mujoco():
         return _spec(scene, assets).compile()
 
@@ -108,7 +100,6 @@ def readable(name: str, content: bytes) -> bytes:
 
 
 def num_objects(content: bytes) -> int:
-    """Return how many objects or groups of an OBJ file have faces."""
     return sum(_OBJ_FACE.search(part) is not None for part in _OBJ_NAME.split(content))
 
 
@@ -123,15 +114,10 @@ def scene_model(scene: SceneFile) -> mujoco.MjModel:
 
 @dataclass(frozen=True)
 class Choice:
-    """What an object is like in one environment.
+    """What an object is like in one environment."""
 
-    Attributes:
-        variant: Which of its variants it has.
-        size: Its size as MuJoCo defines it [m]; None: as the scene or the variant says.
-    """
-
-    variant: int = 0
-    size: tuple[float, float, float] | None = None
+    variant: int = 0  # which of its variants it has
+    size: tuple[float, float, float] | None = None  # its size as MuJoCo defines it [m]; None: as the scene or the variant says
 
 
 def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: Mapping[str, Choice]) -> mujoco.MjSpec:
@@ -168,34 +154,28 @@ def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: M
 
 
 def _welded_geoms(body: mujoco.MjsBody, others: Sequence[str]) -> list[mujoco.MjsGeom]:
-    """Return the geoms of the bodies below one that have no joint, and are not others."""
     below = [child for child in body.bodies if not child.joints and child.name not in others]
     return [geom for child in below for geom in (*child.geoms, *_welded_geoms(child, others))]
 
 
 def _sized_geom(target: SceneObject, variant: int) -> int:
-    """Return which of its body's geoms an object is whose size is chosen."""
     return next(i for i, geom in enumerate(target.variants[variant]) if geom is not None) if target.types else 0
 
 
 def geom_name(target: SceneObject, i: int) -> str:
-    """Return the name that geom i of an object has in the scene."""
     return f"tgdsl/{target.name}/{i}"
 
 
 def placeholder_name(body: str) -> str:
-    """Return the name of the geom that a body has which the document adds, until it is given the object's."""
     return f"tgdsl/{body}/placeholder"
 
 
 def is_absent(model: mujoco.MjModel, geom: int) -> bool:
-    """Return whether a geom is one that its object lacks in this model: see `with_choices`."""
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _absence(model.geom(geom).name))
     return number >= 0 and bool(model.numeric_data[model.numeric_adr[number]])
 
 
 def _absence(name: str) -> str:
-    """Return the name of the custom number that says whether a geom is lacking."""
     return f"{name}/is_absent"
 
 
@@ -238,17 +218,7 @@ class SceneModels:
     def __init__(
         self, scene: SceneFile, options: Options | None = None, prepare: Callable[[mujoco.MjSpec], None] | None = None
     ):
-        """Read the assets.
-
-        Args:
-            scene: The scene.
-            options: MuJoCo's options that are to differ from the scene's: see `set_options`.
-            prepare: Changes the scene before anything of it is compiled.
-
-        Raises:
-            ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
-            SimulationError: If there is no such option, or a value does not fit.
-        """
+        """Read the assets."""
         self.objects = {target.name: target for target in scene.objects}
         with muted_mujoco():
             self._base = _spec(scene, {asset.key: _content(asset) for asset in scene.assets})
@@ -266,16 +236,11 @@ class SceneModels:
             self._models.clear()
 
     def first(self) -> mujoco.MjSpec:
-        """Return the scene with the first variant of each object, to read or to compile."""
         with muted_mujoco():
             return with_choices(self._base.copy(), list(self.objects.values()), {})
 
     def model(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
-        """Return the scene with some choices of objects; the others have their first variant.
-
-        Raises:
-            RobotError: If MuJoCo cannot compile it.
-        """
+        """Return the scene with some choices of objects; the others have their first variant."""
         key = tuple(choices.get(name, Choice()) for name in self.objects)
         if key not in self._models:
             try:
@@ -301,7 +266,6 @@ class SceneModels:
         return float(x), float(y), float(z)
 
     def type(self, name: str, variant: int) -> str:
-        """Return MuJoCo's name of the type of a variant of an object whose size may be chosen."""
         target, model = self.objects[name], self.model({name: Choice(variant)})
         kind = model.geom_type[model.body(target.body).geomadr[0] + _sized_geom(target, variant)]
         return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
@@ -330,6 +294,5 @@ def _content(asset: Asset) -> bytes:
 
 
 def portable(path: Path) -> str:
-    """Return a path as an artefact keeps it: `robots:` and the rest for a robot that comes with tgdsl, else absolute."""
     folder, path = robots_folder().resolve(), path.resolve()
     return f"{ROBOTS}{path.relative_to(folder).as_posix()}" if path.is_relative_to(folder) else path.as_posix()

@@ -36,29 +36,20 @@ from tgdsl.formats.usd.stage import Names, Prim, Stage, unique_names, usd_module
 MJC_ACTUATOR, NEWTON_ACTUATOR = "MjcActuator", "NewtonActuator"
 NO_TARGET = "actuators were dropped whose target is no joint, site, tendon or body of the model"
 TOO_MANY = "targets of actuators after the first one were dropped"
-SAME_GAIN = 1e-5
-"""Relative difference up to which a drive, which is in float32, and an actuator are the same servo."""
+SAME_GAIN = 1e-5  # relative difference up to which a drive, which is in float32, and an actuator are the same servo
 TRN = {name.removeprefix("mjTRN_"): int(value) for name, value in mujoco.mjtTrn.__members__.items()}
 WRAP = {name.removeprefix("mjWRAP_"): int(value) for name, value in mujoco.mjtWrap.__members__.items()}
 
 
 @dataclass(frozen=True)
 class Actuator:
-    """An actuator of MJCF.
+    """An actuator of MJCF."""
 
-    Attributes:
-        attributes: Of the element.
-        joint: Path of the joint that it acts on, or empty.
-        order: Place among those that say so; the others come after them.
-        control: At the keyframe `authored`.
-        kind: Which element it is.
-    """
-
-    attributes: dict[str, str]
-    joint: str
-    order: float
-    control: float = 0.0
-    kind: str = "general"
+    attributes: dict[str, str]  # of the element
+    joint: str  # path of the joint that it acts on, or empty
+    order: float  # place among those that say so; the others come after them
+    control: float = 0.0  # at the keyframe `authored`
+    kind: str = "general"  # which element it is
 
 
 def read_actuators(stage: Stage, names: Names) -> list[Actuator]:
@@ -127,16 +118,7 @@ def _newton_actuator(stage: Stage, prim: Prim, names: Names, name: str) -> Actua
 
 
 def servos_of(stage: Stage, joints: Iterable[Joint], prims: Sequence[Actuator], names: Names) -> list[Actuator]:
-    """Return the drives of joints as actuators, but those that a prim says more exactly.
-
-    A drive with `tgdsl:order` is an actuator of its own beside them.
-
-    Args:
-        stage: The stage.
-        joints: All joints of the tree.
-        prims: Actuators that are prims.
-        names: Names of the joints.
-    """
+    """Return the drives of joints as actuators, but those that a prim says more exactly."""
     results, of_joint = list[Actuator](), {actuator.joint: actuator for actuator in prims if actuator.joint}
     taken = {actuator.attributes["name"] for actuator in prims}
     for joint in joints:
@@ -226,11 +208,7 @@ def _ends(writer: StageWriter, actuator: int, kind: int) -> dict[str, str] | Non
 
 
 def read_tendons(stage: Stage, tendon: ET.Element, names: Names) -> None:
-    """Add all tendons to their element, and their names to the others.
-
-    Raises:
-        RobotError: If the arrays that describe a path do not belong together.
-    """
+    """Add all tendons to their element, and their names to the others."""
     prims = [prim for prim in stage.prims if prim.GetTypeName() == "MjcTendon"]
     prim_names = unique_names(stage, prims)
     for prim in prims:
@@ -342,13 +320,7 @@ def _write_path(writer: StageWriter, tendon: int, prim: Any) -> None:
 
 
 def read_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None:
-    """Add all keyframes whose vectors fit the model; MuJoCo's order of joints and actuators is taken to be theirs.
-
-    Args:
-        stage: The stage.
-        root: The whole model, without any keyframe that does not fit.
-        keyframe: Where keyframes go.
-    """
+    """Add all keyframes whose vectors fit the model; MuJoCo's order of joints and actuators is taken to be theirs."""
     prims = [prim for prim in stage.prims if prim.GetTypeName() == "MjcKeyframe"]
     if not prims:
         return
@@ -368,7 +340,6 @@ def read_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None
 
 
 def write_keyframes(writer: StageWriter) -> None:
-    """Write all keyframes, their vectors in MuJoCo's order."""
     for key in range(writer.model.nkey):
         name = writer.model.key(key).name
         set_sources(writer.define("MjcKeyframe", name or "keyframe", name), KEY, writer.model, key)

@@ -12,27 +12,18 @@ from tgdsl.formats.usd.stage import Stage
 
 @dataclass(frozen=True, eq=False)
 class TreeNode:
-    """A body and its parent in the spanning tree.
+    """A body and its parent in the spanning tree."""
 
-    Attributes:
-        body: Path of the body.
-        parent: Path of its parent; None is the world.
-        joint: What joins it to its parent, or None if it floats or is kinematic.
-        stacked: Joints between the same two bodies that add to its motion, in MuJoCo's order.
-    """
-
-    body: str
-    parent: str | None
-    joint: Joint | None
-    stacked: tuple[Joint, ...] = ()
+    body: str  # path of the body
+    parent: str | None  # path of its parent; None is the world
+    joint: Joint | None  # what joins it to its parent, or None if it floats or is kinematic
+    stacked: tuple[Joint, ...] = ()  # joints between the same two bodies that add to its motion, in MuJoCo's order
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """All joints to its parent."""
         return () if self.joint is None else (self.joint, *self.stacked)
 
     def is_swapped(self, joint: Joint) -> bool:
-        """Return whether body 0 of one of its joints is the child."""
         return joint.bodies[0] == self.body
 
 
@@ -76,19 +67,14 @@ class SpanningTree:
         self.loops = tuple(joint for joint in (*self._joints, *constraints) if id(joint) not in used)
 
     def children(self, parent: str | None) -> tuple[TreeNode, ...]:
-        """Return the children of a body, or of the world."""
         return tuple(node for node in self.nodes.values() if node.parent == parent)
 
     def _depth_first(self, parent: str | None) -> list[str]:
-        """Return all bodies below one, siblings in stage order."""
         children = [body for body in self._kinematic if self.nodes[body].parent == parent]
         return [body for child in children for body in (child, *self._depth_first(child))]
 
     def _stacked(self, node: TreeNode) -> TreeNode:
-        """Return a node with all joints that stack on its own, from the parent on.
-
-        Stage order counts from body 0 of the first of them.
-        """
+        """Return a node with all joints that stack on its own, from the parent on."""
         base = node.joint
         if base is None or not base.is_stackable:
             return node
@@ -97,7 +83,6 @@ class SpanningTree:
         return replace(node, joint=first, stacked=tuple(rest))
 
     def _rank(self, path: str) -> int:
-        """Rank a candidate root: has PhysicsArticulationRootAPI itself, is below a prim that has it, neither."""
         return 0 if path in self._roots else 1 if any(path.startswith(f"{root}/") for root in self._roots) else 2
 
     def _groups(self) -> list[list[str]]:
@@ -150,24 +135,17 @@ class SpanningTree:
 
 
 def _loop_priority(joint: Joint) -> tuple[bool, bool, bool]:
-    """Rank joints by what is lost if they close a loop: an equality constraint can neither slide, nor be driven or limited."""
     return joint.kind != "slide", joint.drive is None, joint.range is None
 
 
 def _end(joint: Joint | None, other: str | None) -> str | None:
-    """Return the body at the other end of a joint, or None if the joint does not touch that end (or it is the world's)."""
     if joint is None or other not in joint.bodies:
         return None
     return joint.bodies[1] if joint.bodies[0] == other else joint.bodies[0]
 
 
 def filtered_pairs(tree: SpanningTree) -> tuple[set[frozenset[str | None]], dict[frozenset[str | None], str]]:
-    """Return the pairs of bodies that MuJoCo never collides by itself.
-
-    Returns:
-        Those that are welded together; and those of two groups of welded bodies of which one is the other's parent, unless one
-        is the world's, with the body whose joint joins the groups.
-    """
+    """Return the pairs of bodies that MuJoCo never collides by itself."""
     group: dict[str | None, str | None] = {None: None}
     above: dict[str, str | None] = {}
     for body, node in tree.nodes.items():

@@ -26,8 +26,7 @@ import numpy as np
 
 from tgdsl.formats.usd.stage import NAMESPACE, Prim, Stage, usd_modules
 
-AGREEMENT = 1e-5
-"""Relative difference up to which two sources say the same: some attributes are float32."""
+AGREEMENT = 1e-5  # relative difference up to which two sources say the same: some attributes are float32
 TOKENS = {"euler": "Euler", "rk4": "RK4", "pgs": "PGS", "cg": "CG", "newton": "Newton"}
 """MjcPhysics' tokens that MJCF spells otherwise."""
 
@@ -51,27 +50,18 @@ KEYWORDS = {
 """MJCF's keywords, in the order of MuJoCo's enumerations."""
 FLAGS = {"disable": (mujoco.mjtDisableBit, "mjDSBL_"), "enable": (mujoco.mjtEnableBit, "mjENBL_")}
 """MuJoCo's flags that are written if set, as lists of MJCF's names, and their bits."""
-KNOWN_FLAGS = ("gravity", "filterparent")
-"""Flags that USD has attributes for."""
+KNOWN_FLAGS = ("gravity", "filterparent")  # flags that USD has attributes for
 
 
 @dataclass(frozen=True)
 class Source:
-    """A USD attribute that holds the value of an MJCF attribute.
+    """A USD attribute that holds the value of an MJCF attribute."""
 
-    Attributes:
-        name: The attribute's name; with `is_range`, what precedes `:min` and `:max`.
-        unit: Its unit, a key of `units`.
-        neutral: A value that says nothing.
-        is_range: Whether two attributes hold the ends of a range.
-        is_rate: Whether it is a whole number of steps per second, whose inverse is meant.
-    """
-
-    name: str
-    unit: str = "1"
-    neutral: float | None = None
-    is_range: bool = False
-    is_rate: bool = False
+    name: str  # the attribute's name; with `is_range`, what precedes `:min` and `:max`
+    unit: str = "1"  # its unit, a key of `units`
+    neutral: float | None = None  # a value that says nothing
+    is_range: bool = False  # whether two attributes hold the ends of a range
+    is_rate: bool = False  # whether it is a whole number of steps per second, whose inverse is meant
 
     def value(self, stage: Stage, prim: Prim, is_angular: bool) -> Any:
         """Return the value in MJCF's unit, or None if nothing is said."""
@@ -93,30 +83,23 @@ class Source:
 
 @dataclass(frozen=True)
 class Row:
-    """Where the value of an MJCF attribute is.
+    """Where the value of an MJCF attribute is."""
 
-    Attributes:
-        array: Array of `MjModel`, or field of `MjOption` or `MjsMesh`, from which it is written; empty if not by the table.
-        sources: USD attributes, most specific first; `tgdsl:<MJCF's name>` always comes before them.
-    """
-
+    # array of `MjModel`, or field of `MjOption` or `MjsMesh`, from which it is written; empty if not by the table
     array: str = ""
-    sources: tuple[Source, ...] = ()
+    sources: tuple[Source, ...] = ()  # USD attributes, most specific first; `tgdsl:<MJCF's name>` always comes before them
 
 
-Table = Mapping[str, Row]
-"""Rows by the names of an MJCF element's attributes."""
+Table = Mapping[str, Row]  # rows by the names of an MJCF element's attributes
 
 
 def mjc(
     name: str, *more: Source, array: str = "", unit: str = "1", neutral: float | None = None, is_range: bool = False
 ) -> Row:
-    """Return a row whose first source is a MuJoCo attribute."""
     return Row(array, (Source(f"mjc:{name}", unit, neutral, is_range), *more))
 
 
 def flag_names(key: str) -> dict[str, int]:
-    """Return MJCF's names of the flags of `disable` or `enable`, and their bits."""
     bits, prefix = FLAGS[key]
     return {name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)}
 
@@ -252,19 +235,11 @@ def units(stage: Stage, is_angular: bool) -> dict[str, float]:
 
 
 def read_custom(stage: Stage, prim: Prim, key: str) -> Any:
-    """Return the value of a custom attribute `tgdsl:<key>`, or None."""
     return stage.authored(prim, f"{NAMESPACE}{key}")
 
 
 def read_attributes(stage: Stage, prim: Prim, table: Table, is_angular: bool = False) -> dict[str, str]:
-    """Return what a prim says of an MJCF element, as its attributes, and take note of contradictions.
-
-    Args:
-        stage: The stage.
-        prim: The prim.
-        table: Which attributes, and where their values are.
-        is_angular: Whether the element turns, which decides on units.
-    """
+    """Return what a prim says of an MJCF element, as its attributes, and take note of contradictions."""
     result = {}
     for attribute, row in table.items():
         custom = read_custom(stage, prim, attribute)
@@ -292,13 +267,7 @@ def _agree(first: Any, other: Any, is_rate: bool) -> bool:
 
 
 def with_limits(stage: Stage, attributes: dict[str, str], pairs: Iterable[str]) -> dict[str, str]:
-    """Return attributes with `…limited` resolved as `mjc:compiler:autoLimits` says.
-
-    Args:
-        stage: The stage.
-        attributes: Of an MJCF element.
-        pairs: What precedes `limited` and `range`.
-    """
+    """Return attributes with `…limited` resolved as `mjc:compiler:autoLimits` says."""
     for name in pairs:
         if attributes.get(f"{name}limited", "auto") != "auto":
             continue
@@ -318,14 +287,7 @@ def text_of(value: Any) -> str:
 
 
 def author(prim: Any, name: str, value: Any, kind: str = "") -> None:
-    """Set an attribute of a prim; an empty string is not written.
-
-    Args:
-        prim: The prim.
-        name: The attribute's name.
-        value: A string, boolean, number, pair, or list of one of these.
-        kind: USD's name of its type, where that does not follow from the value.
-    """
+    """Set an attribute of a prim; an empty string is not written."""
     if isinstance(value, str) and not value:
         return
     if not kind:
@@ -342,29 +304,17 @@ def author(prim: Any, name: str, value: Any, kind: str = "") -> None:
 
 
 def set_custom(prim: Any, key: str, value: str | bool | int | float | tuple[float, float] | list[float] | list[str]) -> None:
-    """Set a prim's custom attribute `tgdsl:<key>`; an empty string is not written."""
     author(prim, f"{NAMESPACE}{key}", value)
 
 
 def set_customs(prim: Any, table: Table, value: Callable[[str], Any], default: Callable[[str], Any]) -> None:
-    """Set the custom attributes of an element whose values are not MuJoCo's defaults.
-
-    Args:
-        prim: The element's prim.
-        table: Its attributes.
-        value: The element's value, by the name of the array that holds it.
-        default: The same of an element with MuJoCo's defaults.
-    """
     for attribute, row in table.items():
         if row.array and not np.array_equal(number := np.asarray(value(row.array)), default(row.array)):
             set_custom(prim, attribute, KEYWORDS[attribute][int(number)] if attribute in KEYWORDS else number.tolist())
 
 
 def set_sources(prim: Any, table: Table, model: mujoco.MjModel, index: int) -> None:
-    """Set the MuJoCo attributes of an element by its index, and as custom ones what they do not include and is not zero.
-
-    Ranges are written only where they hold, and no empty vectors.
-    """
+    """Set the MuJoCo attributes of an element by its index, and as custom ones what they do not include and is not zero."""
     for attribute, row in table.items():
         if not row.array:
             continue
@@ -385,12 +335,7 @@ def set_sources(prim: Any, table: Table, model: mujoco.MjModel, index: int) -> N
 
 
 def set_number(attribute: Any, value: float | np.ndarray) -> None:
-    """Set an attribute to 15 digits; where it is float32, also its double-precision copy `tgdsl:<its name>`.
-
-    Args:
-        attribute: A number, a vector of three or a quaternion (w x y z).
-        value: Its value.
-    """
+    """Set an attribute to 15 digits; where it is float32, also its double-precision copy `tgdsl:<its name>`."""
     u, digits = usd_modules(), [float(f"{number:.15g}") + 0.0 for number in np.ravel(value).tolist()]
     kind = attribute.GetTypeName().type.typeName
     if kind == "GfQuatf":
@@ -408,6 +353,5 @@ def set_number(attribute: Any, value: float | np.ndarray) -> None:
 
 @cache
 def default_model() -> mujoco.MjModel:
-    """Return a model with MuJoCo's default value of every attribute in the tables."""
     inside = '<body><joint/><geom type="sphere" size="1"/><site/></body>'
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{inside}</worldbody></mujoco>")

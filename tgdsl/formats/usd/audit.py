@@ -102,7 +102,6 @@ def note_unread(stage: Stage) -> None:
 
 
 def _is_off(stage: Stage, prim: Prim) -> bool:
-    """Return whether a prim is a joint or a collider that is disabled, which then has no meaning."""
     enabled = [("physics:jointEnabled", prim.IsA(stage.pxr.UsdPhysics.Joint))]
     enabled += [("physics:collisionEnabled", stage.has(prim, "PhysicsCollisionAPI"))]
     return any(is_there and stage.value(prim, name) is False for name, is_there in enabled)

@@ -40,27 +40,17 @@ from tgdsl.formats.usd.export.stage_writer import StageWriter
 from tgdsl.formats.usd.joints import Joint
 from tgdsl.formats.usd.stage import NAMESPACE, Matrix, Names, Prim, Stage, usd_modules
 
-USUAL = (0.0, 1.0, 0.0, 0.0, 0.0)
-"""Coefficients of a joint that follows another one to one."""
-ORDER = "order"
-"""Attribute of an element that is there until all are put in order."""
-SITE_TOLERANCE = 1e-9
-"""Largest difference of a joint frame from the site that it is on [m and 1]."""
+USUAL = (0.0, 1.0, 0.0, 0.0, 0.0)  # coefficients of a joint that follows another one to one
+ORDER = "order"  # attribute of an element that is there until all are put in order
+SITE_TOLERANCE = 1e-9  # largest difference of a joint frame from the site that it is on [m and 1]
 CONNECT_EQ, WELD_EQ, JOINT_EQ, TENDON_EQ = (
     int(getattr(mujoco.mjtEq, f"mjEQ_{kind}")) for kind in ("CONNECT", "WELD", "JOINT", "TENDON")
 )
-NEWTON_COEFFICIENTS = 2
-"""Coefficients of the polynomial that Newton's schema holds; the others are MuJoCo's."""
+NEWTON_COEFFICIENTS = 2  # coefficients of the polynomial that Newton's schema holds; the others are MuJoCo's
 
 
 def shifted(coefficients: Float[np.ndarray, " 5"], follower: float, leader: float) -> Float[np.ndarray, " 5"]:
-    """Return the polynomial p(x - leader) + follower, for one p(x) of displacements: of positions.
-
-    Args:
-        coefficients: Of p, from the constant on.
-        follower: Where the follower's displacement is zero [rad or m].
-        leader: The same of the leader.
-    """
+    """Return the polynomial p(x - leader) + follower, for one p(x) of displacements: of positions."""
     result = np.zeros(5)
     moved = Polynomial(coefficients)(Polynomial([-leader, 1.0])).coef if leader else coefficients
     result[: len(moved)] = moved
@@ -69,17 +59,7 @@ def shifted(coefficients: Float[np.ndarray, " 5"], follower: float, leader: floa
 
 
 def read_couplings(stage: Stage, equality: ET.Element, joints: Iterable[Joint], names: Mapping[str, str]) -> None:
-    """Add the constraint of each joint that follows another.
-
-    Args:
-        stage: The stage.
-        equality: Where constraints go.
-        joints: All joints.
-        names: Names of the hinges and slides of the tree by path: only these can lead or follow.
-
-    Raises:
-        RobotError: If a joint follows several.
-    """
+    """Add the constraint of each joint that follows another."""
     joints = list(joints)
     references = {joint.path: joint.reference if read_custom(stage, joint.prim, "ref") else 0.0 for joint in joints}
     for joint in joints:
@@ -129,18 +109,7 @@ def read_polynomials(stage: Stage, equality: ET.Element, names: Names) -> None:
 
 
 def read_exact_constraint(stage: Stage, equality: ET.Element, joint: Joint, names: Names, sites: Mapping[str, Matrix]) -> bool:
-    """Add a `connect` or `weld` between sites that the joint names, or one between bodies that `export` wrote.
-
-    Args:
-        stage: The stage.
-        equality: Where constraints go.
-        joint: A joint that is an equality constraint of MuJoCo.
-        names: Names of bodies, sites and joints.
-        sites: Poses of the sites in their bodies [m], by path.
-
-    Returns:
-        Whether it is one of these.
-    """
+    """Add a `connect` or `weld` between sites that the joint names, or one between bodies that `export` wrote."""
     is_weld = joint.constraint == "MjcEqualityWeldAPI"
     first, second = joint.frames
     is_on_sites = all(
@@ -163,7 +132,6 @@ def read_exact_constraint(stage: Stage, equality: ET.Element, joint: Joint, name
 
 
 def constraint_attributes(stage: Stage, joint: Joint) -> dict[str, str]:
-    """Return what a joint that is an equality constraint of MuJoCo says of its solver, and whether it is active."""
     table = WELD if joint.constraint == "MjcEqualityWeldAPI" else EQUALITY
     return ({} if joint.is_active else {"active": "false"}) | read_attributes(stage, joint.prim, table)
 
@@ -180,7 +148,6 @@ def _add(stage: Stage, equality: ET.Element, tag: str, prim: Prim, name: str, at
 
 
 def put_in_order(equality: ET.Element) -> None:
-    """Sort constraints as `export` found them; the others come after."""
     equality[:] = sorted(equality, key=lambda element: float(element.attrib.pop(ORDER, math.inf)))
 
 

@@ -20,21 +20,11 @@ from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import Joint
 from tgdsl.formats.usd.stage import Prim, Stage
 
-Pair = frozenset[str | None]
-"""Paths of two bodies; None is the world."""
+Pair = frozenset[str | None]  # paths of two bodies; None is the world
 
 
 def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], welded: Iterable[Pair] = ()) -> list[Pair]:
-    """Return the pairs of bodies that must not collide, sorted.
-
-    MuJoCo tells bodies apart, not their colliders: what only holds for some colliders of a body is dropped, with a warning.
-
-    Args:
-        stage: The stage.
-        joints: All joints.
-        geoms: All geoms.
-        welded: Pairs that MuJoCo's own filter would keep apart, where it is off only because some joints' bodies collide.
-    """
+    """Return the pairs of bodies that must not collide, sorted."""
     filters = _Filters(stage, joints, geoms)
     colliders = filters.colliders
     result: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
@@ -86,7 +76,6 @@ class _Filters:
         return result
 
     def of_colliders(self) -> dict[frozenset[str], Prim]:
-        """Return pairs of colliders that must not collide, and the prim that says so."""
         return self._groups() | self._listed_pairs()
 
     def _listed_pairs(self) -> dict[frozenset[str], Prim]:

@@ -14,60 +14,37 @@ from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 MASS_MODELS = ("legacy", "convex", "exact", "shell")
 """Ways in which MuJoCo takes the mass of a mesh; `shell` is there for all shapes."""
 MASKS = ("tgdsl:contype", "tgdsl:conaffinity")
-FRICTIONS = ("dynamicFriction", "staticFriction")
-"""Coefficients of a physics material, the one that MuJoCo gets first."""
+FRICTIONS = ("dynamicFriction", "staticFriction")  # coefficients of a physics material, the one that MuJoCo gets first
 
 
 @dataclass(frozen=True, eq=False)
 class Gprim:
-    """A UsdGeom.Gprim as a collider or a visual.
+    """A UsdGeom.Gprim as a collider or a visual."""
 
-    Attributes:
-        path: Path of its prim.
-        prim: Its prim.
-        body: Path of its body; None is the world.
-        shape: What it is, in the body's frame.
-        is_collider: Whether it collides.
-        is_visible: Whether it is drawn by default.
-        color: Red, green, blue, alpha, or None.
-        mesh: Attributes of its MJCF mesh, its name among them.
-        is_hull: Whether a mesh was meant to be its convex hull.
-        friction: Coefficients of sliding, torsional [m] and rolling [m] friction, each None if its material does not say.
-        density: Density of its material [kg/m³], or 0.
-        mass_model: How MuJoCo takes its mass and inertia, or empty: as UsdPhysics does.
-        mjcf_attributes: More attributes of the MJCF geom.
-    """
-
-    path: str
-    prim: Prim
-    body: str | None
-    shape: Shape
-    is_collider: bool
-    is_visible: bool
-    color: Float[np.ndarray, " 4"] | None
-    mesh: dict[str, str]
-    is_hull: bool = False
+    path: str  # path of its prim
+    prim: Prim  # its prim
+    body: str | None  # path of its body; None is the world
+    shape: Shape  # what it is, in the body's frame
+    is_collider: bool  # whether it collides
+    is_visible: bool  # whether it is drawn by default
+    color: Float[np.ndarray, " 4"] | None  # red, green, blue, alpha, or None
+    mesh: dict[str, str]  # attributes of its MJCF mesh, its name among them
+    is_hull: bool = False  # whether a mesh was meant to be its convex hull
+    # coefficients of sliding, torsional [m] and rolling [m] friction, each None if its material does not say
     friction: tuple[float | None, float | None, float | None] = (None, None, None)
-    density: float = 0.0
-    mass_model: str = ""
-    mjcf_attributes: dict[str, str] = field(default_factory=dict)
+    density: float = 0.0  # density of its material [kg/m³], or 0
+    mass_model: str = ""  # how MuJoCo takes its mass and inertia, or empty: as UsdPhysics does
+    mjcf_attributes: dict[str, str] = field(default_factory=dict)  # more attributes of the MJCF geom
 
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """A frame on a body that MJCF calls a site.
+    """A frame on a body that MJCF calls a site."""
 
-    Attributes:
-        prim: Its prim.
-        body: Path of its body; None is the world.
-        pose: Its frame in the body's frame [m].
-        mjcf_attributes: More attributes of the MJCF site.
-    """
-
-    prim: Prim
-    body: str | None
-    pose: Matrix
-    mjcf_attributes: dict[str, str]
+    prim: Prim  # its prim
+    body: str | None  # path of its body; None is the world
+    pose: Matrix  # its frame in the body's frame [m]
+    mjcf_attributes: dict[str, str]  # more attributes of the MJCF site
 
 
 def read_sites(stage: Stage) -> list[Site]:
@@ -98,13 +75,7 @@ def _drawn_site(stage: Stage, prim: Prim, pose: Matrix) -> tuple[Matrix, dict[st
 
 
 def read_gprims(stage: Stage) -> list[Gprim]:
-    """Read all colliders and all that is visible.
-
-    A mesh that collides as a box or ball and is visible gives two geoms.
-
-    Raises:
-        RobotError: If a mesh is broken.
-    """
+    """Read all colliders and all that is visible."""
     geoms: list[Gprim] = []
     instancer = "//"  # what is below a point instancer is only there as its instances
     for prim in stage.prims:
@@ -182,13 +153,7 @@ def _is_visible(stage: Stage, prim: Prim) -> bool:
 
 
 def _material(stage: Stage, prim: Prim, is_solref: bool) -> tuple[tuple[float | None, float | None, float | None], float]:
-    """Return frictions and density [kg/m³] of the material that is bound for physics, or else for all purposes.
-
-    Args:
-        stage: The stage.
-        prim: The collider.
-        is_solref: Whether the collider says how stiff its contacts are as MuJoCo does, of which the material's is a copy.
-    """
+    """Return frictions and density [kg/m³] of the material that is bound for physics, or else for all purposes."""
     stage.note(prim, "material:binding", "material:binding:physics")
     material = stage.pxr.UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
     if not material or not stage.has(material, "PhysicsMaterialAPI"):

@@ -12,15 +12,11 @@ from scipy.spatial.transform import Rotation
 from tgdsl.formats.usd.attributes import JOINT, read_attributes, read_custom, units, with_limits
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
-INFINITE = 1e30
-"""Limits of this magnitude and more are infinite: the largest float32 is often written for infinity."""
-ROUNDING = 1e-6
-"""A drive's damping below this share of the joint's own, which was subtracted from it, is rounding of float32."""
+INFINITE = 1e30  # limits of this magnitude and more are infinite: the largest float32 is often written for infinity
+ROUNDING = 1e-6  # a drive's damping below this share of the joint's own, which was subtracted from it, is rounding of float32
 Range = tuple[float, float]
-FAR_LIMIT = 1e10
-"""Stands for an infinite limit opposite a finite one: MuJoCo limits both sides or none [rad or m]."""
-FRAME_TOLERANCE = 1e-4
-"""Largest gap between the two frames of a joint in the authored poses [m and rad]."""
+FAR_LIMIT = 1e10  # stands for an infinite limit opposite a finite one: MuJoCo limits both sides or none [rad or m]
+FRAME_TOLERANCE = 1e-4  # largest gap between the two frames of a joint in the authored poses [m and rad]
 DOFS = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 """Degrees of freedom of a generic joint, as its limits and drives are called."""
 AXES = {"X": np.array([1.0, 0.0, 0.0]), "Y": np.array([0.0, 1.0, 0.0]), "Z": np.array([0.0, 0.0, 1.0])}
@@ -34,68 +30,39 @@ KINDS = {"PhysicsRevoluteJoint": "hinge", "PhysicsPrismaticJoint": "slide", "Phy
 
 @dataclass(frozen=True)
 class Drive:
-    """A spring and damper that pulls a joint towards a target.
+    """A spring and damper that pulls a joint towards a target."""
 
-    Attributes:
-        stiffness: [N·m/rad or N/m].
-        damping: [N·m·s/rad or N·s/m].
-        max_force: [N·m or N], or infinity.
-        target: Target position [rad or m].
-        target_velocity: [rad/s or m/s].
-        actuator: Name of its actuator, or empty: the joint's.
-        control: Range of the target, or None if it is free.
-        gear: The actuator's control is the target times this; it enters its gains twice, its force once.
-        order: Place of its actuator among those that say so; the others come after them.
-    """
-
-    stiffness: float
-    damping: float
-    max_force: float
-    target: float = 0.0
-    target_velocity: float = 0.0
-    actuator: str = ""
-    control: Range | None = None
-    gear: float = 1.0
-    order: float = math.inf
+    stiffness: float  # [N·m/rad or N/m]
+    damping: float  # [N·m·s/rad or N·s/m]
+    max_force: float  # [N·m or N], or infinity
+    target: float = 0.0  # target position [rad or m]
+    target_velocity: float = 0.0  # [rad/s or m/s]
+    actuator: str = ""  # name of its actuator, or empty: the joint's
+    control: Range | None = None  # range of the target, or None if it is free
+    gear: float = 1.0  # the actuator's control is the target times this; it enters its gains twice, its force once
+    order: float = math.inf  # place of its actuator among those that say so; the others come after them
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint between two bodies, or between one and the world.
+    """A joint between two bodies, or between one and the world."""
 
-    Attributes:
-        path: Path of its prim.
-        prim: Its prim.
-        kind: `hinge`, `slide`, `ball`, `fixed`, or `free` if it holds nothing.
-        axis: Its axis, in the joint frame.
-        bodies: Paths of body 0 and body 1; None is the world.
-        targets: Paths of the prims that it names, which may be below the bodies or static; or empty.
-        frames: The joint frame in the frames of body 0 and of body 1 [m]; they coincide at position zero.
-        range: Least and greatest position [rad or m], or None if it has no limits.
-        drive: What drives it.
-        is_excluded: Whether it is kept out of the articulation.
-        is_filtering: Whether the bodies must not collide; None leaves it to MuJoCo's own filter of parents and children.
-        is_stackable: Whether it adds its motion to that of other joints between the same two bodies.
-        constraint: If it is an equality constraint of MuJoCo, its schema; or empty.
-        is_active: Whether that constraint is active.
-        mjcf_attributes: More attributes of the MJCF joint, its own damping, armature and dry friction among them.
-    """
-
-    path: str
-    prim: Prim
-    kind: str
-    axis: Float[np.ndarray, " 3"]
-    bodies: tuple[str | None, str | None]
-    targets: tuple[str, str]
-    frames: tuple[Matrix, Matrix]
-    range: Range | None
-    drive: Drive | None
-    is_excluded: bool
+    path: str  # path of its prim
+    prim: Prim  # its prim
+    kind: str  # `hinge`, `slide`, `ball`, `fixed`, or `free` if it holds nothing
+    axis: Float[np.ndarray, " 3"]  # its axis, in the joint frame
+    bodies: tuple[str | None, str | None]  # paths of body 0 and body 1; None is the world
+    targets: tuple[str, str]  # paths of the prims that it names, which may be below the bodies or static; or empty
+    frames: tuple[Matrix, Matrix]  # the joint frame in the frames of body 0 and of body 1 [m]; they coincide at position zero
+    range: Range | None  # least and greatest position [rad or m], or None if it has no limits
+    drive: Drive | None  # what drives it
+    is_excluded: bool  # whether it is kept out of the articulation
+    # whether the bodies must not collide; None leaves it to MuJoCo's own filter of parents and children
     is_filtering: bool | None
-    is_stackable: bool
-    constraint: str
-    is_active: bool
-    mjcf_attributes: dict[str, str]
+    is_stackable: bool  # whether it adds its motion to that of other joints between the same two bodies
+    constraint: str  # if it is an equality constraint of MuJoCo, its schema; or empty
+    is_active: bool  # whether that constraint is active
+    mjcf_attributes: dict[str, str]  # more attributes of the MJCF joint, its own damping, armature and dry friction among them
 
     @property
     def reference(self) -> float:
@@ -104,12 +71,10 @@ class Joint:
 
     @property
     def is_passive(self) -> bool:
-        """Whether it has neither limits nor a drive, and nothing holds, damps or rubs it."""
         forces = (self.mjcf_attributes.get(name, "0").split() for name in FORCES)
         return not (self.range or self.drive or any(float(value) for values in forces for value in values))
 
     def pose(self, is_swapped: bool) -> Matrix:
-        """Return the pose of the child in its parent at position zero; body 0 is the child if swapped."""
         parent, child = self.frames[::-1] if is_swapped else self.frames
         return parent @ np.linalg.inv(child)
 
@@ -134,18 +99,13 @@ class Joint:
 
 
 def _wrapped(angle: float, limits: Range | None) -> float:
-    """Return the angle, or the same a turn on if only that is within the limits."""
     if limits is None:
         return angle
     return min((angle, angle - 2 * math.pi, angle + 2 * math.pi), key=lambda a: max(limits[0] - a, a - limits[1], 0.0))
 
 
 def read_joints(stage: Stage) -> list[Joint]:
-    """Read all enabled joints.
-
-    Raises:
-        RobotError: If a joint is one that MuJoCo does not have, or joins what does not exist.
-    """
+    """Read all enabled joints."""
     joints = []
     for prim in stage.prims:
         kind = str(prim.GetTypeName())
@@ -205,7 +165,6 @@ def _joint(stage: Stage, prim: Prim) -> Joint:
 
 
 def _is_filtering(stage: Stage, prim: Prim) -> bool | None:
-    """Return whether a joint keeps its bodies from colliding, or None if MuJoCo's scene decides and the joint says nothing."""
     if stage.scenes and stage.has(stage.scenes[0], "MjcSceneAPI") and stage.authored(prim, "physics:collisionEnabled") is None:
         return None
     return not stage.value(prim, "physics:collisionEnabled")
@@ -280,7 +239,6 @@ def _generic(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, " 3"], Ra
 
 
 def _range(low: float, high: float, unit: float) -> Range | None:
-    """Return a range in SI; a side without limit gets a far one if the other has one."""
     ends = tuple(math.copysign(FAR_LIMIT, end) if abs(end) >= INFINITE else end * unit for end in (low, high))
     return None if max(abs(low), abs(high)) >= INFINITE and min(abs(low), abs(high)) >= INFINITE else (ends[0], ends[1])
 
@@ -305,11 +263,7 @@ def _side(stage: Stage, prim: Prim, side: int) -> tuple[str | None, Matrix, str]
 
 
 def rotation_of(stage: Stage, prim: Prim, name: str) -> Rotation:
-    """Return the value of a quaternion attribute.
-
-    Raises:
-        RobotError: If it has no length.
-    """
+    """Return the value of a quaternion attribute."""
     value = stage.value(prim, name)
     quat = np.array([value.GetReal(), *value.GetImaginary()], dtype=np.float64)
     length = np.linalg.norm(quat)
@@ -332,15 +286,7 @@ def _drop_the_rest(stage: Stage, prim: Prim, instance: str) -> None:
 
 
 def _read_drive(stage: Stage, prim: Prim, instance: str, kind: str, joint_damping: float) -> tuple[Drive | None, float]:
-    """Return a joint's drive, if it has one that can exert a force, and the joint's own damping.
-
-    Args:
-        stage: The stage.
-        prim: The joint.
-        instance: Which drive is along its degree of freedom.
-        kind: `hinge` or `slide`.
-        joint_damping: The joint's own damping [N·m·s/rad or N·s/m], which is part of the drive's.
-    """
+    """Return a joint's drive, if it has one that can exert a force, and the joint's own damping."""
     if not prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, instance):
         return None, joint_damping
     stiffness, damping, max_force, target, velocity = (

@@ -16,28 +16,20 @@ from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import rotation_of
 from tgdsl.formats.usd.stage import Prim, Stage
 
-DENSITY = 1000.0
-"""What a collider weighs if nothing says so: UsdPhysics takes water [kg/m³]."""
-FALLBACK_RADIUS = 0.1
-"""Radius of the ball whose inertia a body with a mass, but neither inertia nor geometry, gets [m]."""
+DENSITY = 1000.0  # what a collider weighs if nothing says so: UsdPhysics takes water [kg/m³]
+FALLBACK_RADIUS = 0.1  # radius of the ball whose inertia a body with a mass, but neither inertia nor geometry, gets [m]
 Vector = Float[np.ndarray, "3"]
 Tensor = Float[np.ndarray, "3 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """Mass, centre of mass and inertia of a body, in its frame.
+    """Mass, centre of mass and inertia of a body, in its frame."""
 
-    Attributes:
-        mass: [kg].
-        centre: Centre of mass [m].
-        tensor: Inertia about it [kg·m²].
-        axes: Principal moments [kg·m²] and the rotation of their axes, if they are given in an order of their own.
-    """
-
-    mass: float
-    centre: Vector
-    tensor: Tensor
+    mass: float  # [kg]
+    centre: Vector  # centre of mass [m]
+    tensor: Tensor  # inertia about it [kg·m²]
+    # principal moments [kg·m²] and the rotation of their axes, if they are given in an order of their own
     axes: tuple[Vector, Rotation] | None = None
 
     def principal(self) -> tuple[Vector, Rotation]:
@@ -45,7 +37,6 @@ class Inertial:
         return self.ascending() if self.axes is None else self.axes
 
     def ascending(self) -> tuple[Vector, Rotation]:
-        """Return the same in ascending order."""
         moments, axes = np.linalg.eigh(self.tensor)
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         return moments, Rotation.from_matrix(axes)
@@ -68,20 +59,7 @@ class _Authored:
 
 
 def inertial_of(stage: Stage, body: Prim, geoms: Sequence[Gprim]) -> Inertial | None:
-    """Return the mass and inertia of a body, or None if it has neither mass nor colliders.
-
-    A body's mass overrules its colliders', a collider's density overrules its body's, and that its material's. A centre of
-    mass that is authored without an inertia is the point about which the colliders' inertia is taken, as in usd-core. What
-    `tgdsl:inertial` says of a mass or moments of zero, which USD takes for what is not given, holds while USD's mass is that.
-
-    Args:
-        stage: The stage.
-        body: The body's prim.
-        geoms: Its geoms.
-
-    Raises:
-        RobotError: If what is authored is no mass, or no inertia.
-    """
+    """Return the mass and inertia of a body, or None if it has neither mass nor colliders."""
     authored = _authored(stage, body)
     if (exact := _with_zeros(stage, body, authored)) is not None:
         return exact
@@ -150,7 +128,6 @@ def _full_tensor(stage: Stage, prim: Prim) -> Tensor | None:
 
 
 def _overruled(computed: Inertial, authored: _Authored) -> Inertial:
-    """Put an authored centre of mass and inertia in place of the computed ones."""
     centre = computed.centre if authored.centre is None else authored.centre
     return Inertial(computed.mass, centre, computed.about(centre) if authored.tensor is None else authored.tensor)
 
@@ -175,10 +152,7 @@ def _collider(stage: Stage, geom: Gprim, authored: _Authored, body_density: floa
 
 
 def _properties(stage: Stage, geom: Gprim) -> tuple[float, Vector, Tensor]:
-    """Return volume [m³], centre of mass [m] and inertia about it at density one, in the body's frame.
-
-    A shell is as thick as `newton:shellThickness` says; without that, its density is in kg/m², as in MuJoCo.
-    """
+    """Return volume [m³], centre of mass [m] and inertia about it at density one, in the body's frame."""
     if not geom.mass_model:
         return geom.shape.mass_properties(geom.is_hull)
     try:

@@ -61,14 +61,11 @@ from tgdsl.formats.usd.scene import add_scene
 from tgdsl.formats.usd.shapes import Shape, quaternion
 from tgdsl.formats.usd.stage import NAME_ATTRIBUTE, Matrix, Names, Stage, open_stage, unique_names
 
-AXIS_ARM = 0.05
-"""Distance between the two connect constraints along the axis of a revolute joint that closes a loop [m]."""
-REST_TOLERANCE = 1e-6
-"""Largest authored position without a keyframe [rad or m]: it is rounding of float32."""
+AXIS_ARM = 0.05  # distance between the two connect constraints along the axis of a revolute joint that closes a loop [m]
+REST_TOLERANCE = 1e-6  # largest authored position without a keyframe [rad or m]: it is rounding of float32
 VISIBLE, VISUAL, HIDDEN = "0", "2", "3"
 """Groups of geoms: colliders that are visible, visuals that do not collide, what is not visible."""
-FRICTION = (1.0, 0.005, 0.0001)
-"""MuJoCo's default friction of a geom."""
+FRICTION = (1.0, 0.005, 0.0001)  # MuJoCo's default friction of a geom
 
 
 def read_usd(path: Path) -> Model:
@@ -155,7 +152,6 @@ def _check(robot: _Robot) -> None:
 
 
 def _has_mass(robot: _Robot, path: str) -> bool:
-    """Return whether a body, or one that is welded below it, has mass."""
     welded = (node for node in robot.tree.children(path) if node.joint is not None and node.joint.kind == "fixed")
     return robot.inertials[path] is not None or any(_has_mass(robot, node.body) for node in welded)
 
@@ -273,10 +269,7 @@ class _Mjcf:
             element.set("rgba", text_of(geom.color))
 
     def _mesh(self, shape: Shape, name: str, attributes: Mapping[str, str]) -> str:
-        """Return the name of a shape's mesh, which is added if it is new: under its custom name, or else the given one.
-
-        Meshes are the same if they are in float32, which is MuJoCo's type.
-        """
+        """Return the name of a shape's mesh, which is added if it is new: under its custom name, or else the given one."""
         assert shape.vertices is not None and shape.faces is not None
         vertices = np.ascontiguousarray(shape.vertices + 0.0, dtype=np.float32)
         faces = np.ascontiguousarray(shape.faces, dtype=np.int64)
@@ -292,11 +285,7 @@ class _Mjcf:
         return names[key]
 
     def _add_exclusions(self, contact: ET.Element, flags: Mapping[str, str]) -> dict[str, str]:
-        """Add the pairs of bodies that do not collide; return the flags that this needs.
-
-        MuJoCo never collides a parent with its child. Where a joint says that they do, its filter is off, and all that it
-        would have kept apart is listed. What it never collides by itself is not.
-        """
+        """Add the pairs of bodies that do not collide; return the flags that this needs."""
         robot = self._robot
         nodes, (welded, parents) = robot.tree.nodes, filtered_pairs(robot.tree)
         is_on = flags.get("filterparent") != "disable"

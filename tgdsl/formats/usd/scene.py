@@ -22,18 +22,12 @@ from tgdsl.formats.usd.attributes import (
 )
 from tgdsl.formats.usd.stage import Prim, Stage
 
-GRAVITY = 9.81
-"""What a stage's scene means by earth gravity [m/s²]."""
-NEWTON_TIMESTEP = 0.001
-"""NewtonSceneAPI's default [s]."""
+GRAVITY = 9.81  # what a stage's scene means by earth gravity [m/s²]
+NEWTON_TIMESTEP = 0.001  # NewtonSceneAPI's default [s]
 
 
 def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[str, str]:
-    """Set gravity and the solver's settings as the first scene has them; return its flags.
-
-    Raises:
-        RobotError: If gravity is not finite.
-    """
+    """Set gravity and the solver's settings as the first scene has them; return its flags."""
     for scene in stage.scenes[1:]:
         stage.drop("physics scenes after the first one were dropped", scene)
     if not stage.scenes:

@@ -15,16 +15,12 @@ from tgdsl.formats.usd.stage import Matrix, Prim, Stage, rotation_and_scale
 from tgdsl.surfaces.holes import merged
 from tgdsl.surfaces.surface import Surface
 
-CIRCULAR = 1e-5
-"""Relative difference of two scales up to which a circle stays one: scales are often authored in float32."""
-CONVEX = 1e-3
-"""A closed mesh whose volume is less than its hull's by at most this share counts as convex."""
-FLAT = 1e-6
-"""A mesh whose thickness is at most this share of its length has no hull."""
+CIRCULAR = 1e-5  # relative difference of two scales up to which a circle stays one: scales are often authored in float32
+CONVEX = 1e-3  # a closed mesh whose volume is less than its hull's by at most this share counts as convex
+FLAT = 1e-6  # a mesh whose thickness is at most this share of its length has no hull
 SCHEMAS = ("Mesh", "Cube", "Sphere", "Capsule", "Capsule_1", "Cylinder", "Cylinder_1", "Cone", "Plane")
 """Geometry that can be read."""
-SECTIONS = 64
-"""Corners of a circle where a round shape becomes a mesh: its area is 0.16 % too small."""
+SECTIONS = 64  # corners of a circle where a round shape becomes a mesh: its area is 0.16 % too small
 Vertices = Float[np.ndarray, "vertex 3"]
 Faces = Int[np.ndarray, "face 3"]
 MassProperties = tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]
@@ -32,21 +28,13 @@ MassProperties = tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A shape in its body's frame.
+    """A shape in its body's frame."""
 
-    Attributes:
-        kind: MuJoCo's name of its type.
-        size: Its size as MuJoCo defines it [m].
-        pose: Its frame in the body frame [m].
-        vertices: Of a mesh, in the shape's frame [m].
-        faces: Of a mesh; they look outwards.
-    """
-
-    kind: str
-    size: tuple[float, ...]
-    pose: Matrix
-    vertices: Vertices | None = None
-    faces: Faces | None = None
+    kind: str  # MuJoCo's name of its type
+    size: tuple[float, ...]  # its size as MuJoCo defines it [m]
+    pose: Matrix  # its frame in the body frame [m]
+    vertices: Vertices | None = None  # of a mesh, in the shape's frame [m]
+    faces: Faces | None = None  # of a mesh; they look outwards
 
     @cached_property
     def hull(self) -> trimesh.Trimesh | None:
@@ -59,7 +47,6 @@ class Shape:
 
     @property
     def is_convex(self) -> bool:
-        """Whether a mesh is closed and fills its hull."""
         hull, closed = self.hull, self._closed
         return hull is not None and closed is not None and bool(closed.volume >= (1 - CONVEX) * hull.volume)
 
@@ -71,11 +58,7 @@ class Shape:
         return mesh if mesh.is_volume else None
 
     def mass_properties(self, is_hull: bool) -> MassProperties:
-        """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame.
-
-        Args:
-            is_hull: Whether the hull of a mesh counts, rather than the mesh; that of an open mesh always does.
-        """
+        """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame."""
         if self.kind != "mesh":
             return self.mujoco_mass_properties()
         solid = None if is_hull else self._closed
@@ -90,14 +73,7 @@ class Shape:
         )
 
     def mujoco_mass_properties(self, model: str = "") -> MassProperties:
-        """Return the same as MuJoCo computes it, or of a shell its area [m²].
-
-        Args:
-            model: One of MuJoCo's ways to take a mesh, or `shell` of another shape; empty for its volume.
-
-        Raises:
-            ValueError: If MuJoCo cannot take the mesh so.
-        """
+        """Return the same as MuJoCo computes it, or of a shell its area [m²]."""
         spec = mujoco.MjSpec()
         geom = spec.worldbody.add_body().add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{self.kind.upper()}"), density=1.0)
         geom.pos, geom.quat = self.pose[:3, 3], quaternion(self.pose)
@@ -117,16 +93,7 @@ class Shape:
 
 
 def shape_of(stage: Stage, prim: Prim, place: Matrix) -> Shape:
-    """Return the shape of a prim of `SCHEMAS`.
-
-    Args:
-        stage: The stage.
-        prim: The prim.
-        place: From the prim's space to the body's frame [m], scale and shear included.
-
-    Raises:
-        RobotError: If its mesh is broken, or its size is not positive.
-    """
+    """Return the shape of a prim of `SCHEMAS`."""
     schema = str(prim.GetTypeName())
     if schema == "Mesh":
         return mesh_shape(*read_mesh(stage, prim), place)
@@ -232,17 +199,7 @@ def _plane_shape(stage: Stage, prim: Prim, place: Matrix) -> Shape:
 
 
 def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tuple[Shape, bool]:
-    """Return what a mesh collides as, and whether that is the mesh's hull because of its `physics:approximation`.
-
-    Args:
-        stage: The stage.
-        prim: The prim of the mesh.
-        shape: The mesh itself.
-        place: From the prim's space to the body's frame [m], scale and shear included.
-
-    Raises:
-        RobotError: If it is flat, so that it has no hull.
-    """
+    """Return what a mesh collides as, and whether that is the mesh's hull because of its `physics:approximation`."""
     wanted = "none"
     if stage.has(prim, "PhysicsMeshCollisionAPI"):
         wanted = str(stage.value(prim, "physics:approximation"))
@@ -265,13 +222,7 @@ def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tu
 
 
 def read_mesh(stage: Stage, prim: Prim) -> tuple[Vertices, Faces]:
-    """Return the control cage of a mesh as triangles, in its own space and unit; its faces look outwards.
-
-    Subdivision and holes are ignored.
-
-    Raises:
-        RobotError: If it has no points or faces, or they are broken.
-    """
+    """Return the control cage of a mesh as triangles, in its own space and unit; its faces look outwards."""
     time = stage.pxr.Usd.TimeCode.EarliestTime()
     mesh = stage.pxr.UsdGeom.Mesh(prim)
     points, counts, indices = (
@@ -338,12 +289,7 @@ def _cross(a: Float[np.ndarray, " 2"], b: Float[np.ndarray, "*n 2"]) -> Float[np
 
 
 def surface_of_revolution(profile: list[tuple[float, float]], axis: str) -> tuple[Vertices, Faces]:
-    """Return the surface of a convex solid of revolution as triangles.
-
-    Args:
-        profile: Radius and height of its rings, from the lowest to the highest; a ring of radius zero is a tip.
-        axis: Its axis of revolution, X, Y or Z.
-    """
+    """Return the surface of a convex solid of revolution as triangles."""
     tips = [(0.0, profile[end][1]) for end in (0, -1) if profile[end][0]]
     outline = [*tips[:1], *profile, *tips[1:]] if profile[0][0] else [*profile, *tips]
     mesh = trimesh.creation.revolve(outline, sections=SECTIONS)
@@ -351,19 +297,11 @@ def surface_of_revolution(profile: list[tuple[float, float]], axis: str) -> tupl
 
 
 def rotation_from_z(axis: str) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation that takes z to an axis: a cyclic permutation."""
     return np.eye(3)[:, {"X": [1, 2, 0], "Y": [2, 0, 1], "Z": [0, 1, 2]}[axis]]
 
 
 def capsule_profile(radius: float, low: float, high: float, low_radius: float | None = None) -> list[tuple[float, float]]:
-    """Return the profile of the hull of two balls, for `surface_of_revolution`.
-
-    Args:
-        radius: Radius of the upper ball, and of the lower one too unless that is given.
-        low: Height of the lower ball's centre.
-        high: Height of the upper ball's centre.
-        low_radius: Radius of the lower ball.
-    """
+    """Return the profile of the hull of two balls, for `surface_of_revolution`."""
     low_radius = radius if low_radius is None else low_radius
     gap = high - low
     if gap <= abs(radius - low_radius):  # one holds the other
@@ -378,5 +316,4 @@ def capsule_profile(radius: float, low: float, high: float, low_radius: float | 
 
 
 def quaternion(matrix: Float[np.ndarray, "row row"]) -> Float[np.ndarray, " 4"]:
-    """Return a rotation matrix, or that of a rigid transform, as w, x, y, z."""
     return Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)

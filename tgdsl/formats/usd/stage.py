@@ -17,12 +17,9 @@ from jaxtyping import Float
 
 from tgdsl.errors import RobotError, listed
 
-Prim = Any
-"""A `pxr.Usd.Prim`: usd-core has no type stubs, and is only there if it is installed."""
-Matrix = Float[np.ndarray, "4 4"]
-"""A homogeneous transform of column vectors."""
-SHEAR = 1e-5
-"""Cosine between the axes of a prim from which on it counts as sheared: transforms are often authored in float32."""
+Prim = Any  # a `pxr.Usd.Prim`: usd-core has no type stubs, and is only there if it is installed
+Matrix = Float[np.ndarray, "4 4"]  # a homogeneous transform of column vectors
+SHEAR = 1e-5  # cosine between the axes of a prim from which on it counts as sheared: transforms are often authored in float32
 IMPLIED = {
     "MjcSceneAPI": ("NewtonSceneAPI",),
     "MjcSiteAPI": ("NewtonSiteAPI",),
@@ -40,18 +37,12 @@ IMPLIED = {
 """API schemas by those that build them in (MjcPhysics of mujoco-usd-converter 0.8, newton-usd-schemas 0.6); usd-core only knows
 this of schemas whose plugins are installed."""
 IMPLIED_PHYSICS = frozenset(name for names in IMPLIED.values() for name in names if name.startswith("Physics"))
-NAMESPACE = "tgdsl:"
-"""Namespace of the custom attributes that hold MJCF's values."""
-NAME_ATTRIBUTE = f"{NAMESPACE}name"
-"""A custom string attribute of a prim: the name that it has in MJCF."""
+NAMESPACE = "tgdsl:"  # namespace of the custom attributes that hold MJCF's values
+NAME_ATTRIBUTE = f"{NAMESPACE}name"  # a custom string attribute of a prim: the name that it has in MJCF
 
 
 def usd_modules() -> Any:
-    """Return usd-core's modules by their names; only this function imports them.
-
-    Raises:
-        RobotError: If usd-core is not installed.
-    """
+    """Return usd-core's modules by their names; only this function imports them."""
     try:
         from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
     except ImportError as error:
@@ -63,20 +54,13 @@ def usd_modules() -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A composed stage.
+    """A composed stage."""
 
-    Attributes:
-        file: The file that it came from.
-        usd: The `pxr.Usd.Stage`.
-        pxr: The modules of usd-core.
-        dropped: Prim paths by what was dropped of them, in the order found.
-        read: Path of the prim and name of each attribute and relationship that was read.
-    """
-
-    file: Path
-    usd: Any
-    pxr: Any
-    dropped: dict[str, list[str]] = field(default_factory=dict)
+    file: Path  # the file that it came from
+    usd: Any  # the `pxr.Usd.Stage`
+    pxr: Any  # the modules of usd-core
+    dropped: dict[str, list[str]] = field(default_factory=dict)  # prim paths by what was dropped of them, in the order found
+    # path of the prim and name of each attribute and relationship that was read
     read: set[tuple[str, str]] = field(default_factory=set)
 
     @cached_property
@@ -91,7 +75,6 @@ class Stage:
 
     @cached_property
     def bodies(self) -> dict[str, Prim]:
-        """Prims of the rigid bodies, by path."""
         prims = {str(prim.GetPath()): prim for prim in self.prims if self.has(prim, "PhysicsRigidBodyAPI")}
         return {path: prim for path, prim in prims.items() if self.value(prim, "physics:rigidBodyEnabled")}
 
@@ -106,7 +89,6 @@ class Stage:
 
     @cached_property
     def kinematic(self) -> dict[str, bool]:
-        """Whether each body is kinematic."""
         return {path: bool(self.value(prim, "physics:kinematicEnabled")) for path, prim in self.bodies.items()}
 
     @cached_property
@@ -115,7 +97,6 @@ class Stage:
         return {path: self.frame(prim)[0] for path, prim in self.bodies.items()}
 
     def in_body(self, pose: Matrix, body: str | None) -> Matrix:
-        """Return a pose in the world as one in a body's frame; None is the world."""
         return pose if body is None else np.linalg.inv(self.body_frames[body]) @ pose
 
     @cached_property
@@ -124,27 +105,22 @@ class Stage:
 
     @cached_property
     def scenes(self) -> tuple[Prim, ...]:
-        """All physics scenes."""
         return tuple(prim for prim in self.prims if prim.IsA(self.pxr.UsdPhysics.Scene))
 
     @cached_property
     def is_mjcf_in_degrees(self) -> bool:
-        """Whether `mjc:` attributes of hinges that MJCF counts in its compiler's angle are in degrees."""
         return not self.scenes or self.authored(self.scenes[0], "mjc:compiler:angle") != "radian"
 
     @cached_property
     def is_mjcf_autolimited(self) -> bool:
-        """Whether `mjc:` attributes that are limits hold wherever they are a range."""
         return not self.scenes or self.authored(self.scenes[0], "mjc:compiler:autoLimits") is not False
 
     @cached_property
     def mobility_roots(self) -> tuple[str, ...]:
-        """Paths of the articulations whose joints add mobility, rather than constrain it."""
         return tuple(str(prim.GetPath()) for prim in self.prims if self.authored(prim, "newton:jointsAddMobility"))
 
     @cached_property
     def prims(self) -> tuple[Prim, ...]:
-        """All defined, active, loaded prims, those inside instances too, in stage order."""
         usd = self.pxr.Usd
         return tuple(usd.PrimRange(self.usd.GetPseudoRoot(), usd.TraverseInstanceProxies()))[1:]
 
@@ -167,10 +143,7 @@ class Stage:
         return self.pxr.UsdGeom.XformCache(self._time)
 
     def value(self, prim: Prim, name: str) -> Any:
-        """Return an attribute's value, the schema's own where none is authored, or None where there is no such attribute.
-
-        Where it is what its double twin `tgdsl:<name>` rounds to, that is returned.
-        """
+        """Return an attribute's value, the schema's own where none is authored, or None where there is no such attribute."""
         attribute, twin = prim.GetAttribute(name), prim.GetAttribute(f"{NAMESPACE}{name}")
         self.note(prim, name, f"{NAMESPACE}{name}")
         value = attribute.Get(self._time) if attribute else None
@@ -180,19 +153,16 @@ class Stage:
         return value if exact is None or not _is_rounded(exact, value) else exact
 
     def authored(self, prim: Prim, name: str) -> Any:
-        """Return an attribute's value if it is authored, or else None."""
         attribute = prim.GetAttribute(name)
         self.note(prim, name)
         return self.value(prim, name) if attribute and attribute.HasAuthoredValue() else None
 
     def targets(self, prim: Prim, name: str) -> list[Any]:
-        """Return the paths that a relationship names, through those that it forwards to."""
         self.note(prim, name)
         relationship = prim.GetRelationship(name)
         return list(relationship.GetForwardedTargets()) if relationship else []
 
     def note(self, prim: Prim, *names: str) -> None:
-        """Record that attributes or relationships were read."""
         path = str(prim.GetPath())
         self.read.update((path, name) for name in names)
 
@@ -207,7 +177,6 @@ class Stage:
         return self._schemas[path]
 
     def has(self, prim: Prim, schema: str) -> bool:
-        """Return whether a prim has an API schema, or one that implies it."""
         return schema in self.schemas(prim)
 
     def _fallback(self, prim: Prim, name: str) -> Any:
@@ -227,22 +196,14 @@ class Stage:
         return default if value is None else float(value)
 
     def pose(self, prim: Prim) -> Matrix:
-        """Return the transform from a prim's space to the world in metres with Z up, scale and shear included.
-
-        Raises:
-            RobotError: If it is not finite.
-        """
+        """Return the transform from a prim's space to the world in metres with Z up, scale and shear included."""
         matrix = np.eye(4) if prim.IsPseudoRoot() else np.array(self._poses.GetLocalToWorldTransform(prim), dtype=np.float64).T
         if not np.isfinite(matrix).all():
             raise self.error(prim, "its transform is not finite")
         return self.world_from_stage @ matrix
 
     def frame(self, prim: Prim) -> tuple[Matrix, Float[np.ndarray, " 3"]]:
-        """Return a prim's rigid frame in the world [m] and the scale [m per unit of its space] along its axes.
-
-        Raises:
-            RobotError: If the prim is sheared or flat, and so has no frame.
-        """
+        """Return a prim's rigid frame in the world [m] and the scale [m per unit of its space] along its axes."""
         pose = self.pose(prim)
         split = rotation_and_scale(pose[:3, :3])
         if split is None:
@@ -252,11 +213,9 @@ class Stage:
         return rigid, scale
 
     def error(self, prim: Prim, what: str) -> RobotError:
-        """Return an error that names the file and the prim."""
         return RobotError(f"{self.file}: {prim.GetPath()}: {what}")
 
     def drop(self, what: str, prim: Prim) -> None:
-        """Record what MuJoCo cannot hold, for a warning when the stage is closed."""
         paths = self.dropped.setdefault(what, [])
         if (path := str(prim.GetPath())) not in paths:
             paths.append(path)
@@ -287,13 +246,7 @@ def rotation_and_scale(linear: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarr
 
 @contextmanager
 def open_stage(path: Path) -> Iterator[Stage]:
-    """Open a stage, with all that it refers to; at the end warn once of each kind of thing that was dropped.
-
-    USD's diagnostics become warnings.
-
-    Raises:
-        RobotError: If it is not USD, or something that it refers to does not resolve.
-    """
+    """Open a stage, with all that it refers to; at the end warn once of each kind of thing that was dropped."""
     modules = usd_modules()
     printed = modules.UsdUtils.CoalescingDiagnosticDelegate()
     try:
@@ -316,7 +269,6 @@ def open_stage(path: Path) -> Iterator[Stage]:
 
 
 def _message(error: Exception) -> str:
-    """Return the text of a USD error without file names and lines of its sources."""
     lines = [line.partition(" : ")[2].strip("' ") for line in str(error).splitlines() if " : " in line]
     return " ".join("; ".join(dict.fromkeys(lines)).split())
 
@@ -332,35 +284,19 @@ def _check_composition(stage: Stage) -> None:
 
 @dataclass(frozen=True)
 class Names:
-    """Names in MJCF of what a stage holds, by the paths of the prims.
+    """Names in MJCF of what a stage holds, by the paths of the prims."""
 
-    Attributes:
-        bodies: Of bodies.
-        geoms: Of geoms.
-        sites: Of sites.
-        joints: Of all joints.
-        moving: Of the joints of the tree that are not fixed.
-        scalars: Of its hinges and slides.
-        tendons: Of tendons.
-    """
-
-    bodies: dict[str, str]
-    geoms: dict[str, str]
-    sites: dict[str, str]
-    joints: dict[str, str]
-    moving: dict[str, str]
-    scalars: dict[str, str]
-    tendons: dict[str, str] = field(default_factory=dict)
+    bodies: dict[str, str]  # of bodies
+    geoms: dict[str, str]  # of geoms
+    sites: dict[str, str]  # of sites
+    joints: dict[str, str]  # of all joints
+    moving: dict[str, str]  # of the joints of the tree that are not fixed
+    scalars: dict[str, str]  # of its hinges and slides
+    tendons: dict[str, str] = field(default_factory=dict)  # of tendons
 
 
 def unique_names(stage: Stage, prims: Iterable[Prim], reserved: Iterable[str] = ()) -> dict[str, str]:
-    """Return a name for each prim path: the authored `tgdsl:name`, or the end of the path, as long as it takes to be unique.
-
-    Args:
-        stage: The stage.
-        prims: What to name, in stage order.
-        reserved: Names that are taken.
-    """
+    """Return a name for each prim path: the authored `tgdsl:name`, or the end of the path, as long as it takes to be unique."""
     prims, taken = list(prims), Counter(reserved)
     names: dict[str, str] = {}
     for prim in prims:

@@ -29,14 +29,10 @@ ONE_SIDED, LEANING = 2.99, 1.49
 """A joint bends one way, or leans to one, if its range from the start is this many times longer on one side.
 
 No ratios that people draw, as -30 to 90 degrees is: the last bits of a range shall not decide. The same holds for the angle."""
-SYMMETRIC = 0.05
-"""Limits are the same both ways if their middle is nearer to zero than half this share of the range."""
-MIN_CLOSING = 0.03
-"""Least share by which the tips must draw nearer for an end of a joint's range to count as closed."""
-MIN_BEND = np.radians(29.9)
-"""A hinge that turns by less than this does not close a finger, but shapes a palm."""
-PARALLEL = 0.7
-"""Least cosine of the angle between two axes about which a finger curls."""
+SYMMETRIC = 0.05  # limits are the same both ways if their middle is nearer to zero than half this share of the range
+MIN_CLOSING = 0.03  # least share by which the tips must draw nearer for an end of a joint's range to count as closed
+MIN_BEND = np.radians(29.9)  # a hinge that turns by less than this does not close a finger, but shapes a palm
+PARALLEL = 0.7  # least cosine of the angle between two axes about which a finger curls
 EVENLY = 0.4
 """Mean squared cosine of axes to the second direction of their plane from which on they are spokes: 1/2 if evenly spread."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -44,19 +40,12 @@ _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 @dataclass(frozen=True)
 class Motion:
-    """How a joint that can be set by itself closes a hand.
+    """How a joint that can be set by itself closes a hand."""
 
-    Attributes:
-        opened: Its value when open [rad, of slides m].
-        closed: Its value when closed.
-        is_curling: Whether it bends a finger of several joints.
-        doubt: What speaks against it; empty if nothing does.
-    """
-
-    opened: float
-    closed: float
-    is_curling: bool
-    doubt: str = ""
+    opened: float  # its value when open [rad, of slides m]
+    closed: float  # its value when closed
+    is_curling: bool  # whether it bends a finger of several joints
+    doubt: str = ""  # what speaks against it; empty if nothing does
 
 
 class Closing:
@@ -91,12 +80,10 @@ class Closing:
         self.motions = {joint: motion for joint, motion in motions.items() if motion is not None}
 
     def pose(self, share: float) -> Float[np.ndarray, " qpos"]:
-        """Return the pose in which all joints that close are closed by a share; the others are as at the start."""
         values = {joint: (1.0 - share) * m.opened + share * m.closed for joint, m in self.motions.items()}
         return self.poses.pose(values)
 
     def segment(self, joint: int) -> int:
-        """Return the segment that a joint moves against its parent."""
         return self.tree.segment[int(self.tree.model.jnt_bodyid[joint])]
 
     def _can_close(self, joint: int) -> bool:
@@ -113,16 +100,12 @@ class Closing:
         return self._range(joint)[1 if sense > 0 else 0]
 
     def _sides(self, joint: int) -> tuple[float, float]:
-        """Return how far a joint can go from its start to the low and to the high end."""
         start = float(self.poses.start[self.poses.at(joint)])
         low, high = self._range(joint)
         return max(start - low, 0.0), max(high - start, 0.0)
 
     def _lean(self, joint: int) -> float:
-        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide.
-
-        One with limits that are the same both ways bends to neither side, even if it starts at one of them.
-        """
+        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide."""
         down, up = self._sides(joint)
         low, high = self._range(joint)
         if abs(low + high) < SYMMETRIC * (high - low):
@@ -164,7 +147,6 @@ class Closing:
         return any(sign * cosine > PARALLEL for cosine in self._cosines(one, two))
 
     def is_opposed(self, joint: int) -> bool:
-        """Return whether a joint turns hinges of one finger in opposite senses, as that of a parallel linkage does."""
         return any(cosine < -PARALLEL for cosine in self._cosines(joint, joint))
 
     def _cosines(self, one: int, two: int) -> list[float]:
@@ -195,15 +177,7 @@ class Closing:
         return results
 
     def _spreading(self, free: Set[int], one_way: Set[int]) -> set[int]:
-        """Return the joints that spread fingers: about axes across those of the hinges beyond, which bend one way or alike.
-
-        They are those of two fingers or more with parallel axes, and those of all fingers around a palm. A thumb's, which no
-        other finger has, may bring it before the palm.
-
-        Args:
-            free: Hinges that bend to neither side.
-            one_way: Joints that bend one way only.
-        """
+        """Return the joints that spread fingers: about axes across those of the hinges beyond, which bend one way or alike."""
         alike = {one for one in free for other in free if any(abs(cosine) > PARALLEL for cosine in self._cosines(one, other))}
         path = {other: self.tree.path(self.segment(other)) for other in one_way | alike}
         axes = []
@@ -250,19 +224,16 @@ class Closing:
         return (at_low - at_high) / max(at_low, at_high, 1e-9)
 
     def _points(self, values: Mapping[int, float]) -> Float[np.ndarray, "point 3"]:
-        """Return the centres of the tips, and of the palm if there is one, in the world [m]."""
         data = self.poses.kinematics(self.poses.pose(values))
         bodies = [*self.hand.tips, *([self.hand.palm] if self.hand.palm is not None else [])]
         return np.array([self.tree.centre(body, data) for body in bodies]).reshape(-1, 3)
 
 
 def _is_clear(half: float, whole: float) -> bool:
-    """Return whether two gains, with the other joints half closed and closed, agree, or one by far outweighs the other."""
     small, large = sorted((abs(half), abs(whole)))
     return large > MIN_CLOSING and (half * whole > 0 or small < 0.5 * large)
 
 
 def _are_around(axes: Sequence[Float[np.ndarray, " 3"]]) -> bool:
-    """Return whether axes, as lines, are spread evenly around a third direction, as spokes are."""
     spread = np.linalg.eigvalsh(np.mean([np.outer(axis, axis) for axis in axes], axis=0))
     return bool(spread[1] > EVENLY)

@@ -23,33 +23,24 @@ single jaw."""
 LINK_SNAP, PALM_SNAP = np.radians(30.1), np.radians(40.1)
 """A direction this close to an axis of the link's frame is taken to be that axis; a palm's that is farther is not taken.
 No angles that people draw: the last bits of a pose shall not decide."""
-STEP = 0.02
-"""Share of its way by which a joint closes to see where a link goes."""
-MIN_COSINE = 0.5
-"""Least cosine of the angle between directions to which fingers curl for these to say where the palm faces."""
+STEP = 0.02  # share of its way by which a joint closes to see where a link goes
+MIN_COSINE = 0.5  # least cosine of the angle between directions to which fingers curl for these to say where the palm faces
 PARALLEL, BESIDE = 0.99, 0.25
 """A bar beside a finger turns about an axis with at least this cosine to the finger's, nearer than this share of its length."""
-ALONG = 0.3
-"""Least cosine of the angle between where a link faces and where its own hinge carries it; else its side is weak."""
+ALONG = 0.3  # least cosine of the angle between where a link faces and where its own hinge carries it; else its side is weak
 ALONG_HINGE = 0.7
 """Least cosine of the angle between where a link faces and the axis of a hinge beyond: fingers bend across their hinges."""
 ACROSS = "its own hinge carries it across the side that it faces"
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
-UNCLEAR = "which side is the inner one is not clear"
-"""Why a link has no inner side, where nothing better is known."""
+UNCLEAR = "which side is the inner one is not clear"  # why a link has no inner side, where nothing better is known
 
 
 @dataclass(frozen=True)
 class InnerSide:
-    """Where a link's inner side faces.
+    """Where a link's inner side faces."""
 
-    Attributes:
-        facing: Direction in the link's frame; None if it is not clear.
-        doubt: What speaks against it, or why it is not clear; empty if nothing does.
-    """
-
-    facing: tuple[float, ...] | None
-    doubt: str = ""
+    facing: tuple[float, ...] | None  # direction in the link's frame; None if it is not clear
+    doubt: str = ""  # what speaks against it, or why it is not clear; empty if nothing does
 
 
 class Flexion:
@@ -67,18 +58,15 @@ class Flexion:
 
     @property
     def num_closing(self) -> int:
-        """How many chains close."""
         moved = {self.closing.chain[self.closing.segment(j)] for step in self.steps.values() for j in self._moving_joints(step)}
         return len(moved)
 
     @property
     def tips(self) -> list[int]:
-        """Bodies at the ends of the fingers, those that are bars of linkages left out; of a single jaw, both jaws."""
         fixed = [] if self.hand.jaw is None else [self.hand.jaw]
         return [*fixed, *(tip for tip in self.hand.tips if self.tree.segment[tip] not in self.bars)]
 
     def motion(self) -> dict[int, tuple[float, float]]:
-        """Return the open and closed end of each hinge and slide that closes, those that others drive included."""
         poses = self.closing.poses
         moved = {j for step in self.steps.values() for j in self._moving_joints(step)}
         return {j: (float(self.open[poses.at(j)]), float(self.shut[poses.at(j)])) for j in sorted(moved)}
@@ -114,11 +102,7 @@ class Flexion:
         return is_across and not any(self._is_along_hinge(segment, along) for along in carried / lever[:, None])
 
     def _bars(self) -> dict[int, int]:
-        """Return the segments that are alone in their chain and are driven with a longer chain beside them, and its first.
-
-        They are the second bars of parallel linkages, whose loop a tree of links leaves open. Where nothing would be left for
-        a hand to close on, none is.
-        """
+        """Return the segments that are alone in their chain and are driven with a longer chain beside them, and its first."""
         chains = self.hand.chains
         single, longer = ([chain[0] for chain in chains if (len(chain) == 1) == is_single] for is_single in (True, False))
         bars = {s: other for s in single for other in longer if self._is_bar(s, other)}
@@ -136,13 +120,11 @@ class Flexion:
         return float(np.linalg.norm(one - two)) < BESIDE * length_of(self.tree, other)
 
     def _turn(self, pose: Float[np.ndarray, " qpos"], segment: int) -> Float[np.ndarray, " 3"]:
-        """Return how far a segment turns against its parent from the open pose to one near to it, about its axes [rad]."""
         joints = [joint for joint in self.tree.joints(segment) if joint in self.closing.poses.joints]
         at = [self.closing.poses.at(joint) for joint in joints]
         return (pose[at] - self.open[at]) @ self._frames(self.open).xaxis[joints] if joints else np.zeros(3)
 
     def _step(self, joint: int) -> Float[np.ndarray, " qpos"]:
-        """Return the open pose with one joint a small step closed."""
         values = {other: motion.opened for other, motion in self.closing.motions.items()}
         values[joint] += STEP * (self.closing.motions[joint].closed - values[joint])
         return self.closing.poses.pose(values)
@@ -182,11 +164,7 @@ class Flexion:
         return sum(self.tree.area[body] for body in self.tree.bodies[segment])
 
     def _flexor(self, segment: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
-        """Return where a segment faces in the world in the open pose, and the joint that says so.
-
-        It faces where that joint carries it, unless this is along the axis of a hinge beyond, such as of a thumb that is
-        brought before the palm: it then takes the side of the nearest segment beyond that has one.
-        """
+        """Return where a segment faces in the world in the open pose, and the joint that says so."""
         carried = self._carry_direction(segment)
         if carried is not None and not self._is_along_hinge(segment, carried[1]):
             return carried
@@ -200,7 +178,6 @@ class Flexion:
         return carried
 
     def _is_along_hinge(self, segment: int, along: Float[np.ndarray, " 3"]) -> bool:
-        """Return whether a direction in the open pose is along the axis of a hinge beyond a segment that closes."""
         data, beyond = self._frames(self.open), set(self.tree.below(segment))
         hinges = [j for j in self.motion() if self.closing.segment(j) in beyond and int(self.tree.model.jnt_type[j]) == _HINGE]
         return bool((np.abs(data.xaxis[hinges] @ along) > ALONG_HINGE).any())
@@ -274,7 +251,6 @@ class Flexion:
         return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 
     def _toward(self, start: Float[np.ndarray, " 3"], body: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
-        """Return the direction from a place to the middle of tips in a body's frame, all joints closed by a share."""
         data = self._frames(self.closing.pose(share))
         toward = np.mean([self.tree.centre(tip, data) for tip in tips], axis=0) - start
         return data.xmat[body].reshape(3, 3).T @ toward / max(float(np.linalg.norm(toward)), 1e-9)

@@ -15,34 +15,20 @@ from tgdsl.placement.propose.hands import KinematicTree, anchor
 from tgdsl.surfaces.rays import OrthographicView, first_hits, frame
 from tgdsl.surfaces.surface import Surface
 
-WITHIN_DEG = 75
-"""Largest angle between a normal and the inner side of its link [deg]."""
-RASTER = 40
-"""Rays along the longer side of a surface."""
-GAP = 2e-4
-"""What is closer in front of a surface than this is not in front of it [m]."""
-MIN_SHARE = 0.1
-"""Least share of what faces an inner side, and of a link's surface, to be believed."""
+WITHIN_DEG = 75  # largest angle between a normal and the inner side of its link [deg]
+RASTER = 40  # rays along the longer side of a surface
+GAP = 2e-4  # what is closer in front of a surface than this is not in front of it [m]
+MIN_SHARE = 0.1  # least share of what faces an inner side, and of a link's surface, to be believed
 MARGIN, LEVEL, TOWER, AHEAD = 0.15, 0.2, 0.25, 0.1
 """Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, how high
 above the joints of the fingers a tower is, and how far beside the middle of a palm the fingers must begin to be ahead of it."""
-HALF = 0.5
-"""A part of a palm is in front by this share, and has this share of the largest part's area."""
+HALF = 0.5  # a part of a palm is in front by this share, and has this share of the largest part's area
 
 
 def front_of(
     tree: KinematicTree, body: int, facing: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "point 3"], Bool[np.ndarray, " point"]]:
-    """Return evenly spaced points of a body, and whether no other body of its segment is in front of them.
-
-    Args:
-        tree: The robot.
-        body: The body.
-        facing: Direction in its frame against which it is seen.
-
-    Returns:
-        The points in the body's frame [m], and whether they are free.
-    """
+    """Return evenly spaced points of a body, and whether no other body of its segment is in front of them."""
     direction = np.array(facing) / np.linalg.norm(facing)
     axes, view = frame(-direction), OrthographicView.of(tree.surface[body], frame(-direction))
     corners = view.corners[..., :2].reshape(-1, 2)
@@ -76,7 +62,6 @@ def hidden(flexion: Flexion) -> list[int]:
 
 
 def palm_parts(flexion: Flexion) -> list[int]:
-    """Return the palm, and the bodies fixed to it that are as large by `HALF`."""
     hand, area = flexion.hand, flexion.tree.area
     return [] if hand.palm is None else [body for body in hand.mounts if area[body] >= HALF * area[hand.palm]]
 
@@ -117,13 +102,7 @@ class PalmFront:
         return [body for body in tree.bodies[hand.base] if body == hand.palm or self._is_in_front(body, level, heel)]
 
     def _is_in_front(self, body: int, level: float | None, heel: float) -> bool:
-        """Return whether a body is in front.
-
-        Args:
-            body: The body.
-            level: Height of the palm; None if all of it is behind other bodies.
-            heel: Where the palm begins, in the direction from its middle to the joints of the fingers.
-        """
+        """Return whether a body is in front."""
         free, place, is_beside = self._points(body)
         tree, hand = self.flexion.tree, self.flexion.hand
         assert hand.palm is not None

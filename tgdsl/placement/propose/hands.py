@@ -26,14 +26,11 @@ from tgdsl.formats.model import Model
 from tgdsl.placement.propose.limits import as_meant
 from tgdsl.surfaces.surface import Surface
 
-MAX_FINGER = 0.35
-"""A longer chain is an arm or a leg, of which nothing closes [m]."""
+MAX_FINGER = 0.35  # a longer chain is an arm or a leg, of which nothing closes [m]
 MAX_STEM = 1.5
 """Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
-MIN_TIP = 0.1
-"""Least surface of a fingertip, as a share of the largest body fixed to it."""
-JAW_REACH = 0.5
-"""A fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed."""
+MIN_TIP = 0.1  # least surface of a fingertip, as a share of the largest body fixed to it
+JAW_REACH = 0.5  # a fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed
 MIN_JAW_TURN, MAX_JAW_TURN = np.radians(19.9), np.radians(200.1)
 """A jaw that turns by less does not grip, and what turns by more is a wrist; no angles that people draw."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -42,17 +39,11 @@ _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 @dataclass(frozen=True, eq=False)
 class KinematicTree:
-    """The segments of a robot, and the surface that their bodies carry.
+    """The segments of a robot, and the surface that their bodies carry."""
 
-    Attributes:
-        model: MuJoCo's model, with the limits of its joints as they are meant.
-        surface: Surface of each body that has one, in the body's frame.
-        doubt: What speaks against the limits of its joints; empty if nothing does.
-    """
-
-    model: mujoco.MjModel
-    surface: Mapping[int, Surface]
-    doubt: str = ""
+    model: mujoco.MjModel  # MuJoCo's model, with the limits of its joints as they are meant
+    surface: Mapping[int, Surface]  # surface of each body that has one, in the body's frame
+    doubt: str = ""  # what speaks against the limits of its joints; empty if nothing does
 
     @cached_property
     def area(self) -> dict[int, float]:
@@ -69,14 +60,12 @@ class KinematicTree:
 
     @cached_property
     def segment(self) -> list[int]:
-        """The segment of each body; what is fixed to the world belongs to the topmost body that it is fixed to."""
         model = self.model
         weld, root = model.body_weldid.tolist(), model.body_rootid.tolist()
         return [w or r for w, r in zip(weld, root, strict=True)]
 
     @cached_property
     def parent(self) -> dict[int, int]:
-        """The parent of each segment; 0 for the first of a tree. In depth-first order."""
         above = self.model.body_parentid
         return {s: self.segment[above[s]] if above[s] else 0 for s in sorted(set(self.segment) - {0})}
 
@@ -90,7 +79,6 @@ class KinematicTree:
 
     @cached_property
     def carries(self) -> set[int]:
-        """The segments that have surface, or whose descendants have."""
         return {above for segment, bodies in self.bodies.items() if bodies for above in self.path(segment)}
 
     def path(self, segment: int) -> list[int]:
@@ -102,15 +90,12 @@ class KinematicTree:
         return results
 
     def children(self, segment: int) -> list[int]:
-        """Return the children of a segment that have surface."""
         return [child for child, parent in self.parent.items() if parent == segment and child in self.carries]
 
     def below(self, segment: int) -> list[int]:
-        """Return the descendants of a segment; all segments for the world."""
         return [s for s in self.parent if s != segment and (not segment or segment in self.path(s))]
 
     def joints(self, segment: int) -> list[int]:
-        """Return the joints that move a segment against its parent."""
         first, count = int(self.model.body_jntadr[segment]), int(self.model.body_jntnum[segment])
         return list(range(first, first + count))
 
@@ -134,7 +119,6 @@ class KinematicTree:
 
     @cached_property
     def start(self) -> mujoco.MjData:
-        """The robot's start."""
         data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, data)
         return data
@@ -164,38 +148,21 @@ class KinematicTree:
 
 @dataclass(frozen=True, eq=False)
 class Hand:
-    """Palm, fingers and tips found in a kinematic tree.
+    """Palm, fingers and tips found in a kinematic tree."""
 
-    Attributes:
-        base: Segment from which the chains part; 0 if that is the world.
-        mounts: Bodies of it that have surface; where chains part, without those before the one that carries them.
-        palm: The largest of these, of those that carry all chains if any does; None if there is none or only one chain.
-        chains: Segments of each chain.
-        tips: Bodies at the ends of the chains.
-        fingers: All bodies that move against the base, tips included.
-        length: Length of the longest chain [m].
-        jaw: Of a gripper of one jaw, the body of the base that this closes on.
-        closes: Toward which end of its range, ±1, this jaw closes; 0 of other hands.
-    """
-
-    base: int
-    mounts: list[int]
+    base: int  # segment from which the chains part; 0 if that is the world
+    mounts: list[int]  # bodies of it that have surface; where chains part, without those before the one that carries them
+    # the largest of these, of those that carry all chains if any does; None if there is none or only one chain
     palm: int | None
-    chains: list[list[int]]
-    tips: list[int]
-    fingers: list[int]
-    length: float
-    jaw: int | None = None
-    closes: float = 0.0
+    chains: list[list[int]]  # segments of each chain
+    tips: list[int]  # bodies at the ends of the chains
+    fingers: list[int]  # all bodies that move against the base, tips included
+    length: float  # length of the longest chain [m]
+    jaw: int | None = None  # of a gripper of one jaw, the body of the base that this closes on
+    closes: float = 0.0  # toward which end of its range, ±1, this jaw closes; 0 of other hands
 
 
 def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTree:
-    """Return the tree of a robot.
-
-    Args:
-        robot: The robot.
-        surface: Surface of each body that has one, in the body's frame, by name.
-    """
     model = as_meant(robot.compiled)
     return KinematicTree(model, {int(model.body(name).id): mesh for name, mesh in surface.items()})
 
@@ -209,7 +176,6 @@ def _hull_area(surface: Surface) -> float:
 
 
 def free_standing(tree: KinematicTree) -> list[int]:
-    """Return the bodies with surface that are scenery if others are not: single segments, fixed or floating."""
     roots = [segment for segment, parent in tree.parent.items() if not parent]
     single = {root for root in roots if root not in tree.parent.values() and not _is_driven(tree, root)}
     return [] if single >= tree.carries else [body for segment in sorted(single) for body in tree.bodies[segment]]
@@ -232,16 +198,12 @@ def loose_parts(tree: KinematicTree) -> list[int]:
 
 
 def _is_driven(tree: KinematicTree, segment: int) -> bool:
-    """Return whether a segment has one or two hinges and slides: none stands still, more let it go anywhere."""
     kinds = [int(tree.model.jnt_type[joint]) for joint in tree.joints(segment)]
     return 0 < len(kinds) < 3 and int(mujoco.mjtJoint.mjJNT_FREE) not in kinds
 
 
 def hands(tree: KinematicTree) -> list[Hand]:
-    """Return the candidates for hands; trees that a hinge or slide joins to the world make up one.
-
-    A tree without two chains that part is one candidate as a whole, without a palm, or its grippers with one jaw if it has any.
-    """
+    """Return the candidates for hands; trees that a hinge or slide joins to the world make up one."""
     left_out = set(free_standing(tree))
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
     bases = {root: _bases(tree, [root, *tree.below(root)]) for root in roots}
@@ -261,12 +223,7 @@ def _with_jaws(tree: KinematicTree, hand: Hand) -> list[Hand]:
 
 
 def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
-    """Return the gripper whose moving jaw is a segment; None if it is no jaw.
-
-    A jaw is the only child of its parent, carries nothing, and turns on one hinge. It points away from where the parent is
-    carried; a forearm that folds onto its upper arm points back. It is closed at the end of the hinge's range where its
-    parent's surface reaches farther in the jaw's direction.
-    """
+    """Return the gripper whose moving jaw is a segment; None if it is no jaw."""
     parent, joints, model = tree.parent[segment], tree.joints(segment), tree.model
     if not parent or len(joints) != 1 or tree.children(segment) or len(tree.children(parent)) != 1 or not tree.bodies[parent]:
         return None
@@ -287,10 +244,7 @@ def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
 
 
 def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[int, float]:
-    """Return how far bodies of a jaw and of its parent reach beyond the hinge in the jaw's direction [m].
-
-    Empty if the jaw points back to where the parent is carried.
-    """
+    """Return how far bodies of a jaw and of its parent reach beyond the hinge in the jaw's direction [m]."""
     data, segment = mujoco.MjData(tree.model), tree.segment[int(tree.model.jnt_bodyid[joint])]
     data.qpos[:] = tree.model.qpos0
     data.qpos[tree.model.jnt_qposadr[joint]] = value
@@ -394,10 +348,7 @@ def _chains(tree: KinematicTree, base: int, beyond: Sequence[int]) -> list[list[
 
 
 def _ends(tree: KinematicTree, base: int, chain: Sequence[int], middle: Float[np.ndarray, " 3"]) -> list[int]:
-    """Return the last segments of a chain: none next to them is more joints away from the base; of those in loops the farthest.
-
-    Equalities that close loops count as joints: a link may hang in the tree on the link that it carries.
-    """
+    """Return the last segments of a chain: none next to them is more joints from the base; of those in loops the farthest."""
     steps = _steps(tree, base, chain)
     carrying = [s for s in chain if tree.bodies[s]]
     last = [s for s in carrying if not any(steps[other] > steps[s] for other in _joined(tree, s) if other in steps)]
@@ -407,7 +358,6 @@ def _ends(tree: KinematicTree, base: int, chain: Sequence[int], middle: Float[np
 
 
 def _joined(tree: KinematicTree, segment: int) -> list[int]:
-    """Return the segments that a joint or the equality of a loop binds to a segment, without those that carry no surface."""
     across = [pair[1 - pair.index(segment)] for pair in tree.loops if segment in pair]
     return [tree.parent[segment], *tree.children(segment), *across]
 

@@ -7,12 +7,9 @@ import copy
 import mujoco
 import numpy as np
 
-TURN = 2.0 * np.pi
-"""Hinges of which none turns by more than so many degrees were most likely given in radians."""
-LEAST = 0.5
-"""At least one of them turns by so many radians if they were."""
-RADIANS_AS_DEGREES = float(np.degrees(1.0))
-"""By how much angles are larger that were read as degrees but meant as radians."""
+TURN = 2.0 * np.pi  # hinges of which none turns by more than so many degrees were most likely given in radians
+LEAST = 0.5  # at least one of them turns by so many radians if they were
+RADIANS_AS_DEGREES = float(np.degrees(1.0))  # by how much angles are larger that were read as degrees but meant as radians
 ASSUMED = np.radians(30.0)
 """How far a hinge without limits is taken to turn to either side of its start, where no joint with limits closes a hand."""
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -21,10 +18,7 @@ _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARE
 
 
 def angles_are_misread(model: mujoco.MjModel) -> bool:
-    """Return whether no hinge of a robot turns by more than 2π degrees, as if `angle="radian"` were missing in its file.
-
-    A robot that also has slides with limits may be meant so: its hinges may be pads that give way.
-    """
+    """Return whether no hinge of a robot turns by more than 2π degrees, as if `angle="radian"` were missing in its file."""
     limited = model.jnt_limited.astype(bool)
     spans = np.ptp(model.jnt_range[limited & (model.jnt_type == _HINGE)], axis=1)
     if (limited & (model.jnt_type == _SLIDE)).any() or not len(spans):
@@ -33,11 +27,7 @@ def angles_are_misread(model: mujoco.MjModel) -> bool:
 
 
 def as_meant(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return a model whose joints have the limits that are meant; the same model if they have.
-
-    Position servos narrow the limits of hinges and slides to their setpoints, where these are within. Where radians were
-    read as degrees, limits and initial angles are larger by 180/π; the bodies' initial poses stay.
-    """
+    """Return a model whose joints have the limits that are meant; the same model if they have."""
     servos, is_misread = _servo_limits(model), angles_are_misread(model)
     if not servos and not is_misread:
         return model

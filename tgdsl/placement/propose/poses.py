@@ -15,12 +15,9 @@ from jaxtyping import Float
 
 from tgdsl.placement.propose.hands import Hand, KinematicTree
 
-STEPS, ITERATIONS = 8, 12
-"""Steps from the start to a pose, and iterations in each."""
-RESIDUAL = 1e-5
-"""Largest residual of an equality in a pose [m or rad]."""
-INDEPENDENT = 1e-3
-"""Least share of a joint's motion that the equalities must leave free."""
+STEPS, ITERATIONS = 8, 12  # steps from the start to a pose, and iterations in each
+RESIDUAL = 1e-5  # largest residual of an equality in a pose [m or rad]
+INDEPENDENT = 1e-3  # least share of a joint's motion that the equalities must leave free
 MIN_OVERLAP = 0.5
 """Least share of a driven joint's way that its limits must allow. Below it limits and equality contradict each other, as with a
 mimic joint of the wrong sign, and the equality is ignored."""
@@ -61,17 +58,10 @@ class Poses:
         self.start = start if settled is None else settled
 
     def at(self, joint: int) -> int:
-        """Return a joint's index in `qpos`."""
         return int(self.model.jnt_qposadr[joint])
 
     def pose(self, values: Mapping[int, float]) -> Float[np.ndarray, " qpos"]:
-        """Return the pose in which independent joints have some values and the other independent ones are as at the start.
-
-        Where the equalities cannot hold, the pose is the last on the way at which they do.
-
-        Args:
-            values: Value of each joint [rad, of slides m].
-        """
+        """Return the pose in which independent joints have some values and the other independent ones are as at the start."""
         goal = self.start.copy()
         for joint, value in values.items():
             goal[self.at(joint)] = value
@@ -90,7 +80,6 @@ class Poses:
         return pose
 
     def kinematics(self, qpos: Float[np.ndarray, " qpos"]) -> mujoco.MjData:
-        """Return a pose's frames; they stand until the next call."""
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         return self.data
@@ -188,7 +177,6 @@ def _driven(model: mujoco.MjModel) -> set[int]:
 
 
 def _of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
-    """Return the joints of a fixed tendon; none of a spatial one."""
     path = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
     is_joint = model.wrap_type[path] == int(mujoco.mjtWrap.mjWRAP_JOINT)
     return {int(i) for i in model.wrap_objid[path][is_joint]}

@@ -23,14 +23,10 @@ from tgdsl.placement.propose.limits import RADIANS_AS_DEGREES, angles_are_misrea
 from tgdsl.placement.propose.surfaces import HIDDEN, LinkSurface, Options, Sampler, link_meshes
 from tgdsl.schema.select import matching
 
-FACTORS = {"low": 0.25, "med": 1.0, "high": 4.0}
-"""Each resolution's share of the density."""
-COVERING = 0.75
-"""Radius over the square root of the area per taxel: discs on a triangular grid cover it from 0.62 on."""
-MAX_COUNT = 1_000_000
-"""The most taxels that the grammar lets a link have."""
-ROOM = 1e-3
-"""A box is larger than a link's surface by this [m]."""
+FACTORS = {"low": 0.25, "med": 1.0, "high": 4.0}  # each resolution's share of the density
+COVERING = 0.75  # radius over the square root of the area per taxel: discs on a triangular grid cover it from 0.62 on
+MAX_COUNT = 1_000_000  # the most taxels that the grammar lets a link have
+ROOM = 1e-3  # a box is larger than a link's surface by this [m]
 BEFORE = "before the link from which the fingers part; --include adds it"
 BESIDE = "no part of a hand; --include adds it"
 NO_LIMITS = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
@@ -40,48 +36,29 @@ Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 @dataclass(frozen=True)
 class LinkProposal:
-    """The taxels of a link.
+    """The taxels of a link."""
 
-    Attributes:
-        name: Its body.
-        area: Surface to be covered [m²].
-        facing: Direction of its inner side in the link's frame; None: it is covered all around.
-        doubt: What speaks against that side, or why there is none; empty if nothing does.
-        counts: Number of taxels at each resolution.
-        options: Options by which taxels are where they can feel.
-        box: Lower and upper corner of what is no tower beside the hand, in the link's frame [m]; None if it is all of it.
-    """
-
-    name: str
-    area: float
-    facing: tuple[float, ...] | None
-    doubt: str
-    counts: dict[str, int]
-    options: Options
+    name: str  # its body
+    area: float  # surface to be covered [m²]
+    facing: tuple[float, ...] | None  # direction of its inner side in the link's frame; None: it is covered all around
+    doubt: str  # what speaks against that side, or why there is none; empty if nothing does
+    counts: dict[str, int]  # number of taxels at each resolution
+    options: Options  # options by which taxels are where they can feel
+    # lower and upper corner of what is no tower beside the hand, in the link's frame [m]; None if it is all of it
     box: Box | None = None
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A layout.
+    """A layout."""
 
-    Attributes:
-        density: Taxels per area at `med` [1/m²].
-        groups: Names of groups, and of links and groups in each.
-        links: Links with taxels, in the robot's body order.
-        left_out: Bodies without taxels, and why.
-        shared: Names of links that other links' geoms or meshes have too.
-        is_collided: Whether the simulator collides its links; else none of them.
-        is_misread: Whether limits of its hinges look like radians that were read as degrees.
-    """
-
-    density: float
-    groups: dict[str, tuple[str, ...]]
-    links: tuple[LinkProposal, ...]
-    left_out: tuple[tuple[str, str], ...]
-    shared: tuple[str, ...]
-    is_collided: bool
-    is_misread: bool = False
+    density: float  # taxels per area at `med` [1/m²]
+    groups: dict[str, tuple[str, ...]]  # names of groups, and of links and groups in each
+    links: tuple[LinkProposal, ...]  # links with taxels, in the robot's body order
+    left_out: tuple[tuple[str, str], ...]  # bodies without taxels, and why
+    shared: tuple[str, ...]  # names of links that other links' geoms or meshes have too
+    is_collided: bool  # whether the simulator collides its links; else none of them
+    is_misread: bool = False  # whether limits of its hinges look like radians that were read as degrees
 
     def radius_mm(self, resolution: str) -> float:
         """Return the sensing radius at a resolution, to two digits [mm]."""
@@ -100,7 +77,6 @@ class Proposal:
         return result
 
     def mapping(self) -> dict[str, Any]:
-        """Return the layout as the grammar has it."""
         resolutions = {r: {escaped(link.name): self.placement(link, r) for link in self.links} for r in FACTORS}
         groups = {"groups": {name: list(members) for name, members in self.groups.items()}} if self.groups else {}
         return {"tgdsl": 1, **groups, "resolutions": resolutions}
@@ -162,10 +138,7 @@ def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
 
 
 def chosen_hands(tree: KinematicTree) -> list[Flexion]:
-    """Return the hands of a robot that close, by two chains or a jaw; if none does, all candidates.
-
-    If none closes within the model's limits, hinges without limits are tried within assumed ones.
-    """
+    """Return the hands of a robot that close, by two chains or a jaw; if none does, all candidates."""
     results = [Flexion(tree, hand) for hand in hands(tree)]
     closing = _closing(results)
     if not closing:
@@ -195,16 +168,7 @@ def _outside(tree: KinematicTree, flexions: Sequence[Flexion]) -> dict[int, str]
 
 
 def _included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[str, str]) -> set[str]:
-    """Return the links that some patterns ask for.
-
-    Args:
-        patterns: Names of links, or shell wildcards.
-        names: Links that can have taxels.
-        left_out: Other links, and why they cannot.
-
-    Raises:
-        TgdslError: If a pattern matches no link that can have taxels.
-    """
+    """Return the links that some patterns ask for."""
     result: set[str] = set()
     for pattern in patterns:
         links = {pattern} & {*names} or {*matching(pattern, names)}
@@ -220,10 +184,7 @@ def _included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[s
 def _sampled_hands(
     sampler: Sampler, include: Sequence[str], progress: Progress
 ) -> tuple[list[Flexion], dict[str, LinkSurface]]:
-    """Return the hands, and samples of their links and of those to include, in the robot's body order.
-
-    Only these are sampled. A link of which nothing can be touched is left out, and the hands are looked for again without it.
-    """
+    """Return the hands, and samples of their links and of those to include, in the robot's body order."""
     surfaces: dict[str, LinkSurface] = {}
     while True:
         include_names = _included(include, tuple(sampler.meshes), dict(sampler.left_out))
@@ -315,11 +276,9 @@ def _groups(flexions: Sequence[Flexion], names: dict[int, str], links: tuple[str
 
 
 def escaped(name: str) -> str:
-    """Return the pattern that matches a name and nothing else."""
     return re.sub(r"[*?\[]", r"[\g<0>]", name)
 
 
 def _shared(robot: Model, links: tuple[str, ...]) -> tuple[str, ...]:
-    """Return links whose name some geom or mesh of another link has too: a selection takes both."""
     elsewhere = {name for geom in robot.geoms if geom.body in links for name in geom.names if name != geom.body}
     return tuple(name for name in links if name in elsewhere)

@@ -26,32 +26,22 @@ HIDDEN = "behind what is fixed in front of it; --include adds it"
 COVERED = "all of it is inside other links in the initial state"
 MAX_MARKER = 2e-5
 """A link with no more surface than this only marks a place, such as a ball of a millimetre at a fingertip [m²]."""
-MIN_AREA = 1e-8
-"""A surface smaller than this is degenerate [m²]."""
+MIN_AREA = 1e-8  # a surface smaller than this is degenerate [m²]
 _NO_AREA = "a surface without area"
 _ANYWHERE = Region(is_geom=None, facings=(), boxes=(), spheres=())
-Options = Mapping[str, str | bool]
-"""Options of a placement, `surface` and `exposed`, as the grammar has them."""
+Options = Mapping[str, str | bool]  # options of a placement, `surface` and `exposed`, as the grammar has them
 
 
 @dataclass(frozen=True, eq=False)
 class LinkSurface:
-    """Samples of what can be touched of a body, in its frame.
+    """Samples of what can be touched of a body, in its frame."""
 
-    Attributes:
-        pool: Points on it.
-        options: Options of a placement that samples it.
-    """
-
-    pool: Pool
-    options: Options = field(default_factory=dict)
+    pool: Pool  # points on it
+    options: Options = field(default_factory=dict)  # options of a placement that samples it
 
 
 def link_meshes(robot: Model) -> tuple[dict[str, Surface], list[tuple[str, str]]]:
-    """Return the touchable triangles of each named body, and the bodies that have none, and why.
-
-    Meshes are their convex hulls, as MuJoCo collides them: what is inside of a mesh would shift its middle.
-    """
+    """Return the touchable triangles of each named body, and the bodies that have none, and why."""
     meshes: dict[str, Surface] = {}
     left_out = [("world", "no link")] if robot.touchable("world") else []
     for body in robot.bodies[1:]:
@@ -88,12 +78,7 @@ class Sampler:
     """
 
     def __init__(self, robot: Model, radius: float):
-        """Leave out what the simulator does not collide, unless it collides nothing, as of a robot that is only seen.
-
-        Args:
-            robot: The robot.
-            radius: The least sensing radius of a taxel [m].
-        """
+        """Leave out what the simulator does not collide, unless it collides nothing, as of a robot that is only seen."""
         self.robot, self.radius, self.colliders = robot, radius, Colliders(robot)
         self.meshes, self.left_out = link_meshes(robot)
         ids = {name: int(robot.compiled.body(name).id) for name in self.meshes}
@@ -106,7 +91,6 @@ class Sampler:
                 self.drop(name, NOT_COLLIDED)
 
     def drop(self, name: str, why: str) -> None:
-        """Leave a link out."""
         del self.meshes[name]
         self.left_out.append((name, why))
 
@@ -144,11 +128,7 @@ class Sampler:
 
 
 def _pool(surface: Surface) -> Pool | None:
-    """Return points on the outside of a link's surface; None if none of it can be touched from outside.
-
-    Raises:
-        SampleError: If pymeshlab is not installed.
-    """
+    """Return points on the outside of a link's surface; None if none of it can be touched from outside."""
     try:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:

@@ -17,8 +17,7 @@ from tgdsl.files.write import atomic_write, check_writable, with_folder
 from tgdsl.formats.model import Model
 from tgdsl.placement.propose.propose import FACTORS, LinkProposal, Proposal, escaped, propose
 
-WIDTH = 120
-"""Lists of names are broken at this column."""
+WIDTH = 120  # lists of names are broken at this column
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*\Z")
 _BRACKETED, _CHARACTER = re.compile(r"\[(.)\]"), r"\1"
 _KEYWORDS = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
@@ -124,13 +123,11 @@ def layout_text(proposal: Proposal, robot: str) -> str:
 
 
 def _options(proposal: Proposal) -> list[tuple[str, str, list[LinkProposal]]]:
-    """Return each option that some links need, as the grammar has it, and the links."""
     results = [(key, [link for link in proposal.links if key in link.options]) for key in _OPTIONS]
     return [(key, f"{key}: {_flow(links[0].options[key])}", links) for key, links in results if links]
 
 
 def _doubts(proposal: Proposal, has_side: bool) -> list[str]:
-    """Return the links with an inner side that something speaks against, or without one, one line per reason."""
     return _by_reason(
         [(link.name, link.doubt) for link in proposal.links if link.doubt and (link.facing is not None) == has_side]
     )
@@ -188,7 +185,6 @@ def quoted(name: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return a text as a comment can hold it: on one line, of printable characters."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 

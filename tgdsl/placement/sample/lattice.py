@@ -23,26 +23,18 @@ from jaxtyping import Bool, Float, Int
 
 from tgdsl.surfaces.rays import expanded
 
-STEPS_PER_OCTAVE = 4
-"""Pitches are powers of 2 to the quarter: a pitch shall not follow the last bits of an area."""
-STEEP = 0.37
-"""Least |cosine| of line and normal; no more than 1/√3, and no angle that people draw."""
+STEPS_PER_OCTAVE = 4  # pitches are powers of 2 to the quarter: a pitch shall not follow the last bits of an area
+STEEP = 0.37  # least |cosine| of line and normal; no more than 1/√3, and no angle that people draw
 _MARGIN = 1e-9  # of a pitch: squares that are touched only by rounding are looked at too
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where lines pass through faces, in random order: that of a hash of the line, and along one line by position.
+    """Where lines pass through faces, in random order: that of a hash of the line, and along one line by position."""
 
-    Attributes:
-        pos: Position in the body frame [m].
-        piece: Index of the triangle.
-        area: Surface that the point stands for [m²].
-    """
-
-    pos: Float[np.ndarray, "hit 3"]
-    piece: Int[np.ndarray, " hit"]
-    area: Float[np.ndarray, " hit"]
+    pos: Float[np.ndarray, "hit 3"]  # position in the body frame [m]
+    piece: Int[np.ndarray, " hit"]  # index of the triangle
+    area: Float[np.ndarray, " hit"]  # surface that the point stands for [m²]
 
 
 def pitch_below(largest: float) -> float:
@@ -51,15 +43,7 @@ def pitch_below(largest: float) -> float:
 
 
 def hits(corners: Float[np.ndarray, "piece 3 3"], pitch: float, seed: int) -> Hits:
-    """Return where the lines of all three lattices pass through triangles.
-
-    A line through an edge that two triangles share, with the very same corners, passes through one of them.
-
-    Args:
-        corners: The triangles [m].
-        pitch: Side of the lattices' squares [m].
-        seed: Seed of the lines.
-    """
+    """Return where the lines of all three lattices pass through triangles."""
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(cross, axis=1)
     normal = np.divide(cross, size[:, None], out=np.zeros_like(cross), where=size[:, None] > 0)
@@ -134,10 +118,7 @@ def _is_inside(
 
 
 def _uniform(*keys: int | Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return numbers in [0, 1) that are a hash of integers: a counter through the mixing function of SplitMix64.
-
-    (Steele, Lea and Flood, "Fast Splittable Pseudorandom Number Generators", OOPSLA 2014.)
-    """
+    """Return numbers in [0, 1) that are a hash of integers: a counter through the mixing function of SplitMix64."""
     value = np.zeros(1, dtype=np.uint64)
     for key in keys:
         word = np.array([key % 2**64], dtype=np.uint64) if isinstance(key, int) else key.astype(np.uint64)

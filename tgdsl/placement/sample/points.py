@@ -24,37 +24,18 @@ OPTIONAL = ("radius", "area", *TANGENT, *CELL, "link")
 
 @dataclass(frozen=True, eq=False)
 class PointTable:
-    """Points of a link as given, in its body's frame.
+    """Points of a link as given, in its body's frame."""
 
-    Attributes:
-        pos: Position [m].
-        normal: Outward normal, of any length.
-        tangent: Tangent, of any length and across the normal only roughly; NaN where none is given.
-        radius: Sensing radius [m].
-        area: Surface that the point stands for [m²]; NaN where none is given.
-        cell: Row and column in the link's grid; −1 where there is none.
-    """
-
-    pos: Float[np.ndarray, "point 3"]
-    normal: Float[np.ndarray, "point 3"]
-    tangent: Float[np.ndarray, "point 3"]
-    radius: Float[np.ndarray, " point"]
-    area: Float[np.ndarray, " point"]
-    cell: Int[np.ndarray, "point 2"]
+    pos: Float[np.ndarray, "point 3"]  # position [m]
+    normal: Float[np.ndarray, "point 3"]  # outward normal, of any length
+    tangent: Float[np.ndarray, "point 3"]  # tangent, of any length and across the normal only roughly; NaN where none is given
+    radius: Float[np.ndarray, " point"]  # sensing radius [m]
+    area: Float[np.ndarray, " point"]  # surface that the point stands for [m²]; NaN where none is given
+    cell: Int[np.ndarray, "point 2"]  # row and column in the link's grid; −1 where there is none
 
 
 def point_table(placement: Points, folder: Path, link: str = "") -> PointTable:
-    """Return the points of a link.
-
-    Args:
-        placement: The points, or their file.
-        folder: Where the file is looked up.
-        link: Name of the link, if the file has a column of links.
-
-    Raises:
-        SampleError: If the file cannot be read as points or has none of the link, a tangent is along its normal, or two points
-            have one cell.
-    """
+    """Return the points of a link."""
     if isinstance(placement.points, str):
         placed = list(_read(folder, placement.points, link))
     else:

@@ -31,17 +31,14 @@ from tgdsl.surfaces.rays import OrthographicView, first_hits, frame, sphere_dire
 from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
 
-CANDIDATES = 20
-"""Least number of points per sample from which an exact count is chosen."""
+CANDIDATES = 20  # least number of points per sample from which an exact count is chosen
 DIRECTIONS, FIRST_DIRECTIONS = 100, 10
 """Directions from which points are looked at: what none of them sees is a pocket that nothing outside can touch. Whether what
 the first ones do not see is inside of solids is found before it is looked at from the others."""
-PER_SAMPLE = 50
-"""Points per sample by which the area of each sample is measured; also the density of the pool for a spacing."""
+PER_SAMPLE = 50  # points per sample by which the area of each sample is measured; also the density of the pool for a spacing
 MIN_POOL, MAX_POOL = 10_000, 400_000
 """Bounds of the number of points in a pool; more are drawn only where an exact count needs them."""
-MANY = 30
-"""Points by which the area of a piece is known well enough to set it right for this piece alone."""
+MANY = 30  # points by which the area of a piece is known well enough to set it right for this piece alone
 FIRST_SPACING, SPACING_RATIO = 0.81, 0.99
 """Of an exact count: the largest first spacing, relative to the hexagonal packing's, at which nearly all samples fit; and each
 next one relative to the one before."""
@@ -51,17 +48,11 @@ ORDER = np.sqrt([0.2, 0.3, 0.5])
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Dense points on the outer surface in a region, in the order of their priorities.
+    """Dense points on the outer surface in a region, in the order of their priorities."""
 
-    Attributes:
-        pos: Position in the body frame [m].
-        normal: Outward unit normal of the point's face, body frame.
-        point_area: Surface that each point stands for [m²].
-    """
-
-    pos: Float[np.ndarray, "pool 3"]
-    normal: Float[np.ndarray, "pool 3"]
-    point_area: Float[np.ndarray, " pool"]
+    pos: Float[np.ndarray, "pool 3"]  # position in the body frame [m]
+    normal: Float[np.ndarray, "pool 3"]  # outward unit normal of the point's face, body frame
+    point_area: Float[np.ndarray, " pool"]  # surface that each point stands for [m²]
 
     @property
     def area(self) -> float:
@@ -72,18 +63,7 @@ class Pool:
 def pool(
     shell: Shell, region: Region, seed: int, count: int | None, spacing: float | None, sampler: str = "lattice"
 ) -> Pool | None:
-    """Return a pool dense enough for a count or a spacing; None if the region holds nothing of the outer surface.
-
-    It stays sparse where that would take more than `MAX_POOL` points, or where nearly all of the region lies inside.
-
-    Args:
-        shell: The clean surface.
-        region: The part of it to sample.
-        seed: Seed of the points.
-        count: Number of samples wanted.
-        spacing: Least distance of samples [m], if there is no count.
-        sampler: What draws the points: `lattice` or `pymeshlab`.
-    """
+    """Return a pool dense enough for a count or a spacing; None if the region holds nothing of the outer surface."""
     face, corners = _pieces(shell.surface, region)
     area = float(_areas(corners).sum())
     limit = MAX_POOL * 4 if count is None else size(count)[1]
@@ -100,7 +80,6 @@ def pool(
 
 
 def size(count: int) -> tuple[int, int]:
-    """Return how many points the pool for a count should have, and the most: pools of the same size are the same."""
     return max(min(PER_SAMPLE * count, MAX_POOL), 2 * CANDIDATES * count, MIN_POOL), 4 * max(MAX_POOL, CANDIDATES * count)
 
 
@@ -157,10 +136,7 @@ def _stratified(corners: Float[np.ndarray, "piece 3 3"], point_area: float, seed
 
 
 def _exact(drawn: lattice.Hits, area: Float[np.ndarray, " piece"]) -> Float[np.ndarray, " hit"]:
-    """Return what points stand for so that it adds up to the areas of pieces, which a lattice knows to some percent only [m²].
-
-    Each piece with `MANY` points for itself, the others together.
-    """
+    """Return areas of points that add up to those of their pieces, which a lattice knows to some percent only [m²]."""
     num = np.bincount(drawn.piece, minlength=len(area))
     owner = np.where(num >= MANY, np.arange(len(area)), len(area))
     drawn_area = np.bincount(owner[drawn.piece], drawn.area, minlength=len(area) + 1)
@@ -172,11 +148,7 @@ def _exact(drawn: lattice.Hits, area: Float[np.ndarray, " piece"]) -> Float[np.n
 def _on_outer_surface(
     shell: Shell, region: Region, pos: Float[np.ndarray, "n 3"], face: Int[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return which points of faces are on the outside of the union of all solid components.
-
-    Where solids touch back to back neither is outside; where their faces coincide and look the same way, only the first
-    component that belongs to the region keeps its points, lest the place count twice.
-    """
+    """Return which points of faces are on the outside of the union of all solid components."""
     normal = shell.surface.face_normals[face]
     above, below = pos + shell.offset * normal, pos - shell.offset * normal
     component = shell.component[face]
@@ -229,10 +201,7 @@ def choose(pool: Pool, count: int | None, spacing: float | None) -> Int[np.ndarr
 
 
 def _dart_throwing(pos: Float[np.ndarray, "pool 3"], spacings: tuple[float, ...], count: int) -> Int[np.ndarray, " taxel"]:
-    """Take points in order, those at least a spacing [m] away from all that were taken; then with the next smaller spacing.
-
-    At most `count` are taken; where fewer fit at the last of several spacings, the first of those left.
-    """
+    """Take points in order, those at least a spacing [m] away from all that were taken; then with the next smaller spacing."""
     tree = KDTree(pos)
     gap = np.full(len(pos), np.inf)  # to the nearest point taken, if that is within the first spacing
     taken: list[int] = []

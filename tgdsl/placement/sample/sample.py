@@ -21,8 +21,7 @@ from tgdsl.surfaces.rays import OrthographicView, first_hits, frame, reference_a
 from tgdsl.surfaces.region import Covered, Region, unit
 from tgdsl.surfaces.surface import Surface
 
-MIN_COSINE = 0.1
-"""A grid cell on a steep face counts at most 1/0.1 times its projected area."""
+MIN_COSINE = 0.1  # a grid cell on a steep face counts at most 1/0.1 times its projected area
 ROUNDED = 1e-14
 """Largest rounding of a squared length, and of the cosine of a normal and a tangent that was projected across it."""
 MAX_DENSITY = poisson.MAX_POOL / poisson.PER_SAMPLE
@@ -31,23 +30,14 @@ MAX_DENSITY = poisson.MAX_POOL / poisson.PER_SAMPLE
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Taxels of one link.
+    """Taxels of one link."""
 
-    Attributes:
-        pos: Position in the body frame [m].
-        normal: Outward unit normal in the body frame.
-        tangent: Unit tangent in the body frame, perpendicular to the normal.
-        radius: Sensing radius [m].
-        area: Surface that the taxel stands for [m²].
-        cell: Row and column in the grid; −1 where there is none.
-    """
-
-    pos: Float[np.ndarray, "taxel 3"]
-    normal: Float[np.ndarray, "taxel 3"]
-    tangent: Float[np.ndarray, "taxel 3"]
-    radius: Float[np.ndarray, " taxel"]
-    area: Float[np.ndarray, " taxel"]
-    cell: Int[np.ndarray, "taxel 2"]
+    pos: Float[np.ndarray, "taxel 3"]  # position in the body frame [m]
+    normal: Float[np.ndarray, "taxel 3"]  # outward unit normal in the body frame
+    tangent: Float[np.ndarray, "taxel 3"]  # unit tangent in the body frame, perpendicular to the normal
+    radius: Float[np.ndarray, " taxel"]  # sensing radius [m]
+    area: Float[np.ndarray, " taxel"]  # surface that the taxel stands for [m²]
+    cell: Int[np.ndarray, "taxel 2"]  # row and column in the grid; −1 where there is none
 
 
 def sample(
@@ -81,10 +71,8 @@ def sample(
 def _grid(surface: Surface, placement: Grid, is_covered: Covered | None) -> Samples:
     """Project rows × columns onto the surface.
 
-    Columns, rows and direction are a right-handed frame (rows run along direction × columns): seen from where the rays
-    start, columns run to the right and rows run down, as on a page. The side that a ray comes from is outside, so the
-    normal is the hit face's, turned against the ray should the mesh be inside out. With `rows_reversed` rows run up: the
-    frame is left-handed, as the mirror image of a grid is.
+    Columns, rows and direction are a right-handed frame: seen from where the rays start, columns run to the right and rows
+    down, as on a page. The side that a ray comes from is outside. With `rows_reversed` rows run up, as in a mirror image.
     """
     view = OrthographicView.of(surface, _grid_axes(placement))
     region = Region.of(surface, placement.region, is_covered)
@@ -197,7 +185,6 @@ def _points(table: PointTable) -> Samples:
 
 
 def _kept_unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return vectors over their lengths; those that are unit to within rounding as they are."""
     is_unit = np.abs((vectors**2).sum(axis=1) - 1.0) <= ROUNDED
     return np.where(is_unit[:, None], vectors, unit(vectors))
 

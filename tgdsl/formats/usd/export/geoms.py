@@ -16,20 +16,13 @@ from tgdsl.formats.usd.export.stage_writer import StageWriter, set_pose
 from tgdsl.formats.usd.stage import usd_modules
 
 MESH_GEOM = int(mujoco.mjtGeom.mjGEOM_MESH)
-MASKS = {name: GEOM[name] for name in ("contype", "conaffinity")}
-"""Custom attributes of visuals too."""
-AS_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-"""How the importer takes meshes without the custom attribute `inertia`."""
-PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)
-"""MuJoCo's default colour of a geom: if a material is there too, the material's shows."""
+MASKS = {name: GEOM[name] for name in ("contype", "conaffinity")}  # custom attributes of visuals too
+AS_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # how the importer takes meshes without the custom attribute `inertia`
+PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom: if a material is there too, the material's shows
 
 
 def add_geoms(writer: StageWriter, body: int) -> None:
-    """Write the geoms of a body below its prim.
-
-    Raises:
-        RobotError: If USD has no such shape.
-    """
+    """Write the geoms of a body below its prim."""
     model = writer.model
     first = int(model.body_geomadr[body])
     for geom in range(first, first + int(model.body_geomnum[body])):
@@ -109,11 +102,7 @@ def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
 
 
 def file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
-    """Return a mesh's vertices in the frame of its file [m], in float32 and in MuJoCo's order.
-
-    MuJoCo moves them to the mesh's principal axes, which costs a last bit here and there; its hull of a symmetric mesh depends
-    on that bit. So where all coordinates are, to that bit, of few decimals, these are what the file had.
-    """
+    """Return a mesh's vertices in the frame of its file [m], in float32 and in MuJoCo's order."""
     first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     moved = model.mesh_vert[first : first + count].astype(np.float64)
     result = Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).apply(moved) + model.mesh_pos[mesh]

@@ -30,11 +30,7 @@ SCHEMAS = {BALL: "SphericalJoint", SLIDE: "PrismaticJoint", HINGE: "RevoluteJoin
 
 
 def joint_of(writer: StageWriter, body: int) -> int:
-    """Return the index of a body's joint, or -1 if it is fixed to its parent.
-
-    Raises:
-        RobotError: If it has several joints.
-    """
+    """Return the index of a body's joint, or -1 if it is fixed to its parent."""
     count = int(writer.model.body_jntnum[body])
     if count > 1:
         raise RobotError(
@@ -45,13 +41,7 @@ def joint_of(writer: StageWriter, body: int) -> int:
 
 
 def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
-    """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap).
-
-    Args:
-        writer: Where to write it; all bodies are there.
-        body: MuJoCo's index of the child.
-        collides: Whether the two bodies can collide with each other.
-    """
+    """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap)."""
     model, joint = writer.model, joint_of(writer, body)
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
     if kind == FREE or model.body_mocapid[body] >= 0:
@@ -101,7 +91,6 @@ def _frames(writer: StageWriter, body: int, joint: int, made: Any) -> None:
 
 
 def _x_to(axis: np.ndarray) -> Rotation:
-    """Return a rotation that takes +x to a unit vector; by way of -x where that is nearer, so that no turn is near 180°."""
     start = np.array([1.0 if axis[0] >= 0 else -1.0, 0.0, 0.0])
     turn = Rotation.from_quat([1.0 + start @ axis, *np.cross(start, axis)], scalar_first=True)
     return turn if axis[0] >= 0 else turn * Rotation.from_quat([0.0, 0.0, 0.0, 1.0], scalar_first=True)
@@ -194,7 +183,6 @@ def _servo(model: mujoco.MjModel, actuator: int) -> Drive | None:
 
 
 def _has_more(model: mujoco.MjModel, actuator: int) -> bool:
-    """Return whether an actuator does more than act on its control as it is: it waits, or it weighs or damps."""
     arrays = (model.actuator_delay, model.actuator_history, model.actuator_armature, model.actuator_damping)
     return any(np.any(array[actuator]) for array in arrays)
 

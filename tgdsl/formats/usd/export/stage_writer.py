@@ -14,8 +14,7 @@ from tgdsl.formats.usd.attributes import set_custom
 from tgdsl.formats.usd.stage import usd_modules
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
-DECIMALS = 14
-"""Decimals of positions and rotations: those beyond are rounding, which differs from machine to machine."""
+DECIMALS = 14  # decimals of positions and rotations: those beyond are rounding, which differs from machine to machine
 
 
 def rounded(values: Float[np.ndarray, " number"]) -> Float[np.ndarray, " number"]:
@@ -25,39 +24,23 @@ def rounded(values: Float[np.ndarray, " number"]) -> Float[np.ndarray, " number"
 
 @dataclass(eq=False)
 class StageWriter:
-    """A stage that a compiled model is being written to.
+    """A stage that a compiled model is being written to."""
 
-    Attributes:
-        file: The robot file, for messages.
-        spec: MuJoCo's editable model.
-        model: MuJoCo's compiled model.
-        stage: The `Usd.Stage`.
-        root: Path of the default prim.
-        scope: Path of the scope that holds joints and what acts on them.
-        materials: Path of the scope that holds physics materials.
-        bodies: Path of each body's prim by MuJoCo's index; the world's is there only if it holds something.
-        sites: Path of each site's prim, by MuJoCo's index.
-        geoms: Path of each geom's prim, by MuJoCo's index.
-        joints: Schema of each joint that can move, by MuJoCo's index.
-        tendons: Path of each tendon's prim, by MuJoCo's index.
-        frictions: The physics material of each sliding friction that is in use.
-        unsupported: One message for each thing that USD does not hold.
-    """
-
-    file: Path
-    spec: mujoco.MjSpec
-    model: mujoco.MjModel
-    stage: Any
-    root: str = ""
-    scope: str = ""
-    materials: str = ""
+    file: Path  # the robot file, for messages
+    spec: mujoco.MjSpec  # MuJoCo's editable model
+    model: mujoco.MjModel  # MuJoCo's compiled model
+    stage: Any  # the `Usd.Stage`
+    root: str = ""  # path of the default prim
+    scope: str = ""  # path of the scope that holds joints and what acts on them
+    materials: str = ""  # path of the scope that holds physics materials
+    # path of each body's prim by MuJoCo's index; the world's is there only if it holds something
     bodies: dict[int, str] = field(default_factory=dict)
-    sites: dict[int, str] = field(default_factory=dict)
-    geoms: dict[int, str] = field(default_factory=dict)
-    joints: dict[int, Any] = field(default_factory=dict)
-    tendons: dict[int, str] = field(default_factory=dict)
-    frictions: dict[float, Any] = field(default_factory=dict)
-    unsupported: list[str] = field(default_factory=list)
+    sites: dict[int, str] = field(default_factory=dict)  # path of each site's prim, by MuJoCo's index
+    geoms: dict[int, str] = field(default_factory=dict)  # path of each geom's prim, by MuJoCo's index
+    joints: dict[int, Any] = field(default_factory=dict)  # schema of each joint that can move, by MuJoCo's index
+    tendons: dict[int, str] = field(default_factory=dict)  # path of each tendon's prim, by MuJoCo's index
+    frictions: dict[float, Any] = field(default_factory=dict)  # the physics material of each sliding friction that is in use
+    unsupported: list[str] = field(default_factory=list)  # one message for each thing that USD does not hold
     _taken: set[str] = field(default_factory=set)
 
     def path(self, parent: str, name: str) -> str:
@@ -71,13 +54,11 @@ class StageWriter:
         return result
 
     def define(self, kind: str, prim_name: str, name: str) -> Any:
-        """Define a prim of MuJoCo's schemas in `scope`; `name` is MuJoCo's."""
         prim = self.stage.DefinePrim(self.path(self.scope, prim_name), kind)
         set_custom(prim, "name", name)
         return prim
 
     def body_name(self, body: int) -> str:
-        """Return a body's name, or what a message and a prim call one that has none."""
         return self.model.body(body).name or f"body_{body}"
 
 
@@ -87,14 +68,7 @@ def set_pose(
     quat: Float[np.ndarray, " 4"],
     scale: Float[np.ndarray, " 3"] | None = None,
 ) -> None:
-    """Give a prim its pose in its parent's frame, in double precision.
-
-    Args:
-        prim: A prim that has no pose yet.
-        pos: Its origin [m].
-        quat: Its rotation, w x y z.
-        scale: Factors along its own axes, applied first.
-    """
+    """Give a prim its pose in its parent's frame, in double precision."""
     u = usd_modules()
     xform, double = u.UsdGeom.Xformable(prim), u.UsdGeom.XformOp.PrecisionDouble
     xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*rounded(pos).tolist()))

@@ -154,7 +154,6 @@ def _add_joints(writer: StageWriter) -> None:
 
 
 def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
-    """Return the pairs of bodies that the model excludes from collision, by index and sorted."""
     return {(signature >> 16, signature & 0xFFFF) for signature in model.exclude_signature.tolist()}
 
 
@@ -167,10 +166,7 @@ def _never_collide(model: mujoco.MjModel, one: int, two: int) -> bool:
 
 
 def _add_filters(writer: StageWriter) -> None:
-    """Write the pairs of bodies that do not collide and that USD would not know of.
-
-    MuJoCo's own filter sees bodies that are welded together as one, USD's joints only the two that they join.
-    """
+    """Write the pairs of bodies that do not collide and that USD would not know of."""
     model, u, stage = writer.model, usd_modules(), writer.stage
     pairs = _excluded(model)
     masks = model.geom_contype | model.geom_conaffinity
