@@ -68,7 +68,7 @@ def _of_spec(scene: mujoco.MjSpec) -> Model:
 
 def _self_contained(text: str, model: mujoco.MjModel) -> str:
     """Return MJCF with its meshes and height fields in line, and its textures plain."""
-    from tgdsl.formats.usd.export.geoms import file_vertices
+    from tgdsl.formats.usd.attributes import file_vertices
 
     root = ET.fromstring(text)
     for mesh in root.iterfind("asset/mesh[@file]"):
@@ -98,8 +98,8 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def _of_model(compiled: mujoco.MjModel) -> Model:
-    from tgdsl.formats.usd.export.write import write_usd
     from tgdsl.formats.usd.reader import read_usd
+    from tgdsl.formats.usd.write import write_usd
 
     names = mujoco.MjSpec()
     for i in range(compiled.nmesh):

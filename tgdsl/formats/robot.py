@@ -26,7 +26,7 @@ def _read_usd(path: Path) -> Model:
 
 
 def _write_usd(model: Model, out: Path) -> None:
-    from tgdsl.formats.usd.export.write import write_usd
+    from tgdsl.formats.usd.write import write_usd
 
     write_usd(model, out)
 

@@ -17,10 +17,12 @@ import numpy as np
 from tgdsl.formats.usd.attributes import (
     ACTUATOR,
     DRAWN,
+    FREE,
     KEY,
     LIMITS,
     SERVO,
     TENDON,
+    StageWriter,
     author,
     read_attributes,
     read_custom,
@@ -29,7 +31,6 @@ from tgdsl.formats.usd.attributes import (
     text_of,
     with_limits,
 )
-from tgdsl.formats.usd.export.stage_writer import FREE, StageWriter
 from tgdsl.formats.usd.joints import Drive, Joint
 from tgdsl.formats.usd.stage import Names, Prim, Stage, unique_names, usd_modules
 

@@ -16,16 +16,21 @@ counts as long as USD's value is what it rounds to: who edits the stage edits US
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from tgdsl.formats.usd.stage import NAMESPACE, Prim, Stage, usd_modules
 
+FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
+DECIMALS = 14  # decimals of positions and rotations: those beyond are rounding, which differs from machine to machine
 AGREEMENT = 1e-5  # relative difference up to which two sources say the same: some attributes are float32
 TOKENS = {"euler": "Euler", "rk4": "RK4", "pgs": "PGS", "cg": "CG", "newton": "Newton"}
 """MjcPhysics' tokens that MJCF spells otherwise."""
@@ -307,9 +312,14 @@ def set_custom(prim: Any, key: str, value: str | bool | int | float | tuple[floa
     author(prim, f"{NAMESPACE}{key}", value)
 
 
-def set_customs(prim: Any, table: Table, value: Callable[[str], Any], default: Callable[[str], Any]) -> None:
+def set_customs(prim: Any, table: Table, element: Any, default: Any, index: int | None = None) -> None:
+    """Set custom attributes for fields, or rows `index` of arrays, that differ from those of an element with defaults."""
     for attribute, row in table.items():
-        if row.array and not np.array_equal(number := np.asarray(value(row.array)), default(row.array)):
+        if not row.array:
+            continue
+        one, other = (np.asarray(getattr(each, row.array)) for each in (element, default))
+        number, usual = (one, other) if index is None else (one[index], other[0])
+        if not np.array_equal(number, usual):
             set_custom(prim, attribute, KEYWORDS[attribute][int(number)] if attribute in KEYWORDS else number.tolist())
 
 
@@ -355,3 +365,61 @@ def set_number(attribute: Any, value: float | np.ndarray) -> None:
 def default_model() -> mujoco.MjModel:
     inside = '<body><joint/><geom type="sphere" size="1"/><site/></body>'
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{inside}</worldbody></mujoco>")
+
+
+@dataclass(eq=False)
+class StageWriter:
+    """A stage that a compiled model is being written to."""
+
+    file: Path  # the robot file, for messages
+    spec: mujoco.MjSpec  # MuJoCo's editable model
+    model: mujoco.MjModel  # MuJoCo's compiled model
+    stage: Any  # the `Usd.Stage`
+    root: str = ""  # path of the default prim
+    scope: str = ""  # path of the scope that holds joints and what acts on them
+    materials: str = ""  # path of the scope that holds physics materials
+    # path of each body's prim by MuJoCo's index; the world's is there only if it holds something
+    bodies: dict[int, str] = field(default_factory=dict)
+    sites: dict[int, str] = field(default_factory=dict)  # path of each site's prim, by MuJoCo's index
+    geoms: dict[int, str] = field(default_factory=dict)  # path of each geom's prim, by MuJoCo's index
+    joints: dict[int, Any] = field(default_factory=dict)  # schema of each joint that can move, by MuJoCo's index
+    tendons: dict[int, str] = field(default_factory=dict)  # path of each tendon's prim, by MuJoCo's index
+    frictions: dict[float, Any] = field(default_factory=dict)  # the physics material of each sliding friction that is in use
+    unsupported: list[str] = field(default_factory=list)  # one message for each thing that USD does not hold
+    _taken: set[str] = field(default_factory=set)
+
+    def path(self, parent: str, name: str) -> str:
+        """Return a path below a prim that is valid, like the name, and not yet taken; and take it."""
+        plain = f"{parent}/{usd_modules().Tf.MakeValidIdentifier(name)}"
+        result, number = plain, 0
+        while result in self._taken:
+            number += 1
+            result = f"{plain}_{number}"
+        self._taken.add(result)
+        return result
+
+    def define(self, kind: str, prim_name: str, name: str) -> Any:
+        prim = self.stage.DefinePrim(self.path(self.scope, prim_name), kind)
+        set_custom(prim, "name", name)
+        return prim
+
+    def body_name(self, body: int) -> str:
+        return self.model.body(body).name or f"body_{body}"
+
+
+def rounded(values: Float[np.ndarray, " number"]) -> Float[np.ndarray, " number"]:
+    """Return a position [m] or rotation rounded to `DECIMALS`."""
+    return np.round(values, DECIMALS) + 0.0
+
+
+def file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
+    """Return a mesh's vertices in the frame of its file [m], in float32 and in MuJoCo's order."""
+    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    moved = model.mesh_vert[first : first + count].astype(np.float64)
+    result = Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).apply(moved) + model.mesh_pos[mesh]
+    bit = np.finfo(np.float32).eps * max(np.abs(result).max(), np.abs(moved).max())
+    for decimals in range(8):
+        if np.abs(np.round(result, decimals) - result).max() <= bit:
+            result = np.round(result, decimals)
+            break
+    return np.ascontiguousarray(result + 0.0, dtype=np.float32)

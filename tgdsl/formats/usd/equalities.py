@@ -28,6 +28,7 @@ from tgdsl.formats.usd.attributes import (
     EQUALITY,
     MIMIC,
     WELD,
+    StageWriter,
     author,
     default_model,
     read_attributes,
@@ -36,7 +37,6 @@ from tgdsl.formats.usd.attributes import (
     set_number,
     text_of,
 )
-from tgdsl.formats.usd.export.stage_writer import StageWriter
 from tgdsl.formats.usd.joints import Joint
 from tgdsl.formats.usd.stage import NAMESPACE, Matrix, Names, Prim, Stage, usd_modules
 

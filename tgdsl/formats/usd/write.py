@@ -24,28 +24,45 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import FileError, RobotError, listed
 from tgdsl.files.write import atomic_path
-from tgdsl.formats.model import Model
+from tgdsl.formats.model import SHAPE_NAMES, Model
 from tgdsl.formats.usd.actuators import write_actuators, write_keyframes, write_tendons
 from tgdsl.formats.usd.attributes import (
     FLAGS,
+    FREE,
+    GEOM,
     KNOWN_FLAGS,
+    MESH,
     OPTION,
+    SITE,
+    StageWriter,
     default_model,
+    file_vertices,
     flag_names,
+    rounded,
     set_custom,
     set_customs,
     set_number,
 )
 from tgdsl.formats.usd.equalities import write_equalities
-from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
-from tgdsl.formats.usd.export.joints import add_drives, add_joint
-from tgdsl.formats.usd.export.stage_writer import FREE, StageWriter, set_pose
 from tgdsl.formats.usd.stage import usd_modules
+from tgdsl.formats.usd.write_joints import add_drives, add_joint
 
-ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
+ELLIPSOID, PLANE, MESH_GEOM = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("ELLIPSOID", "PLANE", "MESH"))
+MASKS = {name: GEOM[name] for name in ("contype", "conaffinity")}  # custom attributes of visuals too
+PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom: if a material is there too, the material's shows
+SCHEMAS = {
+    "box": "Cube",
+    "sphere": "Sphere",
+    "ellipsoid": "Sphere",
+    "capsule": "Capsule",
+    "cylinder": "Cylinder",
+    "plane": "Plane",
+    "mesh": "Mesh",
+}
 
 
 def write_usd(model: Model, out: Path) -> None:
@@ -66,7 +83,12 @@ def write_usd(model: Model, out: Path) -> None:
     _add_bodies(writer)
     _add_joints(writer)
     _add_filters(writer)
-    _write(writer, out)
+    try:
+        with atomic_path(out) as temporary:
+            if not writer.stage.GetRootLayer().Export(str(temporary)):
+                raise OSError(0, "USD did not say why")
+    except FileError as error:
+        raise RobotError(f"{out}: cannot be written: {error.reason}") from error
     for message in (*writer.unsupported, *_unsupported_elements(writer)):
         warnings.warn(message, stacklevel=3)
 
@@ -92,8 +114,7 @@ def _add_scene(writer: StageWriter) -> None:
     set_number(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
     # A scene of a stage that this one is layered into may have a schema with another default.
     set_custom(scene.GetPrim(), "timestep", float(model.opt.timestep))
-    default = default_model().opt
-    set_customs(scene.GetPrim(), OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(default, name))
+    set_customs(scene.GetPrim(), OPTION, model.opt, default_model().opt)
     for key in FLAGS:
         bits = int(getattr(model.opt, f"{key}flags"))
         if names := [name for name, bit in flag_names(key).items() if bits & bit and name not in KNOWN_FLAGS]:
@@ -117,10 +138,28 @@ def _add_bodies(writer: StageWriter) -> None:
             set_custom(prim, "name", model.body(body).name)
             if model.body_gravcomp[body]:
                 set_custom(prim, "gravcomp", float(model.body_gravcomp[body]))
-            set_pose(prim, state.xpos[body], state.xquat[body])
+            _set_pose(prim, state.xpos[body], state.xquat[body])
             _add_mass(writer, body, prim)
-        add_geoms(writer, body)
-        add_sites(writer, body)
+        for geom in np.flatnonzero(model.geom_bodyid == body).tolist():
+            _add_geom(writer, geom)
+        for site in np.flatnonzero(model.site_bodyid == body).tolist():
+            name = model.site(site).name
+            prim = u.UsdGeom.Xform.Define(writer.stage, writer.path(path, name or "site")).GetPrim()
+            writer.sites[site] = str(prim.GetPath())
+            _set_pose(prim, model.site_pos[site], model.site_quat[site])
+            set_custom(prim, "site", True)
+            set_custom(prim, "name", name)
+            set_customs(prim, SITE, model, default_model(), site)
+
+
+def _set_pose(prim: Any, pos: np.ndarray, quat: np.ndarray, scale: np.ndarray | None = None) -> None:
+    """Give a prim its position [m], rotation (w x y z) and scale in its parent's frame, in double precision."""
+    u = usd_modules()
+    xform, double = u.UsdGeom.Xformable(prim), u.UsdGeom.XformOp.PrecisionDouble
+    xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*rounded(pos).tolist()))
+    xform.AddOrientOp(double).Set(u.Gf.Quatd(*rounded(quat).tolist()))
+    if scale is not None:
+        xform.AddScaleOp(double).Set(u.Gf.Vec3d(*scale.tolist()))
 
 
 def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
@@ -138,6 +177,89 @@ def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
         return
     set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
     set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
+
+
+def _add_geom(writer: StageWriter, geom: int) -> None:
+    model, u = writer.model, usd_modules()
+    shape, scale = _define(writer, geom)
+    prim = shape.GetPrim()
+    writer.geoms[geom] = str(prim.GetPath())
+    pos, quat = model.geom_pos[geom], model.geom_quat[geom]
+    if model.geom_type[geom] == MESH_GEOM:  # the frame that its file is in
+        mesh = int(model.geom_dataid[geom])
+        turn = Rotation.from_quat(quat, scalar_first=True) * Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).inv()
+        pos, quat = pos - turn.apply(model.mesh_pos[mesh]), turn.as_quat(canonical=True, scalar_first=True)
+    _set_pose(prim, pos, quat, scale)
+    set_custom(prim, "name", model.geom(geom).name)
+    rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    if material >= 0 and np.array_equal(rgba, np.array(PLAIN_RGBA, dtype=rgba.dtype)):
+        rgba = model.mat_rgba[material]
+    *colour, opacity = rgba.tolist()
+    shape.CreateDisplayColorAttr([u.Gf.Vec3f(*colour)])
+    if opacity != 1.0:
+        shape.CreateDisplayOpacityAttr([opacity])
+    is_colliding = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+    set_customs(prim, GEOM if is_colliding else MASKS, model, default_model(), geom)
+    if is_colliding:
+        u.UsdPhysics.CollisionAPI.Apply(prim)
+        if prim.IsA(u.UsdGeom.Mesh):
+            u.UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr("convexHull")  # as MuJoCo collides it
+        surface = _material(writer, float(model.geom_friction[geom, 0]))
+        u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(surface, materialPurpose="physics")
+
+
+def _define(writer: StageWriter, geom: int) -> tuple[Any, np.ndarray | None]:
+    """Define a geom's prim without its pose; return its schema, and the scale that it wants."""
+    model, shapes = writer.model, usd_modules().UsdGeom
+    kind, size = SHAPE_NAMES.get(int(model.geom_type[geom]), "unknown"), model.geom_size[geom]
+    name, body = model.geom(geom).name, int(model.geom_bodyid[geom])
+    mesh = model.mesh(model.geom_dataid[geom]).name if kind == "mesh" else ""
+    if kind not in SCHEMAS:
+        shown = f'geom "{name}"' if name else f"unnamed {kind} geom {geom}"
+        raise RobotError(f"{writer.file}: {shown} of body {writer.body_name(body)} is of type {kind}, which USD does not have")
+    shape = getattr(shapes, SCHEMAS[kind]).Define(writer.stage, writer.path(writer.bodies[body], name or mesh or kind))
+    if kind == "box":
+        shape.CreateSizeAttr(2.0)
+    elif kind == "mesh":
+        _add_triangles(writer, geom, shape)
+    elif kind == "plane":
+        shape.CreateAxisAttr("Z")
+        for create, half in ((shape.CreateWidthAttr, size[0]), (shape.CreateLengthAttr, size[1])):
+            if half > 0:  # MuJoCo draws a half size of 0 without end, and collides every plane so, as UsdPhysics does
+                create(2.0 * float(half))
+    else:
+        shape.CreateRadiusAttr(1.0 if kind == "ellipsoid" else float(size[0]))
+    if kind in ("capsule", "cylinder"):
+        shape.CreateAxisAttr("Z")
+        shape.CreateHeightAttr(2.0 * float(size[1]))
+    shape.CreateExtentAttr(shapes.Boundable.ComputeExtentFromPlugins(shape, usd_modules().Usd.TimeCode.Default()))
+    return shape, size if kind in ("box", "ellipsoid") else None
+
+
+def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
+    """Write a mesh's triangles as its file has them, and what MuJoCo makes of them."""
+    model, mesh, u = writer.model, int(writer.model.geom_dataid[geom]), usd_modules()
+    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(file_vertices(model, mesh)))
+    first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    shape.CreateFaceVertexIndicesAttr(u.Vt.IntArray.FromNumpy(model.mesh_face[first : first + count].astype(np.int32).ravel()))
+    shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
+    shape.CreateSubdivisionSchemeAttr("none")
+    name = model.mesh(mesh).name
+    set_custom(shape.GetPrim(), "mesh", name)
+    default = mujoco.MjSpec().add_mesh(inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)  # as the importer takes meshes
+    set_customs(shape.GetPrim(), MESH, writer.spec.mesh(name), default)
+
+
+def _material(writer: StageWriter, friction: float) -> Any:
+    """Return the physics material of a sliding friction; geoms of the same friction share it."""
+    u = usd_modules()
+    if friction not in writer.frictions:
+        material = u.UsdShade.Material.Define(writer.stage, writer.path(writer.materials, f"friction_{friction!r}"))
+        surface = u.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+        set_number(surface.CreateStaticFrictionAttr(), friction)
+        set_number(surface.CreateDynamicFrictionAttr(), friction)
+        writer.frictions[friction] = material
+    return writer.frictions[friction]
 
 
 def _add_joints(writer: StageWriter) -> None:
@@ -166,11 +288,13 @@ def _never_collide(model: mujoco.MjModel, one: int, two: int) -> bool:
 
 
 def _add_filters(writer: StageWriter) -> None:
-    """Write the pairs of bodies that do not collide and that USD would not know of."""
+    """Write the pairs of bodies that do not collide and that USD would not know of.
+
+    MuJoCo's own filter sees bodies that are welded together as one, USD's joints only the two that they join.
+    """
     model, u, stage = writer.model, usd_modules(), writer.stage
     pairs = _excluded(model)
-    masks = model.geom_contype | model.geom_conaffinity
-    colliding = sorted({int(body) for body in model.geom_bodyid[masks != 0]} - {0})
+    colliding = sorted({int(body) for body in model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) != 0]} - {0})
     pairs |= {(a, b) for a, b in combinations(colliding, 2) if model.body_parentid[b] != a and _never_collide(model, a, b)}
     targets: dict[int, list[str]] = {}
     for one, two in sorted(pairs):
@@ -178,8 +302,7 @@ def _add_filters(writer: StageWriter) -> None:
             targets.setdefault(one, []).append(writer.bodies[two])
         elif one in writer.bodies:  # the world is no rigid body: each of its colliders is named
             others = stage.GetPrimAtPath(writer.bodies[one]).GetChildren()
-            walls = [str(other.GetPath()) for other in others if other.HasAPI(u.UsdPhysics.CollisionAPI)]
-            if walls:
+            if walls := [str(other.GetPath()) for other in others if other.HasAPI(u.UsdPhysics.CollisionAPI)]:
                 targets.setdefault(two, []).extend(walls)
     for body, others in sorted(targets.items()):
         filtered = u.UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(writer.bodies[body]))
@@ -213,13 +336,3 @@ def _unsupported_elements(writer: StageWriter) -> list[str]:
         names = listed([writer.body_name(body) for body in light])
         messages.append(f"{writer.file}: USD takes a mass of 0 for one that is not given: {names}")
     return messages
-
-
-def _write(writer: StageWriter, out: Path) -> None:
-    """Write the stage to a file that is whole whenever it is there."""
-    try:
-        with atomic_path(out) as temporary:
-            if not writer.stage.GetRootLayer().Export(str(temporary)):
-                raise OSError(0, "USD did not say why")
-    except FileError as error:
-        raise RobotError(f"{out}: cannot be written: {error.reason}") from error

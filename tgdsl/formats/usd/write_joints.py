@@ -18,8 +18,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.usd.attributes import JOINT, default_model, set_custom, set_customs, set_number
-from tgdsl.formats.usd.export.stage_writer import BALL, FREE, HINGE, SLIDE, StageWriter, rounded
+from tgdsl.formats.usd.attributes import (
+    BALL,
+    FREE,
+    HINGE,
+    JOINT,
+    SLIDE,
+    StageWriter,
+    default_model,
+    rounded,
+    set_custom,
+    set_customs,
+    set_number,
+)
 from tgdsl.formats.usd.joints import Drive
 from tgdsl.formats.usd.stage import usd_modules
 
@@ -29,20 +40,15 @@ AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
 SCHEMAS = {BALL: "SphericalJoint", SLIDE: "PrismaticJoint", HINGE: "RevoluteJoint"}
 
 
-def joint_of(writer: StageWriter, body: int) -> int:
-    """Return the index of a body's joint, or -1 if it is fixed to its parent."""
-    count = int(writer.model.body_jntnum[body])
+def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
+    """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap)."""
+    model, count = writer.model, int(writer.model.body_jntnum[body])
     if count > 1:
         raise RobotError(
             f'{writer.file}: body "{writer.body_name(body)}" has {count} joints, and a body in USD has one to its parent; '
             "give each joint a body of its own"
         )
-    return int(writer.model.body_jntadr[body]) if count else -1
-
-
-def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
-    """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap)."""
-    model, joint = writer.model, joint_of(writer, body)
+    joint = int(model.body_jntadr[body]) if count else -1
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
     if kind == FREE or model.body_mocapid[body] >= 0:
         if joint >= 0:
@@ -64,7 +70,10 @@ def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
         return
     if kind in (SLIDE, HINGE):
         made.CreateAxisAttr("X")
-        _limit(model, joint, made)
+        low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-math.inf, math.inf)
+        unit = math.degrees(1.0) if kind == HINGE else 1.0
+        set_number(made.CreateLowerLimitAttr(), low * unit)
+        set_number(made.CreateUpperLimitAttr(), high * unit)
     _passive(model, joint, made.GetPrim())
     writer.joints[joint] = made
 
@@ -96,21 +105,12 @@ def _x_to(axis: np.ndarray) -> Rotation:
     return turn if axis[0] >= 0 else turn * Rotation.from_quat([0.0, 0.0, 0.0, 1.0], scalar_first=True)
 
 
-def _limit(model: mujoco.MjModel, joint: int, made: Any) -> None:
-    """Write a joint's range: degrees or metres, infinite without limits."""
-    low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-math.inf, math.inf)
-    if model.jnt_type[joint] == HINGE:
-        low, high = math.degrees(low), math.degrees(high)
-    set_number(made.CreateLowerLimitAttr(), low)
-    set_number(made.CreateUpperLimitAttr(), high)
-
-
 def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
     """Write a joint's armature, dry friction and damping, in SI units; of the first two PhysX has attributes, USD has none."""
     first = int(model.jnt_dofadr[joint])
-    index = {"jnt": joint, "dof": first}
-    default = default_model()
-    set_customs(prim, JOINT, lambda name: getattr(model, name)[index[name[:3]]], lambda name: getattr(default, name)[0])
+    for prefix, index in (("jnt", joint), ("dof", first)):
+        rows = {name: row for name, row in JOINT.items() if row.array.startswith(prefix)}
+        set_customs(prim, rows, model, default_model(), index)
     start = float(model.qpos0[model.jnt_qposadr[joint]])
     if start and model.jnt_type[joint] in (SLIDE, HINGE):
         set_custom(prim, "ref", start)

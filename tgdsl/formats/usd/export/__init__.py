@@ -1,1 +1,0 @@
-"""MJCF and URDF models, exported as USD stages."""
