@@ -31,10 +31,9 @@ from module import median_ms
 from torch import Tensor
 
 from tgdsl.quantities.contact_depth import ReferencePenetration
-from tgdsl.sensors.elastomer import blocks, operators
+from tgdsl.sensors.elastomer import operators
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance_reference
-from tgdsl.sensors.elastomer.kernels import LinkTaxels
-from tgdsl.sensors.elastomer.operators import Operator, OperatorForm
+from tgdsl.sensors.elastomer.operators import LinkTaxels, Operator, OperatorForm
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -90,8 +89,8 @@ def folded(taxels: LinkTaxels, surface: Surface, fields: dict[str, Any]) -> dict
     pad = surface if spec.boundary is not None else None
     form = OperatorForm(spec.operator, spec.tolerance)
     return {
-        name: operators.fold(response, blocks.PLANES[name], taxels, form, is_alike=pad is None or name != "spread")
-        for name, response in blocks.responses(spec, taxels, pad).items()
+        name: operators.fold(response, operators.PLANES[name], taxels, form, is_alike=pad is None or name != "spread")
+        for name, response in operators.responses(spec, taxels, pad).items()
     }
 
 
@@ -240,13 +239,13 @@ class Curved:
 
 def responses_of(taxels: LinkTaxels) -> np.ndarray:
     """Return the in-plane dilation per depth, (3, target, source)."""
-    return blocks.responses(spec_of(), taxels, None)["spread"](np.arange(len(taxels.pos)))[:, 0]
+    return operators.responses(spec_of(), taxels, None)["spread"](np.arange(len(taxels.pos)))[:, 0]
 
 
 def in_float32(taxels: LinkTaxels, h: np.ndarray) -> np.ndarray:
     """Return what a module's dense operator makes of depths (press, taxel), in float32."""
-    response = blocks.responses(spec_of(), taxels, None)["spread"]
-    spread = operators.fold(response, blocks.PLANES["spread"], taxels, OperatorForm("dense", None))
+    response = operators.responses(spec_of(), taxels, None)["spread"]
+    spread = operators.fold(response, operators.PLANES["spread"], taxels, OperatorForm("dense", None))
     link = on({"spread": spread}, "cpu", torch.float32)
     return torch.stack(operators.apply([link["spread"]], [torch.from_numpy(h).float()]), dim=1).double().numpy()
 

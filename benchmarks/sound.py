@@ -39,8 +39,7 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.sensors.base import Context
-from tgdsl.sensors.contact_audio.impulses import impulses
-from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
+from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO, impulses
 
 LINKS, MODES, SAMPLES, STEP = 5, 8, 20, 0.001
 CASES: dict[str, dict[str, Any]] = {

@@ -13,8 +13,7 @@ import torch
 
 import tgdsl
 from tgdsl.runtime.rollout import rollout, script_of
-from tgdsl.sensors.microphone.interpolation import TAPS, coefficients
-from tgdsl.sensors.microphone.retarded import age_of_sound
+from tgdsl.sensors.microphone import TAPS, age_of_sound, coefficients
 from tgdsl.view.sound import Sound, draw, sounding
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "materials_audio.yaml"

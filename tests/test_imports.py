@@ -166,7 +166,7 @@ def test_foreign_libraries_are_imported_in_their_places():
 
     uses = {(name, i, inside) for name, file in MODULES.items() for i, inside in imports(file) if i.startswith("tgdsl.")}
     clamped = {(name, inside) for name, i, inside in uses if i.startswith(f"tgdsl.{CLAMPED}") and not name.startswith(CLAMPED)}
-    assert clamped == {("sensors.elastomer.blocks", True)}
+    assert clamped == {("sensors.elastomer.operators", True)}
 
     assert {place for place in places(*LEARNERS) if not place[0].startswith(LEARNING)} == {
         ("rl.adapters.gymnasium", "gymnasium", False),

@@ -10,9 +10,9 @@ from ringing_bodies import hollow, slabs, thin_box
 from tgdsl.errors import LowerError
 from tgdsl.fields.materials import MATERIALS, Material
 from tgdsl.files import cache
-from tgdsl.modal import spectrum as spectra
+from tgdsl.modal import analysis as spectra
 from tgdsl.modal.analysis import analysed
-from tgdsl.modal.spec import ShapeModes
+from tgdsl.modal.modes import ShapeModes
 from tgdsl.surfaces.surface import Surface
 
 

@@ -6,8 +6,8 @@ import trimesh
 from oracles.setups.solids import ball, box, surface_of
 from ringing_bodies import hollow, slabs, thin_box, turned
 
-from tgdsl.modal import cells, grid
-from tgdsl.modal.closed import closed
+from tgdsl.modal import cells
+from tgdsl.modal.cells import closed
 from tgdsl.surfaces.surface import Surface
 
 
@@ -15,9 +15,9 @@ def cut(
     surface: Surface, cell: float, sight: int = 12, along: np.ndarray | None = None
 ) -> tuple[cells.Filled, cells.Crossings]:
     vertices, faces = closed(surface)
-    vertices = vertices @ (grid.axes(vertices, faces) if along is None else along).T
+    vertices = vertices @ (cells.axes(vertices, faces) if along is None else along).T
     x, y, z = (
-        grid.lines(grid.planes(vertices, faces, axis), vertices[:, axis].min(), vertices[:, axis].max(), cell)
+        cells.lines(cells.planes(vertices, faces, axis), vertices[:, axis].min(), vertices[:, axis].max(), cell)
         for axis in range(3)
     )
     return cells.filled(vertices, faces, (x, y, z), sight, 1e-6)
@@ -39,7 +39,7 @@ def test_a_box_is_exact_in_every_moment():
         wanted = np.prod(
             [0 if p % 2 else 2 * (side / 2) ** (p + 1) / (p + 1) for side, p in zip((2.0, 1.0, 0.5), powers, strict=True)]
         )
-        axes = grid.axes(*closed(surface_of(box((2.0, 1.0, 0.5)))))
+        axes = cells.axes(*closed(surface_of(box((2.0, 1.0, 0.5)))))
         mine = np.abs(axes).argmax(axis=0)  # which of the grid's axes is the body's x, y, z
         got = integral(found, lambda at, p=powers, m=mine: np.prod([at[..., m[i]] ** p[i] for i in range(3)], axis=0))
         assert got == pytest.approx(wanted, abs=1e-12)
@@ -105,27 +105,27 @@ def test_axes_follow_the_flat_faces():
     """Of a box that is turned, its own; of a rod with round ends its length; of a ball the frame's."""
     vector = (0.3, 0.8, -0.4)
     mesh = turned(box((0.3, 0.2, 0.1)), vector, (1.0, 2.0, 3.0))
-    found = grid.axes(*closed(surface_of(mesh)))
+    found = cells.axes(*closed(surface_of(mesh)))
     own = turned(trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False), vector, (0.0, 0.0, 0.0)).vertices
     assert np.abs(found @ own.T).max(axis=1) == pytest.approx(np.ones(3))
     assert np.linalg.det(found) == pytest.approx(1.0)
     rod = turned(trimesh.creation.capsule(0.3, 0.02, count=[24, 24]), vector, (0.0, 0.0, 0.0))
-    assert np.abs(grid.axes(*closed(surface_of(rod))) @ own[2]).max() == pytest.approx(1.0, abs=1e-4)
+    assert np.abs(cells.axes(*closed(surface_of(rod))) @ own[2]).max() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_lines_keep_thin_walls_and_leave_out_small_steps():
     """Walls of a hundredth of a cell; and a step of two small faces beside a large one."""
-    wall = grid.Planes(np.array([0.0, 0.001, 0.999, 1.0]), np.array([1.0, 0.99, 0.99, 1.0]))
-    assert grid.lines(wall, 0.0, 1.0, 0.5) == pytest.approx([0.0, 0.001, 0.5, 0.999, 1.0])
-    step = grid.Planes(np.array([0.0, 0.001, 1.0]), np.array([1.0, 0.05, 1.0]))
-    assert grid.lines(step, 0.0, 1.0, 0.5) == pytest.approx([0.0, 0.5, 1.0])
-    assert grid.lines(grid.Planes(np.zeros(0), np.zeros(0)), -1.0, 1.0, 1.0) == pytest.approx([-1.0, 0.0, 1.0])
+    wall = cells.Planes(np.array([0.0, 0.001, 0.999, 1.0]), np.array([1.0, 0.99, 0.99, 1.0]))
+    assert cells.lines(wall, 0.0, 1.0, 0.5) == pytest.approx([0.0, 0.001, 0.5, 0.999, 1.0])
+    step = cells.Planes(np.array([0.0, 0.001, 1.0]), np.array([1.0, 0.05, 1.0]))
+    assert cells.lines(step, 0.0, 1.0, 0.5) == pytest.approx([0.0, 0.5, 1.0])
+    assert cells.lines(cells.Planes(np.zeros(0), np.zeros(0)), -1.0, 1.0, 1.0) == pytest.approx([-1.0, 0.0, 1.0])
 
 
 def test_faces_that_rounding_puts_a_little_apart_are_one_plane():
     """As coordinates of a mesh in float32 are: no cell is thinner than that."""
-    noisy = grid.Planes(np.array([2e-8, 0.5, 1 - 3e-8]), np.array([1.0, 1.0, 1.0]))
-    assert grid.lines(noisy, 0.0, 1.0, 0.5).tolist() == [0.0, 0.5, 1.0]
+    noisy = cells.Planes(np.array([2e-8, 0.5, 1 - 3e-8]), np.array([1.0, 1.0, 1.0]))
+    assert cells.lines(noisy, 0.0, 1.0, 0.5).tolist() == [0.0, 0.5, 1.0]
     mesh = turned(thin_box(0.1, 0.002), (0.3, 0.5, 0.2), (0.01, 0.02, 0.03))
     mesh.vertices = mesh.vertices.astype(np.float32)
     found, _ = cut(surface_of(mesh), 0.02)

@@ -7,7 +7,7 @@ from oracles.setups.solids import ball, box, surface_of
 from ringing_bodies import hollow, thin_box
 
 from tgdsl.errors import LowerError
-from tgdsl.modal.closed import closed, enclosed
+from tgdsl.modal.cells import closed, enclosed
 from tgdsl.surfaces.surface import Surface
 
 CUBE = 0.1**3

@@ -10,7 +10,7 @@ from oracles import modes as oracles
 from oracles.setups.solids import ball, box, breathing, lamb, surface_of, timoshenko, torsion
 from ringing_bodies import turned
 
-from tgdsl.modal.spectrum import spectrum
+from tgdsl.modal.analysis import spectrum
 
 
 @pytest.fixture(autouse=True)

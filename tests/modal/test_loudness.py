@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ortho_group
 
-from tgdsl.modal.loudness import MERGE_TOLERANCE, Loudness, groups, loudness, of_groups
+from tgdsl.modal.modes import MERGE_TOLERANCE, Loudness, groups, loudness, of_groups
 
 
 def shapes(num: int = 6, points: int = 40) -> tuple[np.ndarray, np.ndarray]:

@@ -6,12 +6,10 @@ from oracles import modes as oracles
 from oracles.setups.solids import ball, bending, box, roots, surface_of
 
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.modal import spectrum as spectra
+from tgdsl.modal import analysis as spectra
 from tgdsl.modal.analysis import analysed
-from tgdsl.modal.loudness import of_groups
-from tgdsl.modal.modes import Modes
-from tgdsl.modal.shapes import ALONG, interpolated, on_grid
-from tgdsl.modal.spec import ShapeModes
+from tgdsl.modal.elasticity import ALONG, on_grid
+from tgdsl.modal.modes import Modes, ShapeModes, interpolated, of_groups
 
 LENGTH, HEIGHT, WIDTH = 0.4, 0.006, 0.01
 SIDE, THICKNESS = 0.2, 0.004

@@ -10,7 +10,7 @@ from oracles.comparison import Values, field
 from oracles.noise import DT
 from oracles.setups.signals import MM, Noise, make_layout, one
 from tgdsl.layout.layout import Layout
-from tgdsl.sensors.noise.crosstalk import crosstalk_kernel
+from tgdsl.sensors.noise.stages import crosstalk_kernel
 
 oracle = field("filters", "noise")
 EXACT = 1e-12

@@ -13,9 +13,8 @@ from scipy.integrate import quad
 from scipy.special import jv
 
 from oracles.comparison import Values, field
-from tgdsl.sensors.elastomer.bonded_layer import Layer
-from tgdsl.sensors.elastomer.half_space import half_space, patch_radius, patch_transform
-from tgdsl.sensors.elastomer.kernels import Elastic, LinkTaxels
+from tgdsl.sensors.elastomer.elastic import Layer, half_space, patch_radius, patch_transform
+from tgdsl.sensors.elastomer.operators import Elastic, LinkTaxels
 
 G = 7e4
 """Shear modulus [Pa]."""

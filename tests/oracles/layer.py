@@ -7,9 +7,8 @@ from scipy.integrate import solve_bvp
 
 from oracles.comparison import Values, field
 from oracles.half_space import NUS, G, flat_skin
-from tgdsl.sensors.elastomer.bonded_layer import Layer, profiles, response, tabulated
-from tgdsl.sensors.elastomer.half_space import half_space
-from tgdsl.sensors.elastomer.kernels import Elastic
+from tgdsl.sensors.elastomer.elastic import Layer, half_space, profiles, response, tabulated
+from tgdsl.sensors.elastomer.operators import Elastic
 
 oracle = field("contact mechanics: bonded layer", "elastomer")
 WAVES = np.array([0.02, 0.1, 0.5, 1.0, 2.0, 6.0, 40.0])

@@ -11,9 +11,8 @@ import numpy as np
 
 from oracles.comparison import Values, field
 from oracles.setups.scenes import probed, state
-from tgdsl.sensors.elastomer.blocks import responses
-from tgdsl.sensors.elastomer.half_space import half_space, patch_radius
-from tgdsl.sensors.elastomer.kernels import Gaussian, LinkTaxels, offset
+from tgdsl.sensors.elastomer.elastic import half_space, patch_radius
+from tgdsl.sensors.elastomer.operators import Gaussian, LinkTaxels, offset, responses
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 
 DEPTH = 5e-4

@@ -11,13 +11,11 @@ import numpy as np
 from oracles.comparison import Values, field
 from oracles.setups.solids import ball, bending, box, breathing, lamb, plate_frequencies, roots, surface_of, timoshenko, torsion
 from tgdsl.fields.materials import MATERIALS, Material
-from tgdsl.modal import cells, grid
-from tgdsl.modal.analysis import analysed
-from tgdsl.modal.closed import closed
-from tgdsl.modal.elasticity import Elements
-from tgdsl.modal.spec import ShapeModes
-from tgdsl.modal.spectrum import SIGHT, SLIVER, spectrum
-from tgdsl.modal.vibration import vibration
+from tgdsl.modal import cells
+from tgdsl.modal.analysis import SIGHT, SLIVER, analysed, spectrum
+from tgdsl.modal.cells import closed
+from tgdsl.modal.elasticity import Elements, vibration
+from tgdsl.modal.modes import ShapeModes
 from tgdsl.surfaces.surface import Surface
 
 oracle = field("sound: modes of bodies", "contact_audio")
@@ -58,9 +56,9 @@ def all_modes(surface: Surface, cell: float, poissons_ratio: float, count: int) 
     """Return κ of all modes, those that are not heard too, on cells of a size over L."""
     vertices, faces = closed(surface)
     vertices = vertices / np.ptp(vertices, axis=0).max()
-    vertices = vertices @ grid.axes(vertices, faces).T
+    vertices = vertices @ cells.axes(vertices, faces).T
     x, y, z = (
-        grid.lines(grid.planes(vertices, faces, axis), vertices[:, axis].min(), vertices[:, axis].max(), cell)
+        cells.lines(cells.planes(vertices, faces, axis), vertices[:, axis].min(), vertices[:, axis].max(), cell)
         for axis in range(3)
     )
     filled, _ = cells.filled(vertices, faces, (x, y, z), SIGHT, SLIVER)

@@ -23,8 +23,15 @@ from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt, unfelt_ids
 from tgdsl.module.state import SHAPES
 from tgdsl.observations import observations
-from tgdsl.observations.observations import ObservationSpec, OfReading, ReadingObservation, ReadingSpec
-from tgdsl.observations.proprioception import PROPRIOCEPTION, JointObservation, JointSpec
+from tgdsl.observations.observations import (
+    PROPRIOCEPTION,
+    JointObservation,
+    JointSpec,
+    ObservationSpec,
+    OfReading,
+    ReadingObservation,
+    ReadingSpec,
+)
 from tgdsl.placement.reach import unfelt
 from tgdsl.plan import tree
 from tgdsl.plan.inputs import ContactPart, Inputs

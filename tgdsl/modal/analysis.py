@@ -16,15 +16,203 @@ material's damping has it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import igl
 import numpy as np
+from jaxtyping import Float, Int
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError
 from tgdsl.fields.materials import Material
-from tgdsl.modal.modes import Modes, ModeShapes
-from tgdsl.modal.spec import ShapeModes
-from tgdsl.modal.spectrum import Spectrum, spectrum
+from tgdsl.files import cache
+from tgdsl.modal import cells
+from tgdsl.modal.cells import closed, enclosed, refused
+from tgdsl.modal.elasticity import Elements, ShapeGrid, on_grid, vibration
+from tgdsl.modal.modes import Modes, ModeShapes, ShapeModes, loudness
 from tgdsl.surfaces.surface import Surface
+
+FORMAT = b"tgdsl modes 4"
+"""Version of cached results; change it with any change of the computation."""
+UNKNOWNS = 25_000
+"""Target number of unknowns, which sets the size of cells."""
+MAX_UNKNOWNS = 60_000
+"""Bound on it: a body whose flat walls alone ask for more cells is refused."""
+FINEST = 1 / 48
+"""Smallest cells, over the size of the body."""
+COARSEST = 1 / 3
+"""Largest cells."""
+BULKY = 1.0
+"""Smallest cells, over the volume over the surface: a ball or a cube has six of them from side to side."""
+ROUNDS = 6
+"""Times that the size of the cells is adjusted."""
+SIGHT, GLANCE = 12, 3
+"""Lines of sight through a cell along each axis: for the analysis, and to count cells."""
+SLIVER = 2e-3
+"""Share of a cell that is filled below which it is left out: too few lines of sight pass through the body there."""
+WHOLE = 0.9
+"""Share of the volume that one connected part has at least; smaller parts are left out."""
+DIGITS = 9
+"""Decimals of coordinates, over the size of the body: so that similar bodies are equal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Modes of a shape by ascending frequency; modes of equal frequency are one.
+
+    Attributes:
+        wave_number: ω L/c with c = √(E/ρ) and the length L of the longest side of the bounding box.
+        multiplicity: Number of modes that are one.
+        gain: Gain times the body's mass: see `loudness.py`.
+        volume: The body's, over L³.
+        unknowns: Size of the eigenproblem.
+        axes: The grid's axes, as rows, of the body's.
+        owner: The group that each field of the mode shapes belongs to, see `loudness.py`.
+        grid: The fields, in the grid's axes, from the middle of the bounding box and over L.
+    """
+
+    wave_number: Float[np.ndarray, " group"]
+    multiplicity: Int[np.ndarray, " group"]
+    gain: Float[np.ndarray, " group"]
+    volume: float
+    unknowns: int
+    axes: Float[np.ndarray, "3 3"]
+    owner: Int[np.ndarray, " field"]
+    grid: ShapeGrid
+
+
+def spectrum(
+    surface: Surface, poissons_ratio: float, count: int, unknowns: int | None = None, progress: Progress = silent
+) -> tuple[Spectrum, float, Float[np.ndarray, " 3"]]:
+    """Return the lowest modes of a shape, from the cache if they are there; its size L [m]; and the middle of its box [m].
+
+    The modes of a shape, whatever its size and material: one analysis per shape and Poisson's ratio, kept by content.
+
+    Frequencies of similar bodies are as √(E/ρ)/L, and mode shapes of unit modal mass as 1/√m. So all that follows from the
+    shape is computed in units of the body's size L, with E = 1 and ρ = 1, and scaled exactly.
+
+    Shapes: `group` modes of distinct frequency, `field` fields of mode shapes.
+
+    Args:
+        surface: Triangles around the body [m].
+        poissons_ratio: Less than 1/2.
+        count: Most modes of distinct frequency.
+        unknowns: Target number of unknowns; default: `UNKNOWNS`.
+        progress: Called with a line of text for each long job.
+
+    Raises:
+        LowerError: If the surface has no inside, the body falls into parts, or needs more cells than are allowed.
+    """
+    unknowns = UNKNOWNS if unknowns is None else unknowns
+    progress("closing its surface")
+    vertices, faces = closed(surface)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size, middle = float((high - low).max()), (low + high) / 2
+    vertices = np.round((vertices - middle) / size, DIGITS) + 0.0
+    key = cache.digest(FORMAT, [vertices, faces, np.array(poissons_ratio), np.array([count, unknowns])])
+    result = cache.cached(
+        key, lambda: _computed(vertices, faces, poissons_ratio, count, unknowns, progress), _packed, _unpacked
+    )
+    return result, size, middle
+
+
+def _computed(
+    vertices: np.ndarray, faces: np.ndarray, poissons_ratio: float, count: int, unknowns: int, progress: Progress
+) -> Spectrum:
+    turned = cells.axes(vertices, faces)
+    placed = vertices @ turned.T
+    progress(f"a grid of cells for {unknowns} unknowns")
+    lines = _lines(placed, faces, unknowns)
+    filled, crossings = cells.filled(placed, faces, lines, SIGHT, SLIVER)
+    elements, crossings = _whole(Elements.of(filled), crossings)
+    progress(f"stiffness and mass of {len(elements.nodes)} cells")
+    stiffness, mass = elements.matrices(poissons_ratio)
+    progress(f"eigenproblem of {3 * len(elements.pos)} unknowns")
+    # A few more than asked for: some are one, and the last group may lack some of its modes.
+    result = vibration(stiffness, mass, count + 8)
+    progress("mode shapes on a grid")
+    displacement = elements.displacement(crossings.cell, crossings.pos, result.shape)
+    normal = np.einsum("xim,xi->xm", displacement, crossings.normal)
+    volume = float(elements.filled.volume.sum())
+    heard = loudness(result.wave_number, normal, crossings.area, volume)
+    first = slice(None, count)
+    in_count = heard.owner < count
+    return Spectrum(
+        wave_number=_rounded(heard.wave_number[first]),
+        multiplicity=heard.multiplicity[first],
+        gain=_rounded(heard.gain[first]),
+        volume=volume,
+        unknowns=3 * len(elements.pos),
+        axes=turned,
+        owner=heard.owner[in_count],
+        grid=on_grid(elements, crossings, lines, result.shape @ heard.mixture[:, in_count]),
+    )
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """Return values to nine digits, so that the order in which a machine adds up does not show."""
+    return np.array([float(f"{value:.9g}") for value in values.tolist()])
+
+
+def _lines(vertices: np.ndarray, faces: np.ndarray, wanted: int) -> cells.Lines:
+    """Return a grid that gives about as many unknowns as wanted, or the finest one."""
+    flat = [cells.planes(vertices, faces, axis) for axis in range(3)]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size, area = float((high - low).max()), float(np.asarray(igl.doublearea(vertices, faces)).sum()) / 2
+    finest = max(FINEST * size, BULKY * abs(enclosed(vertices, faces)) / area)
+
+    def at(cell: float) -> tuple[cells.Lines, int]:
+        x, y, z = (cells.lines(flat[axis], low[axis], high[axis], cell) for axis in range(3))
+        filled, _ = cells.filled(vertices, faces, (x, y, z), GLANCE, SLIVER)
+        return (x, y, z), 3 * len(Elements.of(filled).pos)
+
+    cell, best = size / 8, None
+    for _ in range(ROUNDS):
+        result, unknowns = at(cell)
+        if unknowns <= wanted and (best is None or unknowns > best[1]):
+            best = result, unknowns
+        at_end = (unknowns > wanted and cell >= COARSEST * size) or (unknowns <= wanted and cell <= finest)
+        if at_end or 0.8 * wanted <= unknowns <= wanted:
+            break
+        cell = float(np.clip(cell * (unknowns / (0.9 * wanted)) ** 0.4, finest, COARSEST * size))
+    if best is None and unknowns > MAX_UNKNOWNS:
+        walls = " × ".join(str(len(line) - 1) for line in result)
+        raise refused(
+            f"its flat walls ask for a grid of {walls} cells and {unknowns} unknowns, {MAX_UNKNOWNS} are allowed",
+            "leave out small details",
+        )
+    return result if best is None else best[0]
+
+
+def _whole(elements: Elements, crossings: cells.Crossings) -> tuple[Elements, cells.Crossings]:
+    """Return the largest connected part of a body."""
+    part = elements.part
+    if not part.any():
+        return elements, crossings
+    volume = np.bincount(part, elements.filled.volume)
+    if volume[0] < WHOLE * volume.sum():
+        shares = ", ".join(f"{share:.1%}" for share in volume[:4] / volume.sum())
+        raise refused(f"it is {len(volume)} parts that do not touch, of {shares} of its volume", "join its geoms")
+    is_largest = part == 0
+    row = np.cumsum(is_largest) - 1
+    everything = elements.filled
+    filled = cells.Filled(*(getattr(everything, name)[is_largest] for name in ("index", "low", "size", "weight")))
+    on = is_largest[crossings.cell]
+    one = cells.Crossings(row[crossings.cell[on]], crossings.pos[on], crossings.normal[on], crossings.area[on])
+    return Elements.of(filled), one
+
+
+def _packed(result: Spectrum) -> Mapping[str, np.ndarray]:
+    arrays = {name: np.asarray(getattr(result, name)) for name in Spectrum.__dataclass_fields__ if name != "grid"}
+    return arrays | {f"grid_{name}": getattr(result.grid, name) for name in ShapeGrid.__dataclass_fields__}
+
+
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> Spectrum:
+    result = {name: arrays[name] for name in Spectrum.__dataclass_fields__ if name != "grid"}
+    on_nodes = ShapeGrid(**{name: arrays[f"grid_{name}"] for name in ShapeGrid.__dataclass_fields__})
+    return Spectrum(**{**result, "volume": float(result["volume"]), "unknowns": int(result["unknowns"])}, grid=on_nodes)
+
 
 WANTED = {
     "youngs_modulus": "Young's modulus",

@@ -15,11 +15,253 @@ Everything is in the grid's frame. Shapes: `v` vertices, `f` faces, `cell` cells
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
+import igl
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
-from tgdsl.modal.closed import refused
+from tgdsl.errors import LowerError
+from tgdsl.surfaces.holes import hole_caps
+from tgdsl.surfaces.meshlab import MAX_HOLE
+from tgdsl.surfaces.surface import Surface
+
+COINCIDENT = 1e-7
+"""Distance below which two vertices of a geom are one, over its size."""
+FLAT = 1e-9
+"""Volume below which a geom encloses none, over the cube of its size."""
+
+
+def refused(what: str, hint: str = "") -> LowerError:
+    """Return the error of a body that has no modal analysis."""
+    return LowerError(what, field="modes", hint=hint)
+
+
+def closed(surface: Surface) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Return vertices [m] and faces that wind around the inside of a body, once or more, and not around the outside.
+
+    The triangles that bound a body, repaired so that each point of space is clearly inside or outside.
+
+    A point is inside where the triangles wind around it, once or more. So geoms that overlap are one solid, a component inside
+    another one that is wound like it (a screw) is part of it, and one that is wound the other way round is a cavity: that is
+    what makes a body thin-walled.
+
+    Repaired, geom by geom: vertices that coincide are one; triangles without area and repeated ones are dropped; neighbours
+    that are wound against each other are turned, by connected part, to what most of its area has; a geom that is inside out is
+    turned; small holes are closed. A geom with larger holes has no inside, which is an error.
+
+    Shapes: `v` vertices, `f` faces.
+
+    Raises:
+        LowerError: If there are no triangles, a coordinate is no number, or a geom is open or flat.
+    """
+    parts, count = [], 0
+    for geom in range(len(surface.geoms)):
+        faces = surface.faces[surface.face_geom == geom]
+        if len(faces):
+            names = [name for name in surface.geoms[geom] if name]
+            geom_name = f'geom "{names[0]}"' if names else f"geom {geom}"
+            vertices, faces = _closed_geom(surface.vertices, faces, geom_name)
+            parts.append((vertices, faces + count))
+            count += len(vertices)
+    if not parts:
+        raise refused("there are no triangles", "a body that rings needs a geom")
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def _closed_geom(vertices: np.ndarray, faces: np.ndarray, shown: str) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = _welded(vertices, faces)
+    if not np.isfinite(vertices).all():
+        raise refused(f"{shown} has a vertex that is no number", "repair the mesh")
+    if not len(faces):
+        raise refused(f"{shown} has no triangle with an area", "repair the mesh")
+    faces = _coherent(vertices, faces)
+    area = 0.5 * float(np.asarray(igl.doublearea(vertices, faces)).sum())
+    border = _border(vertices, faces)
+    if border**2 > MAX_HOLE * area:
+        raise refused(
+            f"{shown} is open: {1e3 * border:.3g} mm of edges without a second triangle, or with more than two, around "
+            f"{1e4 * area:.3g} cm² of surface",
+            "close the mesh; a thin wall needs both of its sides",
+        )
+    vertices, caps = hole_caps(vertices, faces)
+    faces = np.concatenate([faces, caps])
+    volume, size = enclosed(vertices, faces), float(np.ptp(vertices, axis=0).max())
+    if abs(volume) < FLAT * size**3:
+        raise refused(f"{shown} encloses no volume", "a thin wall needs both of its sides")
+    return vertices, faces if volume > 0 else faces[:, ::-1]
+
+
+def enclosed(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
+    """Return the volume that triangles wind around, counted as often as they do [m³]."""
+    a, b, c = (vertices - vertices.mean(axis=0))[faces].swapaxes(0, 1)
+    return float((a * np.cross(b, c)).sum()) / 6.0
+
+
+def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a geom's welded vertices, and its distinct faces with an area."""
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used] + 0.0, faces.reshape(-1, 3)
+    if not np.isfinite(vertices).all():
+        return vertices, faces
+    near = COINCIDENT * float(np.ptp(vertices, axis=0).max())
+    first, second = KDTree(vertices).query_pairs(near, output_type="ndarray").T
+    graph = coo_array((np.ones(len(first), bool), (first, second)), (len(vertices),) * 2)
+    _, same = connected_components(graph, directed=False)
+    _, first = np.unique(same, return_index=True)
+    vertices, faces = vertices[first], same[faces].astype(np.int64)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    return vertices, faces[np.sort(np.unique(turned, axis=0, return_index=True)[1])]
+
+
+def _directed(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges, which = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    return edges, which.reshape(-1), np.where(sides[:, 0] < sides[:, 1], 1, -1)
+
+
+def _border(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Return the length of edges along which faces do not run as often one way as the other [m]."""
+    edges, which, sense = _directed(faces)
+    net = np.abs(np.bincount(which, sense, len(edges)))
+    return float((net * np.linalg.norm(np.diff(vertices[edges], axis=1)[:, 0], axis=1)).sum())
+
+
+def _coherent(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return faces wound alike within each connected part, as most of its area was; as they are if all agree already."""
+    edges, which, sense = _directed(faces)
+    pairs = np.bincount(which, minlength=len(edges)) == 2
+    if not (pairs & (np.bincount(which, sense, len(edges)) != 0)).any():
+        return faces
+    turned, part = (np.asarray(array).astype(np.int64) for array in igl.bfs_orient(faces))
+    signed_area = np.where((turned == faces).all(axis=1), 1.0, -1.0) * np.asarray(igl.doublearea(vertices, faces))
+    return np.where((np.bincount(part, signed_area) < 0)[part][:, None], turned[:, ::-1], turned)
+
+
+FLAT_SHARE = 0.02
+"""Share of a body's area that its faces along one direction have, for the grid to follow them."""
+PLANE_SHARE = 0.004
+"""Share of a body's area that lies on one plane, for the grid to have it."""
+MAX_PLANES = 24
+"""Most such planes across each axis."""
+LEAST_LAYER = 0.1
+"""Of planes nearer than this to each other, in cell sizes, those with less than a third of another one's area are left out."""
+MERGE_TOLERANCE = 1e-2
+"""Relative difference below which two principal moments are equal; the axes are then the body frame's."""
+ROUNDING = 1e-5
+"""Difference of places along an axis up to which they are one, over the size of the body: meshes are float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """The flat parts of a surface that face along an axis.
+
+    Attributes:
+        at: Where they are along it, ascending.
+        area: Area on each.
+    """
+
+    at: Float[np.ndarray, " line"]
+    area: Float[np.ndarray, " line"]
+
+
+def axes(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the grid's axes, as rows: what most of the area faces along, then most of the rest; else principal axes.
+
+    The grid of cells that a body is cut by: along the body's own flat faces, and on planes where most of these lie.
+
+    So walls between parallel planes get separate layers of cells, however thin they are; elsewhere the body's surface passes
+    through the cells (`cells.py`).
+
+    Shapes: `v` vertices, `f` faces, `line` planes across an axis.
+    """
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    area = np.linalg.norm(cross, axis=1)
+    cross, corners, area = cross[area > 0], corners[area > 0], area[area > 0]
+    normal = cross / area[:, None]
+    leading = np.sign(np.take_along_axis(normal, np.abs(normal).argmax(axis=1)[:, None], axis=1))
+    normal = normal * leading
+    middle = corners.mean(axis=1)
+    off = middle - (area[:, None] * middle).sum(axis=0) / area.sum()
+    moments = (area[:, None] * off).T @ off
+    first = _main(normal, area)
+    if first is None:
+        first = _principal(moments)
+    across = np.abs(normal @ first) < 1e-3
+    second = _main(normal[across], area[across], area.sum())
+    if second is None:
+        flat = np.eye(3) - np.outer(first, first)
+        second = _principal(flat @ moments @ flat)
+    second = second - (second @ first) * first
+    second /= np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)])
+
+
+def _main(normal: np.ndarray, area: np.ndarray, whole: float | None = None) -> np.ndarray | None:
+    """Return the direction that most area faces along; None if that is too small a share of the whole."""
+    if not len(area):
+        return None
+    rounded, which = np.unique(np.round(normal, 4) + 0.0, axis=0, return_inverse=True)
+    share = np.bincount(which.reshape(-1), area, len(rounded)) / (area.sum() if whole is None else whole)
+    best = int(np.flatnonzero(share > share.max() - 1e-6)[-1])
+    if share[best] < FLAT_SHARE:
+        return None
+    mine = which.reshape(-1) == best
+    mean = (area[mine, None] * normal[mine]).sum(axis=0)
+    mean[np.abs(mean) < 1e-9 * np.abs(mean).max()] = 0.0
+    return mean / np.linalg.norm(mean)
+
+
+def _principal(moments: np.ndarray) -> np.ndarray:
+    """Return the long principal axis; of several, the nearest one to an axis of the frame."""
+    value, vector = np.linalg.eigh(moments)
+    long = vector[:, value > (1 - MERGE_TOLERANCE) * value[-1]]
+    onto = long @ long.T
+    result = onto[int(np.flatnonzero(np.diag(onto) > np.diag(onto).max() - 1e-6)[0])]
+    return result / np.linalg.norm(result)
+
+
+def planes(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], axis: int) -> Planes:
+    """Return the planes across an axis that contain most of a surface's area, at most `MAX_PLANES`."""
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    area = np.linalg.norm(cross, axis=1)
+    size = float(np.ptp(vertices, axis=0).max())
+    is_flat = (np.ptp(corners[:, :, axis], axis=1) < ROUNDING * size) & (area > 0)
+    at, areas = corners[is_flat, :, axis].mean(axis=1), area[is_flat]
+    order = np.argsort(at, kind="stable")
+    at, areas = at[order], areas[order]
+    group = np.cumsum(np.diff(at, prepend=-np.inf) > ROUNDING * size) - 1
+    sums = np.bincount(group, areas, group.max(initial=-1) + 1).astype(float)
+    middle = np.bincount(group, areas * at, len(sums)) / np.maximum(sums, np.finfo(float).tiny)
+    largest = np.sort(np.argsort(-sums, kind="stable")[:MAX_PLANES])
+    largest = largest[sums[largest] > PLANE_SHARE * area.sum()]
+    return Planes(middle[largest], sums[largest])
+
+
+def lines(flat: Planes, low: float, high: float, cell: float) -> Float[np.ndarray, " line"]:
+    """Return the planes of the grid across an axis, from one end of the body to the other, about a cell apart or nearer."""
+    near = ROUNDING * (high - low)
+    at = np.where(flat.at < low + near, low, np.where(flat.at > high - near, high, flat.at))
+    ends = np.array([end for end in (low, high) if end not in at])
+    at, area = np.concatenate([at, ends]), np.concatenate([flat.area, np.zeros(len(ends))])
+    area, at = area[np.argsort(at)], np.sort(at)
+    is_kept = np.ones(len(at), bool)
+    for plane in np.argsort(area[1:-1], kind="stable") + 1:
+        is_near = is_kept & (np.abs(at - at[plane]) < LEAST_LAYER * cell)
+        is_kept[plane] = not (area[is_near] > 3 * area[plane]).any()
+    at = at[is_kept]
+    parts = [np.zeros(1) + at[0]]
+    for start, end in pairwise(at):
+        count = max(1, int(np.ceil((end - start) / cell - 1e-6)))
+        parts.append(start + (end - start) * np.arange(1, count + 1) / count)
+    return np.concatenate(parts)
+
 
 POINTS = 5
 """Gauss points of a cell along each axis: products of two quadratic shape functions are of degree four."""

@@ -15,7 +15,7 @@ from tgdsl.layout.unfelt import unfelt_ids
 from tgdsl.module.memory import Memory
 from tgdsl.module.outputs import outputs_of
 from tgdsl.module.state import example_state
-from tgdsl.observations.proprioception import PROPRIOCEPTION
+from tgdsl.observations.observations import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Quantity

@@ -15,7 +15,7 @@ from tgdsl.errors import LowerError, Problem, SpecError, TgdslError, did_you_mea
 from tgdsl.fields.materials import Material
 from tgdsl.fields.models import Usual
 from tgdsl.files import find
-from tgdsl.observations.proprioception import PROPRIOCEPTION
+from tgdsl.observations.observations import PROPRIOCEPTION
 from tgdsl.plan.scene import Collider
 from tgdsl.schema.document import Spec, document_model
 from tgdsl.schema.objects import CollidersSpec

@@ -11,7 +11,7 @@ from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.sensors.link_contact import LINK_CONTACT
-from tgdsl.sensors.microphone.kind import MICROPHONE
+from tgdsl.sensors.microphone import MICROPHONE
 from tgdsl.sensors.proximity import PROXIMITY
 from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
 from tgdsl.sensors.temperature_grid.kind import TEMPERATURE_GRID

@@ -5,7 +5,7 @@ import torch
 from warp_cases import SCENE, warp
 
 import tgdsl
-from tgdsl.modal import spectrum as spectra
+from tgdsl.modal import analysis as spectra
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 

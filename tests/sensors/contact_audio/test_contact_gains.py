@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.modal import spectrum as spectra
+from tgdsl.modal import analysis as spectra
 from tgdsl.modal.analysis import analysed
-from tgdsl.modal.spec import ShapeModes
+from tgdsl.modal.modes import ShapeModes
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 

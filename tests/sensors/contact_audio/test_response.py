@@ -13,7 +13,7 @@ from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.sensors.base import Context
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
-from tgdsl.sensors.contact_audio.operators import operators
+from tgdsl.sensors.contact_audio.modes import operators
 
 
 def test_a_mode_is_as_loud_as_the_impulse_at_every_frequency_and_rate():

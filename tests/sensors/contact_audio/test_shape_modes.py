@@ -9,9 +9,9 @@ from ringing_bodies import slabs, thin_box
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.modal import spectrum as spectra
+from tgdsl.modal import analysis as spectra
 from tgdsl.modal.analysis import analysed
-from tgdsl.modal.spec import ShapeModes
+from tgdsl.modal.modes import ShapeModes
 
 SIDE, WALL = 0.1, 0.004
 WALLS = "".join(

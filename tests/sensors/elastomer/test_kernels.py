@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from oracles import half_space, markers
 
-from tgdsl.sensors.elastomer.bonded_layer import Layer, profiles
-from tgdsl.sensors.elastomer.kernels import Gaussian
+from tgdsl.sensors.elastomer.elastic import Layer, profiles
+from tgdsl.sensors.elastomer.operators import Gaussian
 
 
 def test_shear_falls_off_as_one_over_r():

@@ -6,8 +6,8 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.sensors.elastomer.bonded_layer import Layer
-from tgdsl.sensors.elastomer.kernels import Elastic
+from tgdsl.sensors.elastomer.elastic import Layer
+from tgdsl.sensors.elastomer.operators import Elastic
 
 BALL, DEPTH, STIFFNESS, YOUNG, NU = 0.01, 5e-4, 1e8, 1e6, 0.4
 SCENE = """

@@ -8,9 +8,21 @@ import tgdsl
 from tgdsl.errors import LowerError, SpecError
 from tgdsl.module.state import SceneState
 from tgdsl.sensors.elastomer import ElastomerSpec
-from tgdsl.sensors.elastomer.blocks import PLANES, clamping, gaussian, responses
-from tgdsl.sensors.elastomer.kernels import LinkTaxels
-from tgdsl.sensors.elastomer.operators import COST, Convolution, Dense, OperatorForm, Truncated, apply, fold, grid
+from tgdsl.sensors.elastomer.operators import (
+    COST,
+    PLANES,
+    Convolution,
+    Dense,
+    LinkTaxels,
+    OperatorForm,
+    Truncated,
+    apply,
+    clamping,
+    fold,
+    gaussian,
+    grid,
+    responses,
+)
 from tgdsl.surfaces.surface import Surface
 
 ELASTIC = {"kernel": "half_space", "youngs_modulus": 2e5, "poissons_ratio": 0.4, "normal_stiffness": 1e8}

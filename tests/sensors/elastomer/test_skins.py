@@ -8,8 +8,7 @@ import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.schema.document import json_schema
-from tgdsl.sensors.elastomer.skins import SKINS, young_of_shore
-from tgdsl.sensors.elastomer.spec import ElastomerSpec
+from tgdsl.sensors.elastomer.spec import SKINS, ElastomerSpec, young_of_shore
 
 SCENE = """<mujoco><worldbody>
   <body name="pad"><geom type="box" size=".03 .03 .01"/></body>

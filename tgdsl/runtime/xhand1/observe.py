@@ -22,8 +22,7 @@ from torch import Tensor
 
 from tgdsl.errors import ObservationError
 from tgdsl.module.module import TactileModule
-from tgdsl.observations.observations import HAND_ONLY
-from tgdsl.observations.proprioception import PROPRIOCEPTION
+from tgdsl.observations.observations import HAND_ONLY, PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedObservation, PlannedSensor
 from tgdsl.runtime.connection import Connection

@@ -68,29 +68,199 @@ spread over a body's surface strikes at its centre alone; friction strikes along
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import product
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import LowerError
 from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
+from tgdsl.modal.modes import ModeShapes
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
-from tgdsl.sensors.contact_audio.bands import membership, middle
-from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses, of_rows, rises
-from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
+from tgdsl.sensors.contact_audio.modes import (
+    ContactAudioSpec,
+    alternatives,
+    axis_of,
+    least,
+    membership,
+    middle,
+    operators,
+    quiet,
+    radiated,
+    ringing,
+    turn_of,
+)
 from tgdsl.sensors.contact_audio.reference import reference
-from tgdsl.sensors.contact_audio.rows import axis_of, ringing
-from tgdsl.sensors.contact_audio.shares import shares, tables
-from tgdsl.sensors.contact_audio.spec import ContactAudioSpec, alternatives
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
 from tgdsl.surfaces.surface import Surface
+
+Load = Float[Tensor, "env body object"]
+UNKNOWN = 1e30
+"""Steady load at the beginning of an episode [N]: no first load exceeds it, and the second finds the first."""
+
+
+def impulses(
+    force: Load, constants: Constants, state: State, share: Float[Tensor, "env body object mode"] | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the impulses that strike at the start of this step [N·s], and what is remembered.
+
+    From the load of a pair at each physics step to the impulses that strike it.
+
+    A collision takes the solver one step or several, as its time step and its contacts' stiffness have it, but a stiff body
+    rings from all of its impulse. So what a load F exceeds a steady load F̄ by is summed up, and strikes at once when it no
+    longer grows:
+
+        A ← κA + (F − F̄)₊ Δt,   F̄ ← F + κ(F̄ − F),   κ = e^(−Δt/τ)                               [N·s], [N]
+        J = A, and A ← 0, F̄ ← F, where (F − F̄)₊ Δt ≤ (1 − κ) A                                   [N·s]
+
+    A collision of the duration T ≪ τ strikes with its impulse ∫F dt, whatever the number of steps; a load that takes much
+    longer than τ to rise by ΔF, at the rate R, with R τ² alone; a steady one not at all. The first load of an episode counts as
+    steady.
+
+    With mode shapes each mode i has an A_i of its own, which grows by s_i (F − F̄)₊ Δt with the mode's share s_i of what strikes
+    where the load acts, and is kept and passed on when A is: so it is weighted by where the load was when it grew.
+
+    `model: force` collects nothing: its drive is the rise of the force in each step.
+
+    Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects, `mode` modes.
+
+    Args:
+        force: F [N].
+        constants: The sensor's.
+        state: The memory.
+        share: Of each mode, s; the impulses are then those of each mode, (env, body, object, mode).
+    """
+    above, kept = force - state["steady"], constants["kept"]
+    grown = above.clamp(min=0.0) * constants["step"]
+    if "is_paper" in constants:
+        return grown if share is None else grown[..., None] * share, {"steady": force}
+    pending = state["pending"].clone()  # derivatives by constants look at it once the state has gone on
+    is_over = grown <= constants["leaked"] * pending
+    impulse = torch.where(is_over, pending, 0.0 * grown)  # not-a-number strikes at once
+    after = torch.where(is_over, force, torch.addcmul(force, above, kept, value=-1))
+    new = {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, kept)), "steady": after}
+    if share is None:
+        return impulse, new
+    own, each = grown[..., None] * share, state["weighted"].clone()
+    new["weighted"] = torch.where(is_over[..., None], 0.0, torch.addcmul(own, each, kept))
+    return torch.where(is_over[..., None], each, 0.0 * own), new
+
+
+def rises(
+    force: Load,
+    context: Context,
+    constants: Constants,
+    state: State,
+    share: Float[Tensor, "env body object mode"] | None = None,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return by how much the force on each row rises in this step (env, row, *mode) [N], and what is remembered.
+
+    Args:
+        force: F [N].
+        context: When.
+        constants: The sensor's.
+        state: The memory.
+        share: Of each mode, s.
+    """
+    load = of_rows(force if share is None else force[..., None] * share, constants)
+    is_first = context.is_first.view(-1, *[1] * (load.ndim - 1))
+    return load - torch.where(is_first, load, state["load"]), {"load": load}
+
+
+def of_rows(pairs: Tensor, constants: Constants) -> Tensor:
+    """Return the sum over what touches each body (or object) that rings, (env, row, *mode), of (env, body, object, *mode)."""
+    dim = 1 if "is_of_object" in constants else 2
+    return pairs.squeeze(dim) if pairs.shape[dim] == 1 else pairs.sum(dim=dim)
+
+
+def tables(shapes: Sequence[ModeShapes], num_modes: int) -> dict[str, np.ndarray]:
+    """Return the grids of all rows as constants; grids that are equal are one.
+
+    Args:
+        shapes: Mode shapes of each row.
+        num_modes: Modes of the row with most.
+    """
+    most = max(own.value.shape[2] for own in shapes)
+    kept: dict[bytes, int] = {}
+    blocks: list[np.ndarray] = []
+    first, owner = np.zeros(len(shapes), np.int64), np.zeros((len(shapes), most, num_modes))
+    for row, own in enumerate(shapes):
+        value = np.zeros((len(own.value), 3, most), np.float32)
+        value[:, :, : own.value.shape[2]] = own.value
+        key = value.tobytes()
+        if key not in kept:
+            kept[key] = sum(map(len, blocks))
+            blocks.append(value.reshape(len(value), -1))
+        first[row] = kept[key]
+        owner[row, np.arange(len(own.owner)), own.owner] = 1.0
+    result = {
+        "shape_value": np.concatenate(blocks),
+        "shape_first": first,
+        "shape_num": np.stack([own.num for own in shapes]),
+        "shape_axes": np.stack([own.axes for own in shapes]),
+        "shape_low": np.stack([own.low for own in shapes]),
+        "shape_rate": np.stack([1.0 / own.step for own in shapes]),
+    }
+    # Without any that are one, field i is mode i.
+    return result if (owner.sum(axis=1) <= 1).all() else result | {"shape_owner": owner}
+
+
+def shares(center: Vec, along: Vec, constants: Constants) -> Float[Tensor, "env body object mode"]:
+    """Return the share of each mode of what rings; 0 where nothing touches, as `along` is 0 there.
+
+    By how much more or less than by its gain each mode is struck, from where a contact is and which way it presses.
+
+        s_i = Σ_k w_k φ_i(node k) · n,   or √(Σ_f (…)²) over the fields f of modes that symmetry makes one
+
+    with the eight nodes around the centre of a pair's contacts on the grid of the body's mode shapes, trilinear weights w, and
+    the mean normal n of the contacts, weighted by their forces, into the body. Both are in the body's frame; mode shapes φ are
+    over the root mean square of what is normal to the surface, so that s² is 1 in the mean over it. Beyond the grid's box φ is
+    that of its nearest point.
+
+    Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects, `row` those of them that ring,
+    `node` nodes of all grids, `mode` modes of the row with most, `field` fields of the row with most.
+
+    Args:
+        center: Centre of the contacts, (env, body, object), in the frame of what rings [m].
+        along: Their mean normal.
+        constants: The sensor's.
+    """
+    dim = 0 if "is_of_object" in constants else 1
+    first, num, axes, low, rate = (
+        constants[f"shape_{name}"].unsqueeze(dim) for name in ("first", "num", "axes", "low", "rate")
+    )
+    rotation = planes.rot(axes[..., i, j] for i in range(3) for j in range(3))
+    pos, turned = planes.rotate(rotation, center), planes.rotate(rotation, along)
+    node, weights, last = first, [], num - 1
+    for i, part in enumerate(pos):
+        at = torch.minimum(((part - low[..., i]) * rate[..., i]).clamp(min=0.0), last[..., i].to(part.dtype))
+        cell = torch.minimum(at.to(torch.int64).clamp(min=0), last[..., i] - 1)  # not-a-number is some cell
+        weights.append((1.0 - (at - cell), at - cell))
+        stride = num[..., 2] * num[..., 1] if i == 0 else num[..., 2] if i == 1 else 1
+        node = node + cell * stride
+    found = None
+    for x, y, z in product(range(2), repeat=3):
+        corner = constants["shape_value"][node + (x * num[..., 1] + y) * num[..., 2] + z]
+        part = (weights[0][x] * weights[1][y] * weights[2][z])[..., None] * corner
+        found = part if found is None else found + part
+    assert found is not None
+    fields = sum(n[..., None] * own for n, own in zip(turned, found.chunk(3, dim=-1), strict=True))
+    assert isinstance(fields, Tensor)
+    return _of_modes(fields, constants["shape_owner"].unsqueeze(dim)) if "shape_owner" in constants else fields
+
+
+def _of_modes(fields: Tensor, owner: Tensor) -> Tensor:
+    own = fields[..., None] * owner
+    return torch.where(owner.sum(dim=-2) > 1, planes.safe_sqrt((own * own).sum(dim=-2)), own.sum(dim=-2))
 
 
 def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:

@@ -15,11 +15,18 @@ from tgdsl.quantities.kinematics import Places
 from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
-from tgdsl.sensors.contact_audio.bands import middle
-from tgdsl.sensors.contact_audio.impulses import reference_impulses
-from tgdsl.sensors.contact_audio.operators import GRAINS, SLOTS, highest, least, quiet, radiated
-from tgdsl.sensors.contact_audio.rows import Ringing, ringing
-from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
+from tgdsl.sensors.contact_audio.modes import (
+    GRAINS,
+    SLOTS,
+    ContactAudioSpec,
+    Ringing,
+    highest,
+    least,
+    middle,
+    quiet,
+    radiated,
+    ringing,
+)
 from tgdsl.sensors.noise.reference import normal_pair
 from tgdsl.sensors.upstream import PLACE, SAMPLES
 from tgdsl.surfaces.surface import Surface
@@ -162,3 +169,36 @@ def _bands(spec: ContactAudioSpec, modes: Ringing, amplitude: np.ndarray) -> np.
             if middle(number) * 10**-0.05 <= own < middle(number) * 10**0.05:
                 result[place[0], b] += 0.5 * amplitude[place] ** 2
     return 10 * np.log10(1 + result / quiet()) if spec.scale == "decibel" else result
+
+
+def reference_impulses(
+    force: Float[np.ndarray, "body object"],
+    before: tuple[np.ndarray, np.ndarray, np.ndarray],
+    share: Float[np.ndarray, "body object mode"],
+    step: float,
+    settling: float,
+    is_paper: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the impulses of each mode, and F̄, A and A_i after them, of one environment: pair by pair.
+
+    Args:
+        force: F [N].
+        before: F̄ [N], A [N·s] and A_i of each mode [N·s].
+        share: s_i; of one mode, 1, where all have the same.
+        step: Δt [s].
+        settling: τ [s].
+        is_paper: Whether each rise of the force strikes by itself.
+    """
+    impulse, (steady, pending, weighted) = np.zeros_like(share), (part.copy() for part in before)
+    kept = np.exp(-step / settling)
+    for place, load in np.ndenumerate(force):
+        grown = max(0.0, load - steady[place]) * step
+        if is_paper:
+            impulse[place], steady[place] = grown * share[place], load
+        elif grown <= (1 - kept) * pending[place]:
+            impulse[place], weighted[place] = weighted[place], 0.0
+            pending[place], steady[place] = 0.0, load
+        else:
+            weighted[place] = kept * weighted[place] + grown * share[place]
+            pending[place], steady[place] = kept * pending[place] + grown, load + kept * (steady[place] - load)
+    return impulse, steady, pending, weighted

@@ -66,8 +66,7 @@ from tgdsl.sensors.base import (
     vector,
 )
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
-from tgdsl.sensors.elastomer.blocks import fold_links
-from tgdsl.sensors.elastomer.operators import Operator, operator_of
+from tgdsl.sensors.elastomer.operators import Operator, fold_links, operator_of
 from tgdsl.sensors.elastomer.point_anchors import Markers
 from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.sensors.elastomer.spec import ElastomerSpec

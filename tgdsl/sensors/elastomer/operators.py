@@ -21,13 +21,146 @@ from typing import Generic, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import LowerError
-from tgdsl.sensors.base import Array
-from tgdsl.sensors.elastomer.kernels import LinkTaxels
+from tgdsl.layout.layout import Layout
+from tgdsl.sensors.base import Array, SurfaceOf
+from tgdsl.sensors.elastomer.elastic import Layer, Profiles, half_space, patch_radius, profiles, tabulated
+from tgdsl.sensors.elastomer.spec import ElastomerSpec
+from tgdsl.surfaces.surface import Surface
 from tgdsl.tensors.link_products import LINK_PRODUCTS
+
+Matrix = Float[np.ndarray, "out in target source"]
+
+
+@dataclass(frozen=True, eq=False)
+class LinkTaxels:
+    """The taxels of one link, body frame: positions [m], unit normals, areas [m²], grid cells, and which are active."""
+
+    pos: Float[np.ndarray, "taxel 3"]
+    normal: Float[np.ndarray, "taxel 3"]
+    area: Float[np.ndarray, " taxel"]
+    cell: Int[np.ndarray, "taxel 2"]
+    is_active: Bool[np.ndarray, " taxel"]
+
+    @property
+    def spacing(self) -> float:
+        """Root of the mean area of the active taxels [m]; 1 if there are none, for then nothing depends on it."""
+        return float(np.sqrt(self.area[self.is_active].mean())) if self.is_active.any() else 1.0
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """The paper's kernels, without their strengths.
+
+    Attributes:
+        dilation_falloff: λ_d [1/m²].
+        shear_falloff: λ_s [1/m²].
+        compressibility: c [1].
+        smoothing: ε [m].
+        is_normalized: Whether the in-plane part is divided by ḡ.
+    """
+
+    dilation_falloff: float
+    shear_falloff: float
+    compressibility: float
+    smoothing: float
+    is_normalized: bool
+
+    def spread(
+        self, pos: Float[np.ndarray, "target 3"], normal: Float[np.ndarray, "target 3"], source: Float[np.ndarray, "source 3"]
+    ) -> Matrix:
+        """Return r_ij (c g + (1 − c) ḡ/ρ̄ ρ) [m], (3, 1, target, source); over ḡ [1] if normalized."""
+        r = offset(pos, normal, source)
+        square = np.einsum("kji,kji->ji", r, r)
+        peak = np.exp(-0.5) / np.sqrt(2.0 * self.dilation_falloff)
+        local = np.exp(-self.dilation_falloff * square)
+        stretch = peak * 2.0 * self.smoothing / (square + self.smoothing**2)
+        size = self.compressibility * local + (1.0 - self.compressibility) * stretch
+        return (r * (size / peak if self.is_normalized else size))[:, None]
+
+    def bulge(self, targets: LinkTaxels, source: Float[np.ndarray, "source 3"]) -> Matrix:
+        """Return g of the dilation, (1, 1, target, source)."""
+        return self._fall(self.dilation_falloff, targets, source)
+
+    def drag(self, targets: LinkTaxels, source: Float[np.ndarray, "source 3"]) -> Matrix:
+        """Return g of the shear, (1, 1, target, source)."""
+        return self._fall(self.shear_falloff, targets, source)
+
+    def _fall(self, falloff: float, targets: LinkTaxels, source: np.ndarray) -> Matrix:
+        r = offset(targets.pos, targets.normal, source)
+        return np.exp(-falloff * np.einsum("kji,kji->ji", r, r))[None, None]
+
+
+@dataclass(frozen=True)
+class Elastic:
+    """A linear elastic taxels.
+
+    Attributes:
+        layer: Its thickness [m], infinite for a half-space, the markers' depth [m], G [Pa] and ν.
+    """
+
+    layer: Layer
+
+    def profiles(self, r: np.ndarray, area: np.ndarray, mean_area: float, is_exact: bool = False) -> Profiles:
+        """Return displacement per force [m/N] at distances r [m], (…, source), from sources of some areas [m²].
+
+        A layer's loads are all spread over the link's mean area, a half-space's each over its own. `is_exact` evaluates a
+        layer's integrals at each r instead of interpolating.
+        """
+        layer = self.layer
+        if np.isinf(layer.thickness):
+            return half_space(r, layer.depth, patch_radius(area), layer.shear_modulus, layer.poissons_ratio)
+        find = profiles if is_exact else tabulated
+        return find(r, layer, float(patch_radius(mean_area)))
+
+    def displacement(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"], targets: LinkTaxels | None = None) -> Matrix:
+        """Return displacement per traction [m/Pa], (3, 3, target, source), both vectors in the body's frame.
+
+        Args:
+            taxels: The taxels of a link, which press.
+            source: Which of them to take.
+            targets: Markers that move; default: the taxels.
+        """
+        targets = taxels if targets is None else targets
+        n, m = targets.normal, taxels.normal[source]
+        area = taxels.area[source]
+        r = offset(targets.pos, n, taxels.pos[source])
+        length = np.sqrt(np.einsum("kji,kji->ji", r, r))
+        e = r / np.where(length > 0, length, 1.0)
+        folded = Profiles(*(part * area for part in self.profiles(length, area, float(taxels.spacing**2))))
+        flat = np.eye(3)[:, :, None] - np.einsum("jk,jl->klj", n, n)
+        source_plane = np.eye(3)[:, :, None] - np.einsum("ik,il->kli", m, m)
+        twist = folded.along - folded.bend
+        # A tangential traction stays as much as it lies in the target's plane; e lies in it already.
+        tangential = np.einsum("kpj,pli,ji->klji", flat, source_plane, twist)
+        seen = np.einsum("pji,pli->lji", e, source_plane)
+        tangential += np.einsum("kji,lji,ji->klji", e, seen, 2.0 * folded.bend)
+        tangential -= np.einsum("jk,lji,ji->klji", n, seen, folded.lift)
+        pressed = np.einsum("jk,ji->kji", n, folded.normal) - e * folded.spread
+        return tangential + np.einsum("kji,il->klji", pressed, m)
+
+
+def offset(
+    pos: Float[np.ndarray, "target 3"], normal: Float[np.ndarray, "target 3"], source: Float[np.ndarray, "source 3"]
+) -> Float[np.ndarray, "3 target source"]:
+    """Return r_ij = Π_nj(x_j − x_i) [m].
+
+    The fixed matrices of an elastomer: what each source taxel of a link does to each target, per unit of its input.
+
+    On a curved link, the offset of source i and target j is projected to the target's tangent plane, r_ij = Π_nj(x_j − x_i),
+    exact for every pair, and tangential loads are projected there. The Gaussian kernel is so by definition. For the elastic
+    kernels it is an approximation that takes the surface between two taxels as flat: it is good where the normals of
+    interacting taxels differ by little, and it neglects curvature and the far side of a link.
+
+    Shapes: `source`, `target` taxels; a matrix is (out, in, target, source), `out` and `in` planes of a vector or scalar.
+    """
+    between = pos.T[:, :, None] - source.T[:, None, :]
+    along = np.einsum("kji,jk->ji", between, normal)
+    return between - normal.T[:, :, None] * along
+
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
 """Time per multiply-add, relative to a large matrix product (one CPU core, float32, 512 environments)."""
@@ -238,3 +371,124 @@ def _truncated(matrix: Float[np.ndarray, "in source out target"], tolerance: flo
     rank = max(1, int(np.count_nonzero(lost > tolerance * lost[0])))
     left, right = u[:, :rank] * s[:rank], v[:rank]
     return left.reshape(num_in, sources, rank), right.reshape(rank, num_out, targets)
+
+
+PLANES = {"spread": (3, 1), "bulge": (1, 1), "drag": (1, 1), "traction": (3, 3), "pressure": (3, 1)}
+"""Planes that each operator puts out and takes in."""
+
+
+def link_taxels(layout: Layout, link: int) -> LinkTaxels:
+    """Return the taxels of one link; inactive ones, whose area may be nothing, get the others' mean."""
+    at = layout.link_id == link
+    is_active, area = layout.radius[at] > 0, layout.area[at]
+    mean = area[is_active].mean() if is_active.any() else 1.0
+    return LinkTaxels(layout.pos[at], layout.normal[at], np.where(is_active, area, mean), layout.cell[at], is_active)
+
+
+def gaussian(spec: ElastomerSpec, part: LinkTaxels) -> Gaussian:
+    """Return the paper's kernels for one link."""
+    smoothing = part.spacing if spec.thickness is None else spec.thickness
+    return Gaussian(spec.dilation_falloff, spec.shear_falloff, spec.compressibility, smoothing, spec.normalize == "peak")
+
+
+def elastic(spec: ElastomerSpec) -> Elastic:
+    """Return the elastic skin that a spec describes."""
+    assert spec.youngs_modulus is not None
+    thickness = np.inf if spec.kernel == "half_space" or spec.thickness is None else spec.thickness
+    modulus = spec.youngs_modulus / (2.0 * (1.0 + spec.poissons_ratio))
+    return Elastic(Layer(thickness, spec.marker_depth, modulus, spec.poissons_ratio))
+
+
+def weights(spec: ElastomerSpec, part: LinkTaxels) -> Float[np.ndarray, " taxel"]:
+    """Return a_i of the Gaussian kernel [1]; 0 for inactive taxels."""
+    area = np.ones(len(part.area)) if spec.model == "paper" else part.area / spec.reference_area
+    return np.where(part.is_active, area, 0.0)
+
+
+def fold_links(
+    spec: ElastomerSpec, layout: Layout, markers: Layout | None, surface_of: SurfaceOf
+) -> dict[str, tuple[Operator[np.ndarray], ...]]:
+    """Return the operators of all links by name, from taxels to markers; None: taxels are markers.
+
+    Raises:
+        LowerError: If a convolution is asked for where it cannot be, or the pad's edge cannot be clamped.
+    """
+    of_links = []
+    for i, link in enumerate(layout.links):
+        try:
+            of_links.append(_fold_link(spec, layout, markers, i, surface_of))
+        except LowerError as error:
+            field = error.field or "boundary"  # what a surface says knows no field
+            raise LowerError(f'link "{link.name}": {error.what}', field, error.hint) from error
+    return {name: tuple(operators[name] for operators in of_links) for name in of_links[0]}
+
+
+def _fold_link(
+    spec: ElastomerSpec, layout: Layout, markers: Layout | None, link: int, surface_of: SurfaceOf
+) -> dict[str, Operator[np.ndarray]]:
+    part, targets = link_taxels(layout, link), None if markers is None else link_taxels(markers, link)
+    pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
+    form = OperatorForm(spec.operator, spec.tolerance)
+    return {
+        name: fold(response, PLANES[name], part, form, is_alike=targets is None and (pad is None or name != "spread"))
+        for name, response in responses(spec, part, pad, targets).items()
+    }
+
+
+def responses(
+    spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None, targets: LinkTaxels | None = None
+) -> dict[str, Response]:
+    """Return the operators of one link by name, from its taxels to its markers; by default the same."""
+    targets = part if targets is None else targets
+    is_active = targets.is_active.astype(np.float64)[:, None]
+    if spec.kernel != "gaussian":
+        return _elastic_responses(spec, part, targets, is_active)
+    kernel, weight = gaussian(spec, part), weights(spec, part)
+    clamped = None
+    if pad is not None:
+        clamped = kernel.spread(part.pos, part.normal, part.pos) + clamping(spec, part, pad)
+
+    def spread(source: np.ndarray) -> np.ndarray:
+        response = kernel.spread(targets.pos, targets.normal, part.pos[source]) if clamped is None else clamped[..., source]
+        return is_active * response * weight[source]
+
+    def bulge(source: np.ndarray) -> np.ndarray:
+        return is_active * kernel.bulge(targets, part.pos[source]) * weight[source]
+
+    def drag(source: np.ndarray) -> np.ndarray:
+        return is_active * kernel.drag(targets, part.pos[source]) * weight[source]
+
+    return {"spread": spread, "bulge": bulge, **({"drag": drag} if spec.anchored == "taxels" else {})}
+
+
+def _elastic_responses(
+    spec: ElastomerSpec, part: LinkTaxels, targets: LinkTaxels, is_active: Float[np.ndarray, "target 1"]
+) -> dict[str, Response]:
+    material = elastic(spec)
+
+    def traction(source: np.ndarray) -> np.ndarray:
+        return is_active * material.displacement(part, source, targets) * part.is_active[source]
+
+    def pressure(source: np.ndarray) -> np.ndarray:
+        return -np.einsum("klji,il->kji", traction(source), part.normal[source])[:, None]
+
+    return {"traction": traction} if spec.has_shear else {"pressure": pressure}
+
+
+def clamping(spec: ElastomerSpec, part: LinkTaxels, pad: Surface) -> Float[np.ndarray, "3 1 target source"]:
+    """Return what clamping the pad's edge adds to `spread`: the edge is moved back by as much as it would move."""
+    # Here, so that only who clamps a pad waits for scikit-fem, and a compiled module runs without it.
+    from tgdsl.sensors.elastomer.clamped.pad import correction, element_size, unroll
+
+    assert spec.boundary is not None and spec.thickness is not None
+    added = np.zeros((3, 1, len(part.pos), len(part.pos)))
+    if not part.is_active.any():
+        return added
+    active, drag = np.flatnonzero(part.is_active), spec.boundary.drag
+    extent = float(np.ptp(pad.corners.reshape(-1, 3), axis=0).max())
+    sheet = unroll(pad, part.pos[active], part.normal[active], element_size(spec.thickness, drag, extent))
+    free = gaussian(spec, part).spread(sheet.edge_pos, sheet.edge_normal, part.pos)[:, 0]
+    back = -np.einsum("eak,kei->aei", sheet.edge_axes, free).reshape(-1, len(part.pos))
+    inside = (correction(sheet, spec.thickness, drag, spec.boundary.bulk) @ back).reshape(2, len(active), -1)
+    added[:, 0, active] = np.einsum("jak,aji->kji", sheet.taxel_axes, inside)
+    return added

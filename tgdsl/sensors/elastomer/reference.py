@@ -15,9 +15,8 @@ from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.points import Points
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceContext, ReferenceState
-from tgdsl.sensors.elastomer import blocks
 from tgdsl.sensors.elastomer.anchors import StickSlip, advance_reference
-from tgdsl.sensors.elastomer.kernels import Elastic
+from tgdsl.sensors.elastomer.operators import elastic
 from tgdsl.sensors.elastomer.point_anchors import reference_drag
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 
@@ -87,7 +86,7 @@ def _gaussian(spec: ElastomerSpec, x: Array, n: Array, sources: _Sources) -> Arr
 def _elastic(spec: ElastomerSpec, x: Array, n: Array, sources: _Sources) -> Array:
     """Return u_j = Σ_i G(x_j − x_i) [τ_i, p_i] A_i [m], each profile of G evaluated at its own distance."""
     assert spec.normal_stiffness is not None
-    material: Elastic = blocks.elastic(spec)
+    material = elastic(spec)
     pressure = spec.normal_stiffness * sources.depth
     stiffness = spec.normal_stiffness * spec.stiffness_ratio
     tau = _tangential(np.where(sources.depth[:, None] > 0, stiffness * sources.shear, 0.0), n)

@@ -20,10 +20,9 @@ from tgdsl.errors import LowerError, TgdslError, did_you_mean
 from tgdsl.files.plugins import installed
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.crosstalk import Crosstalk
 from tgdsl.sensors.noise.spec import ALL, Knobs, quantity, range_of
 from tgdsl.sensors.noise.stage import Now, Signal, Stage
-from tgdsl.sensors.noise.stages import Dead, Delay, Gain, Hysteresis, Offset, Quantization, Radius, Release
+from tgdsl.sensors.noise.stages import Crosstalk, Dead, Delay, Gain, Hysteresis, Offset, Quantization, Radius, Release
 from tgdsl.tensors.fusion import materialised
 
 StageType = type[Stage]

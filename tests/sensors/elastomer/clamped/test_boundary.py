@@ -11,8 +11,7 @@ from pads import MM
 from scipy.special import iv
 
 from tgdsl.errors import LowerError
-from tgdsl.sensors.elastomer.clamped.boundary import correction, element_size
-from tgdsl.sensors.elastomer.clamped.pad import Pad, unroll
+from tgdsl.sensors.elastomer.clamped.pad import Pad, correction, element_size, unroll
 from tgdsl.surfaces.surface import Surface
 
 THICKNESS, DRAG = 2 * MM, 3.0
@@ -86,7 +85,7 @@ def test_exact_solutions(shape, bulk):
 @pytest.mark.parametrize("shape", [pads.l_shape(), pads.ring()], ids=["l_shape", "ring"])
 def test_order_of_convergence(shape, monkeypatch):
     """Quadratic elements of one size on a polygon: third order."""
-    monkeypatch.setattr("tgdsl.sensors.elastomer.clamped.mesh.GRADE", 1e-3)
+    monkeypatch.setattr("tgdsl.sensors.elastomer.clamped.pad.GRADE", 1e-3)
     places = RANDOM.uniform(-9, 9, (100, 2)) * MM
     reach = np.hypot(*places.T)
     places = places[((places < 0).any(axis=1)) & (reach > 4 * MM) & (reach < 9.7 * MM)]

@@ -20,8 +20,7 @@ from tgdsl.compiler.resolve import resolve
 from tgdsl.quantities import ContactDepth
 from tgdsl.schema.load import load
 from tgdsl.sensors.elastomer import ELASTOMER
-from tgdsl.sensors.elastomer.clamped.boundary import element_size
-from tgdsl.sensors.elastomer.clamped.pad import unroll
+from tgdsl.sensors.elastomer.clamped.pad import element_size, unroll
 from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.testing import SCENE, KindConformance, ReferenceModule, conformance_document
 
