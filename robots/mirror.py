@@ -22,7 +22,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from tgdsl.errors import TgdslError
-from tgdsl.placement.sample.points import point_table
+from tgdsl.placement.sample.sample import point_table
 from tgdsl.schema import yaml
 from tgdsl.schema.placement import Grid, LayoutSpec, Points, Poisson
 from tgdsl.surfaces.rays import reference_axes

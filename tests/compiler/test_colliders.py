@@ -7,8 +7,7 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.scene.digest import scene_digest
-from tgdsl.scene.scene import scene_model
+from tgdsl.scene.scene import scene_digest, scene_model
 
 ROBOT = """<mujoco><worldbody>
   <body name="pad" pos="0 0 .1"><joint name="press" type="slide" axis="0 0 1"/>

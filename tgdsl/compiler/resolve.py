@@ -38,8 +38,7 @@ from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders, Reach, reach
 from tgdsl.plan.scene import Collider
-from tgdsl.scene.colliders import with_colliders
-from tgdsl.scene.contact_bits import bits_that_meet
+from tgdsl.scene.colliders import bits_that_meet, with_colliders
 from tgdsl.schema.load import GIVEN, Loaded, LoadedLayout, load_colliders
 from tgdsl.schema.select import select
 from tgdsl.schema.yaml import Path

@@ -14,7 +14,7 @@ from pathlib import Path
 from tgdsl.fields.models import Selection
 from tgdsl.layout.layout import Layout
 from tgdsl.placement.propose.text import one_line, quoted
-from tgdsl.placement.sample.points import CELL, REQUIRED, TANGENT
+from tgdsl.placement.sample.sample import CELL, REQUIRED, TANGENT
 from tgdsl.schema.placement import LayoutSpec
 
 _HEADER = """\

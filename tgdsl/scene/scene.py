@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,7 @@ from tgdsl.errors import ArtifactError, RobotError
 from tgdsl.files.find import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.asset_paths import ROBOTS, resolve_asset
-from tgdsl.scene.colliders import with_colliders
-from tgdsl.scene.contact_bits import INHERITED, free_bit
+from tgdsl.scene.colliders import INHERITED, free_bit, with_colliders
 from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.options import Options, set_options
 
@@ -296,3 +296,19 @@ def _content(asset: Asset) -> bytes:
 def portable(path: Path) -> str:
     folder, path = robots_folder().resolve(), path.resolve()
     return f"{ROBOTS}{path.relative_to(folder).as_posix()}" if path.is_relative_to(folder) else path.as_posix()
+
+
+def scene_digest(scene: SceneFile) -> str:
+    """Return a hash of a scene: its files, assets, objects and colliders, without the contact sensors that a module wants."""
+    root = ET.fromstring(scene.mjcf)
+    for sensors in root.findall("sensor"):
+        for sensor in [element for element in sensors if element.get("name", "").startswith("tgdsl/")]:
+            sensors.remove(sensor)
+        if not len(sensors):
+            root.remove(sensors)
+    texts = [ET.tostring(root, encoding="unicode"), *scene.parts.values(), repr(scene.objects)]
+    texts += [repr(scene.colliders)] if scene.colliders else []
+    result = hashlib.sha256(b"tgdsl scene 1")
+    for part in [*texts, *sorted(asset.sha256 for asset in scene.assets)]:
+        result.update(f"{len(part)} {part}".encode())
+    return result.hexdigest()

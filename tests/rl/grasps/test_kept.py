@@ -16,7 +16,7 @@ from tgdsl.rl.grasps.grasps import Grasps, GraspTable, read_grasps, write_grasps
 from tgdsl.rl.load import load_task
 from tgdsl.rl.sensed import compile_sensed
 from tgdsl.runtime.simulators.state_values import FIELDS
-from tgdsl.scene.digest import scene_digest
+from tgdsl.scene.scene import scene_digest
 
 BY_HAND = Grasps(
     qpos=np.arange(50.0).reshape(5, 10),

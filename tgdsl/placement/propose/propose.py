@@ -16,10 +16,16 @@ from jaxtyping import Bool, Float
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.formats.model import Model
-from tgdsl.placement.propose.flexion import UNCLEAR, Flexion, InnerSide
-from tgdsl.placement.propose.front import MIN_SHARE, WITHIN_DEG, PalmFront, hidden, palm_parts
-from tgdsl.placement.propose.hands import KinematicTree, free_standing, hands, kinematic_tree
-from tgdsl.placement.propose.limits import RADIANS_AS_DEGREES, angles_are_misread, with_assumed_limits
+from tgdsl.placement.propose.flexion import MIN_SHARE, UNCLEAR, WITHIN_DEG, Flexion, InnerSide, PalmFront, hidden, palm_parts
+from tgdsl.placement.propose.hands import (
+    RADIANS_AS_DEGREES,
+    KinematicTree,
+    angles_are_misread,
+    free_standing,
+    hands,
+    kinematic_tree,
+    with_assumed_limits,
+)
 from tgdsl.placement.propose.surfaces import HIDDEN, LinkSurface, Options, Sampler, link_meshes
 from tgdsl.schema.select import matching
 

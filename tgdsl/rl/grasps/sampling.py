@@ -43,7 +43,7 @@ from tgdsl.rl.task import Setup
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.scene.digest import scene_digest
+from tgdsl.scene.scene import scene_digest
 from tgdsl.schema.yaml import Path
 
 SIDE_BY_SIDE = 256  # most trials at once; of a few grasps there are twice as many

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from tgdsl.errors import SimulationError, listed
 from tgdsl.formats.model import Model
 from tgdsl.module.module import TactileModule
-from tgdsl.placement.propose.limits import angles_are_misread
+from tgdsl.placement.propose.hands import angles_are_misread
 from tgdsl.placement.propose.propose import closing_motion
 from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.scene import SceneModels

@@ -23,7 +23,7 @@ from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.fields.units import ZEROS
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.state_values import Numbers
-from tgdsl.scene.contact_bits import free_bit
+from tgdsl.scene.colliders import free_bit
 from tgdsl.scene.scene import Choice, SceneModels, with_choices
 from tgdsl.schema.objects import NUM_SIZES
 from tgdsl.tensors.env_ids import EnvIds, env_mask
