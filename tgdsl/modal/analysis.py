@@ -2,13 +2,13 @@
 
     f = κ √(E/ρ) / 2πL,   d = (α + β ω²)/2,   g = γ/m
 
-with κ = ω L/c and γ = g m of the shape (`spectrum.py`), L the longest side of its bounding box, m its mass, and Rayleigh's
+with κ = ω L/c and γ = g m of the shape (`spectrum`), L the longest side of its bounding box, m its mass, and Rayleigh's
 damping α [1/s] and β [s] of the material. In mass-normalised modal coordinates q [m·√kg] a force F at x moves the body by
 
     q̈ + 2d q̇ + ω² q = φ_n(x) F(t),   displacement of the surface along its normal at y: φ_n(y) q
 
 and g is φ_n(x) φ_n(y) with root mean squares over the surface for both: an impulse J at some point of it makes the surface move
-with the velocity g J e^(−dt) cos ωt, in the mean. `loudness.py` says what g is where symmetry makes modes equal.
+with the velocity g J e^(−dt) cos ωt, in the mean. `modes.loudness` says what g is where symmetry makes modes equal.
 
 The body is free and homogeneous: held, filled or glued, it has other modes. Damping by air counts as far as the source of the
 material's damping has it.
@@ -33,53 +33,31 @@ from tgdsl.modal.elasticity import Elements, ShapeGrid, on_grid, vibration
 from tgdsl.modal.modes import Modes, ModeShapes, ShapeModes, loudness
 from tgdsl.surfaces.surface import Surface
 
-FORMAT = b"tgdsl modes 4"
-"""Version of cached results; change it with any change of the computation."""
-UNKNOWNS = 25_000
-"""Target number of unknowns, which sets the size of cells."""
-MAX_UNKNOWNS = 60_000
-"""Bound on it: a body whose flat walls alone ask for more cells is refused."""
-FINEST = 1 / 48
-"""Smallest cells, over the size of the body."""
-COARSEST = 1 / 3
-"""Largest cells."""
-BULKY = 1.0
-"""Smallest cells, over the volume over the surface: a ball or a cube has six of them from side to side."""
-ROUNDS = 6
-"""Times that the size of the cells is adjusted."""
-SIGHT, GLANCE = 12, 3
-"""Lines of sight through a cell along each axis: for the analysis, and to count cells."""
-SLIVER = 2e-3
-"""Share of a cell that is filled below which it is left out: too few lines of sight pass through the body there."""
-WHOLE = 0.9
-"""Share of the volume that one connected part has at least; smaller parts are left out."""
-DIGITS = 9
-"""Decimals of coordinates, over the size of the body: so that similar bodies are equal."""
+FORMAT = b"tgdsl modes 4"  # version of cached results; change it with any change of the computation
+UNKNOWNS = 25_000  # target number of unknowns, which sets the size of cells
+MAX_UNKNOWNS = 60_000  # bound on it: a body whose flat walls alone ask for more cells is refused
+FINEST = 1 / 48  # smallest cells, over the size of the body
+COARSEST = 1 / 3  # largest cells
+BULKY = 1.0  # smallest cells, over the volume over the surface: a ball or a cube has six of them from side to side
+ROUNDS = 6  # times that the size of the cells is adjusted
+SIGHT, GLANCE = 12, 3  # lines of sight through a cell along each axis: for the analysis, and to count cells
+SLIVER = 2e-3  # share of a cell that is filled below which it is left out: too few lines of sight pass through the body there
+WHOLE = 0.9  # share of the volume that one connected part has at least; smaller parts are left out
+DIGITS = 9  # decimals of coordinates, over the size of the body: so that similar bodies are equal
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Modes of a shape by ascending frequency; modes of equal frequency are one.
+    """Modes of a shape by ascending frequency; modes of equal frequency are one."""
 
-    Attributes:
-        wave_number: ω L/c with c = √(E/ρ) and the length L of the longest side of the bounding box.
-        multiplicity: Number of modes that are one.
-        gain: Gain times the body's mass: see `loudness.py`.
-        volume: The body's, over L³.
-        unknowns: Size of the eigenproblem.
-        axes: The grid's axes, as rows, of the body's.
-        owner: The group that each field of the mode shapes belongs to, see `loudness.py`.
-        grid: The fields, in the grid's axes, from the middle of the bounding box and over L.
-    """
-
-    wave_number: Float[np.ndarray, " group"]
-    multiplicity: Int[np.ndarray, " group"]
-    gain: Float[np.ndarray, " group"]
-    volume: float
-    unknowns: int
-    axes: Float[np.ndarray, "3 3"]
-    owner: Int[np.ndarray, " field"]
-    grid: ShapeGrid
+    wave_number: Float[np.ndarray, " group"]  # ω L/c with c = √(E/ρ) and the length L of the longest side of the bounding box
+    multiplicity: Int[np.ndarray, " group"]  # number of modes that are one
+    gain: Float[np.ndarray, " group"]  # gain times the body's mass: see `modes.loudness`
+    volume: float  # the body's, over L³
+    unknowns: int  # size of the eigenproblem
+    axes: Float[np.ndarray, "3 3"]  # the grid's axes, as rows, of the body's
+    owner: Int[np.ndarray, " field"]  # the group that each field of the mode shapes belongs to, see `modes.loudness`
+    grid: ShapeGrid  # the fields, in the grid's axes, from the middle of the bounding box and over L
 
 
 def spectrum(
@@ -151,7 +129,7 @@ def _computed(
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
-    """Return values to nine digits, so that the order in which a machine adds up does not show."""
+    # To nine digits, so that the order in which a machine adds up does not show.
     return np.array([float(f"{value:.9g}") for value in values.tolist()])
 
 
@@ -221,8 +199,7 @@ WANTED = {
     "stiffness_damping": "damping",
 }
 """Properties of a material that modal analysis needs, with its density."""
-MAX_POISSON = 0.4999
-"""Largest Poisson's ratio: elements lock in nearly incompressible solids."""
+MAX_POISSON = 0.4999  # largest Poisson's ratio: elements lock in nearly incompressible solids
 
 
 def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progress: Progress = silent) -> Modes:

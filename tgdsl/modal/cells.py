@@ -29,10 +29,8 @@ from tgdsl.surfaces.holes import hole_caps
 from tgdsl.surfaces.meshlab import MAX_HOLE
 from tgdsl.surfaces.surface import Surface
 
-COINCIDENT = 1e-7
-"""Distance below which two vertices of a geom are one, over its size."""
-FLAT = 1e-9
-"""Volume below which a geom encloses none, over the cube of its size."""
+COINCIDENT = 1e-7  # distance below which two vertices of a geom are one, over its size
+FLAT = 1e-9  # volume below which a geom encloses none, over the cube of its size
 
 
 def refused(what: str, hint: str = "") -> LowerError:
@@ -125,7 +123,6 @@ def _directed(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _border(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the length of edges along which faces do not run as often one way as the other [m]."""
     edges, which, sense = _directed(faces)
     net = np.abs(np.bincount(which, sense, len(edges)))
     return float((net * np.linalg.norm(np.diff(vertices[edges], axis=1)[:, 0], axis=1)).sum())
@@ -142,31 +139,21 @@ def _coherent(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where((np.bincount(part, signed_area) < 0)[part][:, None], turned[:, ::-1], turned)
 
 
-FLAT_SHARE = 0.02
-"""Share of a body's area that its faces along one direction have, for the grid to follow them."""
-PLANE_SHARE = 0.004
-"""Share of a body's area that lies on one plane, for the grid to have it."""
-MAX_PLANES = 24
-"""Most such planes across each axis."""
+FLAT_SHARE = 0.02  # share of a body's area that its faces along one direction have, for the grid to follow them
+PLANE_SHARE = 0.004  # share of a body's area that lies on one plane, for the grid to have it
+MAX_PLANES = 24  # most such planes across each axis
 LEAST_LAYER = 0.1
 """Of planes nearer than this to each other, in cell sizes, those with less than a third of another one's area are left out."""
-MERGE_TOLERANCE = 1e-2
-"""Relative difference below which two principal moments are equal; the axes are then the body frame's."""
-ROUNDING = 1e-5
-"""Difference of places along an axis up to which they are one, over the size of the body: meshes are float32."""
+MERGE_TOLERANCE = 1e-2  # relative difference below which two principal moments are equal; the axes are then the body frame's
+ROUNDING = 1e-5  # difference of places along an axis up to which they are one, over the size of the body: meshes are float32
 
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """The flat parts of a surface that face along an axis.
+    """The flat parts of a surface that face along an axis."""
 
-    Attributes:
-        at: Where they are along it, ascending.
-        area: Area on each.
-    """
-
-    at: Float[np.ndarray, " line"]
-    area: Float[np.ndarray, " line"]
+    at: Float[np.ndarray, " line"]  # where they are along it, ascending
+    area: Float[np.ndarray, " line"]  # area on each
 
 
 def axes(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "3 3"]:
@@ -175,7 +162,7 @@ def axes(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> F
     The grid of cells that a body is cut by: along the body's own flat faces, and on planes where most of these lie.
 
     So walls between parallel planes get separate layers of cells, however thin they are; elsewhere the body's surface passes
-    through the cells (`cells.py`).
+    through the cells (`filled`).
 
     Shapes: `v` vertices, `f` faces, `line` planes across an axis.
     """
@@ -263,35 +250,24 @@ def lines(flat: Planes, low: float, high: float, cell: float) -> Float[np.ndarra
     return np.concatenate(parts)
 
 
-POINTS = 5
-"""Gauss points of a cell along each axis: products of two quadratic shape functions are of degree four."""
-CHUNK = 1 << 21
-"""Pairs of line and triangle that are looked at at once."""
+POINTS = 5  # Gauss points of a cell along each axis: products of two quadratic shape functions are of degree four
+CHUNK = 1 << 21  # pairs of line and triangle that are looked at at once
 NUDGE = 1e-9
 """How far into the body a point of the surface is moved to tell which cell it belongs to, over the size of the grid."""
-ASIDE = 1e-10
-"""How far lines of sight are moved, over the size of the grid: far more than rounding, and too little to matter."""
-TOUCHING = 1e-6
-"""Distance between two surfaces up to which they touch, over the size of the body."""
+ASIDE = 1e-10  # how far lines of sight are moved, over the size of the grid: far more than rounding, and too little to matter
+TOUCHING = 1e-6  # distance between two surfaces up to which they touch, over the size of the body
 
-Lines = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Planes of the grid across x, y and z."""
+Lines = tuple[np.ndarray, np.ndarray, np.ndarray]  # planes of the grid across x, y and z
 
 
 @dataclass(frozen=True, eq=False)
 class Filled:
-    """The part of a grid that a body fills.
+    """The part of a grid that a body fills."""
 
-    Attributes:
-        index: Place of each cell that holds some of the body along x, y, z.
-        low: Its lower corner.
-        size: Its sides.
-        weight: Of its Gauss points, x outermost and z innermost, over its volume: they sum to the share that is filled.
-    """
-
-    index: Int[np.ndarray, "cell 3"]
-    low: Float[np.ndarray, "cell 3"]
-    size: Float[np.ndarray, "cell 3"]
+    index: Int[np.ndarray, "cell 3"]  # place of each cell that holds some of the body along x, y, z
+    low: Float[np.ndarray, "cell 3"]  # its lower corner
+    size: Float[np.ndarray, "cell 3"]  # its sides
+    # of its Gauss points, x outermost and z innermost, over its volume: they sum to the share that is filled
     weight: Float[np.ndarray, "cell point"]
 
     @property
@@ -302,19 +278,12 @@ class Filled:
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Where lines of sight pass through a body's surface.
+    """Where lines of sight pass through a body's surface."""
 
-    Attributes:
-        cell: Row in `Filled` of the cell that the point lies in.
-        pos: The points.
-        normal: Unit normals out of the body.
-        area: Surface that each stands for.
-    """
-
-    cell: Int[np.ndarray, " x"]
-    pos: Float[np.ndarray, "x 3"]
-    normal: Float[np.ndarray, "x 3"]
-    area: Float[np.ndarray, " x"]
+    cell: Int[np.ndarray, " x"]  # row in `Filled` of the cell that the point lies in
+    pos: Float[np.ndarray, "x 3"]  # the points
+    normal: Float[np.ndarray, "x 3"]  # unit normals out of the body
+    area: Float[np.ndarray, " x"]  # surface that each stands for
 
 
 def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -421,7 +390,6 @@ class _View:
 
 
 def _aside(at: np.ndarray, ratio: float) -> np.ndarray:
-    """Return places of lines, each moved a little: symmetric bodies have edges exactly at symmetric places."""
     return at + ASIDE * (at[-1] - at[0]) * (np.arange(1, len(at) + 1) * ratio % 1.0)
 
 

@@ -43,17 +43,11 @@ def _shape_functions(pos: Float[np.ndarray, "point 3"]) -> tuple[np.ndarray, np.
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """Finite elements on the cells that a body fills.
+    """Finite elements on the cells that a body fills."""
 
-    Attributes:
-        filled: The cells.
-        nodes: Nodes of each.
-        pos: Where the nodes are.
-    """
-
-    filled: Filled
-    nodes: Int[np.ndarray, "cell 27"]
-    pos: Float[np.ndarray, "node 3"]
+    filled: Filled  # the cells
+    nodes: Int[np.ndarray, "cell 27"]  # nodes of each
+    pos: Float[np.ndarray, "node 3"]  # where the nodes are
 
     @staticmethod
     def of(filled: Filled) -> Elements:
@@ -130,35 +124,26 @@ class Elements:
         return result
 
 
-SHIFT = -1e-3
-"""Shift of the eigenvalues: below all of them, so that the factorised matrix is positive definite."""
+SHIFT = -1e-3  # shift of the eigenvalues: below all of them, so that the factorised matrix is positive definite
 RIGID = 1e-7
 """Eigenvalue below which a mode is a rigid motion: rounding makes it 1e-11 to 1e-9, bending of a rod 1 : 1,000 is at 4e-5."""
 NUM_RIGID = 6
 RESIDUAL = 1e-7
 """Relative residual at which the iteration ends; eigenvalues are then right to its square, mode shapes to about that."""
-BLOCK = 12
-"""Vectors that are iterated together: no fewer than modes may have one frequency."""
-DEPENDENT = 1e-20
-"""Squared length below which a vector depends on others, over the largest."""
+BLOCK = 12  # vectors that are iterated together: no fewer than modes may have one frequency
+DEPENDENT = 1e-20  # squared length below which a vector depends on others, over the largest
 FAINT = 1e-13
 """Unknowns whose mass is less than this share of the largest are held at 0: the body hardly reaches into their cells."""
 
-Solve = Callable[[np.ndarray], np.ndarray]
-"""Solves with a factorised matrix, for several right-hand sides."""
+Solve = Callable[[np.ndarray], np.ndarray]  # solves with a factorised matrix, for several right-hand sides
 
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """Modes of vibration by ascending frequency, rigid motions left out.
+    """Modes of vibration by ascending frequency, rigid motions left out."""
 
-    Attributes:
-        wave_number: ω L/c.
-        shape: Displacements of the unknowns, of unit modal mass.
-    """
-
-    wave_number: Float[np.ndarray, " mode"]
-    shape: Float[np.ndarray, "dof mode"]
+    wave_number: Float[np.ndarray, " mode"]  # ω L/c
+    shape: Float[np.ndarray, "dof mode"]  # displacements of the unknowns, of unit modal mass
 
 
 def vibration(stiffness: csc_array, mass: csc_array, count: int) -> Vibration:
@@ -199,11 +184,8 @@ def vibration(stiffness: csc_array, mass: csc_array, count: int) -> Vibration:
 
 
 def _lowest(mass: csc_array, solve: Solve, count: int) -> tuple[Float[np.ndarray, " mode"], Float[np.ndarray, "dof mode"]]:
-    """Return eigenvalues and eigenvectors, of multiple eigenvalues all, by Lanczos' iteration of a block of vectors.
-
-    scipy's `eigsh` iterates one vector, and ends before it has found all vectors of the multiple eigenvalues that symmetric
-    bodies have: of a ball four of five.
-    """
+    """Return eigenvalues and eigenvectors, of multiple eigenvalues all, by Lanczos' iteration of a block of vectors."""
+    # scipy's `eigsh` iterates one vector, and ends before it has found all of multiple eigenvalues: of a ball four of five.
     size = len(mass.diagonal())
     most = min(size, 6 * count + 10 * BLOCK)
     basis, projected = np.zeros((size, most)), np.zeros((most, most))
@@ -235,35 +217,22 @@ def _orthonormal(vectors: np.ndarray, mass: csc_array) -> tuple[np.ndarray, np.n
     return vectors @ (rotation[:, is_independent] / scale), scale[:, None] * rotation[:, is_independent].T
 
 
-ALONG = (9, 17, 25, 33, 49, 65, 97)
-"""Nodes on the longest side that are tried."""
-MAX_NODES = 6000
-"""Most nodes of a grid: 2.3 MB for 32 fields."""
-TOLERANCE = 0.01
-"""Error of a field, over the root mean square of its group, with which a grid is fine enough."""
-TRUSTED = 0.25
-"""Share of a cell that is filled above which its displacement is used throughout; of others only on the surface."""
-MAX_POINTS = 4000
-"""Points of the surface at which the error is measured."""
+ALONG = (9, 17, 25, 33, 49, 65, 97)  # nodes on the longest side that are tried
+MAX_NODES = 6000  # most nodes of a grid: 2.3 MB for 32 fields
+TOLERANCE = 0.01  # error of a field, over the root mean square of its group, with which a grid is fine enough
+TRUSTED = 0.25  # share of a cell that is filled above which its displacement is used throughout; of others only on the surface
+MAX_POINTS = 4000  # points of the surface at which the error is measured
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeGrid:
-    """Fields at the nodes of a grid.
+    """Fields at the nodes of a grid."""
 
-    Attributes:
-        low: Place of its first node.
-        step: Spacing of the nodes along each axis.
-        num: Number of nodes along each axis, two or more.
-        value: The fields there, as vectors.
-        error: Root mean square of what interpolation is off by along the normal.
-    """
-
-    low: Float[np.ndarray, " 3"]
-    step: Float[np.ndarray, " 3"]
-    num: Int[np.ndarray, " 3"]
-    value: Float[np.ndarray, "node 3 field"]
-    error: Float[np.ndarray, " field"]
+    low: Float[np.ndarray, " 3"]  # place of its first node
+    step: Float[np.ndarray, " 3"]  # spacing of the nodes along each axis
+    num: Int[np.ndarray, " 3"]  # number of nodes along each axis, two or more
+    value: Float[np.ndarray, "node 3 field"]  # the fields there, as vectors
+    error: Float[np.ndarray, " field"]  # root mean square of what interpolation is off by along the normal
 
 
 def on_grid(elements: Elements, crossings: Crossings, lines: Lines, fields: Float[np.ndarray, "dof field"]) -> ShapeGrid:
@@ -278,7 +247,7 @@ def on_grid(elements: Elements, crossings: Crossings, lines: Lines, fields: Floa
     surface that are no nodes.
 
     Everything is in the grid's axes, and in units of the body's size. Shapes: `node` nodes of the grid, z running fastest,
-    `dof` unknowns of the elements, `field` fields as `loudness.py` has them, `x` points of the surface.
+    `dof` unknowns of the elements, `field` fields as `modes.loudness` has them, `x` points of the surface.
 
     Args:
         elements: The body's.

@@ -10,7 +10,7 @@ normal, and s the pseudo-velocity ω q of the surface: its displacement q times 
 and no jump at the impulse.
 
 Shapes: `mode` modes of one body, `point` points of it, `node` nodes of a grid, z running fastest, `field` fields of
-its modes, one of each, and as many as there are mode shapes where symmetry makes these one mode, see `loudness.py`.
+its modes, one of each, and as many as there are mode shapes where symmetry makes these one mode, see `loudness`.
 """
 
 from __future__ import annotations
@@ -37,25 +37,15 @@ class ShapeModes(SpecModel):
 
 @dataclass(frozen=True, eq=False)
 class ModeShapes:
-    """Mode shapes on a grid through the body, as vectors, over the root mean square of their normal component on the surface.
+    """Mode shapes on a grid through the body, as vectors, over the RMS of their normal component on the surface."""
 
-    Attributes:
-        axes: The grid's axes, as rows, of the body's frame.
-        low: Place of its first node along these axes [m].
-        step: Spacing of its nodes along each [m].
-        num: Number of its nodes along each, two or more.
-        value: Fields at the nodes, along the grid's axes [1].
-        owner: The mode of each field, ascending.
-        error: Root mean square over the surface of what interpolation is off by, of each field [1].
-    """
-
-    axes: Float[np.ndarray, "3 3"]
-    low: Float[np.ndarray, " 3"]
-    step: Float[np.ndarray, " 3"]
-    num: Int[np.ndarray, " 3"]
-    value: Float[np.ndarray, "node 3 field"]
-    owner: Int[np.ndarray, " field"]
-    error: Float[np.ndarray, " field"]
+    axes: Float[np.ndarray, "3 3"]  # the grid's axes, as rows, of the body's frame
+    low: Float[np.ndarray, " 3"]  # place of its first node along these axes [m]
+    step: Float[np.ndarray, " 3"]  # spacing of its nodes along each [m]
+    num: Int[np.ndarray, " 3"]  # number of its nodes along each, two or more
+    value: Float[np.ndarray, "node 3 field"]  # fields at the nodes, along the grid's axes [1]
+    owner: Int[np.ndarray, " field"]  # the mode of each field, ascending
+    error: Float[np.ndarray, " field"]  # root mean square over the surface of what interpolation is off by, of each field [1]
 
     def share(self, pos: Float[np.ndarray, "point 3"], along: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point mode"]:
         """Return by how much more or less than by its gain each mode is struck at points, along a direction there [1].
@@ -76,44 +66,27 @@ class ModeShapes:
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Modes of a body, by ascending frequency.
+    """Modes of a body, by ascending frequency."""
 
-    Attributes:
-        frequency: f, of the undamped mode's ringing [Hz].
-        decay: Rate d at which its amplitude decays [1/s].
-        gain: Amplitude of s per impulse, g [1/kg].
-        shapes: How strongly each is struck where and along what; None: alike everywhere.
-    """
-
-    frequency: Float[np.ndarray, " mode"]
-    decay: Float[np.ndarray, " mode"]
-    gain: Float[np.ndarray, " mode"]
-    shapes: ModeShapes | None = None
+    frequency: Float[np.ndarray, " mode"]  # f, of the undamped mode's ringing [Hz]
+    decay: Float[np.ndarray, " mode"]  # rate d at which its amplitude decays [1/s]
+    gain: Float[np.ndarray, " mode"]  # amplitude of s per impulse, g [1/kg]
+    shapes: ModeShapes | None = None  # how strongly each is struck where and along what; None: alike everywhere
 
 
-INAUDIBLE = 1e-3
-"""Gain below which a group is left out, over the largest gain."""
-MERGE_TOLERANCE = 1e-3
-"""Relative difference of frequencies up to which modes are one: less than the elements resolve."""
+INAUDIBLE = 1e-3  # gain below which a group is left out, over the largest gain
+MERGE_TOLERANCE = 1e-3  # relative difference of frequencies up to which modes are one: less than the elements resolve
 
 
 @dataclass(frozen=True, eq=False)
 class Loudness:
-    """Modes of one frequency taken together.
+    """Modes of one frequency taken together."""
 
-    Attributes:
-        wave_number: ω L/c, root mean square of each group.
-        multiplicity: How many modes it has.
-        gain: g, per mass of the body: dimensionless.
-        mixture: Of the mode shapes of unit modal mass, what makes the fields.
-        owner: The group of each field, ascending.
-    """
-
-    wave_number: Float[np.ndarray, " group"]
-    multiplicity: Int[np.ndarray, " group"]
-    gain: Float[np.ndarray, " group"]
-    mixture: Float[np.ndarray, "mode field"]
-    owner: Int[np.ndarray, " field"]
+    wave_number: Float[np.ndarray, " group"]  # ω L/c, root mean square of each group
+    multiplicity: Int[np.ndarray, " group"]  # how many modes it has
+    gain: Float[np.ndarray, " group"]  # g, per mass of the body: dimensionless
+    mixture: Float[np.ndarray, "mode field"]  # of the mode shapes of unit modal mass, what makes the fields
+    owner: Int[np.ndarray, " field"]  # the group of each field, ascending
 
 
 def of_groups(

@@ -29,17 +29,11 @@ from tgdsl.layout.layout import Layout
 
 @dataclass(frozen=True)
 class ProprioceptiveReading:
-    """A reading of a robot's joints or actuators.
+    """A reading of a robot's joints or actuators."""
 
-    Attributes:
-        rows: What it has a row for each of.
-        channel: Name of the reading's only channel.
-        units: Unit of a hinge, and of a slide.
-    """
-
-    rows: Literal["joint", "actuator"]
-    channel: str
-    units: tuple[str, str]
+    rows: Literal["joint", "actuator"]  # what it has a row for each of
+    channel: str  # name of the reading's only channel
+    units: tuple[str, str]  # unit of a hinge, and of a slide
 
 
 PROPRIOCEPTION = {
@@ -89,8 +83,7 @@ class LastActionObservation(JointObservation):
     """Control that was last given to each actuator, in its own unit; with `joints`, to the actuators of these."""
 
 
-JointSpec = JointPosObservation | JointVelObservation | JointEffortObservation | LastActionObservation
-"""Any of them."""
+JointSpec = JointPosObservation | JointVelObservation | JointEffortObservation | LastActionObservation  # any of them
 
 
 class NoneObservation(SpecModel):

@@ -244,7 +244,6 @@ def _noise(context: Context, like: Float[Tensor, "env sample joint"]) -> Float[T
 
 
 def _wrapped(angle: Tensor) -> Tensor:
-    """Return an angle within a turn, so that it keeps its precision in float32."""
     return angle - 2 * pi() * torch.round(angle / (2 * pi()))
 
 

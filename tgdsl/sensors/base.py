@@ -136,33 +136,23 @@ def components(name: str, planes: Vec) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class Memory:
-    """A tensor (env, *shape) that is carried from one call to the next.
+    """A tensor (env, *shape) that is carried from one call to the next."""
 
-    Attributes:
-        rest: Its value after a reset.
-        shape: Its shape; None: (row,) of the reading; a type of request: the rows of that quantity's value.
-        overwritten: Whether a kernel may overwrite it in place; `forward` then returns no new value.
-    """
-
-    rest: float = 0.0
+    rest: float = 0.0  # its value after a reset
+    # its shape; None: (row,) of the reading; a type of request: the rows of that quantity's value
     shape: tuple[int, ...] | type[Request] | None = None
-    overwritten: bool = False
+    overwritten: bool = False  # whether a kernel may overwrite it in place; `forward` then returns no new value
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """The rows of a reading.
+    """The rows of a reading."""
 
-    Attributes:
-        name: Noun for a row: "taxel", "body", "voxel", "sample", …
-        size: Number of rows.
-        table: Columns of a table for users: texts, or arrays (row, …).
-        link_id: The layout's link of each row, for noise that differs between links; None: rows are on no link.
-    """
-
-    name: str
-    size: int
+    name: str  # noun for a row: "taxel", "body", "voxel", "sample", …
+    size: int  # number of rows
+    # columns of a table for users: texts, or arrays (row, …)
     table: Mapping[str, Sequence[str] | np.ndarray] = field(default_factory=dict)
+    # the layout's link of each row, for noise that differs between links; None: rows are on no link
     link_id: Int[np.ndarray, " row"] | None = None
 
 
@@ -191,42 +181,27 @@ def _named(constants: Any, path: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Lowered:
-    """A sensor, ready to be planned.
+    """A sensor, ready to be planned."""
 
-    Attributes:
-        channels: Channels of the sensor's reading, in order.
-        constants: Arrays that `forward` gets as tensors: a mapping, or a dataclass, which becomes a mapping by path.
-        state: Tensors carried from one call to the next.
-        requests: Requests to the scene, at most one of each type.
-        rows: Rows of the reading; None: taxels, or bodies if the kind is not on taxels.
-        reports: Further readings `<sensor>/<name>` with these channels and a row per body.
-        report_rows: Rows of a report, where they are not bodies.
-        notes: Lines about its parameters for `explain`.
-        signal: Channels that `forward` returns and noise disturbs, if the kind has `decide`.
-        substeps: Number of physics steps per call. `forward` is called at each, and the reading is a block of this many
-            samples, times `samples`. 0: `forward` is called once per call, with the state of the last physics step.
-        samples: Samples that `forward` returns at once, as "signal" (env, sample, channel, row); 0: a single reading.
-        provides: Planes that `forward` returns for other sensors, among `Kind.provides`.
-        sound: Samples of sound per call of `forward`, see `sensors.upstream`; 0: none.
-        upstream: Request to other sensors: `forward` gets `gathered[Upstream]`, see `sensors.upstream`.
-        timestep: Time between calls of `forward` that the constants are for [s]; another one is warned of. 0: any.
-    """
-
-    channels: tuple[Channel, ...]
+    channels: tuple[Channel, ...]  # channels of the sensor's reading, in order
+    # arrays that `forward` gets as tensors: a mapping, or a dataclass, which becomes a mapping by path
     constants: Any = field(default_factory=dict)
-    state: Mapping[str, Memory] = field(default_factory=dict)
-    requests: tuple[Request, ...] = ()
-    rows: Axis | None = None
+    state: Mapping[str, Memory] = field(default_factory=dict)  # tensors carried from one call to the next
+    requests: tuple[Request, ...] = ()  # requests to the scene, at most one of each type
+    rows: Axis | None = None  # rows of the reading; None: taxels, or bodies if the kind is not on taxels
+    # further readings `<sensor>/<name>` with these channels and a row per body
     reports: Mapping[str, tuple[Channel, ...]] = field(default_factory=dict)
-    report_rows: Mapping[str, Axis] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    signal: tuple[Channel, ...] | None = None
+    report_rows: Mapping[str, Axis] = field(default_factory=dict)  # rows of a report, where they are not bodies
+    notes: tuple[str, ...] = ()  # lines about its parameters for `explain`
+    signal: tuple[Channel, ...] | None = None  # channels that `forward` returns and noise disturbs, if the kind has `decide`
+    # number of physics steps per call. `forward` is called at each, and the reading is a block of this many samples, times
+    # `samples`. 0: `forward` is called once per call, with the state of the last physics step.
     substeps: int = 0
-    samples: int = 0
-    timestep: float = 0.0
-    provides: frozenset[str] = frozenset()
-    sound: int = 0
-    upstream: Upstream | None = None
+    samples: int = 0  # samples that `forward` returns at once, as "signal" (env, sample, channel, row); 0: a single reading
+    timestep: float = 0.0  # time between calls of `forward` that the constants are for [s]; another one is warned of. 0: any.
+    provides: frozenset[str] = frozenset()  # planes that `forward` returns for other sensors, among `Kind.provides`
+    sound: int = 0  # samples of sound per call of `forward`, see `sensors.upstream`; 0: none
+    upstream: Upstream | None = None  # request to other sensors: `forward` gets `gathered[Upstream]`, see `sensors.upstream`
 
     def __post_init__(self) -> None:
         """Name the constants."""
@@ -241,35 +216,21 @@ class ReadSensor(NamedTuple):
 
 
 class Fitting(NamedTuple):
-    """What `Kind.fit` gets, after the sensors that a sensor reads were lowered.
+    """What `Kind.fit` gets, after the sensors that a sensor reads were lowered."""
 
-    Attributes:
-        timestep: Physics time step of the scene [s].
-        upstream: The sensors that it reads by name, in order.
-    """
-
-    timestep: float
-    upstream: Mapping[str, ReadSensor]
+    timestep: float  # physics time step of the scene [s]
+    upstream: Mapping[str, ReadSensor]  # the sensors that it reads by name, in order
 
 
 class Context(NamedTuple):
-    """When `forward` is called. A kind without `is_timed` gets `UNTIMED`, whose fields are None.
+    """When `forward` is called. A kind without `is_timed` gets `UNTIMED`, whose fields are None."""
 
-    Attributes:
-        dt: Time since the last call or substep [s], a scalar.
-        step: Number of this call of each environment, (env, 1).
-        substep: Index of the substep within the call.
-        time: Time since each environment's reset [s], (env, 1); 0 at the first call after it.
-        is_first: Whether this is the first call after each environment's reset, (env, 1).
-        stream: Random words of this call or substep, for a kind with `is_random`: see `noise.random`.
-    """
-
-    dt: Tensor
-    step: Tensor
-    substep: int
-    time: Tensor
-    is_first: Tensor
-    stream: Stream | None = None
+    dt: Tensor  # time since the last call or substep [s], a scalar
+    step: Tensor  # number of this call of each environment, (env, 1)
+    substep: int  # index of the substep within the call
+    time: Tensor  # time since each environment's reset [s], (env, 1); 0 at the first call after it
+    is_first: Tensor  # whether this is the first call after each environment's reset, (env, 1)
+    stream: Stream | None = None  # random words of this call or substep, for a kind with `is_random`: see `noise.random`
 
 
 UNTIMED = Context(*[None] * 5)  # type: ignore[arg-type]
@@ -310,10 +271,8 @@ class SurfaceOf(Protocol):
         ...
 
 
-Array = TypeVar("Array")
-"""`np.ndarray` in `lower`, `Tensor` in `forward`."""
-Constants = Mapping[str, Tensor]
-"""Constants of a kind without a dataclass for them."""
+Array = TypeVar("Array")  # `np.ndarray` in `lower`, `Tensor` in `forward`
+Constants = Mapping[str, Tensor]  # constants of a kind without a dataclass for them
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
 Planes = Mapping[str, Tensor]
@@ -322,21 +281,14 @@ ReferenceAnswer = tuple[np.ndarray, dict[str, np.ndarray]] | tuple[np.ndarray, d
 
 
 class Alternative(NamedTuple):
-    """Other values of a sensor's or an object's fields, with another error and cost.
+    """Other values of a sensor's or an object's fields, with another error and cost."""
 
-    Attributes:
-        label: Name for users: `svd, 0.1 %`.
-        changes: New values of fields, as a document has them; None: left out.
-        unused: Fields that have no effect then. A document that sets one of them excludes this alternative.
-        is_exact: Whether it is exact up to rounding. Errors of others may be measured against it, and it needs no measurement.
-        is_other: Whether its reading has another shape or other times. `accuracy` never chooses it.
-    """
-
-    label: str
-    changes: Mapping[str, Any]
-    unused: tuple[str, ...] = ()
+    label: str  # name for users: `svd, 0.1 %`
+    changes: Mapping[str, Any]  # new values of fields, as a document has them; None: left out
+    unused: tuple[str, ...] = ()  # fields that have no effect then. A document that sets one of them excludes this alternative.
+    # whether it is exact up to rounding. Errors of others may be measured against it, and it needs no measurement.
     is_exact: bool = False
-    is_other: bool = False
+    is_other: bool = False  # whether its reading has another shape or other times. `accuracy` never chooses it.
 
 
 Warn = Callable[[str, Mapping[str, np.ndarray], Sequence[str], np.ndarray], Sequence[str]]

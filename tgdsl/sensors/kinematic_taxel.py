@@ -81,8 +81,7 @@ from tgdsl.sensors.base import (
 )
 from tgdsl.sensors.noise import FORCE
 
-CLOSED = 0.99
-"""Largest depth over `densification`, so that the force stays finite."""
+CLOSED = 0.99  # largest depth over `densification`, so that the force stays finite
 
 
 class LoopSpec(SpecModel):
@@ -302,7 +301,6 @@ def unloaded() -> float:
 
 
 def _within(limit: Tensor, shear: planes.Vec) -> planes.Vec:
-    """Return tangential forces [N], scaled back to their limits where they are larger."""
     size = planes.safe_sqrt(planes.dot(shear, shear))
     is_outside = size > limit
     return planes.scale(torch.where(is_outside, limit / torch.where(is_outside, size, 1.0), 1.0), shear)

@@ -22,8 +22,7 @@ from tgdsl.sensors import KINDS
 from tgdsl.sensors.base import AnySensorSpec, Axis, Kind, Lowered, Memory
 from tgdsl.sensors.upstream import SOUND
 
-GROUP = "tgdsl.kinds"
-"""Group of the entry points by which packages bring kinds."""
+GROUP = "tgdsl.kinds"  # group of the entry points by which packages bring kinds
 ARGUMENTS = {
     "lower": ("spec", "layout", "surface_of"),
     "forward": ("gathered", "context", "constants", "state"),
@@ -31,8 +30,7 @@ ARGUMENTS = {
     "decide": ("planes", "constants", "state"),
 }
 """Arguments of a kind's functions, in order."""
-FORMER = {"probes"}
-"""Names of arguments from before kinds made requests."""
+FORMER = {"probes"}  # names of arguments from before kinds made requests
 
 
 def known_kinds(given: Sequence[Kind] = ()) -> tuple[Kind, ...]:
@@ -113,11 +111,7 @@ def check_lowered(kind: Kind, lowered: Lowered, spec: AnySensorSpec) -> None:
 
 
 def _check_parts(kind: Kind, lowered: Any) -> None:
-    """Refuse parts of a lowered sensor that have another type.
-
-    Raises:
-        TgdslError: With the kind, the type found, and the type expected.
-    """
+    """Refuse parts of a lowered sensor that have another type."""
 
     def refuse(what: str, found: object, expected: str) -> None:
         text = found.__name__ if isinstance(found, type) else repr(found) if isinstance(found, str) else type(found).__name__

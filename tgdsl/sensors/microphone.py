@@ -7,10 +7,11 @@ in metres from the source, at the instant of emission, to the microphone, and c 
 [m/s]. The sources that it hears are sensors of the document; it reads what they find at the same physics step, see
 `sensors.upstream`: K samples, the last one at the step's end. So it reads a block of K samples, of each step of a call.
 
-- Time: a_i is exact at the ends of steps (`retarded`), where source and microphone move evenly in between, and linear within a
+- Time: a_i is exact at the ends of steps (`age_of_sound`), where source and microphone move evenly in between, and linear
+within a
   step. So a tone of frequency f is heard at f (1 − v_m/c)/(1 + v_s/c), with the speeds v_m and v_s of microphone and source
   away from one another.
-- Between samples it is interpolated by 24 of them (`interpolation`), exact up to 0.4 of the sample rate. These look ahead, so
+- Between samples it is interpolated by 24 of them (`delayed`), exact up to 0.4 of the sample rate. These look ahead, so
   that sound arrives at least 12 samples after its emission: from sources nearer than 12 c/f_s it is late, but as loud as at
   their distance.
 - Level is linear within a step.
@@ -103,12 +104,9 @@ class MicrophoneSpec(AnySensorSpec):
         return {} if self.body is None else {"body": self.body}
 
 
-TAPS, ORDER = 24, 6
-"""Samples T that a value is made of, and coefficients of each tap's polynomial."""
-PASS_BAND = 0.4
-"""Frequency up to which values are exact, as a part of the sample rate."""
-LEAST_DELAY = TAPS // 2
-"""Samples by which sound is late at the least: the filter looks as far ahead."""
+TAPS, ORDER = 24, 6  # samples T that a value is made of, and coefficients of each tap's polynomial
+PASS_BAND = 0.4  # frequency up to which values are exact, as a part of the sample rate
+LEAST_DELAY = TAPS // 2  # samples by which sound is late at the least: the filter looks as far ahead
 
 
 @cache
@@ -258,7 +256,7 @@ def interpolated(samples: Float[np.ndarray, " sample"], place: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class MicrophoneConstants(Generic[Array]):
-    """Parameters; C of `interpolation`; l of each source's row; the samples' numbers from 1; and m [m], None on a body."""
+    """Parameters; C of `coefficients`; l of each source's row; the samples' numbers from 1; and m [m], None on a body."""
 
     falloff: Array
     nearest: Array
@@ -271,23 +269,14 @@ class MicrophoneConstants(Generic[Array]):
 
 
 class MicrophoneState(NamedTuple):
-    """State of the sources; see `fit` for shapes.
+    """State of the sources; see `fit` for shapes."""
 
-    Attributes:
-        history: Samples that have not yet arrived from the largest distance [Pa].
-        path: Where sources were at earlier steps, from where they are now [m].
-        place: Where they are in the world [m].
-        place_low: What `place` rounds off [m].
-        age: Age of the sound that arrives now, in steps.
-        beyond: Distance at which a source was not heard [m]; 0: none.
-    """
-
-    history: Tensor
-    path: Tensor
-    place: Tensor
-    place_low: Tensor
-    age: Tensor
-    beyond: Tensor
+    history: Tensor  # samples that have not yet arrived from the largest distance [Pa]
+    path: Tensor  # where sources were at earlier steps, from where they are now [m]
+    place: Tensor  # where they are in the world [m]
+    place_low: Tensor  # what `place` rounds off [m]
+    age: Tensor  # age of the sound that arrives now, in steps
+    beyond: Tensor  # distance at which a source was not heard [m]; 0: none
 
 
 def lower(spec: MicrophoneSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
@@ -387,10 +376,8 @@ def forward(
 
 
 def _path(place: Tensor, state: MicrophoneState, is_first: Tensor) -> Tensor:
-    """Return where sources were at each node, from where they are now (env, 3, node, row) [m].
-
-    Differences are formed in the precision of `place`, which the state holds as two numbers of the module's dtype.
-    """
+    """Return where sources were at each node, from where they are now (env, 3, node, row) [m]."""
+    # The state holds places as two numbers of the module's dtype: differences are formed in the precision of `place`.
     last_place = state.place.to(place.dtype) + state.place_low.to(place.dtype)
     moved = torch.where(is_first[..., None], 0.0, (place - last_place).to(state.place.dtype))
     path = torch.where(is_first[..., None, None], 0.0, state.path - moved[:, :, None])

@@ -34,14 +34,8 @@ SOUND = frozenset({SAMPLES, PLACE})
 
 @dataclass(frozen=True, eq=False)
 class Upstream(Request[Mapping[str, Mapping[str, Tensor]]]):
-    """Requests planes of other sensors at the same call or substep, before their noise: by sensor, then by plane.
+    """Requests planes of other sensors at the same call or substep, before their noise: by sensor, then by plane."""
 
-    Attributes:
-        sensors: Names of the sensors; empty: all whose kinds provide the planes, in the document's order.
-        planes: Planes that each must provide.
-        what: Noun for them in an error: "sound".
-    """
-
-    sensors: tuple[str, ...] = ()
-    planes: frozenset[str] = frozenset()
-    what: str = ""
+    sensors: tuple[str, ...] = ()  # names of the sensors; empty: all whose kinds provide the planes, in the document's order
+    planes: frozenset[str] = frozenset()  # planes that each must provide
+    what: str = ""  # noun for them in an error: "sound"

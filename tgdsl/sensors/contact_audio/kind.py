@@ -104,8 +104,7 @@ from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
 from tgdsl.surfaces.surface import Surface
 
 Load = Float[Tensor, "env body object"]
-UNKNOWN = 1e30
-"""Steady load at the beginning of an episode [N]: no first load exceeds it, and the second finds the first."""
+UNKNOWN = 1e30  # steady load at the beginning of an episode [N]: no first load exceeds it, and the second finds the first
 
 
 def impulses(
@@ -355,16 +354,8 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
 
 
 def _turned(phasors: Tensor, drive: Tensor, turn: Tensor, constants: Constants) -> Tensor:
-    """Return the phasors at the end of a step without noise, (env, row, part · mode) [N·s].
-
-    By products alone, not of a matrix: matrices may be multiplied in TF32, and phasors would then grow or decay by it.
-
-    Args:
-        phasors: Those at its start, real parts first [N·s].
-        drive: Impulse [N·s] or rise of the force [N], (env, row); or of each mode, (env, row, mode).
-        turn: What is left of each part, and what it has of the other, (2, row, part · mode).
-        constants: The sensor's.
-    """
+    """Return the phasors at the end of a step without noise, (env, row, part · mode) [N·s]."""
+    # Not a product of matrices: those may be in TF32, and phasors would then grow or decay by it.
     along, across = turn.unbind()
     crossed = phasors.roll(phasors.shape[-1] // 2, dims=-1)
     after = torch.addcmul(phasors * along, crossed, across)
@@ -374,13 +365,7 @@ def _turned(phasors: Tensor, drive: Tensor, turn: Tensor, constants: Constants) 
 
 
 def _grains(sliding: Tensor, context: Context, constants: Constants) -> list[tuple[Tensor, Tensor]]:
-    """Return each impulse of sliding (env, row, *mode) [N·s], and the slot in which it arrives (env, row).
-
-    Args:
-        sliding: Its power (env, row, *mode) [W].
-        context: The stream that they are drawn from.
-        constants: The sensor's.
-    """
+    """Return each impulse of sliding (env, row, *mode) [N·s], and the slot in which it arrives (env, row)."""
     assert context.stream is not None
     rows, (grains, slots) = sliding.shape[1], constants["grain_left"].shape[:2]
     count = (grains + 1) // 2
@@ -398,7 +383,6 @@ def _grains(sliding: Tensor, context: Context, constants: Constants) -> list[tup
 
 
 def _level(energy: Tensor) -> Tensor:
-    """Return the level of energies [dB]."""
     return 10.0 * torch.log10(1.0 + energy / quiet())
 
 

@@ -164,12 +164,9 @@ def membership(frequency: Float[np.ndarray, "row mode"], bands: Sequence[int]) -
     return (is_in & (frequency > 0)[..., None]).astype(np.float64)
 
 
-GRAINS = 4
-"""Impulses of noise in a physics step, one in each of as many equal parts: the same for any number of samples."""
-SLOTS = 16
-"""Times in its part of the step at which one of them may arrive."""
-HIGHEST = 0.45
-"""Largest frequency that is heard, in sample rates."""
+GRAINS = 4  # impulses of noise in a physics step, one in each of as many equal parts: the same for any number of samples
+SLOTS = 16  # times in its part of the step at which one of them may arrive
+HIGHEST = 0.45  # largest frequency that is heard, in sample rates
 Arrays = Mapping[str, np.ndarray]
 
 # Functions, not floats of the module: under dynamic shapes torch.compile makes those inputs of the graph.
@@ -229,7 +226,6 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
     seen = gain * (1.0 - 1j * over) if is_force else -1j * gain  # heard is Re(seen z)
 
     def factors(time: np.ndarray) -> np.ndarray:
-        """Return e^((−d + 2πif) t), (row, mode, *time); 0 of modes that are not heard, and before an impulse."""
         shape = (..., *[None] * time.ndim)
         return np.where(is_heard[shape] & (time >= -1e-12 * step), np.exp(rate[shape] * np.maximum(time, 0.0)), 0.0)
 
@@ -296,28 +292,19 @@ def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "2 
     return result if result.is_cuda else materialised(result)  # on a CPU it is else chosen again for each environment
 
 
-SurfaceByName = Callable[[str], Surface]
-"""Returns the surface of something that rings, by its name."""
+SurfaceByName = Callable[[str], Surface]  # returns the surface of something that rings, by its name
 
 
 class Ringing(NamedTuple):
-    """The modes of all rows that are computed; those that a row has fewer of than another are 0.
+    """The modes of all rows that are computed; those that a row has fewer of than another are 0."""
 
-    Attributes:
-        frequency: [Hz].
-        decay: [1/s].
-        gain: [1/kg].
-        bands: Numbers of the third octaves from the lowest mode that is heard to the highest, whether computed or not.
-        notes: What was left out, and why; and how exact mode shapes are, if those are wanted.
-        shapes: Mode shapes of each row; none if they are not wanted.
-    """
-
-    frequency: Float[np.ndarray, "row mode"]
-    decay: Float[np.ndarray, "row mode"]
-    gain: Float[np.ndarray, "row mode"]
+    frequency: Float[np.ndarray, "row mode"]  # [Hz]
+    decay: Float[np.ndarray, "row mode"]  # [1/s]
+    gain: Float[np.ndarray, "row mode"]  # [1/kg]
+    # numbers of the third octaves from the lowest mode that is heard to the highest, whether computed or not
     bands: Sequence[int]
-    notes: tuple[str, ...]
-    shapes: tuple[ModeShapes, ...] = ()
+    notes: tuple[str, ...]  # what was left out, and why; and how exact mode shapes are, if those are wanted
+    shapes: tuple[ModeShapes, ...] = ()  # mode shapes of each row; none if they are not wanted
 
 
 def axis_of(spec: ContactAudioSpec, layout: Layout) -> Axis:
@@ -420,18 +407,7 @@ def _unheard(name: str, modes: Modes, spec: ContactAudioSpec, step: float) -> Lo
 
 
 def _modes_of(given: ModesField, name: str, surface: SurfaceByName, below: float, progress: Progress) -> Modes:
-    """Return the modes of a body.
-
-    Args:
-        given: What the document says of them.
-        name: What the body is called in messages.
-        surface: Returns its surface in its frame; called if the modes follow from its shape.
-        below: Frequency beyond which a mode is not heard [Hz]. Those that are listed are returned all the same.
-        progress: Called with a line of text for each long job.
-
-    Raises:
-        LowerError: If its shape gives none.
-    """
+    """Return the modes of a body."""
     if isinstance(given, ShapeModes):
         from tgdsl.modal.analysis import analysed
 

@@ -31,8 +31,7 @@ from tgdsl.sensors.noise.reference import normal_pair
 from tgdsl.sensors.upstream import PLACE, SAMPLES
 from tgdsl.surfaces.surface import Surface
 
-Strikes = list[tuple[float, float]]
-"""When each impulse acts after the start of the step [s], and how large it is [N·s]."""
+Strikes = list[tuple[float, float]]  # when each impulse acts after the start of the step [s], and how large it is [N·s]
 
 
 def reference(

@@ -26,24 +26,16 @@ from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.reference import TIE
 from tgdsl.quantities.contact_depth import Penetration, ReferencePenetration
 
-PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")
-"""State: e_i [m], and the number of its object from 1, 0 for none."""
+PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")  # state: e_i [m], and the number of its object from 1, 0 for none
 
 
 class StickSlip(NamedTuple):
-    """Stick and slip of a contact: when it gets an anchor, loses it, and slides; numbers, or scalar tensors.
+    """Stick and slip of a contact: when it gets an anchor, loses it, and slides; numbers, or scalar tensors."""
 
-    Attributes:
-        standoff: s, height of the undeformed skin above the taxels [m].
-        enter: Depth from which a contact sticks [m].
-        exit: Distance above the skin at which the anchor is released [m].
-        slip: Largest tangential displacement per depth [1]; None: it never slides.
-    """
-
-    standoff: float | Tensor
-    enter: float | Tensor
-    exit: float | Tensor
-    slip: float | Tensor | None
+    standoff: float | Tensor  # s, height of the undeformed skin above the taxels [m]
+    enter: float | Tensor  # depth from which a contact sticks [m]
+    exit: float | Tensor  # distance above the skin at which the anchor is released [m]
+    slip: float | Tensor | None  # largest tangential displacement per depth [1]; None: it never slides
 
 
 def advance(

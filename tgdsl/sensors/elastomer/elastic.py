@@ -40,8 +40,7 @@ import numpy as np
 from jaxtyping import Float
 
 Plane = Float[np.ndarray, "*#point"]
-QUADRATIC = math.cos(math.radians(20.0)) - 0.5
-"""c in φ."""
+QUADRATIC = math.cos(math.radians(20.0)) - 0.5  # c in φ
 
 
 class Profiles(NamedTuple):
@@ -109,16 +108,13 @@ def _integrals(r: np.ndarray, depth: float, patch: np.ndarray | float) -> tuple[
 
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
-CUTOFF = 45.0
-"""Wavenumbers go up to CUTOFF/b, b of the patch: φ there is 1e-16."""
+CUTOFF = 45.0  # wavenumbers go up to CUTOFF/b, b of the patch: φ there is 1e-16
 STEPS_PER_PATCH = 32
 """Distances in the table per b, next to the patch: cubic splines then err by some 1e-6 of the largest value."""
-GRADED = 4.0
-"""Distance over b from which steps in the table grow with the distance."""
+GRADED = 4.0  # distance over b from which steps in the table grow with the distance
 DEEP = 40.0
 """kt from which the base is not felt: its part is exp(−2kt), and the response is smooth over wavenumbers far beyond 1/t."""
-BATCH = 4_000_000
-"""Bessel functions that are formed at once."""
+BATCH = 4_000_000  # Bessel functions that are formed at once
 
 
 class Layer(NamedTuple):

@@ -72,27 +72,16 @@ from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.sensors.noise import TAXEL
 
-Operators: TypeAlias = tuple[Operator[Array], ...] | None
-"""An operator of each link; None if the skin does not need it."""
+Operators: TypeAlias = tuple[Operator[Array], ...] | None  # an operator of each link; None if the skin does not need it
 
 
 @dataclass(frozen=True, eq=False)
 class ElastomerConstants(Generic[Array]):
-    """Operators, strengths and stiffnesses, see `ElastomerSpec`; None if the skin does not need them.
+    """Operators, strengths and stiffnesses, see `ElastomerSpec`; None if the skin does not need them."""
 
-    Attributes:
-        normal: Normals (3, taxel).
-        marker_pos: Positions of the markers (3, marker) [m]; None: taxels are markers.
-        marker_normal: Normals of the markers (3, marker).
-        slip: Largest tangential displacement per depth [1].
-        shear_stiffness: K_t [Pa/m].
-        is_active: 1 of taxels that are moved by points, else 0.
-        flat: Links whose taxels have one normal, by the first taxel; the values are unused.
-    """
-
-    normal: Array
-    marker_pos: Array | None = None
-    marker_normal: Array | None = None
+    normal: Array  # normals (3, taxel)
+    marker_pos: Array | None = None  # positions of the markers (3, marker) [m]; None: taxels are markers
+    marker_normal: Array | None = None  # normals of the markers (3, marker)
     spread: Operators[Array] = None
     bulge: Operators[Array] = None
     drag: Operators[Array] = None
@@ -104,12 +93,13 @@ class ElastomerConstants(Generic[Array]):
     standoff: Array | None = None
     enter: Array | None = None
     exit: Array | None = None
-    slip: Array | None = None
+    slip: Array | None = None  # largest tangential displacement per depth [1]
     shear_strength: Array | None = None
-    shear_stiffness: Array | None = None
+    shear_stiffness: Array | None = None  # K_t [Pa/m]
     shear_falloff: Array | None = None
-    is_active: Array | None = None
+    is_active: Array | None = None  # 1 of taxels that are moved by points, else 0
     reference_area: Array | None = None
+    # links whose taxels have one normal, by the first taxel; the values are unused
     flat: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod

@@ -53,21 +53,13 @@ class LinkTaxels:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """The paper's kernels, without their strengths.
+    """The paper's kernels, without their strengths."""
 
-    Attributes:
-        dilation_falloff: λ_d [1/m²].
-        shear_falloff: λ_s [1/m²].
-        compressibility: c [1].
-        smoothing: ε [m].
-        is_normalized: Whether the in-plane part is divided by ḡ.
-    """
-
-    dilation_falloff: float
-    shear_falloff: float
-    compressibility: float
-    smoothing: float
-    is_normalized: bool
+    dilation_falloff: float  # λ_d [1/m²]
+    shear_falloff: float  # λ_s [1/m²]
+    compressibility: float  # c [1]
+    smoothing: float  # ε [m]
+    is_normalized: bool  # whether the in-plane part is divided by ḡ
 
     def spread(
         self, pos: Float[np.ndarray, "target 3"], normal: Float[np.ndarray, "target 3"], source: Float[np.ndarray, "source 3"]
@@ -96,13 +88,9 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class Elastic:
-    """A linear elastic taxels.
+    """A linear elastic skin."""
 
-    Attributes:
-        layer: Its thickness [m], infinite for a half-space, the markers' depth [m], G [Pa] and ν.
-    """
-
-    layer: Layer
+    layer: Layer  # its thickness [m], infinite for a half-space, the markers' depth [m], G [Pa] and ν
 
     def profiles(self, r: np.ndarray, area: np.ndarray, mean_area: float, is_exact: bool = False) -> Profiles:
         """Return displacement per force [m/N] at distances r [m], (…, source), from sources of some areas [m²].
@@ -164,8 +152,7 @@ def offset(
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
 """Time per multiply-add, relative to a large matrix product (one CPU core, float32, 512 environments)."""
-SAME = 1e-6
-"""Relative difference up to which spacings, areas and normals of a grid count as equal."""
+SAME = 1e-6  # relative difference up to which spacings, areas and normals of a grid count as equal
 
 Response = Callable[[Int[np.ndarray, " source"]], Float[np.ndarray, "out in target source"]]
 """Returns the responses of all taxels of the link to some source taxels."""

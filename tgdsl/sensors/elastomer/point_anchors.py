@@ -32,14 +32,10 @@ from tgdsl.tensors.operations import Operation, needs_autograd
 from tgdsl.tensors.torch_internals import expect_size, is_exporting
 
 Row = tuple[Float[Tensor, "6 row slot"], Int[Tensor, " row"]]
-LARGEST_BLOCK = 16
-"""Largest number of points of a block, which divides the number of points."""
-OVERHEAD = 24
-"""Fixed cost of a row, in slots."""
-WORTHWHILE = 0.75
-"""Largest cost over the dense sum's at which points are compacted."""
-MIN_ACTIVE = 2
-"""Rows of a link at least: torch.compile treats sizes 0 and 1 apart."""
+LARGEST_BLOCK = 16  # largest number of points of a block, which divides the number of points
+OVERHEAD = 24  # fixed cost of a row, in slots
+WORTHWHILE = 0.75  # largest cost over the dense sum's at which points are compacted
+MIN_ACTIVE = 2  # rows of a link at least: torch.compile treats sizes 0 and 1 apart
 EXPECTED = (1000, 100)
 """Numbers of rows and slots for Inductor's estimates: without any it does not fuse the exponential and the sums."""
 
@@ -115,13 +111,7 @@ def _(planes: list[Tensor], is_active: Tensor) -> tuple[list[Tensor], list[Tenso
 
 
 def _row_length(count: Int[Tensor, "link env"], num_blocks: int, size: int) -> int | None:
-    """Return the number of blocks of a row that costs least, or None if to sum over all points costs little more.
-
-    Args:
-        count: Number of active blocks.
-        num_blocks: How many there are.
-        size: Points of each.
-    """
+    """Return the number of blocks of a row that costs least, or None if to sum over all points costs little more."""
     frequency = torch.bincount(count.reshape(-1), minlength=2)
     most = len(frequency) - 1
     lengths = torch.tensor([*(1 << k for k in range(most.bit_length()) if 1 << k < most), most])
@@ -147,47 +137,29 @@ def _index(
     return index
 
 
-PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")
-"""State: e_p in the link's frame [m], and 1 where the point has an anchor."""
-BLOCK = 64
-"""Points that are summed at once where nothing fuses the sum, so that memory stays bounded."""
+PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")  # state: e_p in the link's frame [m], and 1 where the point has an anchor
+BLOCK = 64  # points that are summed at once where nothing fuses the sum, so that memory stays bounded
 
 
 class Markers(NamedTuple):
-    """Markers of all links.
+    """Markers of all links."""
 
-    Attributes:
-        pos: Positions [m], planes (taxel,).
-        normal: Normals, in the same way.
-        falloff: λ_s [1/m²].
-        reference_area: A_ref [m²], or None: points count once.
-        flat: First taxels of the links whose markers have one normal.
-    """
-
-    pos: Vec
-    normal: Vec
-    falloff: Tensor
-    reference_area: Tensor | None
-    flat: frozenset[int] = frozenset()
+    pos: Vec  # positions [m], planes (taxel,)
+    normal: Vec  # normals, in the same way
+    falloff: Tensor  # λ_s [1/m²]
+    reference_area: Tensor | None  # A_ref [m²], or None: points count once
+    flat: frozenset[int] = frozenset()  # first taxels of the links whose markers have one normal
 
 
 class ShearLoad(NamedTuple):
-    """Shear loads of the points of one object, planes (env, link, point) in each link's frame.
+    """Shear loads of the points of one object, planes (env, link, point) in each link's frame."""
 
-    Attributes:
-        taxels: First of each link's taxels, and one beyond the last.
-        tiles: What `points.point_tiles` returns of them.
-        area: Surface of the object that each stands for [m²], (case, 1).
-        pos: z_p [m].
-        strength: (z_p − e_p) h_p [m²].
-        count: Number of active points of each link, (env, link), which then come first; None: inactive ones have strength 0.
-    """
-
-    taxels: tuple[tuple[int, int], ...]
-    tiles: Int[Tensor, "tile 3"]
-    area: Tensor
-    pos: Vec
-    strength: Vec
+    taxels: tuple[tuple[int, int], ...]  # first of each link's taxels, and one beyond the last
+    tiles: Int[Tensor, "tile 3"]  # what `points.point_tiles` returns of them
+    area: Tensor  # surface of the object that each stands for [m²], (case, 1)
+    pos: Vec  # z_p [m]
+    strength: Vec  # (z_p − e_p) h_p [m²]
+    # number of active points of each link, (env, link), which then come first; None: inactive ones have strength 0
     count: Tensor | None = None
 
 
@@ -317,11 +289,9 @@ def _summed_on_link(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 
 
 def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: Tensor) -> Vec:
-    """Return the sum for one link's markers, of one block of points.
-
-    The in-plane offset is taken along two tangents of each marker, scaled so that its square is the exponent of 2. If all
-    markers share one normal, they share the tangents, and terms of points alone are computed once per point.
-    """
+    """Return the sum for one link's markers, of one block of points."""
+    # Offsets are along two tangents of each marker, scaled so that their squares are the exponent of 2. Markers that share a
+    # normal share the tangents, and terms of points alone are computed once per point.
     scale = torch.sqrt(falloff / math.log(2.0))
     z, strengths = (planes.vec(part[:, None] for part in vector) for vector in (pos, strength))
     offset_u, offset_v = (
@@ -334,17 +304,13 @@ def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 
 
 def _along(tangent: Vec, point: Vec) -> Tensor:
-    """Return points along tangents, (env, taxel or 1, point); for a single tangent it is materialised."""
     result = planes.dot(tangent, point)
     return materialised(result) if tangent[0].shape[0] == 1 else result
 
 
 def _tangents(normal: Vec) -> tuple[Vec, Vec]:
-    """Return two unit vectors across unit normals and each other.
-
-    Without a branch that loses digits: Duff et al., "Building an orthonormal basis, revisited", 2017.
-    """
-    x, y, z = normal
+    """Return two unit vectors across unit normals and each other."""
+    x, y, z = normal  # no branch that loses digits: Duff et al., "Building an orthonormal basis, revisited", 2017
     sign = torch.where(z < 0, -1.0, 1.0)
     a = -1.0 / (sign + z)
     b = x * y * a

@@ -37,12 +37,10 @@ from tgdsl.geometry.planes_kernel import LOG2_E
 from tgdsl.geometry.shapes_kernel import chosen, dot
 from tgdsl.quantities.depth_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
-LANES, CHUNK = 32, 512
-"""Threads of a program, which is one warp, and most points of a chunk."""
+LANES, CHUNK = 32, 512  # threads of a program, which is one warp, and most points of a chunk
 REGISTERS = 72
 """Registers per thread, where a compiler would take 110 to 150: the kernel waits for memory, so occupancy decides."""
-MOST = 2**24
-"""Points of an object are fewer: their indices are stored as float32."""
+MOST = 2**24  # points of an object are fewer: their indices are stored as float32
 TINY = tl.constexpr(planes.tiny())
 
 
@@ -101,7 +99,6 @@ def _(pose: list[Tensor], gate: Tensor | None, pair: Tensor, points: Tensor, *_r
 
 
 def _empty(pose: list[Tensor], pair: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return memory for what the kernel finds."""
     num_envs, num_links, num_points = pose[0].shape[0], pair.shape[0], points.shape[2]
     result = pose[0].new_empty((6, num_envs, num_links, num_points))
     return result, pose[0].new_empty((num_envs, num_links), dtype=torch.int32)
@@ -170,7 +167,6 @@ def anchor_kernel(
 
 @triton.jit
 def _rank(are):
-    """Return how many of a block there are before each."""
     return tl.cumsum(are.to(tl.int32), axis=0) - are.to(tl.int32)
 
 
@@ -204,7 +200,6 @@ def _advanced(point, is_point, here, distance, gradient, stick_slip, state, SLID
 
 @triton.jit
 def _lost(pose):
-    """Return 0, or NaN if a pose has a NaN."""
     turn = pose[0] + pose[1] + pose[2] + pose[3] + pose[4] + pose[5] + pose[6] + pose[7] + pose[8]
     return 0.0 * (turn + pose[9] + pose[10] + pose[11])
 
@@ -222,10 +217,8 @@ def _slid(moved, anchor, normal, limit):
     return moved, chosen(slides, (anchor[0] + slid[0], anchor[1] + slid[1], anchor[2] + slid[2]), anchor)
 
 
-GROUP = tl.constexpr(8)
-"""Points that are passed over together."""
-TILES = 4
-"""Tiles of a program where the number of points that load is given: for most tiles it is 0."""
+GROUP = tl.constexpr(8)  # points that are passed over together
+TILES = 4  # tiles of a program where the number of points that load is given: for most tiles it is 0
 
 
 @triton_op("tgdsl::point_sum", mutates_args={})

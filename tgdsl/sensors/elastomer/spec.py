@@ -71,8 +71,7 @@ SKINS: dict[str, dict[str, Any]] = {
     "firm_rubber": _bonded(50.0),
 }
 """Values of each, by field."""
-OF_SHEAR = frozenset({"shear_falloff", "enter", "exit"})
-"""Fields of a skin that are not used where a document turns shear off."""
+OF_SHEAR = frozenset({"shear_falloff", "enter", "exit"})  # fields of a skin that are not used where a document turns shear off
 
 
 def checked_skin(name: str | None) -> str | None:
@@ -148,7 +147,7 @@ class ElastomerSpec(ContactProbeSpec):
     kind: Literal["elastomer"]
     """Displacement of the markers in a soft skin [m]."""
     like: Annotated[str | None, AfterValidator(checked_skin), WithJsonSchema({"enum": [*SKINS]})] = None
-    """Skin that gives the default of each field: paper_gel, soft_gel or firm_rubber, see `elastomer.skins`."""
+    """Skin that gives the default of each field: paper_gel, soft_gel or firm_rubber."""
     kernel: Literal["gaussian", "half_space", "bonded_layer"] = "gaussian"
     """How a load spreads: the paper's Gaussian, or an elastic half-space or layer bonded to a rigid base."""
     model: Literal["tgdsl", "paper"] = "tgdsl"

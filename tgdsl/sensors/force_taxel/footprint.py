@@ -50,20 +50,14 @@ from tgdsl.tensors.operations import Operation
 
 LEVENBERG = 1e-3
 """Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
-FAR = 1e3
-"""Where inactive taxels are for a kernel that does not know of them [m]: beyond all contacts' reach."""
+FAR = 1e3  # where inactive taxels are for a kernel that does not know of them [m]: beyond all contacts' reach
 
 
 class Footprint(NamedTuple):
-    """How one body's contacts are shared out.
+    """How one body's contacts are shared out."""
 
-    Attributes:
-        share: γ_c λ_cj, fraction of each contact's force on each taxel.
-        residual: What the shares leave of the moment, Σ_c γ_c τ_c − Σ_c Σ_j γ_c λ_cj (x_j − x_c) × f_c, a couple [N·m]; planes
-            (*body,).
-    """
-
-    share: Float[Tensor, "*body contact taxel"]
+    share: Float[Tensor, "*body contact taxel"]  # γ_c λ_cj, fraction of each contact's force on each taxel
+    # what the shares leave of the moment, Σ_c γ_c τ_c − Σ_c Σ_j γ_c λ_cj (x_j − x_c) × f_c, a couple [N·m]; planes (*body,)
     residual: Vec
 
 
@@ -115,26 +109,16 @@ def footprint(
 
 @dataclass(frozen=True, eq=False)
 class Bodies(Generic[Array]):
-    """Which taxels each body has: they stand one body after the other.
+    """Which taxels each body has: they stand one body after the other."""
 
-    Attributes:
-        taxel: Taxels of each body (body, padded); a body with fewer than another repeats its first.
-        inverse_radius: 1/R of each (body, padded) [1/m], 0 for inactive and repeated ones.
-        row: Index of each taxel in these, flattened (taxel,).
-        first: First taxel of each body, and the number of all (body + 1,).
-        box: Least and largest coordinates of each body's active taxels (body, 6) [m].
-        place: Position of each taxel [m], of inactive ones beyond all contacts' reach, and −2 times its outward normal
-            (taxel, 6).
-        padded: Position and −2 times the normal of each of `taxel` (6, body, padded).
-    """
-
-    taxel: Array
-    inverse_radius: Array
-    row: Array
-    first: Array
-    box: Array
+    taxel: Array  # taxels of each body (body, padded); a body with fewer than another repeats its first
+    inverse_radius: Array  # 1/R of each (body, padded) [1/m], 0 for inactive and repeated ones
+    row: Array  # index of each taxel in these, flattened (taxel,)
+    first: Array  # first taxel of each body, and the number of all (body + 1,)
+    box: Array  # least and largest coordinates of each body's active taxels (body, 6) [m]
+    # position of each taxel [m], of inactive ones beyond all contacts' reach, and −2 times its outward normal (taxel, 6)
     place: Array
-    padded: Array
+    padded: Array  # position and −2 times the normal of each of `taxel` (6, body, padded)
 
 
 def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, " 6"]:
@@ -150,17 +134,11 @@ def place(
 
 
 class Shared(NamedTuple):
-    """What contacts' forces become.
+    """What contacts' forces become."""
 
-    Attributes:
-        force: Force on each taxel, Σ_c γ_c λ_cj f_c [N].
-        carried: Their sum over each body's taxels [N].
-        residual: What they leave of the moment [N·m].
-    """
-
-    force: Float[Tensor, "env 3 taxel"]
-    carried: Float[Tensor, "env 3 body"]
-    residual: Float[Tensor, "env 3 body"]
+    force: Float[Tensor, "env 3 taxel"]  # force on each taxel, Σ_c γ_c λ_cj f_c [N]
+    carried: Float[Tensor, "env 3 body"]  # their sum over each body's taxels [N]
+    residual: Float[Tensor, "env 3 body"]  # what they leave of the moment [N·m]
 
 
 def shared_forces(

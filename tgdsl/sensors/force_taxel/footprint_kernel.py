@@ -27,20 +27,14 @@ from tgdsl.geometry.planes_kernel import LOG2_E, add3, add6, cross, scale3, scal
 from tgdsl.geometry.shapes_kernel import dot
 from tgdsl.sensors.force_taxel.constants import damping, no_force, wholly
 
-ENVS = 8
-"""Environments of a program, which is one warp: a lane for each of their contacts of a group."""
-GROUP = 4
-"""Contacts of a body that are looked at together; `_each` counts on four."""
-TILE = 4
-"""Taxels whose forces are written together."""
-FEW_STEPS = 12
-"""Steps up to which no exponent β · g can overflow float32, as each makes β longer by √10 at most."""
-UNROLL = tl.constexpr(4)
-"""Taxels of a pass that are worked on at a time."""
+ENVS = 8  # environments of a program, which is one warp: a lane for each of their contacts of a group
+GROUP = 4  # contacts of a body that are looked at together; `_each` counts on four
+TILE = 4  # taxels whose forces are written together
+FEW_STEPS = 12  # steps up to which no exponent β · g can overflow float32, as each makes β longer by √10 at most
+UNROLL = tl.constexpr(4)  # taxels of a pass that are worked on at a time
 BESIDE = tl.constexpr(0.25)
 """Distance of a contact from the box of the taxels from which on moments are about that box [footprints]."""
-LIMIT = tl.constexpr(64.0)
-"""More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
+LIMIT = tl.constexpr(64.0)  # more than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2
 NO_FORCE = tl.constexpr(no_force())
 DAMPING = tl.constexpr(damping())
 WHOLLY = tl.constexpr(wholly())
@@ -199,7 +193,6 @@ def _contacts(planes, normals, row, is_env, start, num_contacts, GROUP: tl.const
 
 @triton.jit
 def _load(at, is_there):
-    """Return the values under a mask, else 0."""
     return tl.load(at, is_there, 0.0)
 
 
@@ -215,19 +208,16 @@ def _taxel(pos, taxel):
 
 @triton.jit
 def _halves(pair):
-    """Return the two floats of 64 bits."""
     return pair.to(tl.int32).to(tl.float32, bitcast=True), (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
 
 
 @triton.jit
 def _tile(at, is_there):
-    """Return the vectors of a tile of taxels, (1, taxel)."""
     return _load(at, is_there)[None, :], _load(at + 1, is_there)[None, :], _load(at + 2, is_there)[None, :]
 
 
 @triton.jit
 def _direction(force):
-    """Return the strength of forces, and their direction, which fades to zero with them."""
     strength = tl.sqrt(dot(force, force) + NO_FORCE * NO_FORCE)
     return strength, scale3(1.0 / strength, force)
 
@@ -243,7 +233,6 @@ def _slope(way, tilt, inverse):
 
 @triton.jit
 def _arm(place, point):
-    """Return x_j − x_c [m]."""
     return place[0] - point[0], place[1] - point[1], place[2] - point[2]
 
 
@@ -335,13 +324,11 @@ def _each(a):
 
 @triton.jit
 def _each3(a):
-    """Return each plane's four contacts."""
     return _each(a[0]), _each(a[1]), _each(a[2])
 
 
 @triton.jit
 def _weighted(p0, p1, p2, p3, force):
-    """Return Σ_c part_c f_c, (env, taxel), of four parts (env, taxel) and four forces (env,)."""
     return p0 * force[0][:, None] + p1 * force[1][:, None] + p2 * force[2][:, None] + p3 * force[3][:, None]
 
 
@@ -359,13 +346,11 @@ def _highest(pos, num_here, point, normal, slope, inverse):
 
 @triton.jit
 def _summed(a):
-    """Return the sum over contacts of (env, contact) planes."""
     return tl.sum(a[0], axis=1), tl.sum(a[1], axis=1), tl.sum(a[2], axis=1)
 
 
 @triton.jit
 def _unmet(captured, mean, force, torque):
-    """Return Σ_c γ_c (Σ_j λ_cj (x_j − x_c) × f_c − τ_c), (env,) [N·m]."""
     x, y, z = cross(mean, force)
     return _summed(scale3(captured, (x - torque[0], y - torque[1], z - torque[2])))
 
@@ -391,5 +376,4 @@ def _of_levers(load, spread, way):
 
 @triton.jit
 def _accumulate(out, value, is_there, start):
-    """Store the part of the first contacts, and add further parts."""
     tl.store(out, value + tl.load(out, is_there & (start > 0), 0.0), is_there)

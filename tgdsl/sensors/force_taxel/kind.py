@@ -62,8 +62,7 @@ from tgdsl.sensors.base import (
 from tgdsl.sensors.force_taxel import footprint
 from tgdsl.sensors.noise import FORCE
 
-SPACINGS = 3.0
-"""Default radius of a footprint, in spacings of the taxels: the middle of a square of four is within half of it."""
+SPACINGS = 3.0  # default radius of a footprint, in spacings of the taxels: the middle of a square of four is within half of it
 
 
 class ForceTaxelSpec(ContactProbeSpec):

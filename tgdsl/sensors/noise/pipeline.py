@@ -28,8 +28,7 @@ from tgdsl.tensors.fusion import materialised
 StageType = type[Stage]
 STAGES: tuple[StageType, ...] = (Radius, Gain, Hysteresis, Crosstalk, Delay, Offset, Quantization, Dead, Release)
 """The stages of tgdsl, in their order."""
-GROUP = "tgdsl.noise_stages"
-"""Group of the entry points by which packages bring stages."""
+GROUP = "tgdsl.noise_stages"  # group of the entry points by which packages bring stages
 _registered: list[StageType] = []
 
 
@@ -97,23 +96,15 @@ def stages_of(terms: Sequence[str]) -> tuple[StageType, ...]:
 
 @dataclass(frozen=True, eq=False)
 class LoweredNoise:
-    """Noise, ready to be planned.
+    """Noise, ready to be planned."""
 
-    Attributes:
-        terms: Names of its stages.
-        constants: Their constants: (channel or 1, row or 1), or (end, …) where an environment draws its own; and kernels.
-        memory: Names of its memory, and how long each call is held [s]; 0: the last call alone.
-        radius: Largest disturbance of a radius [m].
-        streams: Purposes of its random numbers.
-        needs_dt: Whether it needs the time since the last call.
-    """
-
-    terms: tuple[str, ...]
+    terms: tuple[str, ...]  # names of its stages
+    # their constants: (channel or 1, row or 1), or (end, …) where an environment draws its own; and kernels
     constants: Mapping[str, np.ndarray]
-    memory: Mapping[str, float]
-    radius: float
-    streams: tuple[int, ...]
-    needs_dt: bool
+    memory: Mapping[str, float]  # names of its memory, and how long each call is held [s]; 0: the last call alone
+    radius: float  # largest disturbance of a radius [m]
+    streams: tuple[int, ...]  # purposes of its random numbers
+    needs_dt: bool  # whether it needs the time since the last call
 
 
 def lower_noise(

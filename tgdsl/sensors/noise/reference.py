@@ -59,31 +59,18 @@ def normal_pair(word: Words) -> tuple[Float[np.ndarray, "*word"], Float[np.ndarr
 
 @dataclass
 class ReferenceCall:
-    """A call of one environment.
+    """A call of one environment."""
 
-    Attributes:
-        ranges: The stages' numbers of each row.
-        draws: Which random number of an episode says where in its range a number is.
-        channels: Names of the signal's channels.
-        key: The sensor's key, see `random.sensor_key`.
-        env: Number of the environment.
-        layout: The taxels, if there is crosstalk.
-        step: Number of the call.
-        episode: How often the environment was reset.
-        dt: Time since the last call [s].
-        is_sample: Whether the sensor takes a sample.
-    """
-
-    ranges: Sequence[Mapping[str, Range | Amplitude]]
-    draws: Mapping[str, int]
-    channels: Sequence[str]
-    key: tuple[int, int]
-    env: int = 0
-    layout: Layout | None = None
-    step: int = 0
-    episode: int = 0
-    dt: float = 0.0
-    is_sample: bool = True
+    ranges: Sequence[Mapping[str, Range | Amplitude]]  # the stages' numbers of each row
+    draws: Mapping[str, int]  # which random number of an episode says where in its range a number is
+    channels: Sequence[str]  # names of the signal's channels
+    key: tuple[int, int]  # the sensor's key, see `random.sensor_key`
+    env: int = 0  # number of the environment
+    layout: Layout | None = None  # the taxels, if there is crosstalk
+    step: int = 0  # number of the call
+    episode: int = 0  # how often the environment was reset
+    dt: float = 0.0  # time since the last call [s]
+    is_sample: bool = True  # whether the sensor takes a sample
 
     def words(self, purpose: int, columns: int = 1) -> UInt64[np.ndarray, "row column"]:
         """Return random words, numbered column by column."""

@@ -14,8 +14,7 @@ from pydantic import Tag, create_model, model_validator
 
 from tgdsl.fields.models import TEXT_OR_OTHER, Range, RangeOf, SpecModel, Text, Usual
 
-Amplitude = Mapping[str, Range]
-"""A range for each quantity of a reading, or under `ALL` for every one."""
+Amplitude = Mapping[str, Range]  # a range for each quantity of a reading, or under `ALL` for every one
 ALL = "*"
 
 
@@ -150,8 +149,7 @@ class NoiseSpec(Knobs):
     """Knobs of some links, by name, wildcard or group; of several that match, the later one counts."""
 
 
-NoiseField = Annotated[Text | Annotated[NoiseSpec, Tag("other")], TEXT_OR_OTHER]
-"""A profile's name, or knobs in line."""
+NoiseField = Annotated[Text | Annotated[NoiseSpec, Tag("other")], TEXT_OR_OTHER]  # a profile's name, or knobs in line
 
 
 @cache
@@ -174,14 +172,10 @@ def _plain(value: Any) -> Any:
     return tuple(_plain(part) for part in value) if isinstance(value, tuple) else value
 
 
-BASE = frozenset({"read_delay", "jitter", "bias", "white_noise", "drift", "quantization"})
-"""Knobs of every kind."""
-PROBE = BASE | {"radius_noise"}
-"""Knobs of a kind that reads distances."""
-TAXEL = PROBE | {"gain", "dead_probability", "dead_range", "hysteresis"}
-"""Knobs of a kind that reads contact."""
-FORCE = TAXEL | {"crosstalk"}
-"""Knobs of a kind whose taxels read forces."""
+BASE = frozenset({"read_delay", "jitter", "bias", "white_noise", "drift", "quantization"})  # knobs of every kind
+PROBE = BASE | {"radius_noise"}  # knobs of a kind that reads distances
+TAXEL = PROBE | {"gain", "dead_probability", "dead_range", "hysteresis"}  # knobs of a kind that reads contact
+FORCE = TAXEL | {"crosstalk"}  # knobs of a kind whose taxels read forces
 
 _COMMON: dict[str, Any] = {
     "radius_noise": 3e-4,

@@ -25,30 +25,20 @@ from tgdsl.sensors.noise.reference import ReferenceCall
 from tgdsl.sensors.noise.reference import Signal as ReferenceSignal
 from tgdsl.sensors.noise.spec import ZERO, Amplitude
 
-Signal = Float[Tensor, "env channel row"]
-"""The signal that noise disturbs."""
+Signal = Float[Tensor, "env channel row"]  # the signal that noise disturbs
 
 
 class Now(NamedTuple):
-    """Time and random numbers of a reading.
+    """Time and random numbers of a reading."""
 
-    Attributes:
-        dt: Time since the last call [s].
-        step: Number of this call of each environment, (env, 1).
-        age: Calls since each environment's reset, (env, 1); 0 at the first one.
-        ages: Time since each of the calls before this one, the last one first (env, call) [s]; None without a delay.
-        is_sample: Whether each environment's sensor takes a sample now, (env, 1); None: always.
-        period: Time between samples [s], a scalar; None: each call takes one.
-        streams: The sensor's random numbers, by purpose.
-    """
-
-    dt: Tensor | None
-    step: Tensor
-    age: Tensor
+    dt: Tensor | None  # time since the last call [s]
+    step: Tensor  # number of this call of each environment, (env, 1)
+    age: Tensor  # calls since each environment's reset, (env, 1); 0 at the first one
+    # time since each of the calls before this one, the last one first (env, call) [s]; None without a delay
     ages: Tensor | None
-    is_sample: Tensor | None
-    period: Tensor | None
-    streams: Mapping[int, Stream]
+    is_sample: Tensor | None  # whether each environment's sensor takes a sample now, (env, 1); None: always
+    period: Tensor | None  # time between samples [s], a scalar; None: each call takes one
+    streams: Mapping[int, Stream]  # the sensor's random numbers, by purpose
 
 
 NO_CLOCK = Now(*[None] * 6, {})  # type: ignore[arg-type]
@@ -64,33 +54,23 @@ def uniform(now: Now, purpose: int, row: int, like: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Number:
-    """Marks a field of a stage as a number of the knobs.
+    """Marks a field of a stage as a number of the knobs."""
 
-    Attributes:
-        draw: Which random number of an episode says where in its range it is, unique to it; None: it is not drawn.
-        label: Text before its value in `explain`; None: it is not shown.
-        unit: Its unit; None: the unit of the reading.
-        knob: The path of its range in the knobs, `gain.0`; "": its name; None: it is of no knob.
-        absent: Its range where such a knob is None.
-        neutral: The value that has no effect: a stage is left out where all rows have it. None: it does not decide.
-        stream: Purpose of the random numbers that it needs, see `random`.
-    """
-
-    draw: int | None
-    label: str | None = ""
-    unit: str | None = ""
-    knob: str | None = ""
-    absent: Range = ZERO
+    draw: int | None  # which random number of an episode says where in its range it is, unique to it; None: it is not drawn
+    label: str | None = ""  # text before its value in `explain`; None: it is not shown
+    unit: str | None = ""  # its unit; None: the unit of the reading
+    knob: str | None = ""  # the path of its range in the knobs, `gain.0`; "": its name; None: it is of no knob
+    absent: Range = ZERO  # its range where such a knob is None
+    # the value that has no effect: a stage is left out where all rows have it. None: it does not decide.
     neutral: float | None = 0.0
-    stream: int | None = None
+    stream: int | None = None  # purpose of the random numbers that it needs, see `random`
 
 
 class NoMemory(NamedTuple):
     """Memory of a stage without any."""
 
 
-Table = Mapping[str, Float[np.ndarray, "end channel row"]]
-"""Values of a stage's numbers."""
+Table = Mapping[str, Float[np.ndarray, "end channel row"]]  # values of a stage's numbers
 
 
 @dataclass_transform(frozen_default=True, eq_default=False)
@@ -99,25 +79,16 @@ class Stage:
 
     A field is `name: Annotated[Tensor, Number(…)]`, (env or 1, channel or 1, row or 1); of `Tensor | None` it is None where it
     is neutral in all rows. Subclasses are frozen dataclasses without being marked as such.
-
-    Attributes:
-        name: Its name in a plan.
-        Knobs: Fields that it adds to the knobs of a sensor, with neutral defaults.
-        Memory: Its memory: a NamedTuple of (env, channel, row). The content before the first call, where `Now.age` is 0, is
-            arbitrary.
-        needs_dt: Whether it needs the time since the last call.
-        after: Name of the stage that it follows; "": the one before it in `STAGES`, or the last one.
-        is_split: Whether a plan names its active numbers instead of the stage.
-        numbers: Its numbers by name, from the fields.
     """
 
-    name: ClassVar[str]
-    Knobs: ClassVar[type[SpecModel]] = SpecModel
+    name: ClassVar[str]  # its name in a plan
+    Knobs: ClassVar[type[SpecModel]] = SpecModel  # fields that it adds to the knobs of a sensor, with neutral defaults
+    # its memory: a NamedTuple of (env, channel, row). The content before the first call, where `Now.age` is 0, is arbitrary.
     Memory: ClassVar[type[Any]] = NoMemory
-    needs_dt: ClassVar[bool] = False
-    after: ClassVar[str] = ""
-    is_split: ClassVar[bool] = False
-    numbers: ClassVar[Mapping[str, Number]]
+    needs_dt: ClassVar[bool] = False  # whether it needs the time since the last call
+    after: ClassVar[str] = ""  # name of the stage that it follows; "": the one before it in `STAGES`, or the last one
+    is_split: ClassVar[bool] = False  # whether a plan names its active numbers instead of the stage
+    numbers: ClassVar[Mapping[str, Number]]  # its numbers by name, from the fields
     _optional: ClassVar[frozenset[str]]
 
     def __init_subclass__(cls) -> None:

@@ -288,8 +288,7 @@ class Release(Stage):
         return (cls.name,) if (values["release_threshold"] >= 0).all() else ()
 
 
-KERNEL = "kernel/"
-"""Kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels."""
+KERNEL = "kernel/"  # kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels
 NEGLIGIBLE = 1e-14
 """Share of a taxel's signal below which it is set to 0: a millionth of float32's last digit. Products with subnormal numbers
 are ten times slower."""

@@ -25,20 +25,13 @@ from skfem.helpers import dot
 from tgdsl.sensors.elastomer.clamped.sheet import Sheet, flatten, has_area, jacobians, open_sides, opened, refused, welded
 from tgdsl.surfaces.surface import Surface
 
-MAX_CORNERS = 20_000
-"""Bound on the corners of all triangles; the finite elements have four nodes for each."""
-MAX_CELLS = 1_000_000
-"""Bound on the area of the pad's bounding box over the square of the element size."""
-SHAPE = 0.05
-"""How far the meshed edge may be from the pad's own, in element sizes."""
-GRADE = 0.5
-"""Growth of the size of triangles with the distance from the edge."""
-COARSEST = 3
-"""Inside, triangles are at most 2^this element sizes large."""
-CLEARANCE = 0.6
-"""Distance of inner points from the edge, in element sizes."""
-BISECTIONS = 40
-"""Times that pieces of the edge may be bisected."""
+MAX_CORNERS = 20_000  # bound on the corners of all triangles; the finite elements have four nodes for each
+MAX_CELLS = 1_000_000  # bound on the area of the pad's bounding box over the square of the element size
+SHAPE = 0.05  # how far the meshed edge may be from the pad's own, in element sizes
+GRADE = 0.5  # growth of the size of triangles with the distance from the edge
+COARSEST = 3  # inside, triangles are at most 2^this element sizes large
+CLEARANCE = 0.6  # distance of inner points from the edge, in element sizes
+BISECTIONS = 40  # times that pieces of the edge may be bisected
 
 
 def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> MeshTri:
@@ -173,35 +166,22 @@ def _check_edge(mesh: MeshTri, within: Int[np.ndarray, " m"], pieces: Int[np.nda
         )
 
 
-MAX_OFFSET = 1e-3
-"""Largest distance of a taxel from the pad's surface [m]."""
-BESIDE = 1e-4
-"""Largest distance of a taxel from the pad's edge, measured outwards along the surface [m]."""
-FACING = 0.5
-"""Least cosine between a taxel's normal and the surface normal under it."""
+MAX_OFFSET = 1e-3  # largest distance of a taxel from the pad's surface [m]
+BESIDE = 1e-4  # largest distance of a taxel from the pad's edge, measured outwards along the surface [m]
+FACING = 0.5  # least cosine between a taxel's normal and the surface normal under it
 
 
 @dataclass(frozen=True, eq=False)
 class Pad:
-    """A pad in the plane, and how the plane lies on the body.
+    """A pad in the plane, and how the plane lies on the body."""
 
-    Attributes:
-        basis: Quadratic elements in the plane [m]; nodes are their degrees of freedom.
-        edge: Nodes on the pad's edge, ascending.
-        at_taxels: Matrix from values at the nodes to values at the taxels.
-        edge_pos: Place of each node of `edge` on the surface, body frame [m].
-        edge_normal: Outward unit normal of the surface there, body frame.
-        edge_axes: Unit tangents along the two axes of the plane there, body frame.
-        taxel_axes: The same at each taxel, perpendicular to the taxel's own normal.
-    """
-
-    basis: CellBasis
-    edge: Int[np.ndarray, " edge"]
-    at_taxels: csr_matrix
-    edge_pos: Float[np.ndarray, "edge 3"]
-    edge_normal: Float[np.ndarray, "edge 3"]
-    edge_axes: Float[np.ndarray, "edge 2 3"]
-    taxel_axes: Float[np.ndarray, "taxel 2 3"]
+    basis: CellBasis  # quadratic elements in the plane [m]; nodes are their degrees of freedom
+    edge: Int[np.ndarray, " edge"]  # nodes on the pad's edge, ascending
+    at_taxels: csr_matrix  # matrix from values at the nodes to values at the taxels
+    edge_pos: Float[np.ndarray, "edge 3"]  # place of each node of `edge` on the surface, body frame [m]
+    edge_normal: Float[np.ndarray, "edge 3"]  # outward unit normal of the surface there, body frame
+    edge_axes: Float[np.ndarray, "edge 2 3"]  # unit tangents along the two axes of the plane there, body frame
+    taxel_axes: Float[np.ndarray, "taxel 2 3"]  # the same at each taxel, perpendicular to the taxel's own normal
 
 
 def unroll(
@@ -291,11 +271,7 @@ def _axes(jacobian: Float[np.ndarray, "q 3 2"], normal: Float[np.ndarray, "q 3"]
 def _seated(
     sheet: Sheet, pos: Float[np.ndarray, "taxel 3"], normal: Float[np.ndarray, "taxel 3"]
 ) -> tuple[Int[np.ndarray, " taxel"], Float[np.ndarray, "taxel 3"]]:
-    """Return the triangle that each taxel sits on, and the barycentric coordinates of the place.
-
-    Raises:
-        LowerError: A taxel is farther than `MAX_OFFSET` from the surface or outside its edge.
-    """
+    """Return the triangle that each taxel sits on, and the barycentric coordinates of the place."""
     corners = sheet.vertices[sheet.faces]
     is_open = np.zeros(3 * len(corners), dtype=bool)
     is_open[open_sides(sheet.faces)] = True
@@ -336,12 +312,9 @@ def _check_seat(taxel: int, distance: float, beside: float) -> None:
     )
 
 
-PER_LAYER = 4
-"""Elements across the boundary layer."""
-PER_EXTENT = 24
-"""Elements along the pad, where it is not much larger than its boundary layer."""
-CORNERS_PER_LENGTH = 9
-"""Corners of triangles for each element along the edge, counted on graded meshes."""
+PER_LAYER = 4  # elements across the boundary layer
+PER_EXTENT = 24  # elements along the pad, where it is not much larger than its boundary layer
+CORNERS_PER_LENGTH = 9  # corners of triangles for each element along the edge, counted on graded meshes
 
 
 def element_size(thickness: float, drag: float, extent: float) -> float:

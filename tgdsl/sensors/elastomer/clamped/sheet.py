@@ -22,23 +22,16 @@ from scipy.spatial import KDTree
 
 from tgdsl.errors import LowerError
 
-COINCIDENT = 1e-6
-"""Distance below which two vertices are one, over the size of the pad."""
-SEAM_ROUNDS = 16
-"""Passes over the seams; each closes at least one T-junction of every edge that has some."""
+COINCIDENT = 1e-6  # distance below which two vertices are one, over the size of the pad
+SEAM_ROUNDS = 16  # passes over the seams; each closes at least one T-junction of every edge that has some
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A connected orientable surface with an edge.
+    """A connected orientable surface with an edge."""
 
-    Attributes:
-        vertices: Positions in the body frame [m].
-        faces: Vertex indices, counter-clockwise seen from outside.
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Float[np.ndarray, "v 3"]  # positions in the body frame [m]
+    faces: Int[np.ndarray, "f 3"]  # vertex indices, counter-clockwise seen from outside
 
 
 def refused(what: str, hint: str = "") -> LowerError:
@@ -147,15 +140,11 @@ def _point(place: Float[np.ndarray, " 3"]) -> str:
     return "({}) mm".format(", ".join(f"{1e3 * x:.3g}" for x in place))
 
 
-STRETCH = 0.02
-"""Largest relative change of an edge's length that still counts as unrolling."""
+STRETCH = 0.02  # largest relative change of an edge's length that still counts as unrolling
 ROUNDS = 200
-SETTLED = 1e-4
-"""Relative decrease of the squared misfit at which the rounds end."""
-EXACT = 1e-12
-"""Squared relative misfit that counts as none."""
-THIN = 1e-7
-"""Height over length below which a triangle has no side up."""
+SETTLED = 1e-4  # relative decrease of the squared misfit at which the rounds end
+EXACT = 1e-12  # squared relative misfit that counts as none
+THIN = 1e-7  # height over length below which a triangle has no side up
 
 
 def flatten(sheet: Sheet) -> Float[np.ndarray, "v 2"]:
