@@ -21,9 +21,9 @@ class ExportUsd:
 
     def run(self) -> None:
         """Write it."""
+        from tgdsl.files.find import robot_path
         from tgdsl.files.write import check_writable, with_folder
         from tgdsl.formats.robot import export_model
-        from tgdsl.placement.links import robot_path
 
         file = robot_path(self.robot)
         out = check_writable(self.out or in_working_folder(file, ".usda"))

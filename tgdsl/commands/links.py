@@ -19,10 +19,11 @@ class Links:
 
     def run(self) -> None:
         """Print the table."""
-        from tgdsl.files.find import layout_of
-        from tgdsl.placement.links import links_table, open_robot
+        from tgdsl.files.find import layout_of, robot_path
+        from tgdsl.formats.robot import load_model
+        from tgdsl.placement.links import links_table
 
-        robot, beside = open_robot(self.robot), layout_of(self.robot)
+        robot, beside = load_model(robot_path(self.robot)), layout_of(self.robot)
         try:
             lines = links_table(robot, self.layout or beside)
         except SpecError as error:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import tgdsl
+from tgdsl.errors import TgdslError, did_you_mean
 
 _PACKAGE = Path(tgdsl.__file__).parent
 
@@ -38,6 +39,18 @@ def robot_file(model: str, folder: Path) -> Path | None:
         return names[model]
     path = folder / model
     return path if is_file(path) else None
+
+
+def robot_path(robot: str) -> Path:
+    """Return the file of a robot given by a path, or of one that tgdsl brings, by its name.
+
+    Raises:
+        TgdslError: If there is neither.
+    """
+    path = robot_file(robot, Path())
+    if path is None:
+        raise TgdslError(f'there is no file or robot "{robot}"; {did_you_mean(robot, robot_names(), "robots")}')
+    return path
 
 
 def layout_file(model: Path) -> Path | None:

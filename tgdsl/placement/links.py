@@ -10,10 +10,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mean
-from tgdsl.files.find import robot_file, robot_names
+from tgdsl.errors import Problem, RobotError, SpecError
 from tgdsl.formats.model import Model
-from tgdsl.formats.robot import load_model
 from tgdsl.schema.load import LoadedLayout, load_layout
 from tgdsl.schema.select import select
 
@@ -25,18 +23,6 @@ _JOINTS = {
     int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
 }
-
-
-def robot_path(robot: str) -> Path:
-    """Return the file of a robot given by a path, or of one that tgdsl brings, by its name."""
-    path = robot_file(robot, Path())
-    if path is None:
-        raise TgdslError(f'there is no file or robot "{robot}"; {did_you_mean(robot, robot_names(), "robots")}')
-    return path
-
-
-def open_robot(robot: str) -> Model:
-    return load_model(robot_path(robot))
 
 
 def links_table(robot: Model, layout: Path | None = None) -> list[str]:

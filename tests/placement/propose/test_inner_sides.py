@@ -9,9 +9,8 @@ from closing_hands import INNER, MADE, arm, one_jaw, parallel_jaws, single_links
 from odd_hands import FOUR_BAR
 
 from tgdsl.errors import TgdslError
-from tgdsl.files.find import layout_of
+from tgdsl.files.find import layout_of, robot_path
 from tgdsl.formats.robot import load_model
-from tgdsl.placement.links import open_robot
 from tgdsl.placement.propose.propose import Proposal, closing_motion, propose
 from tgdsl.placement.propose.surfaces import Sampler
 from tgdsl.schema.load import load_layout
@@ -102,7 +101,7 @@ REAL = [
 @cache
 def proposed(robot: str) -> Proposal:
     """Return what is proposed for a robot that comes with tgdsl."""
-    return propose(open_robot(robot), DENSITY)
+    return propose(load_model(robot_path(robot)), DENSITY)
 
 
 @pytest.mark.parametrize("robot", REAL)
@@ -111,7 +110,7 @@ def test_our_robots_face_their_pads(robot):
     layout = load_layout(layout_of(robot)).spec
     found = {link.name: link.facing for link in proposed(robot).links}
     for pattern, placement in layout.resolutions["med"].items():
-        for name in matching(pattern, list(open_robot(robot).bodies)):
+        for name in matching(pattern, list(load_model(robot_path(robot)).bodies)):
             known, guess = -np.array(placement.direction), np.array(found[name])
             assert known @ guess / np.linalg.norm(known) / np.linalg.norm(guess) > np.cos(np.radians(45.0)), name
 

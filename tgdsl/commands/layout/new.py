@@ -27,11 +27,12 @@ class New:
     def run(self) -> None:
         """Write the layout and say what it holds."""
         from tgdsl.console.progress import StatusLine
-        from tgdsl.placement.links import open_robot
+        from tgdsl.files.find import robot_path
+        from tgdsl.formats.robot import load_model
         from tgdsl.placement.propose.text import new_layout
 
         with StatusLine() as progress:
-            robot, with_groups = open_robot(self.robot), self.groups == "auto"
+            robot, with_groups = load_model(robot_path(self.robot)), self.groups == "auto"
             lines = new_layout(robot, self.density, with_groups, self.out, self.force, self.include, progress)
         for line in lines:
             print(line)
