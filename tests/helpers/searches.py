@@ -6,7 +6,7 @@ import torch
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.depth_search import Probes, Target
+from tgdsl.quantities.contact_depth import Probes, Target
 from tgdsl.quantities.geoms import Geoms
 from tgdsl.quantities.pairs import Motion, PairedObject, Pairs
 

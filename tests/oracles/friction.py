@@ -5,7 +5,7 @@ import torch
 
 from oracles.comparison import Values, field
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.depth_search import Distance, Penetration
+from tgdsl.quantities.contact_depth import Distance, Penetration
 from tgdsl.quantities.geoms import Frame
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance
 

@@ -7,7 +7,7 @@ from searches import CASES, SHAPES, made, paired
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.quantities.depth_search import DEEPEST, Probes, Target, measure, penetration
+from tgdsl.quantities.contact_depth import DEEPEST, Probes, Target, measure, penetration
 from tgdsl.quantities.geoms import Geoms
 from tgdsl.quantities.pairs import Motion, Pairs
 

@@ -10,11 +10,26 @@ from pressed_pads import compiled
 from searches import paired
 
 from tgdsl.module.state import example_state
-from tgdsl.quantities import depth_search
-from tgdsl.quantities.depth_search import DEEPEST, Probes, Target, deepest, is_searchable, measure, penetration, search
+from tgdsl.quantities import contact_depth
+from tgdsl.quantities.contact_depth import (
+    BOUND,
+    DEEPEST,
+    EVERYWHERE,
+    MARGIN,
+    POS,
+    ROTATION,
+    Deepest,
+    Probes,
+    Target,
+    deepest,
+    geom_tables,
+    is_searchable,
+    measure,
+    penetration,
+    search,
+)
 from tgdsl.quantities.geoms import Geoms
 from tgdsl.quantities.pairs import relate
-from tgdsl.quantities.search_tables import BOUND, EVERYWHERE, MARGIN, POS, ROTATION, Deepest, geom_tables
 from tgdsl.tensors import operations
 
 NUM_LINKS, NUM_OBJECTS, NUM_ENVS, NUM_TAXELS = 2, 6, 5, 40
@@ -40,7 +55,7 @@ def brute_force(pairs, probes, targets, known, reach):
 @pytest.fixture
 def kernel(monkeypatch):
     """A kernel that runs everywhere, in float64."""
-    monkeypatch.setattr(depth_search, "DEEPEST", replace(DEEPEST, kernel=brute_force))
+    monkeypatch.setattr(contact_depth, "DEEPEST", replace(DEEPEST, kernel=brute_force))
     monkeypatch.setattr(operations, "are_kernel_inputs", lambda *_: True)
 
 
@@ -133,7 +148,7 @@ def test_a_cpu_has_no_kernel_for_it(scene):
 
 
 def test_what_the_kernel_cannot_answer_is_left_to_torch():
-    many = ["box"] * depth_search.THRESHOLD
+    many = ["box"] * contact_depth.THRESHOLD
     assert is_searchable(many, {"normal", "motion"}) and is_searchable(many, ())
     assert not is_searchable(many, {"normal", "distance"})
     assert not is_searchable(many[1:], {"normal"})
@@ -153,7 +168,7 @@ def test_a_module_asks_the_kernel_of_the_tables_that_its_plan_holds(tmp_path, ke
         asked.append(set(known))
         return brute_force(pairs, probes, targets, known, reach)
 
-    monkeypatch.setattr(depth_search, "DEEPEST", replace(DEEPEST, kernel=spied))
+    monkeypatch.setattr(contact_depth, "DEEPEST", replace(DEEPEST, kernel=spied))
     found = touch(state)["depth"]
     assert asked == [{"pair", "spheres", "geoms"}]
     monkeypatch.undo()

@@ -9,8 +9,8 @@ from oracles.setups.scenes import in_link, module, pad, state, wrench
 import tgdsl
 from tgdsl.geometry.planes import vec
 from tgdsl.quantities import ContactDepth, Contacts, Gathered
+from tgdsl.quantities.contact_depth import Penetration
 from tgdsl.quantities.contacts import ContactPoints
-from tgdsl.quantities.depth_search import Penetration
 from tgdsl.sensors.base import UNTIMED
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL, LoopState
 from tgdsl.testing import KindConformance

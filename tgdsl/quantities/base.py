@@ -53,7 +53,7 @@ class Request(Generic[Value]):
         values = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
         return (type(self), *((name, v.tobytes() if isinstance(v, np.ndarray) else v) for name, v in values))
 
-    def merged(self, other: Request) -> Request:
+    def merged(self, other: Any) -> Request:
         """Return a request for what both ask for; they have one key."""
         return self
 
@@ -61,7 +61,7 @@ class Request(Generic[Value]):
         """Return what requests at different taxels must have in common to be joined to one; by default all of it."""
         return self.key()
 
-    def joined(self, others: Sequence[Request]) -> Request:
+    def joined(self, others: Sequence[Any]) -> Request:
         """Return one request for several sensors' taxels, one after the other, this one's first; they have one join key."""
         return self
 
@@ -74,7 +74,7 @@ class Request(Generic[Value]):
 class Use:
     """A request and its taxels, shared by all sensors with equal requests."""
 
-    request: Request  #: the request
+    request: Any  #: the request
     sensors: tuple[str, ...]  #: the sensors, by their names in the document
     links: tuple[Link, ...]  #: the links that carry them
     taxels: Int[np.ndarray, " taxel"]  #: their taxels, rows of the layout

@@ -13,36 +13,27 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.shapes_kernel import TIE, chosen, distance_to, dot, gradient_of, is_any, length, loaded, rotate, rotate_back
-from tgdsl.quantities import search_tables
+from tgdsl.quantities import contact_depth
+from tgdsl.quantities.contact_depth import Deepest
 from tgdsl.quantities.pairs import Pairs
-from tgdsl.quantities.search_tables import Deepest, Tables
 
 # Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 
 BLOCK = 64  # probes of a program, which is one warp: two for each of its lanes
-POS, ROTATION, BOUND = (tl.constexpr(column) for column in (search_tables.POS, search_tables.ROTATION, search_tables.BOUND))
-KIND, ROW = tl.constexpr(search_tables.KIND), tl.constexpr(search_tables.ROW)
+POS, ROTATION, BOUND, KIND, ROW = (tl.constexpr(getattr(contact_depth, n)) for n in ("POS", "ROTATION", "BOUND", "KIND", "ROW"))
 
 
-def find(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object *env taxel"]) -> Deepest:
-    """Return what the probes are deepest in.
-
-    Args:
-        pairs: Relative poses of all pairs of the plan; the gate holds.
-        pos: Positions of the probes in their links' frames [m].
-        tables: The objects.
-        reach: Radius of each probe towards each of those felt [m]; −∞ where the probe is inactive or the pair cannot meet.
-    """
-    depth, normal, winner = _deepest([*pairs.rotation, *pairs.offset], list(pos), tables.pair, reach, pairs.gate, *tables[1:])
+def find(pairs: Pairs, pos: Vec, pair: Tensor, spheres: Tensor, geoms: Tensor, reach: Tensor) -> Deepest:
+    """Return what the probes are deepest in: `spheres` and `geoms` as `geom_tables` has them, the rest as `search`."""
+    depth, normal, winner = _deepest([*pairs.rotation, *pairs.offset], list(pos), pair, reach, pairs.gate, spheres, geoms)
     return Deepest(depth, planes.vec(normal.unbind()), winner)
 
 

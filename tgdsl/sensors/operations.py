@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tgdsl.quantities.depth_search import DEEPEST
+from tgdsl.quantities.contact_depth import DEEPEST
 from tgdsl.quantities.nearby import FELT_MOMENTS
 from tgdsl.quantities.patch import CONTACT_PATCH
 from tgdsl.quantities.points import LINK_POINTS

@@ -7,8 +7,7 @@ from oracles import friction
 from scipy.spatial.transform import Rotation
 
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.contact_depth import ReferencePenetration
-from tgdsl.quantities.depth_search import Distance, Penetration
+from tgdsl.quantities.contact_depth import Distance, Penetration, ReferencePenetration
 from tgdsl.quantities.geoms import Frame
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance, advance_reference
 
