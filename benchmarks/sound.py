@@ -36,8 +36,8 @@ from tgdsl.module.artifact import load_plan
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contacts import Loads, PairLoads
 from tgdsl.quantities.kinematics import Places
-from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.sensors.base import Context
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO, impulses
 

@@ -5,8 +5,7 @@ from searches import paired
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.quantities.moment_sums import MomentField
-from tgdsl.quantities.nearby import MomentSource
+from tgdsl.quantities.moment_sums import MomentField, MomentSource
 from tgdsl.quantities.pairs import Pairs
 
 NUM = ((7, 6, 8), (5, 8, 6))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tgdsl.layout.layout import Layout
 from tgdsl.module.state import SHAPES
 from tgdsl.quantities.base import Scene
-from tgdsl.quantities.loads import LOADS, LoadsPart
+from tgdsl.quantities.contacts import LOADS, LoadsPart
 from tgdsl.quantities.reference import ReferenceScene
 
 

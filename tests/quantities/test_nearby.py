@@ -5,7 +5,7 @@ import torch
 from moment_fields import made
 from pressed_pads import compiled
 
-from tgdsl.quantities.nearby import FELT_MOMENTS
+from tgdsl.quantities.moment_sums import FELT_MOMENTS
 
 
 @pytest.mark.parametrize("case", ["one field", "radius noise"])

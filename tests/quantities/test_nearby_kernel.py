@@ -6,7 +6,7 @@ from kernels import interpreted, needs_triton, use_kernels
 from moment_fields import CASES, made
 
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.nearby import FELT_MOMENTS
+from tgdsl.quantities.moment_sums import FELT_MOMENTS
 
 TOLERANCE = 1e-5
 """Of full scale: float32 places within a cell of a lattice of 8 nodes, times the slope of a random field."""

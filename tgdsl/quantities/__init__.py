@@ -2,10 +2,9 @@
 
 from tgdsl.quantities.base import Gathered, Planning, Quantity, Request, Scene, Use
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.quantities.contacts import Contacts
+from tgdsl.quantities.contacts import Contacts, Loads
 from tgdsl.quantities.kinematics import Joints, LinkMotion, Places
 from tgdsl.quantities.known import QUANTITIES, known_quantities
-from tgdsl.quantities.loads import Loads
 from tgdsl.quantities.moments import MomentsRequest
 from tgdsl.quantities.points import Points
 from tgdsl.quantities.reference import References, ReferenceScene

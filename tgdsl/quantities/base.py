@@ -45,8 +45,8 @@ class Request(Generic[Value]):
 
     @property
     def num_slots(self) -> int:
-        """Contacts per body and object that are read."""
-        return 0
+        """Contacts per body and object that are read: its field `slots`, if it has one."""
+        return getattr(self, "slots", 0)
 
     def key(self) -> tuple[Any, ...]:
         """Return what two requests at the same taxels must have in common to be one; by default all of it."""

@@ -1,7 +1,7 @@
-"""The solver's contacts on the bodies that carry a sensor, each in its body's frame.
+"""The solver's contacts on the bodies that carry a sensor: each in its body's frame, or as loads of bodies and objects.
 
-Shapes: `env` environments, `body` bodies that carry the sensor, `contact` contacts of one body: slot after slot of one object
-after the other, `all_bodies` bodies of the state, `pair` pairs of the state, `slot` contacts per pair, `object` felt objects.
+Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects, `slot` contacts of a body and an object,
+`contact` contacts of one body: slot after slot of one object after the other.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -47,25 +47,15 @@ class Contacts(Request[ContactPoints]):
     slots: int = 0  # contacts per body and object that are wanted; 0: the net force alone
     wants_contacts: ClassVar[bool] = True
 
-    @property
-    def num_slots(self) -> int:
-        """Contacts per body and object that are read."""
-        return self.slots
-
     def key(self) -> tuple[Any, ...]:
-        """Return what two requests at the same taxels have in common if they are one: the objects."""
         return type(self), self.objects
 
-    def merged(self, other: Request) -> Contacts:
-        """Return a request for as many slots as both want."""
-        assert isinstance(other, Contacts)
+    def merged(self, other: Contacts) -> Contacts:
         return dataclasses.replace(self, slots=max(self.slots, other.slots))
 
 
 Array = TypeVar("Array")
-
-SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
-"""Fields of the state that are read contact by contact."""
+SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")  # fields that are read contact by contact
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +71,7 @@ class ContactsPart(Generic[Array]):
     """All of it."""
 
     slots: int  # contacts per pair that are read; 0: the net force alone
-    uses: tuple[ContactsUse[Array], ...]  # the uses
-
-
-def _use(planning: Planning, use: Use) -> ContactsUse[np.ndarray]:
-    objects = [name for name in use.request.objects if planning.object_id(name) is not None]
-    counted = [name for name in objects if not is_counted(planning, name, use.request.objects)]
-    return ContactsUse(planning.body_ids(use.bodies), planning.contact_table(use.bodies, counted))
+    uses: tuple[ContactsUse[Array], ...]
 
 
 def is_counted(planning: Planning, name: str, felt: Sequence[str]) -> bool:
@@ -147,19 +131,13 @@ def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]
     names = ("contact_pos", "contact_force", "contact_normal", *(["contact_torque"] if has_torque else []))
     pos, force, normal, *rest = (planes.split(_of_pairs(state[name], index)) for name in names)
     torque = rest[0] if rest else None
-    is_used = _is_any((*force, *(torque or ()), *normal))
+    is_used = force[0] != 0
+    for part in (*force[1:], *(torque or ()), *normal):
+        is_used = is_used | (part != 0)
     whole = planes.split(_of_pairs(state["contact_netforce"], index))
     is_missing = is_used & (planes.dot(normal, normal) == 0)
     normal = planes.vec(torch.where(is_missing, torch.nan, part) for part in normal)
     return PairContacts(pos, _completed(whole, force, is_used), torque, normal, is_used)
-
-
-def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
-    """Return where any of some numbers is not zero; not-a-number is none."""
-    result = parts[0] != 0
-    for part in parts[1:]:
-        result = result | (part != 0)
-    return result
 
 
 def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
@@ -210,8 +188,12 @@ class _Contacts(Quantity):
     name, request, part = "contacts", Contacts, ContactsPart
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> ContactsPart[np.ndarray]:
-        slots = max((use.request.slots for use in uses if isinstance(use.request, Contacts)), default=0)
-        return ContactsPart(slots, tuple(_use(planning, use) for use in uses))
+        parts = []
+        for use in uses:
+            felt = use.request.objects
+            names = [n for n in felt if planning.object_id(n) is not None and not is_counted(planning, n, felt)]
+            parts.append(ContactsUse(planning.body_ids(use.bodies), planning.contact_table(use.bodies, names)))
+        return ContactsPart(max((use.request.slots for use in uses), default=0), tuple(parts))
 
     def gather(self, part: ContactsPart[Tensor], scene: Scene) -> tuple[ContactPoints, ...]:
         return tuple(contacts_of(scene.tensors, use.bodies, use.pairs, scene.dtype) for use in part.uses)
@@ -240,3 +222,143 @@ class _Contacts(Quantity):
 
 
 CONTACTS = _Contacts()
+
+
+class PairLoads(NamedTuple):
+    """What each body and object do to one another; planes (env, body, object), zero where they do not touch.
+
+    The reference's are arrays (body, object, …), its centre and mean normal always there.
+
+        F = Σ_c max(0, f_c · n_c),   W = Σ_c max(0, f_c · n_c) |v_c − (v_c · n_c) n_c|
+
+    with the force f_c on the body and the unit normal n_c out of the object at each contact c, and the velocity v_c of the
+    object's material there relative to the body's. What contacts beyond the slots carry is shared out over those shown, as
+    `quantities.contacts` has it.
+    """
+
+    force: Any  # sum of the contacts' normal forces, F [N]
+    sliding: Any  # normal force times sliding speed, W [W]; times a coefficient of friction it is the power of friction
+    # centre of the contacts weighted by F, in the frame of the body or object that was asked for [m], and mean of their normals
+    # weighted by F, in that frame, into this body or object; zero where they do not touch. None if they were not asked for.
+    center: Any
+    along: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Loads(Request[PairLoads]):
+    """Asks how hard each body is pressed by each object, and how fast they slide on one another."""
+
+    slots: int = 4  # contacts per body and object that are read
+    # whose loads they are to be summed up for: geoms that two objects share load a link once, but both objects
+    of: Literal["link", "object"] = "link"
+    # whether the centre and the mean normal of the contacts are wanted, in the frame of what they are of
+    has_center: bool = False
+    wants_contacts: ClassVar[bool] = True
+
+    def key(self) -> tuple[Any, ...]:
+        return type(self), self.objects, self.of
+
+    def merged(self, other: Loads) -> Loads:
+        return dataclasses.replace(self, slots=max(self.slots, other.slots), has_center=self.has_center or other.has_center)
+
+
+@dataclass(frozen=True, eq=False)
+class LoadsUse(Generic[Array]):
+    """One request."""
+
+    bodies: Array  # indices of the sensors' bodies in the state, (body,)
+    objects: Array  # indices of the objects' bodies in the state, (object,)
+    pairs: Array  # whose contacts: indices into `inputs.pairs`, or their number for none, (body, object)
+    center: Literal["", "link", "object"]  # the frame of the centre of contacts; empty: no centre is computed
+
+
+@dataclass(frozen=True, eq=False)
+class LoadsPart(Generic[Array]):
+    """All of it: the uses."""
+
+    uses: tuple[LoadsUse[Array], ...]
+
+
+def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtype) -> PairLoads:
+    found = pair_contacts(state, use.pairs)
+    pressed = planes.dot(found.force, found.normal).clamp(min=0.0)
+
+    def spread(parts: Sequence[Tensor], side: str) -> list[Tensor]:
+        return [part[:, :, None, None] if side == "link" else part[:, None, :, None] for part in parts]
+
+    def of(name: str, side: str) -> Vec:
+        bodies = use.bodies if side == "link" else use.objects
+        return planes.vec(spread(planes.split(state[name].index_select(1, bodies)), side))
+
+    def away(side: str) -> Vec:  # from the body's origin to each contact [m]
+        return planes.vec(torch.where(found.is_used, part, 0.0) for part in planes.sub(found.pos, of("body_pos", side)))
+
+    def velocity(side: str) -> Vec:  # of the body's material at each contact [m/s]
+        return planes.add(of("body_linvel", side), planes.cross(of("body_angvel", side), away(side)))
+
+    apart = planes.sub(velocity("object"), velocity("link"))
+    across = planes.sub(apart, planes.scale(planes.dot(apart, found.normal), found.normal))
+    speed = planes.safe_sqrt(planes.dot(across, across))
+    force, sliding = pressed.sum(dim=-1), (pressed * speed).sum(dim=-1)
+    if not use.center:
+        return PairLoads(force.to(dtype), sliding.to(dtype), None)
+    share = pressed / torch.where(force > 0, force, 1.0)[..., None]
+    quat = state["body_quat"][:, use.bodies if use.center == "link" else use.objects]
+    rotation = planes.rot(spread(planes.rotation(quat), use.center))
+    center, normal = (
+        [(share * part).sum(dim=-1) for part in planes.rotate_back(rotation, vector)]
+        for vector in (away(use.center), found.normal)
+    )
+    sign = 1.0 if use.center == "link" else -1.0
+    center, along = planes.vec(c.to(dtype) for c in center), planes.vec((sign * n).to(dtype) for n in normal)
+    return PairLoads(force.to(dtype), sliding.to(dtype), center, along)
+
+
+class _Loads(Quantity):
+    name, request, part = "loads", Loads, LoadsPart
+    has_rows = True
+
+    def plan(self, planning: Planning, uses: Sequence[Use]) -> LoadsPart[np.ndarray]:
+        parts = []
+        for use in uses:
+            names, of = use.request.objects, use.request.of
+            counted = [] if of == "object" else [name for name in names if is_counted(planning, name, names)]
+            objects = planning.body_ids([planning.sensed[name].body for name in names])
+            table = planning.contact_table(use.bodies, names, missing=counted)
+            parts.append(LoadsUse(planning.body_ids(use.bodies), objects, table, of if use.request.has_center else ""))
+        return LoadsPart(tuple(parts))
+
+    def gather(self, part: LoadsPart[Tensor], scene: Scene) -> tuple[PairLoads, ...]:
+        return tuple(_loads(use, scene.tensors, scene.dtype) for use in part.uses)
+
+    def reference(self, part: LoadsPart[np.ndarray], use: int, scene: ReferenceScene) -> PairLoads:
+        use_part = part.uses[use]
+        force, sliding, center, along = (np.zeros((*use_part.pairs.shape, *rest)) for rest in ((), (), (3,), (3,)))
+        for (b, o), pair in np.ndenumerate(use_part.pairs):
+            if pair == len(scene.contact_pairs):
+                continue
+            link, target = scene.body(scene.bodies[use_part.bodies[b]]), scene.body(scene.bodies[use_part.objects[o]])
+            ringing, sign = (target, -1.0) if use_part.center == "object" else (link, 1.0)
+            for pos, on_link, _, normal in reference_contacts(scene, pair):
+                pressed = max(0.0, float(on_link @ normal))
+                apart = target.velocity_at(pos) - link.velocity_at(pos)
+                force[b, o] += pressed
+                sliding[b, o] += pressed * float(np.linalg.norm(apart - (apart @ normal) * normal))
+                center[b, o] += pressed * (ringing.rotation.T @ (pos - ringing.pos))
+                along[b, o] += pressed * sign * (ringing.rotation.T @ normal)
+            center[b, o] /= force[b, o] or 1.0
+            along[b, o] /= force[b, o] or 1.0
+        return PairLoads(force, sliding, center, along)
+
+    def fields(self, part: LoadsPart) -> set[str]:
+        slots = {"contact_pos", "contact_force", "contact_normal"}
+        return {"body_linvel", "body_angvel", *slots, "contact_found", "contact_netforce"}
+
+    def num_rows(self, part: LoadsPart, use: int) -> int:
+        return part.uses[use].pairs.size
+
+    def explain(self, part: LoadsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
+        return ["normal force and sliding speed of the solver's contacts"]
+
+
+LOADS = _Loads()

@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from tgdsl.files.plugins import known
 from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.contact_depth import CONTACT_DEPTH
-from tgdsl.quantities.contacts import CONTACTS
+from tgdsl.quantities.contacts import CONTACTS, LOADS
 from tgdsl.quantities.kinematics import JOINTS, MOTION, PLACES
-from tgdsl.quantities.loads import LOADS
 from tgdsl.quantities.moments import MOMENTS
 from tgdsl.quantities.patches import PATCHES
 from tgdsl.quantities.points import POINTS

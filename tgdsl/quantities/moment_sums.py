@@ -13,8 +13,9 @@ of all clouds; `bin` cubes of all lattices; `slot` places of a list; `*point` br
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -22,9 +23,11 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Count, within
-from tgdsl.geometry.planes import Vec, vec
+from tgdsl.geometry.planes import Rot, Vec, vec
+from tgdsl.quantities.base import Request
+from tgdsl.quantities.pairs import Motion, PairedObject, Pairs, gathered
+from tgdsl.tensors.operations import Operation
 
-Pair = tuple[Tensor, Tensor]
 BLOCK = 16  # candidates of each point that are summed at once where nothing fuses the sum, so that memory stays bounded
 
 
@@ -71,10 +74,7 @@ class PointCloud(NamedTuple):
 def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = None) -> Moments:
     """Return moments by trilinear interpolation or splines; zero outside the lattice, not-a-number for a point that is none.
 
-    Args:
-        point: Points in the object's frame [m].
-        field: The field.
-        radius_shift: By how much the radius is larger than the field's [m], to first order; the field then has 8 channels.
+    `point` is in the object's frame [m]; the radius is `radius_shift` [m] larger than the field's, which then has 8 channels.
     """
     if field.is_smooth:
         base, weights = _spline_weights(point, field)
@@ -98,23 +98,15 @@ def _spline_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Vec, 
     nodes = [within((part - start) / field.cell - 0.5, count - 2) for part, start, count in axes]
     lower = [within(part.floor().long(), count - 3) for part, count in zip(nodes, field.num, strict=True)]
     base = (lower[0] * field.num[1] + lower[1]) * field.num[2] + lower[2]
-    x, y, z = (_quadratic(part - corner) for part, corner in zip(nodes, lower, strict=True))
+    along = vec(part - corner for part, corner in zip(nodes, lower, strict=True))
+    x, y, z = ((0.5 * (1 - t) * (1 - t), 0.5 + t * (1 - t), 0.5 * t * t) for t in along)
     return base, (x, y, z)
 
 
-def _quadratic(t: Tensor) -> Vec:
-    rest = 1 - t
-    return 0.5 * rest * rest, 0.5 + t * rest, 0.5 * t * t
-
-
 def plane_moments(point: Vec, radius: Tensor) -> Moments:
-    """Return the exact moments of the plane z = 0.
+    """Return the exact moments of the plane z = 0 at points in its frame [m], of sensing radii of 0 or more [m].
 
     With d = |z| < R: S0 = 2π ∫_d^R (R − r) r dr = π/3 (R − d)² (R + 2d), S1 = −z S0 along z.
-
-    Args:
-        point: Points in the plane's frame [m].
-        radius: Their sensing radius, 0 or more [m].
     """
     height = torch.maximum(torch.minimum(point[2], radius), -radius)
     depth = radius - height.abs()
@@ -126,10 +118,7 @@ def plane_moments(point: Vec, radius: Tensor) -> Moments:
 def cloud_moments(point: Vec, cloud: PointCloud, radius: Tensor) -> Moments:
     """Return the sums over the points of a cloud; zero outside its lattice, not-a-number for a point that is none.
 
-    Args:
-        point: Points in the object's frame [m].
-        cloud: The cloud.
-        radius: Their sensing radius, at most that of the lists [m].
+    `point` is in the object's frame [m]; `radius` is at most that of the lists [m].
     """
     base, rest = _cell_of(point, cloud.origin, cloud.cell, cloud.num, last=1)
     is_outside = (rest[0] < 0) | (rest[1] < 0) | (rest[2] < 0) | (rest[0] > 1) | (rest[1] > 1) | (rest[2] > 1)
@@ -157,3 +146,95 @@ def _cell_of(point: Vec, origin: Vec, cell: Tensor, num: tuple[Count, Count, Cou
     lower = [within(part.floor().long(), count - last) for part, count in zip(place, num, strict=True)]
     base = (lower[0] * num[1] + lower[1]) * num[2] + lower[2]
     return base, vec(part - corner for part, corner in zip(place, lower, strict=True))
+
+
+class SurfaceMoments(NamedTuple):
+    """Moments of surfaces near each probe, in its link's frame; planes (env, taxel)."""
+
+    pos: Vec  # where the probes are [m], planes (taxel,)
+    none: Tensor  # zero at each probe
+    moments: dict[str, Moments]  # moments of each object's surface about each probe, by the object's name
+    motions: dict[str, Motion]  # motion of each object relative to the link; empty if not asked for
+    area: dict[str, Tensor]  # area of each object's outer surface, planes left out [m²], (case, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class MomentsRequest(Request[SurfaceMoments]):
+    """Asks for moments of objects' surfaces around probes. They are never gated."""
+
+    radius: float | None = None  # sensing radius of all active probes [m]; None: that of each in the layout
+    # "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
+    backend: Literal["field", "points"] = "field"
+    num_points: int = 5000  # points of each object
+    tolerance: float = 0.005  # root mean square error of a field as a fraction of full scale
+    # error that 99.9 % of S0's gradients by place may have, as a fraction of the largest; None: any
+    gradient_tolerance: float | None = None
+    max_bytes: int = 64 * 2**20  # largest size of all fields of an object, or of its lists of points [bytes]
+    with_area: bool = False  # whether the area of the felt objects is wanted, so that there must be one
+    motion: bool = False  # whether the objects' motions are asked for
+    is_within_radii: ClassVar[bool] = True
+
+
+class Plane(NamedTuple):
+    """A plane in its object's frame: rotates plane vectors, whose z is its normal, into it; its origin [m]."""
+
+    rotation: Rot
+    pos: Vec
+
+
+class MomentSource(NamedTuple):
+    """One object, and the source of its moments."""
+
+    target: PairedObject
+    pair: Int[Tensor, " taxel"]  # index of each probe's pair among its own
+    # sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on the object
+    # itself
+    radius: Float[Tensor, "*env taxel"]
+    # by how much that is more than the radius that a field is of [m], (env, taxel); None: nothing
+    shift: Float[Tensor, "env taxel"] | None
+    surface: MomentField | PointCloud | None  # its outer surface without planes; None if it has planes alone
+    planes: tuple[Plane, ...]
+    area: Float[Tensor, "case 1"]  # area of its outer surface, planes left out [m²]
+
+
+def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
+    """Return the moments of an object at the probes, in their links' frames; `pos` is where these are there [m]."""
+    rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
+    point = planes.add(planes.rotate(rotation, pos), gathered(pairs.offset, own, source.pair))
+    parts = []
+    if isinstance(source.surface, MomentField):
+        near = field_moments(point, source.surface, source.shift)
+        if source.shift is not None:  # to first order S0 becomes negative near the edge of the sensing ball
+            near = near._replace(mass=torch.clamp(near.mass, min=0))
+        # The field knows no radius: an inactive probe asks one that is not its own.
+        is_active = source.radius > 0
+        none = torch.zeros_like(near.mass)
+        parts.append(Moments(torch.where(is_active, near.mass, 0.0), planes.where(is_active, near.first, (none, none, none))))
+    elif source.surface is not None:
+        parts.append(cloud_moments(point, source.surface, source.radius))
+    for plane in source.planes:
+        near = plane_moments(planes.rotate_back(plane.rotation, planes.sub(point, plane.pos)), source.radius)
+        parts.append(Moments(near.mass, planes.rotate(plane.rotation, near.first)))
+    mass, first = parts[0]
+    for part in parts[1:]:
+        mass, first = mass + part.mass, planes.add(first, part.first)
+    return Moments(mass, planes.rotate_back(rotation, first))
+
+
+def _by_kernel(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
+    from tgdsl.quantities import nearby_kernel
+
+    assert isinstance(source.surface, MomentField)
+    return nearby_kernel.felt_moments(pairs, own, pos, source.pair, source.radius, source.shift, source.surface)
+
+
+def _inputs(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> list[Tensor]:
+    shift = [] if source.shift is None else [source.shift]
+    return [source.radius, *pos, *pairs.rotation, *pairs.offset, *shift]
+
+
+def _is_one_field(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> bool:
+    return isinstance(source.surface, MomentField) and not source.surface.is_smooth and not source.planes
+
+
+FELT_MOMENTS = Operation("felt_moments", felt_moments, _by_kernel, _inputs, _is_one_field)

@@ -6,22 +6,29 @@ Shapes: `object` objects of a use, `taxel` probes, `variant` variants of an obje
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from tgdsl.errors import BakeError, LowerError
-from tgdsl.geometry.grid import Count
 from tgdsl.geometry.planes import rot, split, vec
 from tgdsl.quantities.base import Planning, Quantity, Scene, Use, pairs_for, variant_of
-from tgdsl.quantities.moment_sums import MomentField, PointCloud
-from tgdsl.quantities.nearby import MomentSource, MomentsRequest, Plane, SurfaceMoments, surface_moments
-from tgdsl.quantities.pairs import Pair, PairedObject
+from tgdsl.quantities.moment_sums import (
+    FELT_MOMENTS,
+    MomentField,
+    MomentSource,
+    MomentsRequest,
+    Plane,
+    PointCloud,
+    SurfaceMoments,
+)
+from tgdsl.quantities.pairs import Motion, Pair, PairedObject, gathered
 from tgdsl.quantities.reference import ReferenceScene
 from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.sensed import SensedObject
@@ -101,16 +108,14 @@ def _source(table: MomentTable[Tensor], use: MomentUse[Tensor], k: int, scene: S
     target = scene.objects[table.object]
     shift = scene.radius_shifts[use.radius_noise] if use.radius_noise else None
     variant, reach = variant_of(scene, target), use.reach[k]
+    rows = zip(table.plane_rotation, table.plane_pos, strict=True)
     return MomentSource(
         target=target,
         pair=use.pair[k],
         radius=reach if shift is None else torch.where(reach > 0, torch.clamp(reach + shift, min=0), 0.0),
         shift=None if shift is None else torch.maximum(shift, -reach),
         surface=_surface(table, variant, use.radius_id[k]),
-        planes=tuple(
-            Plane(rot(rotation.unbind()), vec(at.unbind()))
-            for rotation, at in zip(table.plane_rotation, table.plane_pos, strict=True)
-        ),
+        planes=tuple(Plane(rot(rotation.unbind()), vec(at.unbind())) for rotation, at in rows),
         area=(table.area if variant is None else table.area[variant])[:, None],
     )
 
@@ -123,26 +128,18 @@ def _surface(table: MomentTable[Tensor], variant: Tensor | None, radius_id: Tens
     which = None if variant is None else variant[:, None]
     if isinstance(surface, FieldTable) and num_radii > 1:
         which = radius_id if which is None else num_radii * which + radius_id
-    start: Count = 0
-    if which is None:
-        counts: tuple[Count, Count, Count] = surface.counts
-        place, side = split(surface.origin[0]), surface.cell[0]
-    else:
-        start, counts, place, side = (
-            surface.first[which],
-            split(surface.num[which]),
-            split(surface.origin[which]),
-            surface.cell[which],
-        )
+    lattice: Any = (0, surface.counts, split(surface.origin[0]), surface.cell[0])
+    if which is not None:
+        lattice = (surface.first[which], *(split(part[which]) for part in (surface.num, surface.origin)), surface.cell[which])
     if isinstance(surface, FieldTable):
-        return MomentField(surface.values, start, counts, place, side, surface.is_smooth)
-    weight = surface.weight[0] if which is None else surface.weight[which]
-    return PointCloud(vec(surface.points.unbind()), weight, surface.lists, start, counts, place, side)
+        return MomentField(surface.values, *lattice, surface.is_smooth)
+    weight = surface.weight[0 if which is None else which]
+    return PointCloud(vec(surface.points.unbind()), weight, surface.lists, *lattice)
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceMoments:
-    """Moments of objects' surfaces and the objects' motion, in the links' frames: `request.SurfaceMoments` as arrays."""
+    """Moments of objects' surfaces and the objects' motion, in the links' frames: `SurfaceMoments` as arrays."""
 
     mass: Float[np.ndarray, "taxel object"]  # S0 [m³]
     first: Float[np.ndarray, "taxel object 3"]  # S1 about the probe [m⁴]
@@ -152,66 +149,31 @@ class ReferenceMoments:
     area: Float[np.ndarray, " object"]  # area of each object's outer surface, planes left out [m²]
 
 
-def _splines(factors: np.ndarray, place: np.ndarray) -> float:
-    """Return a sum of quadratic B-splines about nodes at a place in cells, clamped to half a cell within the border."""
-    from scipy.ndimage import map_coordinates
-
-    place = np.clip(place, 0.5, np.array(factors.shape) - 1.5)
-    return float(map_coordinates(factors, place[:, None], order=2, prefilter=False, mode="nearest")[0])
-
-
-class ReferenceTable:
-    """One object's moments by other means than the module's: SciPy's interpolation, a sum over all points, closed form."""
-
-    def __init__(self, table: MomentTable[np.ndarray], variant: int):
-        """Take the tables of a variant of an object."""
-        self.table, self.variant = table, variant
-        self.area = float(table.area[variant])
-        self.fields: dict[float, Callable[[np.ndarray], np.ndarray]] = {}
-
-    def at(self, point: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
-        """Return S0 [m³] and S1 [m⁴] at a point in the object's frame [m]."""
-        total = np.zeros(4)
-        surface, radii = self.table.surface, self.table.radii
-        if isinstance(surface, FieldTable):
-            if radius not in self.fields:
-                self.fields[radius] = self._field(surface, self.variant * len(radii) + radii.index(radius))
-            total += self.fields[radius](point)[0]
-        elif isinstance(surface, CloudTable):
-            total += self._summed(surface, point, radius)
-        for pos, rotation in zip(self.table.plane_pos, self.table.plane_rotation, strict=True):
-            normal = rotation.reshape(3, 3)[:, 2]
-            height = float(normal @ (point - pos))
-            d = min(abs(height), radius)
-            s0 = 2 * np.pi * (radius**3 / 6 - radius * d**2 / 2 + d**3 / 3)
-            total += [s0, *(-height * normal * s0)] if d < radius else np.zeros(4)
-        return float(total[0]), total[1:]
-
-    def _field(self, field: FieldTable[np.ndarray], i: int) -> Callable[[np.ndarray], np.ndarray]:
-        first, num, origin, cell = field.first[i], field.num[i], field.origin[i], field.cell[i]
-        values = field.values[first : first + num.prod()].reshape(*num, 4).astype(np.float64)
-        if field.is_smooth:
-            return lambda point: np.array([_splines(part, (point - origin) / cell) for part in np.moveaxis(values, 3, 0)])[None]
-        from scipy.interpolate import RegularGridInterpolator
-
-        axes = [start + cell * np.arange(count) for start, count in zip(origin, num, strict=True)]
-        return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=0.0)
-
-    def _summed(self, cloud: CloudTable[np.ndarray], point: np.ndarray, radius: float) -> np.ndarray:
-        first = cloud.first
-        end = first[self.variant + 1] if self.variant + 1 < len(first) else len(cloud.lists)
-        rows, filler = np.unique(cloud.lists[first[self.variant] : end]), cloud.points.shape[1] - 1
-        way = cloud.points.T[rows[rows != filler]] - point
-        weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * self.area / len(way)
-        return np.array([weight.sum(), *(weight @ way)])
-
-
-def _gradients(accuracy: Mapping[str, float]) -> list[str]:
-    """Return the measured errors of a field's gradients by place, if there are any."""
-    if "gradient_p999" not in accuracy:
-        return []
-    p999, largest, first = (f"{100 * accuracy[key]:.2g} %" for key in ("gradient_p999", "gradient_max", "first_gradient_p999"))
-    return [f"  gradients: 99.9 % of S0's within {p999} of the largest (largest error {largest}), of S1's within {first}"]
+def _reference(table: MomentTable[np.ndarray], variant: int, point: np.ndarray, radius: float) -> np.ndarray:
+    """Return S0 [m³] and S1 [m⁴] at a point in the object's frame [m]: by SciPy, a sum over all points, or in closed form."""
+    total, surface = np.zeros(4), table.surface
+    if isinstance(surface, FieldTable):
+        i = variant * len(table.radii) + table.radii.index(radius)
+        first, num = surface.first[i], surface.num[i]
+        values = surface.values[first : first + num.prod()].reshape(*num, 4)
+        place = (point - surface.origin[i]) / surface.cell[i]
+        # Quadratic B-splines about nodes end half a cell within the border; a linear field is zero beyond it.
+        place, order, mode = (np.clip(place, 0.5, num - 1.5), 2, "nearest") if surface.is_smooth else (place, 1, "constant")
+        options = {"output": np.float64, "order": order, "prefilter": False, "mode": mode}
+        total += [map_coordinates(values[..., c], place[:, None], **options)[0] for c in range(4)]
+    elif isinstance(surface, CloudTable):
+        end = surface.first[variant + 1] if variant + 1 < len(surface.first) else len(surface.lists)
+        rows, filler = np.unique(surface.lists[surface.first[variant] : end]), surface.points.shape[1] - 1
+        way = surface.points.T[rows[rows != filler]] - point
+        weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * float(table.area[variant]) / len(way)
+        total += [weight.sum(), *(weight @ way)]
+    for pos, rotation in zip(table.plane_pos, table.plane_rotation, strict=True):
+        normal = rotation.reshape(3, 3)[:, 2]
+        height = float(normal @ (point - pos))
+        d = min(abs(height), radius)
+        s0 = 2 * np.pi * (radius**3 / 6 - radius * d**2 / 2 + d**3 / 3)
+        total += [s0, *(-height * normal * s0)] if d < radius else np.zeros(4)
+    return total
 
 
 class _Moments(Quantity):
@@ -222,17 +184,15 @@ class _Moments(Quantity):
         tables: list[MomentTable[np.ndarray]] = []
         numbers: Number = {}
         for use in uses:
-            request = _request(use)
-            for i, name in enumerate(request.objects):
-                key = *_way(use), name
+            for i, name in enumerate(use.request.objects):
+                key = _way(use), name
                 radii = _radii(planning, uses, use, name)
                 if key in numbers or not radii or planning.object_id(name) is None:
                     continue
                 try:
                     planning.progress(f"object {name}: moments of its surface")
-                    tables.append(
-                        moment_table(planning.sensed[name], request, radii, use.largest_shift, planning.object_id(name))
-                    )
+                    number = planning.object_id(name)
+                    tables.append(moment_table(planning.sensed[name], use.request, radii, use.largest_shift, number))
                     numbers[key] = len(tables) - 1
                 except LowerError as error:
                     place = ["feels", i] if error.field else []
@@ -241,13 +201,17 @@ class _Moments(Quantity):
         return MomentsPart(tuple(tables), tuple(_use(planning, use, tables, numbers) for use in uses))
 
     def gather(self, part: MomentsPart[Tensor], scene: Scene) -> tuple[SurfaceMoments, ...]:
-        results = []
+        results, pairs = [], pairs_for(scene, is_gated=False)
         for use in part.uses:
-            sources = [_source(part.tables[i], use, k, scene) for k, i in enumerate(use.tables)]
-            pairs = pairs_for(scene, is_gated=False)
-            results.append(
-                surface_moments(pairs if use.motion else pairs._replace(motion=None), vec(use.pos.unbind()), sources)
-            )
+            moments, motions, areas, pos = {}, {}, {}, vec(use.pos.unbind())
+            for k, i in enumerate(use.tables):
+                source = _source(part.tables[i], use, k, scene)
+                name, own = source.target.name, source.target.pairs
+                moments[name], areas[name] = FELT_MOMENTS(pairs, own, pos, source), source.area
+                if use.motion and pairs.motion is not None:
+                    motions[name] = Motion(*(gathered(part, own, source.pair) for part in pairs.motion))
+            none = pairs.offset[0].new_zeros((pairs.offset[0].shape[0], pos[0].shape[0]))
+            results.append(SurfaceMoments(pos, none, moments, motions, areas))
         return tuple(results)
 
     def reference(self, part: MomentsPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferenceMoments:
@@ -257,16 +221,16 @@ class _Moments(Quantity):
         turn, area = np.zeros((layout.num_taxels, 3)), np.zeros(num)
         for k, table in enumerate(part.tables[i] for i in use_part.tables):
             target = scene.objects[table.object]
-            moments, body = ReferenceTable(table, scene.variant(target)), scene.object_body(target)
-            area[k] = moments.area
+            variant, body = scene.variant(target), scene.object_body(target)
+            area[k] = table.area[variant]
             for t, link_id in enumerate(layout.link_id):
                 name = layout.links[link_id].body
                 if use_part.reach[k, t] <= 0 or name == target.body:
                     continue
                 link = scene.body(name)
                 q = link.pos + link.rotation @ layout.pos[t]
-                mass[t, k], about_q = moments.at(body.rotation.T @ (q - body.pos), float(use_part.reach[k, t]))
-                first[t, k] = link.rotation.T @ body.rotation @ about_q
+                near = _reference(table, variant, body.rotation.T @ (q - body.pos), float(use_part.reach[k, t]))
+                mass[t, k], first[t, k] = near[0], link.rotation.T @ body.rotation @ near[1:]
                 velocity[t, k] = link.rotation.T @ (body.velocity_at(q) - link.velocity_at(q))
                 angular[t, k] = link.rotation.T @ (body.angvel - link.angvel)
                 turn[t] = link.rotation.T @ link.angvel
@@ -288,38 +252,27 @@ class _Moments(Quantity):
                 size = field.values[0].nbytes * int(field.num[i].prod())
                 which = f"variant {i // num_radii}, " if len(table.area) > 1 else ""
                 nodes = f"{' × '.join(map(str, field.num[i]))} nodes every {1e3 * accuracy['cell']:.3g} mm, {size} bytes"
-                s0, s0_max, s1, s1_max = (
-                    f"{100 * accuracy[key]:.2g} %" for key in ("mass_rms", "mass_max", "first_rms", "first_max")
-                )
+                shown = {key: f"{100 * value:.2g} %" for key, value in accuracy.items()}
                 lines += [
                     f"{objects[table.object].name}, {which}radius {1e3 * accuracy['radius']:.3g} mm: {nodes}",
-                    f"  RMS error of S0 {s0} of full scale (largest {s0_max}), of S1 {s1} (largest {s1_max})",
-                    *_gradients(accuracy),
+                    f"  RMS error of S0 {shown['mass_rms']} of full scale (largest {shown['mass_max']}), of S1"
+                    f" {shown['first_rms']} (largest {shown['first_max']})",
                 ]
+                if "gradient_p999" in accuracy:
+                    p999, largest = shown["gradient_p999"], f"(largest error {shown['gradient_max']})"
+                    lines.append(
+                        f"  gradients: 99.9 % of S0's within {p999} of the largest {largest}, of S1's within"
+                        f" {shown['first_gradient_p999']}"
+                    )
         return {"fields of moments": lines} if lines else {}
 
 
 MOMENTS = _Moments()
 
 
-def _request(use: Use) -> MomentsRequest:
-    assert isinstance(use.request, MomentsRequest)
-    return use.request
-
-
 def _way(use: Use) -> tuple[Any, ...]:
     """Return the method of a request: uses with equal methods share a table."""
-    request = _request(use)
-    result = (
-        request.radius,
-        request.backend,
-        request.num_points,
-        request.tolerance,
-        request.gradient_tolerance,
-        request.max_bytes,
-        request.with_area,
-    )
-    return *result, use.largest_shift
+    return dataclasses.replace(use.request, objects=(), is_gated=False, motion=False).key(), use.largest_shift
 
 
 def _radii(planning: Planning, uses: Sequence[Use], use: Use, name: str) -> list[float]:
@@ -328,22 +281,22 @@ def _radii(planning: Planning, uses: Sequence[Use], use: Use, name: str) -> list
 
 
 def _radius(planning: Planning, use: Use) -> Float[np.ndarray, " taxel"]:
-    radius, of_all = planning.layout.radius[use.taxels], _request(use).radius
+    radius, of_all = planning.layout.radius[use.taxels], use.request.radius
     return radius if of_all is None else np.where(radius > 0, of_all, radius)
 
 
 def _check_area(planning: Planning, use: Use, tables: Sequence[MomentTable], numbers: Number) -> None:
-    request = _request(use)
-    counts = [numbers[key] for name in request.objects if (key := (*_way(use), name)) in numbers]
+    request = use.request
+    counts = [numbers[key] for name in request.objects if (key := (_way(use), name)) in numbers]
     if request.with_area and len(counts) == len(request.objects) and not sum(tables[i].area.min() for i in counts) > 0:
         problem = f"{', '.join(request.objects)}: planes alone have no area to share the density among"
         planning.report(("sensors", use.sensors[0]), problem, "give `reference_area`, or feel an object that is no plane")
 
 
 def _use(planning: Planning, use: Use, tables: Sequence[MomentTable[np.ndarray]], numbers: Number) -> MomentUse[np.ndarray]:
-    names = [name for name in use.request.objects if (*_way(use), name) in numbers]
+    names = [name for name in use.request.objects if (_way(use), name) in numbers]
     bodies, radius = planning.bodies_of(use.taxels), _radius(planning, use)
-    number = [numbers[(*_way(use), name)] for name in names]
+    number = [numbers[(_way(use), name)] for name in names]
     index, reach, radius_id = np.zeros((3, len(names), len(bodies)))
     for o, name in enumerate(names):
         pairs, radii = planning.own_pairs(name), tables[number[o]].radii
@@ -352,7 +305,7 @@ def _use(planning: Planning, use: Use, tables: Sequence[MomentTable[np.ndarray]]
                 index[o, t], reach[o, t] = pairs.index(Pair(body, name)), radius[t]
                 radius_id[o, t] = radii.index(radius[t])
     ids = index.astype(np.int64), reach, radius_id.astype(np.int64)
-    return MomentUse(tuple(number), use.pos, *ids, use.radius_noise, _request(use).motion)
+    return MomentUse(tuple(number), use.pos, *ids, use.radius_noise, use.request.motion)
 
 
 def moment_table(

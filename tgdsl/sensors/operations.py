@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tgdsl.quantities.contact_depth import DEEPEST
-from tgdsl.quantities.nearby import FELT_MOMENTS
+from tgdsl.quantities.moment_sums import FELT_MOMENTS
 from tgdsl.quantities.patch import CONTACT_PATCH
 from tgdsl.quantities.points import LINK_POINTS
 from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, SHEAR_LOADS

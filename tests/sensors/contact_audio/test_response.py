@@ -9,8 +9,8 @@ from oracles import sound as oracles
 from oracles.setups.sounds import STEP, energy, plate, pressed, sound
 
 from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contacts import Loads, PairLoads
 from tgdsl.quantities.kinematics import Places
-from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.sensors.base import Context
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.sensors.contact_audio.modes import operators

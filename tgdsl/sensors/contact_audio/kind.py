@@ -82,8 +82,8 @@ from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
 from tgdsl.modal.modes import ModeShapes
 from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contacts import Loads
 from tgdsl.quantities.kinematics import Places
-from tgdsl.quantities.loads import Loads
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.contact_audio.modes import (
     ContactAudioSpec,

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contacts import Loads, PairLoads
 from tgdsl.quantities.kinematics import Places
-from tgdsl.quantities.loads import Loads, PairLoads
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
 from tgdsl.sensors.contact_audio.modes import (
