@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from tgdsl.fields.materials import Material
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
@@ -30,7 +31,7 @@ from tgdsl.surfaces.sensed import ObjectHeat
 class Topology:
     """What is joined."""
 
-    num_bodies: int  # number of bodies
+    num_bodies: int
     cells: tuple[tuple[int, int, int], ...]  # how many cells each object has along each axis; all 1 if it has one temperature
     grids: tuple[int, ...]  # the objects that are rows themselves
     lumped: tuple[int, ...]  # the objects that are nodes
@@ -39,7 +40,6 @@ class Topology:
 
     @property
     def num_objects(self) -> int:
-        """Number of objects."""
         return len(self.cells)
 
     @property
@@ -49,7 +49,6 @@ class Topology:
 
     @property
     def num_rows(self) -> int:
-        """Number of rows of cells."""
         return self.num_bodies + len(self.grids)
 
     @property
@@ -59,11 +58,9 @@ class Topology:
 
     @property
     def num_nodes(self) -> int:
-        """Number of nodes."""
         return len(self.lumped) + len(self.interfaces)
 
     def node_of(self, body: int, target: int) -> int:
-        """Return the node of a pair's patch."""
         if target in self.lumped:
             return self.lumped.index(target)
         return len(self.lumped) + self.interfaces.index((body, target))
@@ -88,28 +85,30 @@ class Topology:
         node, share), pairs of slots counted row by row, with their number where there is none.
         """
         rows = self.sides()
-        count = max([len(row) for row in rows] + [1])
-        no_pair = self.num_bodies * self.num_objects
-        pair = np.full((self.num_rows, count), no_pair, dtype=np.int64)
-        is_object, node = np.zeros(pair.shape, dtype=np.int64), np.zeros(pair.shape, dtype=np.int64)
+        count = max(1, *map(len, rows)) if rows else 1
+        pair = np.full((self.num_rows, count), self.num_bodies * self.num_objects, dtype=np.int64)
+        is_object, node = np.zeros((2, *pair.shape), dtype=np.int64)
         at: list[list[int]] = [[] for _ in range(self.num_nodes)]
-        coupled: dict[tuple[int, int], list[int]] = {}
+        between: list[list[int]] = [[] for _ in range(self.num_nodes**2)]
         for r, row in enumerate(rows):
             for s, (entry, is_objects, n) in enumerate(row):
                 pair[r, s], is_object[r, s], node[r, s] = entry, is_objects, n
                 at[n].append(r * count + s)
                 for t, (_, _, m) in enumerate(row):
                     if m != n:
-                        coupled.setdefault((n, m), []).append((r * count + s) * count + t)
-        shares = max([len(entry) for entry in at] + [1])
-        at_node = np.full((self.num_nodes, shares), pair.size, dtype=np.int64)
-        for n, entry in enumerate(at):
-            at_node[n, : len(entry)] = entry
-        shares = max([len(entry) for entry in coupled.values()] + [0])
-        between = np.full((self.num_nodes, self.num_nodes, shares), pair.size * count, dtype=np.int64)
-        for (n, m), entry in coupled.items():
-            between[n, m, : len(entry)] = entry
-        return {"pair": pair, "is_object": is_object, "node": node, "at_node": at_node, "coupled": between}
+                        between[n * self.num_nodes + m].append((r * count + s) * count + t)
+        coupled = _filled(between, 0, pair.size * count)
+        coupled = coupled.reshape(self.num_nodes, self.num_nodes, coupled.shape[1])
+        sides = {"pair": pair, "is_object": is_object, "node": node}
+        return {**sides, "at_node": _filled(at, 1, pair.size), "coupled": coupled}
+
+
+def _filled(rows: Sequence[Sequence[int]], least: int, none: int) -> np.ndarray:
+    """Return rows of numbers as an array, at least so wide, filled up with the number for none."""
+    result = np.full((len(rows), max([least, *map(len, rows)])), none, dtype=np.int64)
+    for row, numbers in zip(result, rows, strict=True):
+        row[: len(numbers)] = numbers
+    return result
 
 
 class HeatOfObjects(NamedTuple):
@@ -168,11 +167,9 @@ class ContactPatches(Request[ContactPatch]):
 
     @property
     def num_slots(self) -> int:
-        """Contacts per body and object that are read."""
         return self.slots if self.objects else 0
 
     def key(self) -> tuple[Any, ...]:
-        """Return what two requests have in common if they are one: each sensor has its own."""
         return (type(self), self.objects, self.slots, self.is_star, self.boxes.tobytes())
 
 
@@ -205,7 +202,7 @@ class PatchesUse(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class PatchesPart(Generic[Array]):
-    """All of it."""
+    """All uses."""
 
     uses: tuple[PatchesUse[Array], ...]
 
@@ -219,17 +216,11 @@ def tables(
     faces: Sequence[str] = FACES,
     loss: Float[np.ndarray, "row 3"] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return what a step needs of boxes.
+    """Return what a step needs of boxes with so many cells along each axis, of sizes [m], some faces of which are exposed.
 
     `count`, `number` and `volume` of cells; by axis `ends`, how many exposed faces across it a cell has, `mode`, the modes,
     their eigenvalues `square`, `smooth` with (kπ/n)² instead of 4 sin²(kπ/2n) in them, and the modes' sums over the cells
-    `total`.
-
-    Args:
-        count: Cells of each box along each axis.
-        size: Its sides [m].
-        faces: Its exposed faces.
-        loss: b of the exposed faces across each axis [1]; default: they are insulated.
+    `total`. `loss` is b of the exposed faces across each axis [1]; default: they are insulated.
     """
     loss = np.zeros(count.shape) if loss is None else loss
     result = {"count": count.astype(np.float64)}
@@ -280,11 +271,7 @@ def modes(
 ) -> tuple[Float[np.ndarray, "row mode cell"], Float[np.ndarray, "row mode"]]:
     """Return the modes along an axis, orthonormal, the slowest first and positive, and their eigenvalues μ [1].
 
-    Both are 0 where a row has fewer cells than another.
-
-    Args:
-        count: Cells of each row.
-        loss: What each cell loses at its exposed faces, b of each [1].
+    Both are 0 where a row has fewer cells than another. `loss` is what each cell loses at its exposed faces, b of each [1].
     """
     most = int(count.max(initial=1))
     vectors, values = np.zeros((len(count), most, most)), np.zeros((len(count), most))
@@ -303,83 +290,67 @@ def modes(
     return vectors, values
 
 
-HINT = "give it `material`, and `temperature` if it does not begin at the sensor's ambient"
-
-
-def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
-    """Return whether the objects of a use have heat that is this use's alone; note mistakes."""
-    assert isinstance(use.request, ContactPatches)
-    is_well = True
-    for name in use.request.objects:
-        heat, holders = planning.sensed[name].heat, [*([held[name]] if name in held else []), *use.sensors]
-        if heat is None:
-            planning.report(("objects", name), "it has no `material`, and a sensor of temperature feels it", HINT)
-        elif heat.cells and not np.isfinite(heat.volume).all():
-            planning.report(
-                ("objects", name, "cells"), "a plane is without bounds, and has one temperature", "leave `cells` out"
-            )
-        elif planning.sensed[name].body in {link.body for link in use.links} and (heat.cells or heat.temperature is not None):
-            which = "cells" if heat.cells else "temperature"
-            problem = f"it is a link of the sensor, whose own {which} counts; its `material` says how stiff it is to touch"
-            planning.report(("objects", name, which), problem, f"leave `{which}` out")
-        elif use.request.needs_stiffness and any(material.youngs_modulus is None for material in heat.materials):
-            problem = "neither it nor a link that feels it has a `youngs_modulus`, from which the area of a contact follows"
-            planning.report(("objects", name, "material"), problem, "give one, or the sensor's `contact_area`")
-        elif heat.cells and len(heat.volume) > 1:
-            planning.report(("objects", name, "cells"), "an object with variants has one temperature", "leave `cells` out")
-        elif is_counted(planning, name, use.request.objects):
-            planning.report(("objects", name), "it shares its geoms with another object of the sensor", "one body has one heat")
-        elif len(holders) > 1:
-            hint = "put their links into one sensor, with `materials` by link"
-            problem = f'the sensors "{holders[0]}" and "{holders[1]}" both hold the heat of object "{name}"'
-            planning.report(("sensors", holders[1], "feels"), problem, hint)
-        else:
-            held[name] = use.sensors[0]
-            continue
-        is_well = False
-    return is_well
+def _mistake(planning: Planning, use: Use, name: str, holder: str | None) -> tuple[tuple[str, ...], str, str] | None:
+    """Return why the heat of an object is not this use's alone: a place, the problem and a hint; None if it is."""
+    heat, place, holders = planning.sensed[name].heat, ("objects", name), [*([holder] if holder else []), *use.sensors]
+    if heat is None:
+        hint = "give it `material`, and `temperature` if it does not begin at the sensor's ambient"
+        return place, "it has no `material`, and a sensor of temperature feels it", hint
+    if heat.cells and not np.isfinite(heat.volume).all():
+        return (*place, "cells"), "a plane is without bounds, and has one temperature", "leave `cells` out"
+    if planning.sensed[name].body in use.bodies and (heat.cells or heat.temperature is not None):
+        which = "cells" if heat.cells else "temperature"
+        problem = f"it is a link of the sensor, whose own {which} counts; its `material` says how stiff it is to touch"
+        return (*place, which), problem, f"leave `{which}` out"
+    if use.request.needs_stiffness and any(material.youngs_modulus is None for material in heat.materials):
+        problem = "neither it nor a link that feels it has a `youngs_modulus`, from which the area of a contact follows"
+        return (*place, "material"), problem, "give one, or the sensor's `contact_area`"
+    if heat.cells and len(heat.volume) > 1:
+        return (*place, "cells"), "an object with variants has one temperature", "leave `cells` out"
+    if is_counted(planning, name, use.request.objects):
+        return place, "it shares its geoms with another object of the sensor", "one body has one heat"
+    if len(holders) > 1:
+        problem = f'the sensors "{holders[0]}" and "{holders[1]}" both hold the heat of object "{name}"'
+        return ("sensors", holders[1], "feels"), problem, "put their links into one sensor, with `materials` by link"
+    return None
 
 
 def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
-    assert isinstance(use.request, ContactPatches)
-    names = use.request.objects
-    bodies = use.bodies
+    names, bodies = use.request.objects, use.bodies
     heats = [heat for name in names if (heat := planning.sensed[name].heat) is not None]
     objects = [next((target for target in planning.objects if target.name == name), None) for name in names]
-    gate = {pair: i for i, pair in enumerate(planning.contact_pairs)}
-    order = {pair: i for i, pair in enumerate(planning.pairs)}
     topology = _topology(planning, bodies, names, heats)
-    met = set(topology.met)
 
-    def table(index: dict[Pair, int]) -> np.ndarray:
-        rows = [
-            [index.get(Pair(body, name), len(index)) if (b, o) in met else len(index) for o, name in enumerate(names)]
-            for b, body in enumerate(bodies)
-        ]
-        return np.array(rows, dtype=np.int64).reshape(len(bodies), len(names))
+    def table(pairs: Sequence[Pair]) -> np.ndarray:
+        result = np.full((len(bodies), len(names)), len(pairs), dtype=np.int64)
+        for b, o in topology.met:
+            if (pair := Pair(bodies[b], names[o])) in pairs:
+                result[b, o] = pairs.index(pair)
+        return result
 
-    choices = max([len(heat.materials) for heat in heats] + [1])
-    variants = max([len(heat.volume) for heat in heats] + [1])
+    materials = [[_thermal(m) for m in heat.materials] for heat in heats]
+    shapes = [np.stack([heat.volume, heat.area, heat.curvature], axis=1).tolist() for heat in heats]
+    count = np.array([topology.cells[i] for i in topology.grids], dtype=np.int64).reshape(-1, 3)
+    size = np.array([heats[i].box_size[0] for i in topology.grids], dtype=np.float64).reshape(-1, 3)
+    told = [name in planning.heated and (h.is_per_env or len(h.materials) > 1) for name, h in zip(names, heats, strict=True)]
     return PatchesUse(
         topology=topology,
         is_star=use.request.is_star,
         bodies=np.array([planning.bodies.index(b) for b in bodies if names], dtype=np.int64),
-        pairs=table(gate),
-        relations=table(order),
+        pairs=table(planning.contact_pairs),
+        relations=table(planning.pairs),
         boxes=use.request.boxes,
         start=np.array([heat.temperature or 0.0 for heat in heats]),
         has_start=np.array([float(heat.temperature is not None) for heat in heats]),
-        materials=np.array([_padded([_thermal(m) for m in heat.materials], choices) for heat in heats]).reshape(-1, choices, 4),
-        shapes=np.array(
-            [_padded(np.stack([heat.volume, heat.area, heat.curvature], axis=1).tolist(), variants) for heat in heats]
-        ).reshape(-1, variants, 3),
+        materials=_padded(materials, 4),
+        shapes=_padded(shapes, 3),
         grids=np.array([_grid(heat) for heat in heats]).reshape(-1, 2, 3),
         variants=tuple(-1 if target is None or target.num_variants == 1 else target.varied for target in objects),
-        heated=tuple(_place(planning, name, heat) for name, heat in zip(names, heats, strict=True)),
+        heated=tuple(planning.heated.index(name) if is_told else -1 for name, is_told in zip(names, told, strict=True)),
         has_own_start=tuple(heat.is_per_env for heat in heats),
         num_materials=tuple(len(heat.materials) for heat in heats),
         sides=topology.tables(),
-        cells=_cells(topology, heats),
+        cells=tables(count, size) if len(count) else {},
     )
 
 
@@ -400,12 +371,7 @@ def _topology(planning: Planning, bodies: Sequence[str], names: Sequence[str], h
     return Topology(len(bodies), cells, grids, lumped, tuple(links), tuple(met))
 
 
-def _place(planning: Planning, name: str, heat: ObjectHeat) -> int:
-    is_told = heat.is_per_env or len(heat.materials) > 1
-    return planning.heated.index(name) if is_told and name in planning.heated else -1
-
-
-def _thermal(material) -> list[float]:  # type: ignore[no-untyped-def]
+def _thermal(material: Material) -> list[float]:
     modulus, ratio = material.youngs_modulus, material.poissons_ratio
     compliance = 0.0 if modulus is None else (1.0 - (ratio or 0.0) ** 2) / modulus
     return [material.conductivity, material.density * material.specific_heat, material.emissivity, compliance]
@@ -418,14 +384,10 @@ def _grid(heat: ObjectHeat) -> list[np.ndarray]:
     return [np.asarray(heat.box_center[0]) - 0.5 * size, size]
 
 
-def _cells(topology: Topology, heats: Sequence[ObjectHeat]) -> dict[str, np.ndarray]:
-    count = np.array([topology.cells[i] for i in topology.grids], dtype=np.int64).reshape(-1, 3)
-    size = np.array([heats[i].box_size[0] for i in topology.grids], dtype=np.float64).reshape(-1, 3)
-    return tables(count, size) if len(count) else {}
-
-
-def _padded(rows: list[list[float]], count: int) -> list[list[float]]:
-    return [*rows, *[rows[0]] * (count - len(rows))]
+def _padded(rows: list[list[list[float]]], num: int) -> np.ndarray:
+    """Return rows of choices of `num` numbers, as many of each row: the first again where there are fewer."""
+    most = max([1, *map(len, rows)])
+    return np.array([[*row, *[row[0]] * (most - len(row))] for row in rows]).reshape(-1, most, num)
 
 
 FIELDS = (*(f"contact_{name}" for name in ("force", "torque", "normal", "pos", "netforce")), "body_pos", "body_quat")
@@ -465,9 +427,7 @@ def _objects(use: PatchesUse[Tensor], scene: Scene) -> HeatOfObjects:
     shaped = _chosen(shapes, scene.tensors.get("variant"), use.variants, counts)
     grids = use.grids.to(scene.dtype)
     corner, size = (planes.vec(grids[:, i, axis] for axis in range(3)) for i in range(2))
-    conductivity, volumetric_heat, emissivity, compliance = material_id.unbind(-1)
-    volume, area, curvature = shaped.unbind(-1)
-    made_of = (conductivity, volumetric_heat, emissivity, compliance, volume, area, curvature)
+    made_of: Any = (*material_id.unbind(-1), *shaped.unbind(-1))
     return HeatOfObjects(start, use.has_start.to(scene.dtype)[None], *made_of, size, corner)
 
 
@@ -520,8 +480,8 @@ class ReferencePatches:
     boxes: Float[np.ndarray, "body 2 3"]
 
 
-def _reference_patch(scene: ReferenceScene, b: int, name: str, pair: int, is_star: bool) -> ReferencePatch | None:
-    link = scene.body(scene.layout.bodies[b])
+def _reference_patch(scene: ReferenceScene, b: int, pair: int, is_star: bool) -> ReferencePatch | None:
+    link, name = scene.body(scene.layout.bodies[b]), scene.contact_pairs[pair].object
     target = scene.object_body(next(each for each in scene.objects if each.name == name))
     contacts = reference_contacts(scene, pair)
     pressing = [(pos, float(force @ normal), normal) for pos, force, _, normal in contacts if not force @ normal <= 0]
@@ -555,16 +515,14 @@ def _area(points: list[np.ndarray], normal: np.ndarray, is_star: bool) -> float:
     return max(0.0, 0.5 * float(np.sum(flat[:, 0] * after[:, 1] - flat[:, 1] * after[:, 0])))
 
 
-def _reference_object(use, i: int, scene: ReferenceScene) -> ReferenceObject:  # type: ignore[no-untyped-def]
+def _reference_object(use: PatchesUse[np.ndarray], i: int, scene: ReferenceScene) -> ReferenceObject:
     start = float(use.start[i]) if use.has_start[i] else None
     if use.has_own_start[i]:
         start = float(scene.fields["object_temperature"][use.heated[i]])
     material = int(scene.fields["object_material"][use.heated[i]]) if use.num_materials[i] > 1 else 0
     variant = int(scene.fields["variant"][use.variants[i]]) if use.variants[i] >= 0 else 0
     corner, size = use.grids[i]
-    k, heat, emissivity, compliance = use.materials[i, material].tolist()
-    volume, area, curvature = use.shapes[i, variant].tolist()
-    return ReferenceObject(start, k, heat, emissivity, compliance, volume, area, curvature, corner, size)
+    return ReferenceObject(start, *use.materials[i, material].tolist(), *use.shapes[i, variant].tolist(), corner, size)
 
 
 class _Patches(Quantity):
@@ -573,10 +531,19 @@ class _Patches(Quantity):
     is_fused = True
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> PatchesPart[np.ndarray]:
+        """Return the part of the Plan; an object that has no heat, or whose heat another sensor has, is a mistake."""
         held: dict[str, str] = {}
         results = []
         for use in uses:
-            if _check(planning, use, held):
+            mistakes = []
+            for name in use.request.objects:
+                mistake = _mistake(planning, use, name, held.get(name))
+                if mistake is None:
+                    held[name] = use.sensors[0]
+                else:
+                    mistakes.append(mistake)
+                    planning.report(*mistake)
+            if not mistakes:
                 results.append(_use(planning, use))
         return PatchesPart(tuple(results))
 
@@ -584,25 +551,20 @@ class _Patches(Quantity):
         return tuple(_patches(use, scene) for use in part.uses)
 
     def reference(self, part: PatchesPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferencePatches:
-        use_part, result = part.uses[use], {}
-        for b, o in use_part.topology.met:
-            patch = _reference_patch(
-                scene, b, scene.contact_pairs[use_part.pairs[b, o]].object, int(use_part.pairs[b, o]), use_part.is_star
-            )
-            if patch is not None:
-                result[b, o] = patch
+        use_part = part.uses[use]
+        pairs, is_star = use_part.pairs, use_part.is_star
+        patches = {(b, o): _reference_patch(scene, b, int(pairs[b, o]), is_star) for b, o in use_part.topology.met}
         objects = tuple(_reference_object(use_part, i, scene) for i in range(use_part.topology.num_objects))
-        return ReferencePatches(result, objects, use_part.topology, use_part.boxes)
+        kept = {pair: patch for pair, patch in patches.items() if patch is not None}
+        return ReferencePatches(kept, objects, use_part.topology, use_part.boxes)
 
     def fields(self, part: PatchesPart) -> set[str]:
-        fields = (
-            {"contact_found", "contact_netforce", *SLOT_FIELDS} if any(use.topology.num_objects for use in part.uses) else set()
-        )
-        if any(any(use.has_own_start) for use in part.uses):
-            fields.add("object_temperature")
+        names = {"object_temperature"} if any(any(use.has_own_start) for use in part.uses) else set()
+        if any(use.topology.num_objects for use in part.uses):
+            names |= {"contact_found", "contact_netforce", *SLOT_FIELDS}
         if any(count > 1 for use in part.uses for count in use.num_materials):
-            fields.add("object_material")
-        return fields
+            names.add("object_material")
+        return names
 
     def bodies(self, use: Use) -> tuple[str, ...]:
         return use.bodies if use.request.objects else ()

@@ -28,15 +28,13 @@ from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.operations import Operation
 
 LINKS = DistanceOptions()  # how the distance to links' own surfaces is computed
-
-
 SMALLEST_TILE, LARGEST_TILE = 32, 128  # numbers of taxels of a tile
 
 
 class PointSource(NamedTuple):
     """The points of one object, and the links that they may meet."""
 
-    object: str  # the object's name
+    object: str
     pair: Int[Tensor, " link"]  # index of the pair of each link and the object
     taxels: tuple[tuple[int, int], ...]  # first of each link's taxels, and one beyond the last
     tiles: Int[Tensor, "tile 3"]  # what `point_tiles` returns of them
@@ -99,7 +97,6 @@ def tile_size(taxels: Sequence[tuple[int, int]]) -> int:
 
 
 def _by_kernel(own: ObjectPoints) -> LinkPoints:
-    """One geom of the links after the other."""
     from tgdsl.quantities.depth_kernel import meet
 
     pairs, source = own
@@ -119,6 +116,7 @@ def are_grids(own: ObjectPoints) -> bool:
 
 
 LINK_POINTS = Operation("meet", link_points, _by_kernel, _inputs, are_grids)
+Array = TypeVar("Array")
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +125,6 @@ class Points(Request[dict[str, ObjectPoints]]):
 
     num_points: int = 5000  # points of each object
     range: float = 0.0  # distance from a link's surface up to which it is needed [m]
-
-
-Array = TypeVar("Array")
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +140,7 @@ class CloudPart(Generic[Array]):
 class MetObject(Generic[Array]):
     """An object of a use, and the links that may meet it."""
 
-    cloud: int  # number of its cloud
+    cloud: int
     links: tuple[int, ...]  # the links: indices into `PointsPart.links`
     taxels: tuple[tuple[int, int], ...]  # first of each link's taxels among the use's, and one beyond the last
     pair: Array  # index of the pair of each link and the object among all pairs, (link,)
@@ -171,27 +166,6 @@ class PointsPart(Generic[Array]):
     uses: tuple[PointsUse[Array], ...]  # the uses
 
 
-def _source(part: PointsPart[Tensor], met: MetObject[Tensor], scene: Scene) -> PointSource:
-    """Return the points of an object, and the links that they may meet."""
-    cloud = part.clouds[met.cloud]
-    target = scene.objects[cloud.object]
-    points, area, variant = cloud.points, cloud.area, variant_of(scene, target)
-    if variant is not None:
-        points, area = points[:, variant], area[variant]
-    assert part.surfaces is not None
-    places = vec(points[:, :, None].unbind())
-    links = link_geoms(part.surfaces, met.link)
-    return PointSource(target.name, met.pair, met.taxels, met.tiles, places, area[:, None], links)
-
-
-def _with_lost(pairs: Pairs) -> Pairs:
-    """Return pairs that are nowhere, their offset not-a-number, where their gate is not-a-number."""
-    if pairs.gate is None:
-        return pairs
-    lost = pairs.gate.clamp(min=0.0)  # zero where it is a number
-    return pairs._replace(offset=planes.vec(part + lost for part in pairs.offset))
-
-
 @dataclass(frozen=True, eq=False)
 class ReferencePoints:
     """Points sampled on one object, in the frame of one link that they may meet: a row of `points.LinkPoints` as arrays."""
@@ -211,22 +185,32 @@ class _Points(Quantity):
         """Return the part of the Plan; an object or a link without a surface is a mistake."""
         from tgdsl.quantities.bake import geom_table  # compilers alone bake meshes
 
-        clouds = _clouds(planning, uses)
-        links = _links(planning, uses)
-        numbers = {key: i for i, key in enumerate(clouds)}
+        clouds, links = _clouds(planning, uses), _links(planning, uses)
         return PointsPart(
             links=tuple(links),
             surfaces=geom_table(list(links.values())) if links else None,
             clouds=tuple(clouds.values()),
-            uses=tuple(_use(planning, use, numbers, list(links)) for use in uses),
+            uses=tuple(_use(planning, use, list(clouds), list(links)) for use in uses),
         )
 
     def gather(self, part: PointsPart[Tensor], scene: Scene) -> tuple[dict[str, ObjectPoints], ...]:
         results = []
         for use in part.uses:
-            pairs = _with_lost(pairs_for(scene, use.is_gated))
-            sources = [_source(part, met, scene) for met in use.objects]
-            results.append({source.object: ObjectPoints(pairs, source) for source in sources})
+            pairs, found = pairs_for(scene, use.is_gated), {}
+            if pairs.gate is not None:
+                lost = pairs.gate.clamp(min=0.0)  # zero where it is a number: else the points are nowhere
+                pairs = pairs._replace(offset=planes.vec(part + lost for part in pairs.offset))
+            for met in use.objects:
+                cloud = part.clouds[met.cloud]
+                target = scene.objects[cloud.object]
+                points, area, variant = cloud.points, cloud.area, variant_of(scene, target)
+                if variant is not None:
+                    points, area = points[:, variant], area[variant]
+                assert part.surfaces is not None
+                where, links = vec(points[:, :, None].unbind()), link_geoms(part.surfaces, met.link)
+                source = PointSource(target.name, met.pair, met.taxels, met.tiles, where, area[:, None], links)
+                found[target.name] = ObjectPoints(pairs, source)
+            results.append(found)
         return tuple(results)
 
     def reference(self, part: PointsPart[np.ndarray], use: int, scene: ReferenceScene) -> tuple[ReferencePoints, ...]:
@@ -271,34 +255,25 @@ class _Points(Quantity):
 POINTS = _Points()
 
 
-def _request(use: Use) -> Points:
-    assert isinstance(use.request, Points)
-    return use.request
-
-
 def _clouds(planning: Planning, uses: Sequence[Use]) -> dict[tuple[int, str], CloudPart[np.ndarray]]:
     """Return the points of all objects, by their number and the object."""
     result: dict[tuple[int, str], CloudPart[np.ndarray]] = {}
     for use in uses:
-        num_points = _request(use).num_points
+        num_points = use.request.num_points
         for i, name in enumerate(use.request.objects):
             number = planning.object_id(name)
             if (num_points, name) in result or number is None:
                 continue
             planning.progress(f"object {name}: points on its surface")
             try:
-                result[num_points, name] = cloud(planning.sensed[name], num_points, number)
+                result[num_points, name] = _cloud(planning.sensed[name], num_points, number)
             except LowerError as error:
                 planning.report(("sensors", use.sensors[0], "feels", i), error.what, error.hint)
     return result
 
 
-def cloud(sensed: SensedObject, num_points: int, number: int) -> CloudPart[np.ndarray]:
-    """Return the points of an object.
-
-    Raises:
-        LowerError: If it has no surface of a fixed size to sample ("feels").
-    """
+def _cloud(sensed: SensedObject, num_points: int, number: int) -> CloudPart[np.ndarray]:
+    """Return the points of an object; a LowerError says why it has no surface of a fixed size to sample."""
     from tgdsl.quantities.moment_fields import sample_points
 
     if sensed.is_sized:
@@ -306,9 +281,8 @@ def cloud(sensed: SensedObject, num_points: int, number: int) -> CloudPart[np.nd
         raise LowerError(problem, "feels", "use `variants` for the sizes that it has, or `anchors: taxels`")
     if any(geom.shape == "plane" for geoms in sensed.variants for geom in geoms):
         problem = f'body "{sensed.body}" has a plane, which has no end, so no points can be sampled on it'
-        raise LowerError(
-            problem, "feels", "use `anchors: taxels`, which take hold of any surface, or a box instead of the plane"
-        )
+        hint = "use `anchors: taxels`, which take hold of any surface, or a box instead of the plane"
+        raise LowerError(problem, "feels", hint)
     try:
         sampled = [sample_points(geoms, num_points) for geoms in sensed.variants]
     except BakeError as error:
@@ -331,7 +305,7 @@ def _links(planning: Planning, uses: Sequence[Use]) -> dict[str, list[Any]]:
                 users = [other for other in uses if link in other.links]
                 # Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
                 radii = [planning.layout.radius[other.taxels].max() for other in users]
-                margin = float(max([*radii, *(_request(other).range for other in users)]))
+                margin = float(max([*radii, *(other.request.range for other in users)]))
                 geoms = planning.geoms_of(link.name)
                 result[link.name] = [geom_distance(geom, LINKS, margin, f"link {link.name}") for geom in geoms]
             except BakeError as error:
@@ -340,19 +314,22 @@ def _links(planning: Planning, uses: Sequence[Use]) -> dict[str, list[Any]]:
     return result
 
 
-def _use(planning: Planning, use: Use, clouds: dict[tuple[int, str], int], links: Sequence[str]) -> PointsUse[np.ndarray]:
-    request, layout = _request(use), planning.layout.take(use.taxels)
-    active = [i for i in range(len(layout.links)) if (layout.radius[layout.link_id == i] > 0).any()]
-    allowed, result = planning.allowed(request), []
-    for name in request.objects:
-        rows = [i for i in active if Pair(layout.links[i].body, name) in allowed and layout.links[i].name in links]
-        number = clouds.get((request.num_points, name))
-        if not rows or number is None:
+def _use(planning: Planning, use: Use, clouds: list[tuple[int, str]], links: list[str]) -> PointsUse[np.ndarray]:
+    layout, allowed, result = planning.layout.take(use.taxels), planning.allowed(use.request), []
+    for name in use.request.objects:
+        rows = [
+            (link, places)
+            for i, link in enumerate(layout.links)
+            if (layout.radius[places := np.flatnonzero(layout.link_id == i)] > 0).any()
+            and Pair(link.body, name) in allowed
+            and link.name in links
+        ]
+        if not rows or (use.request.num_points, name) not in clouds:
             continue
-        pair = [planning.pairs.index(Pair(layout.links[i].body, name)) for i in rows]
-        places = [np.flatnonzero(layout.link_id == i) for i in rows]
-        taxels = tuple((int(part[0]), int(part[-1]) + 1) for part in places)
-        met = tuple(links.index(layout.links[i].name) for i in rows)
+        pair = [planning.pairs.index(Pair(link.body, name)) for link, _ in rows]
+        taxels = tuple((int(places[0]), int(places[-1]) + 1) for _, places in rows)
+        met = tuple(links.index(link.name) for link, _ in rows)
         tiles = np.array(point_tiles(taxels, len(use.taxels)), dtype=np.int32).reshape(-1, 3)
+        number = clouds.index((use.request.num_points, name))
         result.append(MetObject(number, met, taxels, np.array(pair), np.array(met), tiles))
-    return PointsUse(request.is_gated, tuple(result))
+    return PointsUse(use.request.is_gated, tuple(result))
