@@ -28,8 +28,7 @@ from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.sensed import SensedObject
 
 Value = TypeVar("Value")
-Report = Callable[[tuple[str | int, ...], str, str], None]
-"""Notes a mistake: its place in the document, the problem, and a hint."""
+Report = Callable[[tuple[str | int, ...], str, str], None]  # notes a mistake: its place in the document, the problem, a hint
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +37,8 @@ class Request(Generic[Value]):
 
     objects: tuple[str, ...] = ()  #: objects that it concerns; empty where a request has nothing to do with objects
     is_gated: bool = False  #: whether an object counts only while the simulator has it in contact with the link
-    wants_contacts: ClassVar[bool] = False
-    """Whether the contacts of each link with the objects are read from the state."""
-    is_within_radii: ClassVar[bool] = False
-    """Whether it depends on the taxels' radii, which noise may disturb."""
+    wants_contacts: ClassVar[bool] = False  #: whether the contacts of each link with the objects are read from the state
+    is_within_radii: ClassVar[bool] = False  #: whether it depends on the taxels' radii, which noise may disturb
 
     @property
     def num_slots(self) -> int:
@@ -74,7 +71,7 @@ class Request(Generic[Value]):
 class Use:
     """A request and its taxels, shared by all sensors with equal requests."""
 
-    request: Any  #: the request
+    request: Any  #: a `Request`
     sensors: tuple[str, ...]  #: the sensors, by their names in the document
     links: tuple[Link, ...]  #: the links that carry them
     taxels: Int[np.ndarray, " taxel"]  #: their taxels, rows of the layout

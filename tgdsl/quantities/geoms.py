@@ -70,7 +70,12 @@ def union_distance(point: Vec, frames: Sequence[Frame | None], geoms: Geoms) -> 
 
     `frames` say how each geom sees the points; None: they are in its frame already.
     """
-    return united((_in_frame(point, frame, geoms, g) for g, frame in enumerate(frames)), geoms.is_absent)
+    found = []
+    for g, frame in enumerate(frames):
+        here = point if frame is None else planes.add(planes.rotate(frame.rotation, point), frame.offset)
+        distance, gradient = _to_geom(here, geoms, g)
+        found.append((distance, gradient if frame is None else planes.rotate_back(frame.rotation, gradient)))
+    return united(found, geoms.is_absent)
 
 
 def united(geoms: Iterable[tuple[Tensor, Vec]], is_absent: Bool[Tensor, "case geom"] | None) -> tuple[Tensor, Vec]:
@@ -86,14 +91,6 @@ def united(geoms: Iterable[tuple[Tensor, Vec]], is_absent: Bool[Tensor, "case ge
             least = torch.minimum(least, distance)
     assert least is not None and outward is not None
     return least, outward
-
-
-def _in_frame(point: Vec, frame: Frame | None, geoms: Geoms, g: int) -> tuple[Tensor, Vec]:
-    """Return signed distance [m] of points to a geom that sees them as a frame says, and its gradient in the points' frame."""
-    if frame is None:
-        return _to_geom(point, geoms, g)
-    distance, gradient = _to_geom(planes.add(planes.rotate(frame.rotation, point), frame.offset), geoms, g)
-    return distance, planes.rotate_back(frame.rotation, gradient)
 
 
 def _to_geom(point: Vec, geoms: Geoms, g: int) -> tuple[Tensor, Vec]:
@@ -184,23 +181,11 @@ def account_of_geoms(table: GeomTable[np.ndarray], names: Sequence[str]) -> list
 
 def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -> Geoms:
     """Return an object's geoms as each environment has them: its variant, its size. What none of them has may be left out."""
-    variant = variant_of(scene, target)
-    size, is_absent = _chosen(table.size, variant), None
-    if variant is not None and table.is_absent is not None:
-        is_absent = _chosen(table.is_absent, variant) > 0
+    geoms = geoms_of_cases(table, variant_of(scene, target))
+    size, is_absent = geoms.size, geoms.is_absent
     if target.is_sized:
         sizes = scene.tensors["object_size"][:, target.varied, None].to(size.dtype).expand(-1, size.shape[1], -1)
-        size = sizes if is_absent is None else torch.where(is_absent[..., None], size, sizes)
-    geoms = Geoms(
-        shapes=table.shapes,
-        is_centred=table.is_centred,
-        size=size,
-        pos=_chosen(table.pos, variant),
-        rotation=_chosen(table.rotation, variant),
-        is_absent=is_absent,
-        variant=variant,
-        surfaces=tuple(_surface(surface, variant) for surface in table.surfaces),
-    )
+        geoms = geoms._replace(size=sizes if is_absent is None else torch.where(is_absent[..., None], size, sizes))
     return geoms if is_absent is None or not is_cheap_to_read(is_absent) else _had_by_some(geoms, is_absent)
 
 
@@ -216,35 +201,25 @@ def _had_by_some(geoms: Geoms, is_absent: Bool[Tensor, "env geom"]) -> Geoms:
     )
 
 
-def link_geoms(table: GeomTable[Tensor], links: Tensor) -> Geoms:
-    """Return the own geoms of some links: each is a case."""
-    return Geoms(
-        shapes=table.shapes,
-        is_centred=table.is_centred,
-        size=table.size[links],
-        pos=table.pos[links],
-        rotation=table.rotation[links],
-        is_absent=None if table.is_absent is None else table.is_absent[links] > 0,
-        variant=links,
-        surfaces=tuple(_surface(surface, links) for surface in table.surfaces),
-    )
+def geoms_of_cases(table: GeomTable[Tensor], case: Tensor | None) -> Geoms:
+    """Return the geoms of some cases: of links, or of the variant that each environment has; None: of the only one."""
+    size, pos, rotation = (part if case is None else part[case] for part in (table.size, table.pos, table.rotation))
+    is_absent = None if case is None or table.is_absent is None else table.is_absent[case] > 0
+    surfaces = tuple(_surface(surface, case) for surface in table.surfaces)
+    return Geoms(table.shapes, table.is_centred, size, pos, rotation, is_absent, case, surfaces)
 
 
 def _surface(
-    table: GridTable[Tensor] | TriangleTable | RaycastSurface | None, variant: Tensor | None
+    table: GridTable[Tensor] | TriangleTable | RaycastSurface | None, case: Tensor | None
 ) -> Grid | RaycastSurface | None:
     if isinstance(table, TriangleTable):
         return table.prepared
     if not isinstance(table, GridTable):
         return table
-    if variant is None:
+    if case is None:
         return Grid(table.values, 0, table.counts, split(table.origin[:, None]), table.cell[:, None])
-    origin, cell, num = table.origin[variant], table.cell[variant], table.num[variant]
-    return Grid(table.values, table.first[variant][:, None], split(num[:, None]), split(origin[:, None]), cell[:, None])
-
-
-def _chosen(array: Tensor, variant: Tensor | None) -> Tensor:
-    return array if variant is None else array[variant]
+    num, origin = (split(part[case][:, None]) for part in (table.num, table.origin))
+    return Grid(table.values, table.first[case][:, None], num, origin, table.cell[case][:, None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,7 +109,6 @@ class _Places(Quantity):
         body_of = {target.name: target.body for target in planning.objects}
         planned = []
         for request in (use.request for use in uses):
-            assert isinstance(request, Places)
             names = request.bodies or tuple(body_of[name] for name in request.objects if name in body_of)
             bodies = np.array([planning.bodies.index(body) for body in names], dtype=np.int64)
             offset = request.offset if request.bodies else np.zeros((len(names), 3))
@@ -126,7 +125,6 @@ class _Places(Quantity):
         return {"body_pos", "body_quat"}
 
     def bodies(self, use: Use) -> tuple[str, ...]:
-        assert isinstance(use.request, Places)
         return use.request.bodies
 
     def explain(self, part: PlacesPart, use: int, objects: Sequence[PairedObject]) -> list[str]:

@@ -84,18 +84,8 @@ def relate(
 ) -> Pairs:
     """Form the relative poses and motions of all pairs in the dtype of the state, then cast them.
 
-    Args:
-        pos: World positions of the bodies' frames [m].
-        quat: World orientations, w, x, y, z.
-        link: Body index of each pair's link.
-        target: Body index of each pair's object.
-        dtype: Dtype of the result.
-        linvel: World velocities of the bodies' frame origins [m/s], if motion is wanted.
-        angvel: World angular velocities [rad/s], if motion is wanted.
-        gate: 0 where a pair counts, −∞ where it does not; None if nothing is gated.
-
-    Returns:
-        The pairs, in `dtype`.
+    `link` and `target` are indices of bodies; `gate` is 0 where a pair counts, −∞ where it does not, None if nothing
+    is gated; the velocities of the bodies' frames [m/s, rad/s] are given if motion is wanted. All in world axes.
     """
     velocities = () if linvel is None or angvel is None else (linvel, angvel)
     fields = (quat, pos, *velocities)

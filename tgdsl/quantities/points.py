@@ -20,7 +20,16 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec, vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use, pairs_for, variant_of
-from tgdsl.quantities.geoms import Geoms, GeomTable, account_of_geoms, body_distance, distance_to, geoms_of, link_geoms, united
+from tgdsl.quantities.geoms import (
+    Geoms,
+    GeomTable,
+    account_of_geoms,
+    body_distance,
+    distance_to,
+    geoms_of,
+    geoms_of_cases,
+    united,
+)
 from tgdsl.quantities.pairs import Pair, PairedObject, Pairs
 from tgdsl.quantities.reference import ReferenceScene
 from tgdsl.surfaces.sensed import DistanceOptions, SensedObject
@@ -207,7 +216,7 @@ class _Points(Quantity):
                 if variant is not None:
                     points, area = points[:, variant], area[variant]
                 assert part.surfaces is not None
-                where, links = vec(points[:, :, None].unbind()), link_geoms(part.surfaces, met.link)
+                where, links = vec(points[:, :, None].unbind()), geoms_of_cases(part.surfaces, met.link)
                 source = PointSource(target.name, met.pair, met.taxels, met.tiles, where, area[:, None], links)
                 found[target.name] = ObjectPoints(pairs, source)
             results.append(found)
