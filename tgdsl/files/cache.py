@@ -7,6 +7,7 @@ whole, whoever has one open reads it to its end, and all evict files in the same
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import os
 import re
@@ -16,7 +17,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 import numpy as np
 
@@ -115,3 +116,34 @@ def cached(
         np.savez(out, allow_pickle=False, **pack(value))
     evict(limit)
     return value
+
+
+def cached_record(key: str, make: Callable[[], T], kind: type[T]) -> T:
+    """Return a dataclass that a cache file holds, or else make it and write one; see `cached`.
+
+    Its fields are arrays of finite numbers, numbers, texts, tuples of these, and dataclasses of numbers or None.
+    """
+
+    def unpack(found: Mapping[str, np.ndarray]) -> T:
+        values: dict[str, Any] = {}
+        for name, hint in get_type_hints(kind).items():
+            value = found[name]
+            if dataclasses.is_dataclass(hint):
+                numbers = zip(dataclasses.fields(hint), value.tolist(), strict=True)
+                values[name] = hint(*(None if n != n else int(n) if field.type == "int" else n for field, n in numbers))
+            elif value.ndim == 0 or get_origin(hint) is tuple:
+                values[name] = value.item() if value.ndim == 0 else tuple(value.tolist())
+            elif np.isfinite(value).all():
+                values[name] = value
+            else:
+                raise ValueError("a damaged file")
+        return kind(**values)
+
+    def pack(record: Any) -> dict[str, np.ndarray]:
+        values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+        return {
+            name: np.array(dataclasses.astuple(value), float) if dataclasses.is_dataclass(value) else np.asarray(value)  # type: ignore[arg-type]
+            for name, value in values.items()
+        }
+
+    return cached(key, make, pack, unpack)

@@ -81,28 +81,8 @@ def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int =
         raise BakeError("a surface to bake needs faces, finite vertices, and a margin and a tolerance above 0")
     limits = np.array([margin, tolerance, budget], float)
     arrays = [limits, np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)]
-
-    def make() -> Baked:
-        return _bake(Solid(surface), margin, tolerance, budget)
-
-    return cache.cached(cache.digest(FORMAT, arrays), make, _packed, _unpacked)
-
-
-def _packed(baked: Baked) -> dict[str, np.ndarray]:
-    fields = {
-        field.name: np.asarray(getattr(baked, field.name)) for field in dataclasses.fields(baked) if field.name != "errors"
-    }
-    return fields | {"errors": np.array(dataclasses.astuple(baked.errors), float)}
-
-
-def _unpacked(found: Mapping[str, np.ndarray]) -> Baked:
-    count, *errors = found["errors"].tolist()
-    errors[4] = int(errors[4])
-    values, method = found["values"], str(found["method"])
-    if values.dtype != np.float32 or not np.isfinite(values).all() or method not in METHODS:
-        raise ValueError("a damaged grid")
-    report, cell = Errors(int(count), *errors), float(found["cell"])
-    return Baked(values, found["origin"], cell, method, report, tuple(found["flaws"].tolist()))
+    key = cache.digest(FORMAT, arrays)
+    return cache.cached_record(key, lambda: _bake(Solid(surface), margin, tolerance, budget), Baked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,18 +157,14 @@ def _errors(points: _Points, values: np.ndarray, lattice: Lattice, method: str, 
     angle = np.arccos(np.clip(cosine[~is_edge & points.gradient.any(axis=1)], -1, 1))
     return Errors(
         count=len(away),
-        p99=_percentile(away, percentile),
+        p99=float(np.percentile(away, percentile)) if len(away) else 0.0,
         max=float(away.max(initial=0)),
         rms=float(np.sqrt(np.mean(away**2))) if len(away) else 0.0,
-        angle_p99=_percentile(angle, percentile),
+        angle_p99=float(np.percentile(angle, percentile)) if len(angle) else 0.0,
         edge_count=len(near),
-        edge_p99=_percentile(near, percentile),
+        edge_p99=float(np.percentile(near, percentile)) if len(near) else 0.0,
         edge_max=float(near.max(initial=0)),
     )
-
-
-def _percentile(values: np.ndarray, percentile: float) -> float:
-    return float(np.percentile(values, percentile)) if len(values) else 0.0
 
 
 OUTER_FORMAT = b"tgdsl outer surface 1"
@@ -214,15 +190,19 @@ def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, na
         return GeomDistance(felt, felt.shape, {}, {})
     _warn_of_hull(felt, margin, name)
     if options.query == "raycast":
-        triangles = _outer(felt.surface)
-        _warn_of_flaws(triangles.flaws, felt, name)
-        arrays = {"vertices": triangles.vertices, "faces": triangles.faces, "max_distance": np.asarray(2.0 * margin)}
-        return GeomDistance(felt, "raycast", arrays, {})
-    baked = bake(felt.surface, margin, options.tolerance, options.max_bytes)
-    _warn_of_flaws(baked.flaws, felt, name)
-    arrays = {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell)}
-    accuracy = {key: float(value) for key, value in dataclasses.asdict(baked.errors).items()}
-    return GeomDistance(felt, baked.method, arrays, {**accuracy, "tolerance": options.tolerance, "cell": baked.cell})
+        mesh = np.asarray(felt.surface.vertices, np.float64), np.asarray(felt.surface.faces, np.int64)
+        made = cache.cached_record(cache.digest(OUTER_FORMAT, mesh), lambda: outer(felt.surface), Outer)
+        arrays = {"vertices": made.vertices, "faces": made.faces, "max_distance": np.asarray(2.0 * margin)}
+        found = GeomDistance(felt, "raycast", arrays, {})
+    else:
+        made = bake(felt.surface, margin, options.tolerance, options.max_bytes)
+        arrays = {"values": made.values, "origin": made.origin, "cell": np.asarray(made.cell)}
+        accuracy = {key: float(value) for key, value in dataclasses.asdict(made.errors).items()}
+        limits = {"tolerance": options.tolerance, "cell": made.cell}
+        found = GeomDistance(felt, made.method, arrays, {**accuracy, **limits})
+    for flaw in made.flaws:
+        warnings.warn(f"{name}: {felt.geom.shown} {flaw}", stacklevel=2)
+    return found
 
 
 def geom_table(cases: Sequence[Sequence[GeomDistance]]) -> GeomTable[np.ndarray]:
@@ -247,9 +227,6 @@ def geom_table(cases: Sequence[Sequence[GeomDistance]]) -> GeomTable[np.ndarray]
 
 def aligned(rows: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], list[list[int | None]]]:
     """Give the members of several rows common columns, each for one kind, the order within each row kept.
-
-    Args:
-        rows: The kinds of each row's members.
 
     Returns:
         The kind of each column; and for each row the index of its member in each column, None where it has none.
@@ -292,22 +269,6 @@ def _surface(column: Sequence[GeomDistance | None]) -> GridTable[np.ndarray] | T
         cell=np.array([grid["cell"] for grid in owned]),
         counts=(x, y, z),
     )
-
-
-def _outer(surface: Surface) -> Outer:
-    """Return the outer surface of a mesh, cached on disk."""
-
-    def unpacked(found: Mapping[str, np.ndarray]) -> Outer:
-        return Outer(found["vertices"], found["faces"], found["uncut"], tuple(found["flaws"].tolist()))
-
-    arrays = [np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)]
-    key = cache.digest(OUTER_FORMAT, arrays)
-    return cache.cached(key, lambda: outer(surface), lambda made: {k: np.asarray(v) for k, v in vars(made).items()}, unpacked)
-
-
-def _warn_of_flaws(flaws: Sequence[str], felt: SurfaceGeom, name: str) -> None:
-    for flaw in flaws:
-        warnings.warn(f"{name}: {felt.geom.shown} {flaw}", stacklevel=3)
 
 
 def _warn_of_hull(felt: SurfaceGeom, margin: float, name: str) -> None:

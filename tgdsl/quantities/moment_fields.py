@@ -13,7 +13,7 @@ Shapes: `n` points, `x`, `y`, `z` nodes along the axes.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -111,11 +111,10 @@ def bake_field(
         raise BakeError(
             f"a field of moments needs a radius above 0 and a tolerance between 0 and 1, found {radius}, {tolerance}"
         )
-    return cache.cached(
+    return cache.cached_record(
         moments_key(geoms, b"field", radius, tolerance, gradient_tolerance or 0.0, budget, float(with_slope)),
         lambda: _bake(geoms, radius, Limits(tolerance, gradient_tolerance, budget), with_slope),
-        _packed,
-        _unpacked,
+        BakedField,
     )
 
 
@@ -126,20 +125,6 @@ def moments_key(geoms: Sequence[SurfaceGeom], what: bytes, *limits: float | int)
         arrays += [np.frombuffer(felt.shape.encode(), np.uint8), felt.geom.size, felt.geom.pos, felt.geom.rotation]
         arrays += [] if felt.surface is None else [felt.surface.vertices, felt.surface.faces]
     return cache.digest(FORMAT + what, arrays)
-
-
-def _packed(baked: BakedField) -> dict[str, np.ndarray]:
-    errors = np.array(dataclasses.astuple(baked.errors), float)
-    return {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell), "errors": errors}
-
-
-def _unpacked(found: Mapping[str, np.ndarray]) -> BakedField:
-    values = found["values"]
-    if values.dtype != np.float32 or values.ndim != 4 or not np.isfinite(values).all():
-        raise ValueError("a damaged field")
-    always, measured = np.split(found["errors"], [4])
-    errors = FieldErrors(*always.tolist(), *(None if np.isnan(error) else error for error in measured.tolist()))
-    return BakedField(values, found["origin"], float(found["cell"]), errors)
 
 
 class Limits(NamedTuple):
@@ -355,11 +340,7 @@ def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.nd
     """Return points drawn alike from all of an object's outer surface [m], always the same ones, and its whole area [m²].
 
     Points that are near each other mostly follow each other, so that those in contact are in few runs. Kept in the user's cache
-    folder.
-
-    Args:
-        geoms: The geoms of one variant of an object, none of them a plane.
-        count: Number of points.
+    folder; none of the geoms is a plane.
     """
 
     def make() -> tuple[np.ndarray, float]:
@@ -379,30 +360,12 @@ def sample_cloud(
 ) -> Cloud:
     """Return points drawn alike from all of an object's outer surface (the paper's backend), always the same ones.
 
-    Kept in the user's cache folder. The cubes of the lattice are as small as the budget allows, half the radius at least: the
-    smaller, the shorter the lists that are gone through.
-
-    Args:
-        geoms: The geoms of one variant of an object.
-        radius: Largest sensing radius [m].
-        count: Number of points.
-        budget: Largest size of the lists [bytes].
-        radius_noise: By how much probes may reach farther [m]; the points are the same with and without.
+    Kept in the cache folder. The cubes of the lattice are as small as the budget [bytes] allows, half the largest sensing
+    radius [m] at least: the smaller, the shorter the lists. `radius_noise` is by how much probes may reach
+    farther [m]; the points are the same with and without.
     """
-    return cache.cached(
-        moments_key(geoms, b"cloud", radius, count, budget, radius_noise),
-        lambda: _sample(geoms, radius, count, budget, radius_noise),
-        lambda cloud: {field.name: np.asarray(getattr(cloud, field.name)) for field in dataclasses.fields(cloud)},
-        _unpacked_cloud,
-    )
-
-
-def _unpacked_cloud(found: Mapping[str, np.ndarray]) -> Cloud:
-    x, y, z = found["num"].tolist()
-    points, lists = found["points"], found["lists"]
-    if len(lists) != x * y * z or not np.isfinite(points).all():
-        raise ValueError("a damaged cloud")
-    return Cloud(points, float(found["weight"]), lists, (x, y, z), found["origin"], float(found["cell"]))
+    key = moments_key(geoms, b"cloud", radius, count, budget, radius_noise)
+    return cache.cached_record(key, lambda: _sample(geoms, radius, count, budget, radius_noise), Cloud)
 
 
 def _sample(geoms: Sequence[SurfaceGeom], radius: float, count: int, budget: int, radius_noise: float) -> Cloud:
