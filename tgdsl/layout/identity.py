@@ -67,12 +67,7 @@ def columns_of(layout: Layout) -> dict[str, np.ndarray]:
 
 
 def check_same_rows(here: Columns, there: Columns, what: str) -> None:
-    """Refuse tables of which some row is another one.
-
-    Args:
-        here: The table that is in use.
-        there: The one that is expected.
-        what: Whose tables they are, as the message begins.
+    """Refuse a table that is in use, `here`, if some row is not that of the expected one, `there`.
 
     Raises:
         TaxelError: How they differ: how many rows, and the first one that does, here and there.

@@ -212,7 +212,7 @@ def _around(pieces: Pieces, radius: float, count: int, seed: int) -> Float[np.nd
     rng = np.random.default_rng(seed)
     way = rng.normal(size=(count, 3))
     way *= radius * np.cbrt(rng.uniform(size=(count, 1))) / np.linalg.norm(way, axis=1, keepdims=True)
-    return pieces.random(count, seed).pos + way
+    return pieces.random(count, seed) + way
 
 
 def _lattice(pos: Float[np.ndarray, "m 3"], radius: float, cell: float) -> tuple[np.ndarray, tuple[int, int, int]]:
@@ -345,7 +345,7 @@ def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.nd
 
     def make() -> tuple[np.ndarray, float]:
         pieces = outer_surface(geoms, spacing_of(geoms))
-        return pieces.random_by_side(count, seed=0).pos, surface_area(geoms)
+        return pieces.random_by_side(count, seed=0), surface_area(geoms)
 
     return cache.cached(
         moments_key(geoms, b"points side by side", spacing_of(geoms), count),
@@ -372,7 +372,7 @@ def _sample(geoms: Sequence[SurfaceGeom], radius: float, count: int, budget: int
     pieces = outer_surface(geoms, radius / 4)
     if not len(pieces.area):
         raise BakeError("there is no surface to sample: planes are exact")
-    points, weight = pieces.random(count, seed=0).pos, surface_area(geoms) / count
+    points, weight = pieces.random(count, seed=0), surface_area(geoms) / count
     needed, reach = 0, radius + radius_noise
     for share in (0.5, 1.0, 2.0):
         cell = share * radius

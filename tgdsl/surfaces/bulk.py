@@ -5,10 +5,9 @@ Shapes: `n` geoms.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, pi
-from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
@@ -38,10 +37,9 @@ class Bulk:
 
 
 def bulk(geoms: Sequence[SurfaceGeom]) -> Bulk:
-    """Return volume, area, box and curvature of a body's geoms; a hull stands for its mesh, whose holes are closed.
+    """Return volume, area, box and curvature of a body's geoms, at least one; a plane is a half-space of infinite volume.
 
-    Args:
-        geoms: At least one; a plane is a half-space, whose volume is infinite.
+    A hull stands for its mesh, whose holes are closed.
     """
     each = [_of_mesh(geom) if geom.shape == "mesh" else _of_primitive(geom.geom) for geom in geoms]
     area = sum(one.area for one in each)
@@ -56,8 +54,38 @@ def bulk(geoms: Sequence[SurfaceGeom]) -> Bulk:
 
 def _of_primitive(geom: Geom) -> Bulk:
     a, b, c = geom.size.tolist()
-    volume, area, curvature, half = PRIMITIVES[geom.shape](a, b, c, geom.rotation)
-    return Bulk(volume, area, geom.pos - half, geom.pos + half, curvature)
+    x, y, z = np.abs(geom.rotation).T
+    match geom.shape:
+        case "plane":  # of its surface, most of which is of no interest, nothing counts
+            return Bulk(inf, 0.0, np.full(3, -inf), np.full(3, inf), 0.0)
+        case "sphere":
+            volume, curvature, half = 4 / 3 * pi * a**3, 1 / a, np.full(3, a)
+        case "capsule":
+            volume, curvature, half = 2 * pi * a**2 * b + 4 / 3 * pi * a**3, 1 / (2 * a), z * b + a
+        case "cylinder":
+            volume, curvature, half = 2 * pi * a**2 * b, 1 / (2 * a), z * b + a * np.hypot(x, y)
+        case "ellipsoid":
+            volume, curvature = 4 / 3 * pi * a * b * c, (a * b * c) ** (-1 / 3)
+            half = np.linalg.norm(geom.rotation * [a, b, c], axis=1)
+        case _:
+            volume, curvature, half = 8 * a * b * c, 0.0, np.abs(geom.rotation) @ [a, b, c]
+    return Bulk(volume, primitive_area(geom.shape, geom.size), geom.pos - half, geom.pos + half, curvature)
+
+
+def primitive_area(shape: str, size: Float[np.ndarray, " 3"]) -> float:
+    """Return the area of a primitive of a size as in MuJoCo [m²]; of an ellipsoid by Carlson's integral R_G (DLMF 19.33.2)."""
+    a, b, c = map(float, size)
+    match shape:
+        case "box":
+            return 8.0 * (a * b + b * c + c * a)
+        case "sphere":
+            return 4.0 * pi * a**2
+        case "capsule":
+            return 4.0 * pi * a * (a + b)
+        case "cylinder":
+            return 2.0 * pi * a * (a + 2.0 * b)
+        case _:
+            return float(4.0 * pi * elliprg((a * b) ** 2, (b * c) ** 2, (c * a) ** 2))
 
 
 def _of_mesh(mesh_geom: SurfaceGeom) -> Bulk:
@@ -75,43 +103,3 @@ def _enclosed(surface: Surface) -> tuple[float, float]:
     a, b, c = (vertices - vertices.mean(axis=0))[np.concatenate([faces, caps])].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     return abs(float((a * normals).sum())) / 6.0, float(np.linalg.norm(normals, axis=1).sum()) / 2.0
-
-
-Measured = tuple[float, float, float, Float[np.ndarray, " 3"]]
-"""Volume [m³], area [m²], curvature [1/m], and half-lengths of the bounding box in the body's frame [m]."""
-Measure = Callable[[float, float, float, Float[np.ndarray, "3 3"]], Measured]
-"""Called with a primitive's size as MuJoCo defines it [m], and the rotation of its frame into the body's."""
-
-
-def _sphere(r: float, _h: float, _c: float, _rotation: np.ndarray) -> Measured:
-    return 4 / 3 * pi * r**3, 4 * pi * r**2, 1 / r, np.full(3, r)
-
-
-def _capsule(r: float, h: float, _c: float, rotation: np.ndarray) -> Measured:
-    volume, area = 2 * pi * r**2 * h + 4 / 3 * pi * r**3, 4 * pi * r * (h + r)
-    return volume, area, 1 / (2 * r), np.abs(rotation[:, 2]) * h + r
-
-
-def _cylinder(r: float, h: float, _c: float, rotation: np.ndarray) -> Measured:
-    half = np.abs(rotation[:, 2]) * h + r * np.hypot(rotation[:, 0], rotation[:, 1])
-    return 2 * pi * r**2 * h, 2 * pi * r * (2 * h + r), 1 / (2 * r), half
-
-
-def _ellipsoid(a: float, b: float, c: float, rotation: np.ndarray) -> Measured:
-    volume = 4 / 3 * pi * a * b * c
-    area = 3 * volume * float(elliprg(a**-2, b**-2, c**-2))
-    return volume, area, (a * b * c) ** (-1 / 3), np.linalg.norm(rotation * [a, b, c], axis=1)
-
-
-def _box(x: float, y: float, z: float, rotation: np.ndarray) -> Measured:
-    return 8 * x * y * z, 8 * (x * y + y * z + z * x), 0.0, np.abs(rotation) @ [x, y, z]
-
-
-def _plane(_x: float, _y: float, _z: float, _rotation: np.ndarray) -> Measured:
-    return inf, 0.0, 0.0, np.full(3, inf)
-
-
-PRIMITIVES: Mapping[str, Measure] = MappingProxyType(
-    {"plane": _plane, "sphere": _sphere, "capsule": _capsule, "cylinder": _cylinder, "ellipsoid": _ellipsoid, "box": _box}
-)
-"""Primitives, by MuJoCo's name."""

@@ -30,12 +30,9 @@ class Crossings:
 
 
 def crossings(corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 3"], tolerance: float) -> Crossings:
-    """Return how faces meet, if there are no more than `MAX_PAIRS` and `MAX_SEGMENTS`.
+    """Return how faces of these corners [m] and unit normals meet, if they do not meet too often.
 
-    Args:
-        corners: Their corners [m].
-        normal: Unit normal of each face.
-        tolerance: Distance at which faces touch [m].
+    Faces touch at a distance of `tolerance` [m].
     """
     edges = np.roll(corners, -1, axis=1) - corners
     edges /= np.linalg.norm(edges, axis=2, keepdims=True)

@@ -79,9 +79,6 @@ def outer_shell(surface: Surface) -> Shell:
 
     Closed components that are inside out are turned, so that all face outward.
 
-    Args:
-        surface: The link's triangles, in the body frame.
-
     Raises:
         ImportError: If pymeshlab is not installed.
     """
@@ -131,12 +128,7 @@ def _clean(surface: Surface) -> Surface:
 def stratified_points(
     corners: Float[np.ndarray, "piece 3 3"], num: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Return about `num` points that are spread evenly over triangles, and the triangle of each; without random numbers.
-
-    Args:
-        corners: The triangles.
-        num: Number of points wanted.
-    """
+    """Return about `num` points that are spread evenly over triangles, and the triangle of each; without random numbers."""
     import igl
     import pymeshlab as untyped
 

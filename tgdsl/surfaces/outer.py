@@ -22,7 +22,7 @@ from tgdsl.errors import BakeError
 from tgdsl.surfaces.crossings import Crossings, cells, crossings
 from tgdsl.surfaces.holes import merged
 from tgdsl.surfaces.parts import outward
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, face_cross
 
 TOUCH = 1e-6  # distance at which faces touch, over the mesh's size: MuJoCo has its vertices in float32
 STEP = 1e-5  # distance in front of and behind a face at which one looks whether it is inside, over the mesh's size
@@ -61,7 +61,7 @@ def outer(surface: Surface) -> Outer:
     vertices, caps = parts.vertices, parts.caps[_has_area(parts.vertices[parts.caps])]
     closed = np.concatenate([parts.faces, caps])
     corners, size = vertices[closed], float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = face_cross(corners)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     crossed = crossings(corners, normal, TOUCH * size)
     cells = _cells(corners, crossed, TOUCH * size)

@@ -36,12 +36,8 @@ class Parts:
 def outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], written: Int[np.ndarray, "f 3"]) -> Parts:
     """Return a surface with its parts wound outwards: those within a larger part as it is wound, or opposite, as they were.
 
-    So an inner shell that is wound against the shell around it remains a cavity, if both are inside out too.
-
-    Args:
-        vertices: Distinct positions [m].
-        faces: Their indices.
-        written: The same faces as the file has them, where several vertices may be in one place.
+    So an inner shell that is wound against the shell around it remains a cavity, if both are inside out too. `faces` are of
+    distinct vertices, `written` the same faces as the file has them, where several vertices may be in one place.
     """
     part, is_turned, is_orientable = _coherent(vertices, faces, *_neighbours(vertices, faces, written))
     faces = np.where(is_turned[:, None], faces[:, ::-1], faces)

@@ -18,12 +18,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
-from scipy.special import elliprg
 
 from tgdsl.geometry.planes import vec
 from tgdsl.geometry.shapes import SHAPES
+from tgdsl.surfaces.bulk import primitive_area
 from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.solid import Solid
+from tgdsl.surfaces.surface import face_areas, face_cross
 
 SECTIONS = 128  # least number of sides of what stands for a circle before its points are moved onto the true surface
 CUT = 16.0  # how many times finer than the spacing triangles are where another geom's surface cuts them
@@ -63,11 +64,11 @@ class Pieces:
         pos = np.stack([np.bincount(which, self.area * part) for part in self.pos.T], axis=1)
         return Quadrature(pos / area[:, None], area)
 
-    def random(self, count: int, seed: int) -> Quadrature:
-        """Return points drawn alike from all of the surface, each standing for the same area."""
-        return Quadrature(self._drawn(count, seed)[0], np.full(count, self.area.sum() / count))
+    def random(self, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
+        """Return points drawn alike from all of the surface [m]."""
+        return self._drawn(count, seed)[0]
 
-    def random_by_side(self, count: int, seed: int) -> Quadrature:
+    def random_by_side(self, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
         """Return the points of `random` in an order in which neighbours are mostly near: side by side, each along a curve.
 
         The six sides are what faces along one of the axes more than along the others; on each, points follow a Morton curve.
@@ -76,7 +77,7 @@ class Pieces:
         normal = self.normal[piece]
         axis = np.abs(normal).argmax(axis=1)
         faces_up = normal[np.arange(count), axis] > 0
-        return Quadrature(pos[np.lexsort((_morton(pos), faces_up, axis))], np.full(count, self.area.sum() / count))
+        return pos[np.lexsort((_morton(pos), faces_up, axis))]
 
     def _drawn(self, count: int, seed: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
         """Return random points, and the piece that each is from."""
@@ -88,18 +89,14 @@ class Pieces:
 
 
 def outer_surface(geoms: Sequence[SurfaceGeom], spacing: float) -> Pieces:
-    """Return the outer surface of an object's geoms, planes left out, in pieces not longer than a spacing.
-
-    Args:
-        geoms: The geoms of one variant.
-        spacing: Longest side of a piece [m].
+    """Return the outer surface of an object's geoms, planes left out, in pieces not longer than a spacing [m].
 
     Raises:
         BakeError: If a mesh has no face with an area.
     """
     solids = [_Geom.of(felt, spacing) for felt in geoms if felt.shape != "plane"]
-    empty = np.zeros((0, 3))
-    parts = [(np.zeros((0, 3, 3)), empty, empty, np.zeros(0)), *(_outer(i, solids, spacing) for i in range(len(solids)))]
+    parts = [tuple(np.zeros((0, *rest)) for rest in ((3, 3), (3,), (3,), ()))]
+    parts += [_outer(i, solids, spacing) for i in range(len(solids))]
     return Pieces(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -140,11 +137,8 @@ class _Geom:
                 value, gradient = planes[0].numpy(), torch.stack(planes[1], dim=1).numpy()
             return value, gradient @ geom.rotation.T
 
-        stretch = 1.0 if solid is not None else primitive_area(felt.shape, geom.size) / _areas(corners).sum()
+        stretch = 1.0 if solid is not None else primitive_area(felt.shape, geom.size) / face_areas(corners).sum()
         return _Geom(corners @ geom.rotation.T + geom.pos, distance, solid is not None, stretch)
-
-    def is_inside(self, pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        return self.distance(pos)[0] < 0
 
     def on_surface(self, corners: Float[np.ndarray, "f 3 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Return the points of the true surface at the middle of triangles, and the unit normals out of the solid there."""
@@ -152,9 +146,9 @@ class _Geom:
         if not self.is_mesh:
             value, gradient = self.distance(middle)
             return middle - value[:, None] * gradient, gradient
-        normal = _cross(corners)
+        normal = face_cross(corners)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        is_inverted = self.is_inside(middle + STEP * normal)
+        is_inverted = self.distance(middle + STEP * normal)[0] < 0
         return middle, np.where(is_inverted[:, None], -normal, normal)
 
 
@@ -176,7 +170,7 @@ def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray,
         is_split = is_out & ((side > spacing) | is_cut)
         is_done = is_out & ~is_split
         done = corners[is_done]
-        kept.append((done, pos[is_done], normal[is_done], own.stretch * _areas(done)))
+        kept.append((done, pos[is_done], normal[is_done], own.stretch * face_areas(done)))
         corners = _bisected(corners[is_split])
     return tuple(np.concatenate(part) for part in zip(*kept, strict=True))
 
@@ -188,8 +182,8 @@ def _hidden(own: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarra
     for k in range(4):
         pulled = corners if k == 0 else corners + 0.98 * (corners[:, k - 1] - middle)[:, None]
         pos, normal = own.on_surface(pulled)
-        hidden = other.is_inside(pos + STEP * normal)
-        results.append(hidden | other.is_inside(pos - STEP * normal) if is_earlier else hidden)
+        hidden = other.distance(pos + STEP * normal)[0] < 0
+        results.append(hidden | (other.distance(pos - STEP * normal)[0] < 0) if is_earlier else hidden)
     return np.array(results)
 
 
@@ -209,35 +203,6 @@ def _morton(pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     cube = (1023 / size * (pos - low)).astype(np.int64)
     bit = np.arange(10)
     return ((cube[:, :, None] >> bit & 1) << (3 * bit + np.arange(3)[:, None])).sum(axis=(1, 2))
-
-
-def _cross(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _areas(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, " f"]:
-    return 0.5 * np.linalg.norm(_cross(corners), axis=1)
-
-
-def primitive_area(shape: str, size: Float[np.ndarray, " 3"]) -> float:
-    """Return the area of a primitive [m²]; of an ellipsoid by Carlson's integral (DLMF 19.33.2).
-
-    Args:
-        shape: Its type.
-        size: As in MuJoCo: half sizes, semi-axes, or radius and half length [m].
-    """
-    a, b, c = map(float, size)
-    match shape:
-        case "box":
-            return 8.0 * (a * b + b * c + c * a)
-        case "sphere":
-            return 4.0 * np.pi * a**2
-        case "capsule":
-            return 4.0 * np.pi * a * (a + b)
-        case "cylinder":
-            return 2.0 * np.pi * a * (a + 2.0 * b)
-        case _:
-            return float(4.0 * np.pi * elliprg((a * b) ** 2, (b * c) ** 2, (c * a) ** 2))
 
 
 def _triangles(shape: str, size: Float[np.ndarray, " 3"], spacing: float) -> Float[np.ndarray, "f 3 3"]:
@@ -279,5 +244,5 @@ def _revolved(profile: Float[np.ndarray, "k 2"], sections: int, swell: float) ->
     )
     a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
     both = np.concatenate([np.stack(part, axis=2).reshape(-1, 3, 3) for part in ((a, b, c), (a, c, d))])
-    area = np.linalg.norm(_cross(both), axis=1)
+    area = np.linalg.norm(face_cross(both), axis=1)
     return both[area > 1e-12 * area.max()]

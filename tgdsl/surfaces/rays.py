@@ -50,10 +50,7 @@ class OrthographicView:
     ) -> OrthographicView:
         """Return the view of a surface along `axes[2]`, without faces that are edge-on or have no area.
 
-        Args:
-            surface: The surface.
-            axes: Unit vectors of u, v and t.
-            is_one_sided: Which faces are left out where they look along the rays, as those of solids are hidden then.
+        Faces that are one-sided are left out where they look along the rays, as those of solids are hidden then.
         """
         cosine = surface.face_normals @ axes[2]
         face_id = np.flatnonzero((np.abs(cosine) > EDGE_ON) & ((cosine < 0) | np.logical_not(is_one_sided)))
@@ -84,9 +81,7 @@ def reference_axes(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n
 def frame(direction: Float[np.ndarray, " 3"], columns: Float[np.ndarray, " 3"] | None = None) -> Float[np.ndarray, "3 3"]:
     """Return unit vectors along columns, rows and rays, right-handed; rows run along direction × columns.
 
-    Args:
-        direction: Unit vector along the rays.
-        columns: A vector that is not parallel to it; default: its reference axis.
+    `columns` is a vector that is not parallel to the rays' direction; default: its reference axis.
     """
     along = reference_axes(direction[None])[0] if columns is None else columns
     across = np.cross(direction, along)
@@ -106,11 +101,7 @@ def first_hits(view: OrthographicView, uv: Float[np.ndarray, "ray 2"]) -> Hits:
     """Return what each ray hits first.
 
     Where several faces are hit at the same depth (a shared edge), the one that faces the ray most squarely counts, then
-    the first in the surface's order.
-
-    Args:
-        view: The surface, seen along the rays.
-        uv: Where the rays pass through the (u, v) plane [m].
+    the first in the surface's order. `uv` is where the rays pass through the (u, v) plane [m].
     """
     hits = [_hits(view, uv, face, ray) for face, ray in _pairs(view, uv)]
     face, ray, t = (np.concatenate([part[i] for part in hits]) for i in range(3)) if hits else (np.zeros(0, int),) * 3
@@ -199,10 +190,6 @@ def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.
     Without a region it is the rectangle of the projected corners. With one it is exact wherever an extreme point of the
     region on some face is visible (a box's side, a sphere's rim, a corner of the mesh); where what hides or covers it cuts
     the region it is known to within one raster cell, 1/256 of the region's longer side.
-
-    Args:
-        view: The surface, seen along the rays.
-        region: What counts as a hit.
     """
     if region.is_everything:
         corners = view.corners[:, :, :2].reshape(-1, 2)

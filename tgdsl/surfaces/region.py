@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from tgdsl.errors import SampleError, did_you_mean
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import Facing, InBox, InSphere, OnGeoms, RegionPart
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, face_areas
 
 LENGTH_TOLERANCE = 1e-6  # points this close to a region's border belong to it [m]: float32 mesh files round by about as much
 ANGLE_TOLERANCE = 1e-4
@@ -101,13 +101,7 @@ class Region:
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
         """Return the points where the part of a face in the region, covered or not, can reach farthest along some axes.
 
-        Args:
-            corners: The faces' corners (body frame) [m].
-            normals: Their unit normals (body frame).
-            axes: Unit vectors (body frame).
-
-        Returns:
-            The points, and for each a point within its face, both in the body frame [m].
+        With each comes a point within its face. Normals and axes are unit vectors, all in the body frame [m].
         """
         polygons, owner = self.clipped(corners)
         candidates = [polygons]
@@ -190,7 +184,7 @@ def clip(surface: Surface, parts: Sequence[RegionPart]) -> Surface:
     fans = [np.stack([polygons[:, 0], polygons[:, k], polygons[:, k + 1]], axis=1) for k in range(1, polygons.shape[1] - 1)]
     corners = np.concatenate(fans)
     geom = np.tile(surface.face_geom[faces][owner], len(fans))
-    size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    size = face_areas(corners)
     corners, geom = corners[size > 0], geom[size > 0]
     if not len(corners):
         raise SampleError("the region holds nothing of the link's surface", "widen it")

@@ -8,6 +8,7 @@ Shapes: `n` points, `v` vertices, `f` faces, `x`, `y`, `z` nodes along the axes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import igl
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
 from tgdsl.surfaces.outer import is_inside, outer
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, face_cross
 
 SHARP = np.deg2rad(30.0)  # angle between the normals of two faces from which their edge is sharp [rad]
 CHUNK = 1 << 18  # points that are asked for at once
@@ -39,14 +40,9 @@ class Lattice:
         return Lattice((low + high) / 2 - cell * num_cells / 2, cell, tuple(int(num) + 1 for num in num_cells))
 
     @property
-    def num_nodes(self) -> int:
-        """Number of nodes."""
-        return self.shape[0] * self.shape[1] * self.shape[2]
-
-    @property
     def num_bytes(self) -> int:
         """Size of a float32 at every node [bytes]."""
-        return 4 * self.num_nodes
+        return 4 * math.prod(self.shape)
 
     def pos(self, nodes: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Return the positions of nodes, given as flat indices [m]."""
@@ -93,7 +89,7 @@ class Solid:
         Between two neighbours that are both farther from the surface than half a cell there is none: such nodes that hang
         together are on one side, and the winding number of one of them tells which.
         """
-        length = np.empty(lattice.num_nodes)
+        length = np.empty(math.prod(lattice.shape))
         for start in range(0, len(length), CHUNK):
             pos = lattice.pos(np.arange(start, min(start + CHUNK, len(length))))
             length[start : start + CHUNK] = np.sqrt(np.reshape(self._tree.squared_distance(*self._faces, pos)[0], -1))
@@ -127,8 +123,7 @@ def _tree(vertices: np.ndarray, simplices: np.ndarray) -> igl.AABB:
 def _creases(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the sharp edges: vertices and pairs of their indices; `igl.sharp_edges` leaves out open and non-manifold ones."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = face_cross(vertices[faces])
     normal = np.tile(normal / np.linalg.norm(normal, axis=1, keepdims=True), (3, 1))
     pairs, first, which, count = np.unique(edges, axis=0, return_index=True, return_inverse=True, return_counts=True)
     total = np.stack([np.bincount(which.reshape(-1), part, len(pairs)) for part in normal.T], axis=1)

@@ -29,8 +29,7 @@ class Surface:
 
     @cached_property
     def _cross(self) -> Float[np.ndarray, "f 3"]:
-        corners = self.corners
-        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return face_cross(self.corners)
 
     @cached_property
     def face_areas(self) -> Float[np.ndarray, " f"]:
@@ -63,3 +62,13 @@ class Surface:
             geoms.extend(part.geoms)
             num_vertices += len(part.vertices)
         return Surface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(face_geom), tuple(geoms))
+
+
+def face_cross(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:
+    """Return the normal of each face, twice its area long [m²]."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def face_areas(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, " f"]:
+    """Return the area of each face [m²]."""
+    return 0.5 * np.linalg.norm(face_cross(corners), axis=1)

@@ -159,7 +159,7 @@ def test_points_that_are_near_follow_each_other(tmp_path):
 def test_the_order_changes_no_point():
     corners = np.random.default_rng(0).normal(size=(20, 3, 3))
     pieces = Pieces(corners, corners.mean(axis=1), corners[:, 0], np.ones(20))
-    plain, ordered = (sorted(draw(50, seed=3).pos.tolist()) for draw in (pieces.random, pieces.random_by_side))
+    plain, ordered = (sorted(draw(50, seed=3).tolist()) for draw in (pieces.random, pieces.random_by_side))
     assert plain == ordered
 
 
