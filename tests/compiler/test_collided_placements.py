@@ -6,7 +6,7 @@ from covered_hands import hand
 
 from tgdsl.compiler.resolve import Resolved, resolve
 from tgdsl.errors import SpecError
-from tgdsl.layout.unfelt import COVERED
+from tgdsl.layout.layout import COVERED
 from tgdsl.placement.reach import unfelt
 from tgdsl.schema.load import load
 

@@ -8,8 +8,7 @@ from covered_hands import HOLLOW, hand, layout, model, shell
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.formats.usd.write import write_usd
-from tgdsl.layout.layout import Layout
-from tgdsl.layout.unfelt import BURIED, COVERED, NOT_COLLIDED, by_reason, unfelt_ids
+from tgdsl.layout.layout import BURIED, COVERED, NOT_COLLIDED, Layout, by_reason, unfelt_ids
 from tgdsl.placement.reach import Colliders, reach, unfelt
 
 MESH_ATOL = 1e-8  # [m] vertices are float32

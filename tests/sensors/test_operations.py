@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).parents[2] / "tgdsl"
 OPERATION = {operation.name: operation for operation in OPERATIONS}
 NAMES = list(OPERATION)
 KERNEL_FILES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*_kernel.py"))
-LIBRARIES = {"geometry/planes_kernel.py", "geometry/shapes_kernel.py"}
+LIBRARIES = {"geometry/shapes_kernel.py"}
 """Functions that kernels call."""
 
 

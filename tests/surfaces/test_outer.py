@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from surfaces import plate
 
 from tgdsl.errors import BakeError
-from tgdsl.surfaces import crossings
-from tgdsl.surfaces.outer import OPEN, TWISTED, UNCUT, Outer, outer
+from tgdsl.surfaces.outer import OPEN, TWISTED, UNCUT, Outer, cut_cells, outer
 from tgdsl.surfaces.solid import Solid
 from tgdsl.surfaces.surface import Surface
 
@@ -141,7 +140,7 @@ def test_lines_through_one_point_cut_a_triangle_into_cells_with_sides():
         corners = triangle @ turn.T
         center = corners.mean(axis=0)
         ends = [[center - 3 * way, center + 3 * way] for way in (corners - center)]
-        found = crossings.cells(corners, np.array(ends), 1e-6)
+        found = cut_cells(corners, np.array(ends), 1e-6)
         sides = [np.linalg.norm(cell - np.roll(cell, 1, axis=0), axis=1).min() for cell in found]
         assert len(found) == 6 and min(sides) > 0.1
         areas = [np.linalg.norm(np.cross(cell[1:-1] - cell[0], cell[2:] - cell[0]), axis=1).sum() / 2 for cell in found]
@@ -254,7 +253,7 @@ def test_boxes_at_random_make_their_union():
 
 @pytest.mark.parametrize("limit", ["MAX_PAIRS", "MAX_SEGMENTS"])
 def test_where_faces_are_not_cut_it_is_said_and_only_those_wholly_inside_go(monkeypatch, limit):
-    monkeypatch.setattr(crossings, limit, 2)
+    monkeypatch.setattr(f"tgdsl.surfaces.outer.{limit}", 2)
     bar = box((0.004, 0.004, 0.06))
     within = box((0.01, 0.01, 0.01))
     found = outer(surface(CUBE, bar, within))

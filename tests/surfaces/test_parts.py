@@ -7,7 +7,7 @@ import trimesh
 from oracles.setups.solids import ball, box, surface_of
 
 from tgdsl.surfaces.meshlab import outer_shell
-from tgdsl.surfaces.parts import outward
+from tgdsl.surfaces.outer import outward
 
 PLACES = [(x, y, z) for x in range(3) for y in range(3) for z in range(3)]
 

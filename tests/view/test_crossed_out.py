@@ -9,8 +9,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from tgdsl.compiler.pipeline import placed
-from tgdsl.layout.layout import Layout
-from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt
+from tgdsl.layout.layout import BURIED, COVERED, Layout, Unfelt
 from tgdsl.view.render import drawing, render
 
 ROBOT = """<mujoco><worldbody><body name="palm"><geom type="box" size=".005 .03 .04"/>

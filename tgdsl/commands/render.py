@@ -38,7 +38,7 @@ class Render:
 
     def run(self) -> None:
         """Draw, write and say how many taxels there are."""
-        from tgdsl.layout.unfelt import by_reason, unfelt_ids
+        from tgdsl.layout.layout import by_reason, unfelt_ids
         from tgdsl.view.render import render
 
         out = self.out or in_working_folder(self.hand, ".png")

@@ -19,8 +19,7 @@ from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import BakeError, LowerError, TgdslError, UnfeltWarning, did_you_mean
 from tgdsl.formats.joints import RobotJoints
-from tgdsl.layout.layout import Layout
-from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt, unfelt_ids
+from tgdsl.layout.layout import BURIED, COVERED, Layout, Unfelt, unfelt_ids
 from tgdsl.module.state import SHAPES
 from tgdsl.observations import observations
 from tgdsl.observations.observations import (

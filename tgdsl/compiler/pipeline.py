@@ -21,8 +21,7 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SpecError, TgdslError, did_you_mean, listed
 from tgdsl.formats.mjcf import xml_files
 from tgdsl.formats.model import Model
-from tgdsl.layout.layout import Layout
-from tgdsl.layout.unfelt import Unfelt
+from tgdsl.layout.layout import Layout, Unfelt
 from tgdsl.placement.reach import unfelt
 from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable

@@ -6,7 +6,7 @@ import math
 import re
 from copy import copy
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -15,6 +15,8 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    StrictBool,
+    StrictInt,
     Tag,
     WithJsonSchema,
     create_model,
@@ -191,3 +193,28 @@ Selector = Annotated[
     ),
 ]
 """What a user may write for a selection: `hand`, `[tips, "*_link1"]` or `{include: [...], exclude: [...]}`."""
+
+
+class HistorySpec(SpecModel):
+    """What is read of the last calls."""
+
+    length: Annotated[StrictInt, Field(ge=1), Usual("number", high=1000.0)]
+    """Calls that count, this one included; before there are so many since a reset, the first one stands for the missing."""
+    reduce: Literal["stack", "last", "median", "mean"] = "stack"
+    """`stack`: all of them, oldest first, as a further dimension; or one reading made of them."""
+    view: StrictBool = False
+    """Whether a stack is handed out as a view of the module's own memory, which the next call overwrites and which
+    carries no gradient; default: a copy."""
+
+    @model_validator(mode="after")
+    def _is_used(self) -> HistorySpec:
+        if self.view and self.reduce != "stack":
+            raise ValueError("`view` is used by `reduce: stack` alone, expected it to be left out")
+        return self
+
+
+History = Annotated[
+    HistorySpec,
+    BeforeValidator(lambda found: {"length": found} if isinstance(found, int) else found),
+    WithJsonSchema({"anyOf": [{"type": "integer", "minimum": 1}, HistorySpec.model_json_schema()]}),
+]

@@ -3,16 +3,17 @@
 A vector is a tuple of three blocks, a rotation one of nine, row by row. A geom's size lies in memory, one after the other.
 """
 
-# Only Triton's compiler knows the types in a kernel.
-# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
-
 from __future__ import annotations
 
 import triton
 import triton.language as tl
 
-from tgdsl.geometry.planes import tie
+from tgdsl.geometry.planes import log2_e, tie
 from tgdsl.geometry.shapes import KINDS
+
+# Only Triton's compiler knows the types in a kernel.
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
+
 
 CAPSULE, CYLINDER, BOX = (tl.constexpr(float(KINDS.index(shape))) for shape in ("capsule", "cylinder", "box"))
 TIE = tl.constexpr(tie())
@@ -132,3 +133,63 @@ def loaded(at):
     """Return the rotation that is in memory there."""
     x, y, z = (tl.load(at), tl.load(at + 1), tl.load(at + 2)), at + 3, at + 6
     return x[0], x[1], x[2], tl.load(y), tl.load(y + 1), tl.load(y + 2), tl.load(z), tl.load(z + 1), tl.load(z + 2)
+
+
+# Only Triton's compiler knows the types in a kernel.
+# pyright: reportArgumentType=false
+
+
+LOG2_E = tl.constexpr(log2_e())
+
+
+@triton.jit
+def cross(a, b):
+    """Return a × b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
+def add3(a, b):
+    """Return a + b of vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@triton.jit
+def add6(a, b):
+    """Return A + B of symmetric matrices."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@triton.jit
+def scale3(factor, a):
+    """Return factor · a of a vector."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@triton.jit
+def scale6(factor, a):
+    """Return factor · A of a symmetric matrix."""
+    return factor * a[0], factor * a[1], factor * a[2], factor * a[3], factor * a[4], factor * a[5]
+
+
+@triton.jit
+def times(matrix, right):
+    """Return A b of a symmetric A, its upper triangle row by row."""
+    xx, xy, xz, yy, yz, zz = matrix
+    return dot((xx, xy, xz), right), dot((xy, yy, yz), right), dot((xz, yz, zz), right)
+
+
+@triton.jit
+def solve(matrix, least, right):
+    """Return (A + ε)⁻¹ b as `footprint` does."""
+    xx, xy, xz, yy, yz, zz = matrix
+    first = xx + least
+    by_x, bz_x = xy / first, xz / first
+    second = tl.maximum(yy + least - by_x * xy, least / 2)
+    below = yz - by_x * xz
+    bz_y = below / second
+    third = tl.maximum(zz + least - bz_x * xz - bz_y * below, least / 2)
+    y = right[1] - by_x * right[0]
+    z = (right[2] - bz_x * right[0] - bz_y * y) / third
+    y = y / second - bz_y * z
+    return right[0] / first - by_x * y - bz_x * z, y, z

@@ -25,9 +25,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from tgdsl.errors import LowerError
-from tgdsl.surfaces.holes import hole_caps
 from tgdsl.surfaces.meshlab import MAX_HOLE
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, hole_caps
 
 COINCIDENT = 1e-7  # distance below which two vertices of a geom are one, over its size
 FLAT = 1e-9  # volume below which a geom encloses none, over the cube of its size

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Shaped
 
 from tgdsl.geometry.bvh import query_operations
-from tgdsl.layout.unfelt import unfelt_ids
+from tgdsl.layout.layout import unfelt_ids
 from tgdsl.module.memory import Memory
 from tgdsl.module.outputs import outputs_of
 from tgdsl.module.state import example_state

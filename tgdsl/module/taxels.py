@@ -26,8 +26,8 @@ from tgdsl.layout.identity import REQUIRED, Columns, check_same_rows, columns_of
 from tgdsl.layout.layout import Layout
 from tgdsl.module.memory import last_step
 from tgdsl.plan.plan import Plan
+from tgdsl.quantities import QUANTITIES
 from tgdsl.quantities.base import Quantity
-from tgdsl.quantities.known import QUANTITIES
 from tgdsl.scene.asset_paths import check_scene
 from tgdsl.tensors.torch_internals import HookedModule
 

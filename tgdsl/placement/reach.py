@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tgdsl.formats.model import Model
-from tgdsl.layout.layout import Layout
-from tgdsl.layout.unfelt import BURIED, COVERED, NOT_COLLIDED, Unfelt
+from tgdsl.layout.layout import BURIED, COVERED, NOT_COLLIDED, Layout, Unfelt
 from tgdsl.surfaces.convex import ConvexSolid, hull_planes
 from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.rays import sphere_directions

@@ -19,14 +19,13 @@ import numpy as np
 
 from tgdsl.errors import ArtifactError
 from tgdsl.layout.identity import taxels_id
-from tgdsl.layout.layout import Layout
-from tgdsl.layout.unfelt import Unfelt
+from tgdsl.layout.layout import Layout, Unfelt
 from tgdsl.plan import tree
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.scene import SceneFile
 from tgdsl.plan.sensors import PlannedObservation, PlannedReading, PlannedSensor
+from tgdsl.quantities import QUANTITIES
 from tgdsl.quantities.base import Quantity
-from tgdsl.quantities.known import QUANTITIES
 from tgdsl.quantities.pairs import PairedObject, PairTable
 
 FORMAT = 17  # version of the Plan; a reader refuses any other

@@ -2,7 +2,7 @@
 
 A quantity is one file: the typed request that a kind puts into `Lowered.requests` and what the kind gets for it, its part of
 the Plan, and a `Quantity` that plans (in NumPy), gathers (in torch) and has a float64 reference. It is registered in
-`quantities/known.py`, or by an entry point.
+`quantities/__init__.py`, or by an entry point.
 
 Shapes: `env` environments, `taxel` taxels, `pair` (link, object) pairs, `row` rows of a sensor.
 """

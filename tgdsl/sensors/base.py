@@ -20,8 +20,7 @@ from torch import Tensor
 
 from tgdsl.console.progress import Progress
 from tgdsl.fields.accuracy import AccuracyField
-from tgdsl.fields.history import History
-from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
+from tgdsl.fields.models import Frequency, History, Selector, SpecModel, Usual
 from tgdsl.fields.regions import RegionPart
 from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout

@@ -16,8 +16,8 @@ import numpy as np
 
 from tgdsl.errors import LowerError, TgdslError, did_you_mean
 from tgdsl.files.plugins import known
+from tgdsl.quantities import known_quantities
 from tgdsl.quantities.base import Quantity, Request
-from tgdsl.quantities.known import known_quantities
 from tgdsl.sensors import KINDS
 from tgdsl.sensors.base import AnySensorSpec, Axis, Kind, Lowered, Memory
 from tgdsl.sensors.upstream import SOUND

@@ -14,8 +14,9 @@ from jaxtyping import Float
 from scipy.special import elliprg
 
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
-from tgdsl.surfaces.holes import hole_caps, merged
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, hole_caps, merged
+
+PRIMITIVES = ("plane", "sphere", "capsule", "cylinder", "ellipsoid", "box")  # by MuJoCo's name
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ from scipy.ndimage import gaussian_filter
 
 from tgdsl.errors import FileError
 from tgdsl.files.write import atomic_open, check_writable, with_folder
-from tgdsl.layout.layout import Layout
-from tgdsl.layout.unfelt import Unfelt, unfelt_ids
+from tgdsl.layout.layout import Layout, Unfelt, unfelt_ids
 from tgdsl.view.cameras import ViewError, angles_of, camera_of, pose_of
 from tgdsl.view.discs import discs, group_of, legend, radii
 from tgdsl.view.meshes import mesh_of, robot_bodies

@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage, rotation_and_scale
-from tgdsl.surfaces.holes import merged
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, merged
 
 CIRCULAR = 1e-5  # relative difference of two scales up to which a circle stays one: scales are often authored in float32
 CONVEX = 1e-3  # a closed mesh whose volume is less than its hull's by at most this share counts as convex

@@ -33,8 +33,7 @@ from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry import planes
-from tgdsl.geometry.planes_kernel import LOG2_E
-from tgdsl.geometry.shapes_kernel import chosen, dot
+from tgdsl.geometry.shapes_kernel import LOG2_E, chosen, dot
 from tgdsl.quantities.depth_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
 LANES, CHUNK = 32, 512  # threads of a program, which is one warp, and most points of a chunk

@@ -23,8 +23,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
-from tgdsl.geometry.planes_kernel import LOG2_E, add3, add6, cross, scale3, scale6, solve, times
-from tgdsl.geometry.shapes_kernel import dot
+from tgdsl.geometry.shapes_kernel import LOG2_E, add3, add6, cross, dot, scale3, scale6, solve, times
 from tgdsl.sensors.force_taxel.constants import damping, no_force, wholly
 
 ENVS = 8  # environments of a program, which is one warp: a lane for each of their contacts of a group
