@@ -241,21 +241,6 @@ def test_each_point_asks_its_own_of_several_meshes():
         assert torch.equal(torch.stack(gradient, -1)[row], torch.stack(own_gradient, -1))
 
 
-@pytest.mark.parametrize(
-    ("vertices", "faces", "message"),
-    [
-        (np.zeros((3, 3)), np.array([[0, 1, 3]]), "mesh: faces name vertices 0 to 3; there are 3"),
-        (np.zeros((3, 3)), np.array([[0, 1, 2]]), "mesh: no face has an area"),
-        (np.zeros((3, 3)), np.zeros((0, 3), int), "mesh: no face has an area"),
-        (np.full((3, 3), np.nan), np.array([[0, 1, 2]]), "mesh: vertices must be finite"),
-    ],
-)
-def test_invalid_meshes(vertices, faces, message):
-    with pytest.raises(TgdslError) as error:
-        TriangleMesh(vertices, faces)
-    assert str(error.value) == message
-
-
 def test_without_warp(monkeypatch):
     monkeypatch.setitem(sys.modules, "warp", None)
     with pytest.raises(TgdslError) as error:

@@ -41,10 +41,7 @@ class Accuracy:
 
 
 def parse_bound(value: object) -> Bound:
-    """Return a bound in the unit that readings have.
-
-    Args:
-        value: A fraction as a number or in percent, or a text with a unit of `DIMENSIONS`. Temperatures are differences.
+    """Return a bound in the unit that readings have, of a number or text as `EXPECTED` says. Temperatures are differences.
 
     Raises:
         ValueError: If it is none, not positive, or a fraction of 1 or more.

@@ -62,17 +62,14 @@ _SPELLINGS = str.maketrans({"^": "", "²": "2", "³": "3", "°": "deg", "·": "*
 
 
 def parse(value: object, dimension: str | Dimension) -> float:
-    """Return a quantity in SI units; a temperature in °C.
-
-    Args:
-        value: A number (taken as SI, or °C) or a string such as `"4 mm"`.
-        dimension: A key of `UNITS`, or one's own.
+    """Return a quantity in SI units, a temperature in °C: of a number, taken as SI or °C, or a string such as `"4 mm"`.
 
     Raises:
         ValueError: If the value is no finite number, or its unit is not one of the dimension.
     """
     factors = units_of(dimension)
-    expected = f'a number in {next(iter(factors))} or a string such as "4 {_example(factors)}"' if factors else "a number"
+    example = next((unit for unit in reversed(factors) if unit not in ZEROS), "")
+    expected = f'a number in {next(iter(factors))} or a string such as "4 {example}"' if factors else "a number"
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{value!r} is not a quantity, expected {expected}")
     if isinstance(value, str):
@@ -111,16 +108,10 @@ def dimension_of(value: str, dimensions: Sequence[str]) -> str | None:
 
 def _without_unit(number: float, unit: str) -> str:
     """Return what is expected where a plain number is, if one with a unit was found: in SI, if the unit is known."""
-    for factors in UNITS.values():
-        if unit in factors:
-            return (
-                f"expected a plain number: {number * factors[unit] + ZEROS.get(unit, 0.0):g}, if {next(iter(factors))} is meant"
-            )
-    return "expected a plain number"
-
-
-def _example(known: Mapping[str, float]) -> str:
-    return [unit for unit in known if unit not in ZEROS][-1]
+    factors = next((factors for factors in UNITS.values() if unit in factors), None)
+    if factors is None:
+        return "expected a plain number"
+    return f"expected a plain number: {number * factors[unit] + ZEROS.get(unit, 0.0):g}, if {next(iter(factors))} is meant"
 
 
 def doubt(value: float, dimension: str | Dimension, low: float, high: float) -> tuple[str, str] | None:

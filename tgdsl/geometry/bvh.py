@@ -43,26 +43,16 @@ SEARCH_ERROR = 2e-6
 class TriangleMesh:
     """Triangles to ask distances of, with one hierarchy per device, built when a point on that device first asks.
 
-    Copies and pickles hold the triangles and build again. The mesh must outlive whatever was compiled with it.
-
-    Attributes:
-        vertices: Positions in the mesh's frame [m].
-        faces: Vertex indices, counter-clockwise seen from outside.
-        key: Names the mesh to the operator; unique in the process.
+    Copies and pickles hold the triangles and build again. The mesh must outlive whatever was compiled with it. Vertices are in
+    the mesh's frame [m], faces counter-clockwise seen from outside, at least one with an area.
     """
 
     def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]):
-        """Raise `TgdslError` if Warp is missing, if indices or positions are invalid, or if no face has an area."""
+        """Raise `TgdslError` if Warp is missing."""
         _warp()
-        if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-            raise TgdslError(f"mesh: faces name vertices {faces.min()} to {faces.max()}; there are {len(vertices)}")
-        if not np.isfinite(vertices).all():
-            raise TgdslError("mesh: vertices must be finite")
-        self.vertices, self.faces, self.key = vertices, faces, next(_KEYS)
+        self.vertices, self.faces, self.key = vertices, faces, next(_KEYS)  # the key names the mesh to the operator
         corners = vertices.astype(np.float64)[faces]
         corners = corners[np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0]
-        if not len(corners):
-            raise TgdslError("mesh: no face has an area")
         lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         self._middle, self._half = 0.5 * (lower + upper), 0.5 * (upper - lower)
         self._corners = corners - self._middle
@@ -124,14 +114,9 @@ def nearest(
 ) -> tuple[Tensor, Vec]:
     """Return the signed distance [m] of points to a mesh, negative inside, and its outward unit gradient.
 
-    The derivative of the distance is the gradient; the gradient itself has none.
-
-    Args:
-        point: Positions in the mesh's frame [m], planes of one shape.
-        meshes: The mesh, or several of which each point asks one.
-        max_distance: Points farther than this [m] read it, negative if inside; their gradient is (1, 0, 0), and the
-            derivative 0. NaN points read NaN.
-        which: Which mesh each point asks, broadcast with the points; only if there are several.
+    The derivative of the distance is the gradient; the gradient itself has none. Points farther than `max_distance` [m] read
+    it, negative if inside; their gradient is (1, 0, 0), and the derivative 0. NaN points read NaN. Of several meshes each point
+    asks the one that `which` names.
     """
     stacked = torch.stack(point, dim=-1)
     flat = stacked.reshape(-1, 3).to(torch.float64).contiguous()
@@ -206,11 +191,13 @@ def _quiet() -> Iterator[Any]:
 
 @functools.cache
 @no_type_check
-def _away_from(wp: Any) -> Any:
-    """Return Warp's function from a face's closest point to a point (Ericson, *Real-Time Collision Detection*, 5.1.5)."""
+def _kernel(wp: Any) -> Any:
+    """Return the kernel: one thread per point."""
+    on_surface, sign_offset = wp.constant(wp.float64(ON_SURFACE)), wp.constant(wp.float64(SIGN_OFFSET))
 
     @wp.func
     def away_from(face: wp.int32, corners: Any, p: wp.vec3d):
+        """From a face's closest point to a point (Ericson, *Real-Time Collision Detection*, 5.1.5)."""
         a, b, c, zero = corners[3 * face], corners[3 * face + 1], corners[3 * face + 2], wp.float64(0.0)
         ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
         d1, d2, d3, d4, d5, d6 = wp.dot(ab, ap), wp.dot(ac, ap), wp.dot(ab, bp), wp.dot(ac, bp), wp.dot(ab, cp), wp.dot(ac, cp)
@@ -229,19 +216,11 @@ def _away_from(wp: Any) -> Any:
             return bp - (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
         return ap - ab * (vb / (va + vb + vc)) - ac * (vc / (va + vb + vc))
 
-    return away_from
-
-
-@functools.cache
-@no_type_check
-def _nearest_face(wp: Any) -> Any:
-    """Return Warp's function for the nearest face, −1 if none is within reach, and the vector from it to the point."""
-    away_from = _away_from(wp)
-
     @wp.func
     def nearest_face(
         mesh: wp.uint64, corners: Any, boxes: wp.uint64, faces: Any, p: wp.vec3d, size: wp.float64, reach: wp.float64
     ):
+        """The nearest face, −1 if none is within reach, and the vector from it to the point."""
         face, best, length = wp.int32(-1), wp.vec3d(), wp.float64(reach)
         slack = wp.float64(1e-5) * size
         found = wp.mesh_query_point_no_sign(mesh, wp.vec3(p), wp.float32(wp.float64(1.00001) * reach + slack))
@@ -257,16 +236,6 @@ def _nearest_face(wp: Any) -> Any:
                 if wp.length(away) < length:
                     face, best, length = wp.int32(faces[item]), away, wp.length(away)
         return face, best
-
-    return nearest_face
-
-
-@functools.cache
-@no_type_check
-def _kernel(wp: Any) -> Any:
-    """Return the kernel: one thread per point."""
-    nearest_face = _nearest_face(wp)
-    on_surface, sign_offset = wp.constant(wp.float64(ON_SURFACE)), wp.constant(wp.float64(SIGN_OFFSET))
 
     # fmt: off
     @wp.kernel(enable_backward=False)

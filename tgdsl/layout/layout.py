@@ -37,8 +37,7 @@ class Layout:
     @staticmethod
     def of_links(links: tuple[Link, ...], groups: Mapping[str, tuple[str, ...]]) -> Layout:
         """Return the layout of links that carry no taxels, for sensors that have a place on each link."""
-        none, names = np.zeros((0, 3)), {link.name for link in links}
-        kept = {group: own for group, members in groups.items() if (own := _only(members, names))}
+        none, kept = np.zeros((0, 3)), _groups_of(links, groups)
         no_cells = np.zeros((0, 2), dtype=np.int64)
         return Layout(links, kept, np.zeros(0, dtype=np.int64), none, none, none, none[:, 0], none[:, 0], no_cells)
 
@@ -72,22 +71,15 @@ class Layout:
         used = np.unique(self.link_id[taxels])
         renumbered = np.full(len(self.links), -1, dtype=np.int64)
         renumbered[used] = np.arange(len(used))
-        names = {self.links[i].name for i in used}
-        return Layout(
-            links=tuple(self.links[i] for i in used),
-            groups={group: kept for group, members in self.groups.items() if (kept := _only(members, names))},
-            link_id=renumbered[self.link_id[taxels]],
-            pos=self.pos[taxels],
-            normal=self.normal[taxels],
-            tangent=self.tangent[taxels],
-            radius=self.radius[taxels],
-            area=self.area[taxels],
-            cell=self.cell[taxels],
-        )
+        links = tuple(self.links[i] for i in used)
+        columns = {name: getattr(self, name)[taxels] for name in ("pos", "normal", "tangent", "radius", "area", "cell")}
+        return Layout(links, _groups_of(links, self.groups), renumbered[self.link_id[taxels]], **columns)
 
 
-def _only(members: tuple[str, ...], names: set[str]) -> tuple[str, ...]:
-    return tuple(name for name in members if name in names)
+def _groups_of(links: Sequence[Link], groups: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    names = {link.name for link in links}
+    kept = {group: tuple(name for name in members if name in names) for group, members in groups.items()}
+    return {group: members for group, members in kept.items() if members}
 
 
 REASONS = NOT_COLLIDED, BURIED, COVERED = "not collided", "buried", "covered at rest"

@@ -35,14 +35,9 @@ GEOM, ORIGIN, CELL, FRAME = tl.constexpr(3), tl.constexpr(12), tl.constexpr(15),
 def meet(
     pairs: Pairs, pair: Int[Tensor, " link"], points: Vec, links: Geoms, g: int
 ) -> tuple[Vec, Float[Tensor, "env link point"], Vec]:
-    """Return the points' places in the links' frames [m], signed distances to their surfaces [m], and unit gradients.
+    """Return the points' places in the links' frames [m], signed distances to their `g`-th geoms [m], and unit gradients.
 
-    Args:
-        pairs: Relative poses of all pairs; where the gate is closed the distance is +∞.
-        pair: Index of the pair of each link and the object.
-        points: Places in the object's frame [m], planes (case, 1, point).
-        links: The links' own surfaces: an object whose cases are links.
-        g: Which of their geoms.
+    Where the gate is closed the distance is +∞. `points` are planes (case, 1, point) in the object's frame [m].
     """
     frames, counts, values = grid_tables(links, g)
     where, is_cubic = torch.stack(points)[:, :, 0], links.shapes[g] == "tricubic"

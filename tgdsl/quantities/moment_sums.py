@@ -225,7 +225,7 @@ def _by_kernel(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Mome
     from tgdsl.quantities import nearby_kernel
 
     assert isinstance(source.surface, MomentField)
-    return nearby_kernel.felt_moments(pairs, own, pos, source.pair, source.radius, source.shift, source.surface)
+    return nearby_kernel.felt_moments(pairs, own, pos, source, source.surface)
 
 
 def _inputs(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> list[Tensor]:

@@ -12,12 +12,11 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.moment_sums import MomentField, Moments
+from tgdsl.quantities.moment_sums import MomentField, Moments, MomentSource
 from tgdsl.quantities.pairs import Pairs
 
 # Only Triton's compiler knows the types in a kernel.
@@ -27,26 +26,8 @@ from tgdsl.quantities.pairs import Pairs
 BLOCK = 128  # probes of a program, which has four warps: so each thread loads whole nodes, and none is sent to another one
 
 
-def felt_moments(
-    pairs: Pairs,
-    own: slice,
-    pos: Vec,
-    pair: Int[Tensor, " taxel"],
-    radius: Float[Tensor, "*env taxel"],
-    shift: Float[Tensor, "env taxel"] | None,
-    field: MomentField,
-) -> Moments:
-    """Return the moments of an object at probes, in the frame of each one's link; zero for an inactive probe.
-
-    Args:
-        pairs: Relative poses of all pairs.
-        own: The object's pairs among them.
-        pos: Positions of the probes in their links' frames [m].
-        pair: Index of each probe's pair among the object's.
-        radius: Sensing radius of each probe [m]; 0 where it is inactive.
-        shift: By how much that is more than the field's [m], to first order; the field then has 8 channels.
-        field: The object's field.
-    """
+def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource, field: MomentField) -> Moments:
+    """Return the moments of an object's field at probes, in the frame of each one's link; zero for an inactive probe."""
     lattice = torch.stack(torch.broadcast_tensors(*field.origin, field.cell), dim=-1)
     counts = (field.first, *field.num)
     numbers, table = [part for part in counts if isinstance(part, int)], None
@@ -54,7 +35,7 @@ def felt_moments(
         parts = (torch.as_tensor(part, device=lattice.device) for part in counts)
         numbers, table = [0] * 4, torch.stack(torch.broadcast_tensors(*parts), dim=-1).int()
     pose = [part[:, own] for part in (*pairs.rotation, *pairs.offset)]
-    sums = _felt_moments(pose, list(pos), pair, radius, shift, field.values, lattice, table, numbers)
+    sums = _felt_moments(pose, list(pos), source.pair, source.radius, source.shift, field.values, lattice, table, numbers)
     mass, first_x, first_y, first_z = sums.unbind()
     return Moments(mass, (first_x, first_y, first_z))
 

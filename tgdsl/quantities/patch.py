@@ -55,10 +55,9 @@ class Slot(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """The same as the state has it, planes: force [N], torque [N·m], normal, position in the world [m]; whether it is one."""
+    """The same as the state has it, planes: force [N], normal, position in the world [m]; whether it is one."""
 
     force: Vec
-    torque: Vec
     normal: Vec
     pos: Vec
     is_used: Tensor
@@ -77,7 +76,7 @@ def slots_of(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Slot]
         is_used = force[0] != 0
         for part in (*force[1:], *torque, *normal):
             is_used = is_used | (part != 0)
-        touches.append(Touch(force, torque, normal, pos, is_used))
+        touches.append(Touch(force, normal, pos, is_used))
     forces = _normal_forces(planes.split(_of_pairs(contacts.whole, sides)), touches)
     origin = planes.split(contacts.body_pos[:, sides.bodies, None])
     results = []
@@ -127,12 +126,8 @@ def patch_area(away: Sequence[Vec], normal: Vec, is_used: Sequence[Tensor], is_s
 
         A_k = max over j < k of A_j + x_j y_k − y_j x_k,    area = ½ max over k of A_k + x_k y_0 − y_k x_0.
 
-    Args:
-        away: The points about a centre that lies within their hull, planes each [m].
-        normal: Unit normal of the plane that they are projected to, planes.
-        is_used: Which of the points count.
-        is_star: Take the polygon through all points in the order of their angles instead, which the paper has. It is smaller
-            wherever a point lies inside the hull.
+    The points that count are about a centre within their hull [m]. With `is_star` it is the paper's polygon through all points
+    in the order of their angles, which is smaller wherever a point lies inside the hull.
     """
     if len(away) < 3:
         return torch.zeros_like(normal[0])
@@ -247,7 +242,6 @@ def _unit(vector: Vec) -> Vec:
 
 
 def _by_kernel(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> Patch:
-    """Do the same by the kernel."""
     from tgdsl.quantities.patch_kernel import contact_patch
 
     force, area, x, y, z, normal_x, normal_y, normal_z = contact_patch(

@@ -27,11 +27,7 @@ WARPS = 1  # warps of a program
 def contact_patch(contacts: list[Tensor], pairs: Tensor, bodies: Tensor, cancelled: float) -> Tensor:
     """Return force, area, centre and normal in the link's frame, (8, env, body, object).
 
-    Args:
-        contacts: The fields of `Contacts`.
-        pairs: `Sides.pairs`.
-        bodies: `Sides.bodies`.
-        cancelled: Length of the mean of unit normals below which it has no direction.
+    `contacts` are the fields of `Contacts`; the mean of unit normals has no direction below a length of `cancelled`.
     """
     fields = [part.contiguous() for part in contacts]
     num_envs, num_pairs, num_slots = fields[0].shape[:3]
