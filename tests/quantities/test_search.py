@@ -9,15 +9,13 @@ import torch
 from pressed_pads import compiled
 from searches import paired
 
+from tgdsl.geometry.shapes import BOUND, POS, ROTATION
 from tgdsl.module.state import example_state
 from tgdsl.quantities import contact_depth
 from tgdsl.quantities.contact_depth import (
-    BOUND,
     DEEPEST,
     EVERYWHERE,
     MARGIN,
-    POS,
-    ROTATION,
     Deepest,
     Probes,
     Target,

@@ -122,3 +122,5 @@ SHAPES: Mapping[str, Shape] = MappingProxyType(
 """Signed distance by MuJoCo's name of the geom type."""
 KINDS = ("", "plane", "capsule", "cylinder", "box")
 """Numbers by which kernels know the shapes; a sphere is a capsule without a length."""
+COLUMNS = POS, ROTATION, BOUND, KIND, ROW = 3, 6, 15, 16, 17
+"""Columns of a kernel's table of geoms, which begins with the size: place, rotation, bound and kind; and their number."""

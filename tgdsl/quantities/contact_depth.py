@@ -45,7 +45,6 @@ from tgdsl.tensors.operations import Operation
 SEARCHED = ("", "plane", "sphere", "capsule", "cylinder", "box")
 EVERYWHERE = 3e38  # bound of a plane [m]: finite, but not its square, so that no place is beyond it, and −∞ added to it is −∞
 MARGIN = 10 * planes.tie()  # a geom is passed over farther than its reach and this [m]: beyond what counts as equal in float32
-POS, ROTATION, BOUND, KIND, ROW = 3, 6, 15, 16, 17  # columns of the table of geoms, which begins with the size; their number
 
 
 class Deepest(NamedTuple):
@@ -317,7 +316,7 @@ def _by_kernel(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: M
 
     made = () if "geoms" in known else geom_tables([target.geoms for target in targets])
     spheres, geoms = made or (known["spheres"], known["geoms"])
-    return find(pairs, probes.pos, known["pair"], spheres, geoms, reach)
+    return Deepest(*find(pairs, probes.pos, known["pair"], spheres, geoms, reach))
 
 
 def _inputs(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapping[str, Tensor], reach: Reach) -> list[Tensor]:

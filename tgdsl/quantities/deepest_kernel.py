@@ -18,9 +18,8 @@ from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
+from tgdsl.geometry.shapes import COLUMNS
 from tgdsl.geometry.shapes_kernel import TIE, chosen, distance_to, dot, gradient_of, is_any, length, loaded, rotate, rotate_back
-from tgdsl.quantities import contact_depth
-from tgdsl.quantities.contact_depth import Deepest
 from tgdsl.quantities.pairs import Pairs
 
 # Only Triton's compiler knows the types in a kernel.
@@ -28,13 +27,13 @@ from tgdsl.quantities.pairs import Pairs
 
 
 BLOCK = 64  # probes of a program, which is one warp: two for each of its lanes
-POS, ROTATION, BOUND, KIND, ROW = (tl.constexpr(getattr(contact_depth, n)) for n in ("POS", "ROTATION", "BOUND", "KIND", "ROW"))
+POS, ROTATION, BOUND, KIND, ROW = (tl.constexpr(column) for column in COLUMNS)
 
 
-def find(pairs: Pairs, pos: Vec, pair: Tensor, spheres: Tensor, geoms: Tensor, reach: Tensor) -> Deepest:
-    """Return what the probes are deepest in: `spheres` and `geoms` as `geom_tables` has them, the rest as `search`."""
+def find(pairs: Pairs, pos: Vec, pair: Tensor, spheres: Tensor, geoms: Tensor, reach: Tensor) -> tuple[Tensor, Vec, Tensor]:
+    """Return what `Deepest` holds: `spheres` and `geoms` as `geom_tables` has them, the rest as `search`."""
     depth, normal, winner = _deepest([*pairs.rotation, *pairs.offset], list(pos), pair, reach, pairs.gate, spheres, geoms)
-    return Deepest(depth, planes.vec(normal.unbind()), winner)
+    return depth, planes.vec(normal.unbind()), winner
 
 
 @triton_op("tgdsl::deepest", mutates_args={})

@@ -225,7 +225,8 @@ def _by_kernel(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Mome
     from tgdsl.quantities import nearby_kernel
 
     assert isinstance(source.surface, MomentField)
-    return nearby_kernel.felt_moments(pairs, own, pos, source, source.surface)
+    mass, *first = nearby_kernel.felt_moments(pairs, own, pos, source, source.surface)
+    return Moments(mass, vec(first))
 
 
 def _inputs(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> list[Tensor]:

@@ -9,6 +9,8 @@ Shapes: `env` environments, `taxel` probes, `pair` pairs of the object, `node` n
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
@@ -16,7 +18,6 @@ from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.moment_sums import MomentField, Moments, MomentSource
 from tgdsl.quantities.pairs import Pairs
 
 # Only Triton's compiler knows the types in a kernel.
@@ -26,8 +27,8 @@ from tgdsl.quantities.pairs import Pairs
 BLOCK = 128  # probes of a program, which has four warps: so each thread loads whole nodes, and none is sent to another one
 
 
-def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource, field: MomentField) -> Moments:
-    """Return the moments of an object's field at probes, in the frame of each one's link; zero for an inactive probe."""
+def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: Any, field: Any) -> tuple[Tensor, ...]:
+    """Return S0 and the parts of S1 of a `MomentSource` with a field, in the frames of the probes' links."""
     lattice = torch.stack(torch.broadcast_tensors(*field.origin, field.cell), dim=-1)
     counts = (field.first, *field.num)
     numbers, table = [part for part in counts if isinstance(part, int)], None
@@ -35,9 +36,9 @@ def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource, field
         parts = (torch.as_tensor(part, device=lattice.device) for part in counts)
         numbers, table = [0] * 4, torch.stack(torch.broadcast_tensors(*parts), dim=-1).int()
     pose = [part[:, own] for part in (*pairs.rotation, *pairs.offset)]
-    sums = _felt_moments(pose, list(pos), source.pair, source.radius, source.shift, field.values, lattice, table, numbers)
-    mass, first_x, first_y, first_z = sums.unbind()
-    return Moments(mass, (first_x, first_y, first_z))
+    return _felt_moments(
+        pose, list(pos), source.pair, source.radius, source.shift, field.values, lattice, table, numbers
+    ).unbind()
 
 
 @triton_op("tgdsl::felt_moments", mutates_args={})
