@@ -191,13 +191,24 @@ class Quantity(ABC):
     #: whether kernels on a CPU are to be as large as can be: all that is computed is alike, and would be read again
     is_fused: ClassVar[bool] = False
 
-    @abstractmethod
+    reads: ClassVar[tuple[str, ...]] = ()  #: fields of `SceneState` that are read, whatever is asked
+    shown: ClassVar[str] = ""  #: what an account of a sensor says of a use
+
     def plan(self, planning: Planning, uses: Sequence[Use]) -> Any:
         """Return the part of the Plan for all uses; mistakes go to `planning.report`, and then the part does not matter."""
+        return self.part(tuple(self.plan_use(planning, use) for use in uses))
 
-    @abstractmethod
+    def plan_use(self, planning: Planning, use: Use) -> Any:
+        """Return the part of one use, where the uses have nothing in common and the part's only field is `uses`."""
+        raise NotImplementedError
+
     def gather(self, part: Any, scene: Scene) -> tuple[Any, ...]:
         """Return the value of each use: pure, traceable."""
+        return tuple(self.gather_use(use, scene) for use in part.uses)
+
+    def gather_use(self, part: Any, scene: Scene) -> Any:
+        """Return the value of one use, of its own part: see `plan_use`."""
+        raise NotImplementedError
 
     @abstractmethod
     def reference(self, part: Any, use: int, scene: ReferenceScene) -> Any:
@@ -205,7 +216,7 @@ class Quantity(ABC):
 
     def fields(self, part: Any) -> set[str]:
         """Return the names of the fields of `SceneState` that are read."""
-        return set()
+        return {*self.reads}
 
     def bodies(self, use: Use) -> tuple[str, ...]:
         """Return the bodies whose poses are read in addition to the pairs' bodies."""
@@ -221,7 +232,7 @@ class Quantity(ABC):
 
     def explain(self, part: Any, use: int, objects: Sequence[PairedObject]) -> list[str]:
         """Return what an account of a sensor says of a use."""
-        return []
+        return [self.shown] if self.shown else []
 
     def account(self, part: Any, objects: Sequence[PairedObject]) -> dict[str, list[str]]:
         """Return measured errors and sizes of precomputed tables, by headline."""

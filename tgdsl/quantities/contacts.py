@@ -19,7 +19,6 @@ from torch import Tensor
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Plane, Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
-from tgdsl.quantities.pairs import PairedObject
 from tgdsl.quantities.reference import ReferenceScene
 from tgdsl.tensors.on_host import on_host
 
@@ -186,6 +185,7 @@ def reference_contacts(scene: ReferenceScene, pair: int | np.integer) -> list[li
 
 class _Contacts(Quantity):
     name, request, part = "contacts", Contacts, ContactsPart
+    shown = "the solver's contacts"
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> ContactsPart[np.ndarray]:
         parts = []
@@ -216,9 +216,6 @@ class _Contacts(Quantity):
 
     def is_light(self, part: ContactsPart) -> bool:
         return True
-
-    def explain(self, part: ContactsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
-        return ["the solver's contacts"]
 
 
 CONTACTS = _Contacts()
@@ -316,20 +313,27 @@ def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtyp
 
 class _Loads(Quantity):
     name, request, part = "loads", Loads, LoadsPart
+    reads = (
+        "body_linvel",
+        "body_angvel",
+        "contact_pos",
+        "contact_force",
+        "contact_normal",
+        "contact_found",
+        "contact_netforce",
+    )
+    shown = "normal force and sliding speed of the solver's contacts"
     has_rows = True
 
-    def plan(self, planning: Planning, uses: Sequence[Use]) -> LoadsPart[np.ndarray]:
-        parts = []
-        for use in uses:
-            names, of = use.request.objects, use.request.of
-            counted = [] if of == "object" else [name for name in names if is_counted(planning, name, names)]
-            objects = planning.body_ids([planning.sensed[name].body for name in names])
-            table = planning.contact_table(use.bodies, names, missing=counted)
-            parts.append(LoadsUse(planning.body_ids(use.bodies), objects, table, of if use.request.has_center else ""))
-        return LoadsPart(tuple(parts))
+    def plan_use(self, planning: Planning, use: Use) -> LoadsUse[np.ndarray]:
+        names, of = use.request.objects, use.request.of
+        counted = [] if of == "object" else [name for name in names if is_counted(planning, name, names)]
+        objects = planning.body_ids([planning.sensed[name].body for name in names])
+        table = planning.contact_table(use.bodies, names, missing=counted)
+        return LoadsUse(planning.body_ids(use.bodies), objects, table, of if use.request.has_center else "")
 
-    def gather(self, part: LoadsPart[Tensor], scene: Scene) -> tuple[PairLoads, ...]:
-        return tuple(_loads(use, scene.tensors, scene.dtype) for use in part.uses)
+    def gather_use(self, part: LoadsUse[Tensor], scene: Scene) -> PairLoads:
+        return _loads(part, scene.tensors, scene.dtype)
 
     def reference(self, part: LoadsPart[np.ndarray], use: int, scene: ReferenceScene) -> PairLoads:
         use_part = part.uses[use]
@@ -350,15 +354,8 @@ class _Loads(Quantity):
             along[b, o] /= force[b, o] or 1.0
         return PairLoads(force, sliding, center, along)
 
-    def fields(self, part: LoadsPart) -> set[str]:
-        slots = {"contact_pos", "contact_force", "contact_normal"}
-        return {"body_linvel", "body_angvel", *slots, "contact_found", "contact_netforce"}
-
     def num_rows(self, part: LoadsPart, use: int) -> int:
         return part.uses[use].pairs.size
-
-    def explain(self, part: LoadsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
-        return ["normal force and sliding speed of the solver's contacts"]
 
 
 LOADS = _Loads()

@@ -48,6 +48,8 @@ class MotionPart(Generic[Array]):
 
 class _Motion(Quantity):
     name, request, part = "motion", LinkMotion, MotionPart
+    reads = ("body_pos", "body_quat", "body_linvel", "body_angvel")
+    shown = "poses and velocities of its links"
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> MotionPart[np.ndarray]:
         return MotionPart(tuple(np.array([planning.bodies.index(body) for body in self.bodies(use)]) for use in uses))
@@ -65,14 +67,8 @@ class _Motion(Quantity):
     def reference(self, part: MotionPart[np.ndarray], use: int, scene: ReferenceScene) -> list[ReferenceBody]:
         return [scene.body(name) for name in scene.layout.bodies]
 
-    def fields(self, part: MotionPart) -> set[str]:
-        return {"body_pos", "body_quat", "body_linvel", "body_angvel"}
-
     def bodies(self, use: Use) -> tuple[str, ...]:
         return use.bodies
-
-    def explain(self, part: MotionPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
-        return ["poses and velocities of its links"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,25 +100,20 @@ class PlacesPart(Generic[Array]):
 
 class _Places(Quantity):
     name, request, part = "places", Places, PlacesPart
+    reads = ("body_pos", "body_quat")
 
-    def plan(self, planning: Planning, uses: Sequence[Use]) -> PlacesPart[np.ndarray]:
-        body_of = {target.name: target.body for target in planning.objects}
-        planned = []
-        for request in (use.request for use in uses):
-            names = request.bodies or tuple(body_of[name] for name in request.objects if name in body_of)
-            bodies = np.array([planning.bodies.index(body) for body in names], dtype=np.int64)
-            offset = request.offset if request.bodies else np.zeros((len(names), 3))
-            planned.append(PlacesUse(bodies, np.asarray(offset, dtype=np.float64).reshape(-1, 3)))
-        return PlacesPart(tuple(planned))
+    def plan_use(self, planning: Planning, use: Use) -> PlacesUse[np.ndarray]:
+        request, body_of = use.request, {target.name: target.body for target in planning.objects}
+        names = request.bodies or tuple(body_of[name] for name in request.objects if name in body_of)
+        bodies = np.array([planning.bodies.index(body) for body in names], dtype=np.int64)
+        offset = request.offset if request.bodies else np.zeros((len(names), 3))
+        return PlacesUse(bodies, np.asarray(offset, dtype=np.float64).reshape(-1, 3))
 
-    def gather(self, part: PlacesPart[Tensor], scene: Scene) -> tuple[Vec, ...]:
-        return tuple(_places(scene, use.bodies, use.offset) for use in part.uses)
+    def gather_use(self, part: PlacesUse[Tensor], scene: Scene) -> Vec:
+        return _places(scene, part.bodies, part.offset)
 
     def reference(self, part: PlacesPart[np.ndarray], use: int, scene: ReferenceScene) -> Float[np.ndarray, "point 3"]:
         return _reference_places(scene, part.uses[use].bodies, part.uses[use].offset)
-
-    def fields(self, part: PlacesPart) -> set[str]:
-        return {"body_pos", "body_quat"}
 
     def bodies(self, use: Use) -> tuple[str, ...]:
         return use.request.bodies
@@ -168,35 +159,25 @@ class JointsPart(Generic[Array]):
 
 class _Joints(Quantity):
     name, request, part = "joints", Joints, JointsPart
+    reads = ("body_pos", "body_quat", "joint_vel", "joint_effort")
+    shown = "velocity, effort and place of its joints"
 
-    def plan(self, planning: Planning, uses: Sequence[Use]) -> JointsPart[np.ndarray]:
-        planned = []
-        for use in uses:
-            joints = np.array([planning.joints.index(link.name) for link in use.links], dtype=np.int64)
-            bodies = np.array([planning.bodies.index(link.body) for link in use.links], dtype=np.int64)
-            planned.append(JointsUse(joints, bodies, np.array([planning.anchors[link.name] for link in use.links])))
-        return JointsPart(tuple(planned))
+    def plan_use(self, planning: Planning, use: Use) -> JointsUse[np.ndarray]:
+        joints = np.array([planning.joints.index(link.name) for link in use.links], dtype=np.int64)
+        bodies = np.array([planning.bodies.index(link.body) for link in use.links], dtype=np.int64)
+        return JointsUse(joints, bodies, np.array([planning.anchors[link.name] for link in use.links]))
 
-    def gather(self, part: JointsPart[Tensor], scene: Scene) -> tuple[JointDrive, ...]:
-        values = []
-        for use in part.uses:
-            velocity, effort = (scene.tensors[name][:, use.joints].to(scene.dtype) for name in ("joint_vel", "joint_effort"))
-            values.append(JointDrive(velocity, effort, _places(scene, use.bodies, use.anchor)))
-        return tuple(values)
+    def gather_use(self, part: JointsUse[Tensor], scene: Scene) -> JointDrive:
+        velocity, effort = (scene.tensors[name][:, part.joints].to(scene.dtype) for name in ("joint_vel", "joint_effort"))
+        return JointDrive(velocity, effort, _places(scene, part.bodies, part.anchor))
 
     def reference(self, part: JointsPart[np.ndarray], use: int, scene: ReferenceScene) -> JointDrive:
         use_part = part.uses[use]
         velocity, effort = (scene.fields[name][use_part.joints] for name in ("joint_vel", "joint_effort"))
         return JointDrive(velocity, effort, _reference_places(scene, use_part.bodies, use_part.anchor))
 
-    def fields(self, part: JointsPart) -> set[str]:
-        return {"body_pos", "body_quat", "joint_vel", "joint_effort"}
-
     def bodies(self, use: Use) -> tuple[str, ...]:
         return use.bodies
-
-    def explain(self, part: JointsPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
-        return ["velocity, effort and place of its joints"]
 
 
 def _places(scene: Scene, bodies: Tensor, offset: Tensor) -> Vec:

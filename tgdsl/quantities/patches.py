@@ -547,8 +547,8 @@ class _Patches(Quantity):
                 results.append(_use(planning, use))
         return PatchesPart(tuple(results))
 
-    def gather(self, part: PatchesPart[Tensor], scene: Scene) -> tuple[ContactPatch, ...]:
-        return tuple(_patches(use, scene) for use in part.uses)
+    def gather_use(self, part: PatchesUse[Tensor], scene: Scene) -> ContactPatch:
+        return _patches(part, scene)
 
     def reference(self, part: PatchesPart[np.ndarray], use: int, scene: ReferenceScene) -> ReferencePatches:
         use_part = part.uses[use]

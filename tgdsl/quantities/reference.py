@@ -62,9 +62,8 @@ class ReferenceScene:
 
     def is_touching(self, link: str, target: str) -> bool:
         """Return whether the simulator has a link's body in contact with an object."""
-        pairs = {(pair.link, pair.object): i for i, pair in enumerate(self.contact_pairs)}
-        result, i = self.fields.get("contact_found"), pairs.get((link, target))
-        return result is not None and i is not None and bool(result[i] > 0)
+        found, pair = self.fields.get("contact_found"), Pair(link, target)
+        return found is not None and pair in self.contact_pairs and bool(found[self.contact_pairs.index(pair)] > 0)
 
     def variant(self, target: PairedObject) -> int:
         """Return which of its variants an object has."""
@@ -75,13 +74,5 @@ class ReferenceScene:
         return self.fields["object_size"][target.varied] if target.is_sized else None
 
 
-class References:
+class References(dict[type, Any]):
     """What a sensor asked for, by the type of the request, as the quantities' references return it."""
-
-    def __init__(self, values: Mapping[type, Any]):
-        """Hold values by the types of their requests."""
-        self._values = dict(values)
-
-    def __getitem__(self, request: type) -> Any:
-        """Return what came of the sensor's request of a type."""
-        return self._values[request]
