@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -55,12 +56,9 @@ class Term(SpecModel, ABC):
     of a captured step, so no Python branch may depend on a tensor's value.
     """
 
-    senses: ClassVar[tuple[str, ...]] = ()
-    """Kinds of sensors of the sensors' document that it looks at: see `Task.senses`."""
-    constants: ClassVar[tuple[str, ...]] = ()
-    """Parameters that no curriculum can change."""
-    watches_links: ClassVar[bool] = False
-    """Whether it looks at where the links of `Setup.links` are: `now.watched.body(link)`."""
+    senses: ClassVar[tuple[str, ...]] = ()  # kinds of sensors that it looks at: see `Task.senses`
+    constants: ClassVar[tuple[str, ...]] = ()  # parameters that no curriculum can change
+    watches_links: ClassVar[bool] = False  # whether it looks at where `Setup.links` are: `now.watched.body(link)`
     term: str | None = None
     """Which term it is: a name, or `package.module:Class` or `file.py:Class`; default: the name that it has in the document."""
 
@@ -68,8 +66,7 @@ class Term(SpecModel, ABC):
 class RewardTerm(Term):
     """A term of the reward."""
 
-    unit: ClassVar[str] = "1/s"
-    """Unit of its weight."""
+    unit: ClassVar[str] = "1/s"  # of its weight
     weight: Number
     """Factor on its rate: more than 0 for what pays, less for what costs."""
 
@@ -142,10 +139,8 @@ class Event:
 class EventTerm(Term):
     """Something that happens to the simulation, at each reset or after intervals that are drawn."""
 
-    changes_model: ClassVar[bool] = False
-    """Whether it changes what the scene is made of: at a reset it then happens before the scene begins again."""
-    per_env: ClassVar[tuple[str, ...]] = ()
-    """Properties of objects that environments have of their own for it: see `tgdsl.simulate`."""
+    changes_model: ClassVar[bool] = False  # whether it changes the scene's model: at a reset it happens before the others
+    per_env: ClassVar[tuple[str, ...]] = ()  # properties of objects that differ between environments: see `tgdsl.simulate`
     mode: Literal["reset", "interval"] = "interval"
     """When it happens."""
     interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
@@ -286,11 +281,8 @@ class ObjectSpeed(RewardTerm):
     """ω_free: the same for its angular velocity, about any axis [rad/s]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        velocities, free = (now.object.linvel, now.object.angvel), (self.free_speed, self.free_spin)
-        speed, spin = (
-            (vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(velocities, free, strict=True)
-        )
-        return speed + spin
+        speed, spin = vector_norm(now.object.linvel, dim=1), vector_norm(now.object.angvel, dim=1)
+        return (speed / self.free_speed - 1.0).clamp(min=0.0) + (spin / self.free_spin - 1.0).clamp(min=0.0)
 
 
 class ForceLimit(TerminationTerm):
@@ -338,7 +330,7 @@ class LinkForce(ObservationTerm):
         return groups.link_forces([setup.links[i] for i in self.rows(setup)])
 
     def rows(self, setup: Setup) -> list[int]:
-        """Return which links are observed."""
+        """Return which links are observed; raise `SimulationError` if a name or wildcard matches none."""
         for pattern in self.links:
             if not matching(pattern, setup.links):
                 raise SimulationError(f'no link matches "{pattern}"; {did_you_mean(pattern, setup.links, "links")}')
@@ -488,26 +480,9 @@ class Linear(CurriculumTerm):
         return self.start + share * (self.end - self.start)
 
 
-TERMS: Mapping[str, type[Term]] = {
-    "action_rate": ActionRate,
-    "joint_limit": JointLimit,
-    "work": Work,
-    "effort": Effort,
-    "contact_force": ContactForce,
-    "near": Near,
-    "net_force": NetForce,
-    "object_speed": ObjectSpeed,
-    "force_limit": ForceLimit,
-    "speed_limit": SpeedLimit,
-    "score_limit": ScoreLimit,
-    "link_force": LinkForce,
-    "object_state": ObjectState,
-    "object_velocity": ObjectVelocity,
-    "friction": Friction,
-    "mass": Mass,
-    "placement": Placement,
-    "drive": Drive,
-    "push": Push,
-    "linear": Linear,
-}
+_TERMS = (
+    *(ActionRate, JointLimit, Work, Effort, ContactForce, Near, NetForce, ObjectSpeed, ForceLimit, SpeedLimit, ScoreLimit),
+    *(LinkForce, ObjectState, ObjectVelocity, Friction, Mass, Placement, Drive, Push, Linear),
+)
+TERMS: Mapping[str, type[Term]] = {re.sub(r"(?<=[a-z])(?=[A-Z])", "_", term.__name__).lower(): term for term in _TERMS}
 """The terms that documents may name."""

@@ -86,22 +86,6 @@ def test_files_that_do_not_fit_are_refused(tmp_path):
         write_grasps(BY_HAND, tmp_path)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"qpos": np.full((5, 10), np.nan)},
-        {"ctrl": np.zeros((4, 3))},
-        {"variant": np.zeros(5)},
-        {"qpos": np.zeros(5)},
-        {"qpos": np.zeros((0, 10)), "ctrl": np.zeros((0, 3)), "variant": np.zeros(0, dtype=np.int64)},
-    ],
-)
-def test_arrays_that_do_not_fit_together_are_none(tmp_path, wrong):
-    np.savez(tmp_path / "grasps.npz", **(BY_HAND.packed() | wrong))
-    with pytest.raises(SimulationError, match="arrays that do not fit together"):
-        read_grasps(tmp_path / "grasps.npz", "a" * 64, "rod")
-
-
 def test_the_digest_is_of_the_scene_and_not_of_what_is_felt(tmp_path):
     document = write_pincer(tmp_path)
     plain = digest_of(document)

@@ -106,12 +106,9 @@ class Grasps:
         """Return what `packed` has made arrays of."""
         if str(arrays["format"]) != FORMAT:
             raise ValueError(f"format {arrays['format']}")
-        qpos, ctrl, variant = arrays["qpos"], arrays["ctrl"], arrays["variant"]
-        is_whole = qpos.ndim == ctrl.ndim == 2 and variant.shape == (len(qpos),) == (len(ctrl),) and len(qpos)
-        if not is_whole or variant.dtype.kind != "i" or not all(np.isfinite(part).all() for part in (qpos, ctrl)):
-            raise ValueError("arrays that do not fit together")
-        words = (str(arrays[name]) for name in ("scene", "object", "settings"))
-        return cls(qpos, ctrl, variant, *words)
+        return cls(
+            arrays["qpos"], arrays["ctrl"], arrays["variant"], *(str(arrays[name]) for name in ("scene", "object", "settings"))
+        )
 
 
 def settings_of(spec: TaskSpec, joints: tuple[str, ...]) -> str:

@@ -140,8 +140,6 @@ OF_LEARNING, OF_TOUCH = ("train", "distill"), ("touch", "placement", "resolution
 """What of a document matters to those alone who learn, and to those alone who feel."""
 POLICY = "policy.pt"  # name of a run's policy in its folder
 CARD = "card.json"  # name of the card in the file
-FIELDS = ("groups", "joints", "taxels", "spec", "spec.task", "spec.action", "spec.physics.timestep", "spec.physics.substeps")
-"""What every card has."""
 TAXELS = "taxels.csv"  # name of the table of taxels in the file
 
 
@@ -183,12 +181,6 @@ def read_policy(file: Path) -> PolicyFile:
             raise PolicyError(f"{file}: this is a checkpoint, from which learning goes on; {policy}") from error
         problem = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
         raise PolicyError(f"{file}: {problem}: {str(error).strip().splitlines()[0]}") from error
-    for path in FIELDS if card is not None else ():
-        part = card
-        for key in path.split("."):
-            if not isinstance(part, dict) or key not in part:
-                raise PolicyError(f"{file}: its {CARD} has no {path}: this is not what tgdsl train writes")
-            part = part[key]
     return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
 
 

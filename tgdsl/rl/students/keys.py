@@ -65,13 +65,7 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
         for placement in placements
         for noise in noises
     ]
-    keys = [StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)]
-    named: dict[str, StudentKey] = {}
-    for key in keys:
-        if (other := named.setdefault(key.name, key)) is not key:
-            both = " and ".join(" ".join(part for part in each.kind if part) for each in (other, key))
-            raise StudentError(f"two students would have the name {key.name}: those of {both}")
-    return keys
+    return [StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)]
 
 
 def feels(dealt: Sequence[StudentKey], also: Felt | None = None) -> list[Felt]:

@@ -27,8 +27,6 @@ class Teacher:
             raise PolicyError(f"{file}: this policy has no card that says how it was learned, as `tgdsl train` writes it")
         check_learned(card, file, loaded.spec, "teacher")
         self.card, theirs, ours = card, card["spec"], loaded.spec.model_dump(mode="json")
-        if missing := [name for name in OF_TOUCH if GROUP in card["groups"] and name not in theirs]:
-            raise PolicyError(f"{file}: its card has no spec.{missing[0]}: this is not what tgdsl train writes")
         self.felt = Felt(theirs["touch"], theirs["placement"], theirs["noise"]) if GROUP in card["groups"] else None
         if self.felt and theirs["resolution"] != ours["resolution"]:
             resolutions = f"resolution {theirs['resolution']}, here {ours['resolution']}"

@@ -32,12 +32,7 @@ LOSSES = ("value", "surrogate", "entropy", "rnd")
 
 
 class CapturedPPO(PPO):
-    """rsl_rl's PPO, captured.
-
-    Attributes:
-        rate: The learning rate.
-        losses: Means of the last update: value, surrogate, entropy, and error of random network distillation.
-    """
+    """rsl_rl's PPO, captured; `losses` are means of the last update by `LOSSES`."""
 
     def __init__(
         self,
@@ -161,8 +156,9 @@ class CapturedPPO(PPO):
         for group in self.optimizer.param_groups:
             self.rate.fill_(float(group["lr"]))
             group["lr"] = self.rate
-        graphs = (self._chosen, self._valued, self._rnd_graph, self._returned, self._learned, *self._parts, self._applied)
-        for graph in graphs:
+        for graph in (value for value in vars(self).values() if isinstance(value, Captured)):
+            graph.forget()
+        for graph in self._parts:
             graph.forget()
         return is_loaded
 
@@ -252,7 +248,12 @@ class CapturedPPO(PPO):
             ratio = (distribution.log_prob(actions) - chance[:, 0]).exp()
             gain = advantages[:, 0]
             surrogate = torch.max(-gain * ratio, -gain * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)).mean()
-            value = self._value_loss(self._judge(obs), values, returns)
+            value = self._judge(obs)
+            squares = (value - returns).square()
+            if self.use_clipped_value_loss:
+                clipped = values + (value - values).clamp(-self.clip_param, self.clip_param)
+                squares = torch.max(squares, (clipped - returns).square())
+            value = squares.mean()
             entropy = distribution.entropy.mean()
             loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
             error = self.rnd.compute_loss(obs) if self.rnd is not None else torch.zeros_like(loss)
@@ -263,13 +264,6 @@ class CapturedPPO(PPO):
             params = tuple(each.detach() for each in distribution.params)
             self._kl.copy_(distribution.kl_divergence(old_params, params).mean())
             self.losses += torch.stack([value, surrogate, entropy, error]).detach()
-
-    def _value_loss(self, value: Tensor, old_value: Tensor, returns: Tensor) -> Tensor:
-        squares = (value - returns).square()
-        if not self.use_clipped_value_loss:
-            return squares.mean()
-        clipped = old_value + (value - old_value).clamp(-self.clip_param, self.clip_param)
-        return torch.max(squares, (clipped - returns).square()).mean()
 
     def _take_step(self) -> None:
         """Adapt the learning rate, and make a step of the optimisers."""
@@ -291,10 +285,9 @@ class CapturedPPO(PPO):
 
 def _refuse(actor: MLPModel, critic: MLPModel, options: dict[str, Any]) -> None:
     """Refuse what cannot be captured."""
-    unsupported = {
-        name: options.get(name) for name in ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")
-    }
-    unsupported["recurrent networks"] = actor.is_recurrent or critic.is_recurrent
-    unsupported[f"optimizer {options.get('optimizer')}"] = options.get("optimizer", "adam") not in ("adam", "adamw")
-    if wrong := [name for name, value in unsupported.items() if value]:
+    names = ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")
+    wrong = [name for name in names if options.get(name)]
+    wrong += ["recurrent networks"] if actor.is_recurrent or critic.is_recurrent else []
+    wrong += [] if options.get("optimizer", "adam") in ("adam", "adamw") else [f"optimizer {options['optimizer']}"]
+    if wrong:
         raise TgdslError(f"CapturedPPO does without {', '.join(wrong)}: take rsl_rl's own PPO")

@@ -30,14 +30,10 @@ class Ranks:
 
     @staticmethod
     def of(environ: Mapping[str, str] = os.environ) -> Ranks:
-        """Return what torchrun says; raise `RankError` if its variables make no sense."""
-        try:
-            result = Ranks(int(environ.get("RANK", 0)), int(environ.get("WORLD_SIZE", 1)), int(environ.get("LOCAL_RANK", 0)))
-        except ValueError as error:
-            raise RankError(f"RANK, WORLD_SIZE and LOCAL_RANK are set by torchrun, and are whole numbers: {error}") from error
-        if not 0 <= result.rank < result.size or result.local < 0:
-            raise RankError(f"RANK is {result.rank} and WORLD_SIZE {result.size}: expected a rank from 0 below the size")
-        return result
+        """Return what torchrun says."""
+        return Ranks(
+            *(int(environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
+        )
 
     @property
     def is_first(self) -> bool:
