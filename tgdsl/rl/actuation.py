@@ -161,7 +161,6 @@ class Actuators:
 
 
 def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
-    """Return the columns of `Actuators` for one joint."""
     joint = model.joint(name)
     actuators = np.flatnonzero((model.actuator_trnid[:, 0] == joint.id) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT))
     if len(actuators) != 1:
@@ -189,20 +188,12 @@ def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
 
 
 class Actuation:
-    """The drives of all environments: their targets, what was drawn for each, and their torques.
+    """The drives of all environments: their targets, what was drawn for each, and their torques."""
 
-    Attributes:
-        target: Position targets after the last action [rad].
-        start: Those that episodes began with [rad].
-        torque: What each drive exerted in the last physics step [N·m].
-        drawn: What was drawn for each drive, by the names of `DriveSpec`.
-        scale: What an action of 1 is for each joint [rad, m].
-    """
-
-    target: Float[Tensor, "env joint"]
-    start: Float[Tensor, "env joint"]
-    torque: Float[Tensor, "env joint"]
-    drawn: Mapping[str, Float[Tensor, "env joint"]]
+    target: Float[Tensor, "env joint"]  # position targets after the last action [rad]
+    start: Float[Tensor, "env joint"]  # those that episodes began with [rad]
+    torque: Float[Tensor, "env joint"]  # what each drive exerted in the last physics step [N·m]
+    drawn: Mapping[str, Float[Tensor, "env joint"]]  # what was drawn for each drive, by the names of `DriveSpec`
 
     def __init__(
         self,

@@ -40,11 +40,7 @@ class _Prefetched(NamedTuple):
 
 
 class Draws:
-    """The random numbers of some environments.
-
-    Attributes:
-        seed: What they follow from.
-    """
+    """The random numbers of some environments; they follow from `seed`."""
 
     def __init__(
         self, seed: int, num_envs: int, device: torch.device | str = "cpu", first_env: int = 0, *, is_compiled: bool = False

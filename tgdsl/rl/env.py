@@ -339,7 +339,6 @@ class TouchEnv:
         return {part: tensors for part, tensors in memory.items() if tensors or part == "task"}
 
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Begin a new episode in some environments, in the simulation and the module too."""
         self.resets += chosen
         self._events.reset(chosen, self.resets, is_placed=False)
         start = self.task.reset(chosen, self.resets)
@@ -372,7 +371,6 @@ class TouchEnv:
             return step, now
 
     def _step_physics(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
-        """Make the physics steps of a control step, and return the readings at its end."""
         if self._substeps is not None:
             return self._substeps.step(control)
         self.sim.step(control)
@@ -387,7 +385,6 @@ class TouchEnv:
         return replace(now, score=self.task.score())
 
     def _begin_instant(self, chosen: Bool[Tensor, " env"], readings: dict[str, Tensor]) -> Now:
-        """Return the instant at which some environments begin an episode."""
         now = self._now(readings)
         if self._speeds:
             self._speeds.begin(chosen, now.joint_pos)
@@ -442,7 +439,6 @@ class TouchEnv:
         return rates
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
-        """Return the instant that readings are of."""
         watched, none, num = self.sim.watched(), self._used[:, :0], self.num_actions
         distance = self._sensed.distance
         force, normal_force = self._sensed.forces(readings, self._used)
@@ -466,7 +462,6 @@ class TouchEnv:
         )
 
     def _observe(self, now: Now) -> Observations:
-        """Return all groups of observations."""
         felt = self._sensed.observe(now.readings) if self._substeps is None else self._substeps.observe()
         measured = replace(now, joint_vel=self._speeds.value) if self._speeds else now
         count = (self.resets << 32) | self.steps

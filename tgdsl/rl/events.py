@@ -44,9 +44,8 @@ def event_terms(random: RandomSpec, terms: Mapping[str, Term]) -> dict[str, Even
 class Events:
     """The events of all environments.
 
-    Attributes:
-        memory: Live tensors by name: control steps until the next event, negative while one lasts; number of events, with the
-            episode in the upper 32 bits.
+    `memory` has live tensors by name: control steps until the next event, negative while one lasts; and the number of events,
+    with the episode in the upper 32 bits.
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], sim: Simulation, setup: Setup, actuation: Actuation):
@@ -100,12 +99,9 @@ M = TypeVar("M", bound=SpecModel)
 
 
 class Curricula:
-    """The curricula of a task's document.
+    """The curricula of a task's document: `values` of the numbers that they change, by dotted path, tensors without axes.
 
-    Attributes:
-        values: The numbers that they change, by dotted path: tensors without axes.
-        spec: The task's document, with these tensors in place of its own numbers.
-        terms: The terms that it adds, in the same way.
+    `spec` is the document and `terms` are those that it adds, with these tensors in place of its own numbers.
     """
 
     def __init__(self, loaded: LoadedTask, like: Tensor):

@@ -221,7 +221,6 @@ def task_schema() -> dict[str, Any]:
 
 
 def _renamed(schema: Any, others: Mapping[str, str]) -> Any:
-    """Return a schema whose references name definitions as `others` renames them."""
     if isinstance(schema, list):
         return [_renamed(part, others) for part in schema]
     if not isinstance(schema, dict):

@@ -266,22 +266,17 @@ def _sensors_of(loaded: LoadedTask, document: Loaded, wanted: Mapping[str, Seque
 
 
 class SubstepTouch:
-    """The groups of touch after each physics step of the last control step; all steps of a start are alike.
-
-    Attributes:
-        stacks: By group of observations: live tensors.
-    """
+    """The groups of touch after each physics step of the last control step (`temporal: stack`); at a start all are alike."""
 
     def __init__(self, sensed: Sensed, sim: Simulation):
         self._sensed, self._sim = sensed, sim
-        self.stacks: dict[str, Float[Tensor, "env step feature"]] = {}
+        self.stacks: dict[str, Float[Tensor, "env step feature"]] = {}  # live tensors
 
     def step(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
         """Make a control step, feeling at each physics step; return the readings of the last one."""
         readings: dict[str, Tensor] = {}
-        touch: TactileModule = self._sensed.touch
         for i, state in enumerate(self._sim.substates(control)):
-            readings = touch(state)
+            readings = self._sensed.touch(state)
             for name, value in self._sensed.observe(readings).items():
                 self.stacks[name][:, i].copy_(value)
         return readings

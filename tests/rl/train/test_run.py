@@ -1,6 +1,7 @@
 """Runs: what is written, going on after a kill at any instant, and what cannot be written."""
 
 import csv
+import errno
 import itertools
 import json
 import os
@@ -442,3 +443,18 @@ def test_a_disk_that_fills_up_leaves_a_whole_checkpoint_and_says_how_to_go_on(tm
     with pytest.raises(FileError, match=goes_on):
         run.learn(5, float("inf"))
     assert read_checkpoint(run._folder.checkpoint)["iteration"] == 1
+
+
+@pytest.mark.parametrize("name", ["add_scalar", "close"])
+def test_what_tensorboard_cannot_write_is_named(tmp_path, monkeypatch, name):
+    """It writes in a thread of its own, and raises what that has met where it is called next, without a file's name."""
+    run, _ = begun(tmp_path)
+    close = run.board.close
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(run.board, name, full)
+    with pytest.raises(FileError, match=r"events\.out\.tfevents: No space left on device"):
+        run.learn(1, float("inf"))
+    close()

@@ -127,7 +127,7 @@ class Train:
                     print(f"changed since the run began: {line}{end}")
                 folder.begin(origin, loaded, env)
             run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
-            if ranks.is_first and not run.has_board:
+            if ranks.is_first and run.board is None:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
             run.learn_with_bar(self.iterations, self.minutes, loaded.spec.train.iterations)
             if ranks.is_first:

@@ -81,14 +81,11 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
     def reset(
         self, *, seed: SupportsIndex | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin a new episode in all environments.
+        """Begin a new episode in all environments; return observations by group, (env, feature) each, and an empty dictionary.
 
         Args:
             seed: What all that is random follows from; default: go on.
             options: None or empty: there are none.
-
-        Returns:
-            Observations by group, (env, feature) each, and nothing else to tell.
 
         Raises:
             TgdslError: If there is a seed per environment, or an option.
@@ -102,13 +99,10 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         return self._obs(self.touch_env.reset(new_seed)), {}
 
     def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
-        """Make one control step.
-
-        Args:
-            actions: What the policy asks for, (env, joint), from −1 to 1: an array or a tensor.
+        """Make one control step with actions (env, joint) from −1 to 1, an array or a tensor.
 
         Returns:
-            Observations by group, rewards, terminations, truncations, and what else there is to tell: see the class.
+            Observations by group, rewards, terminations, truncations, and further entries: see the class.
         """
         action = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
         obs, reward, terminated, truncated, info = self.touch_env.step(action)
@@ -129,10 +123,8 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
 
     def _torch_info(self, info: StepInfo) -> dict[str, Any]:
         entries = {name: getattr(info, name) for name in STEP_KEYS}
-        final = {
-            "final_obs": {group: info.final_obs[group] for group in self._groups},
-            "final_info": _masked(entries, info.ended),
-        }
+        final_obs = {group: info.final_obs[group] for group in self._groups}
+        final = {"final_obs": final_obs, "final_info": _masked(entries, info.ended)}
         return _masked(entries, ~info.ended) | final | {f"_{name}": info.ended for name in final}
 
     def _numpy_info(self, info: StepInfo) -> dict[str, Any]:
@@ -141,11 +133,10 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         present = {} if ended.all() else _masked(entries, ~ended)
         if not ended.any():
             return present
-        rows = np.flatnonzero(ended)
-        last = {group: info.final_obs[group].cpu().numpy()[rows] for group in self._groups}
+        last = {group: info.final_obs[group].cpu().numpy() for group in self._groups}
         final_obs = np.full(self.num_envs, None, dtype=object)
-        for i, row in enumerate(rows):
-            final_obs[row] = {group: values[i] for group, values in last.items()}
+        for row in np.flatnonzero(ended):
+            final_obs[row] = {group: values[row] for group, values in last.items()}
         final = {"final_obs": final_obs, "final_info": _masked(entries, ended)}
         return present | final | {f"_{name}": ended.copy() for name in final}
 

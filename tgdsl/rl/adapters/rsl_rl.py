@@ -30,16 +30,7 @@ except ImportError as error:
 
 
 class TouchVecEnv(VecEnv):
-    """Environments of rsl_rl: a translation of a `TouchEnv`, to which it adds nothing.
-
-    Attributes:
-        touch_env: The `TouchEnv`.
-        num_envs: Number of environments.
-        num_actions: Number of joints that the policy moves.
-        max_episode_length: Control steps of an episode that nothing ends before.
-        device: Where tensors are.
-        cfg: The task's document, as plain values.
-    """
+    """Environments of rsl_rl: a translation of a `TouchEnv`, to which it adds nothing; `cfg` is the task's document."""
 
     def __init__(self, touch_env: TouchEnv):
         self.touch_env, self.device = touch_env, touch_env.device
@@ -74,8 +65,7 @@ class TouchVecEnv(VecEnv):
     def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
         """Begin a new episode in all environments; return the observations, and nothing else to tell.
 
-        Args:
-            seed: What all that is random follows from; default: go on.
+        All that is random follows from `seed`; default: go on.
         """
         self._obs = self._given(self.touch_env.reset(seed))
         return self._obs, {}
@@ -83,10 +73,7 @@ class TouchVecEnv(VecEnv):
     def step(
         self, actions: Float[Tensor, "env joint"]
     ) -> tuple[TensorDict, Float[Tensor, " env"], Int[Tensor, " env"], dict[str, Any]]:
-        """Make one control step.
-
-        Args:
-            actions: What the policy asks for, from −1 to 1: what is beyond is clipped.
+        """Make one control step with actions from −1 to 1: what is beyond is clipped.
 
         Returns:
             Observations by group, of episodes that have ended the first of the next one; rewards; 1 where an episode has ended,

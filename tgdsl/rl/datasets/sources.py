@@ -49,8 +49,8 @@ class _Sampler(Actor):
         """Return the actor's actions."""
         env, now, action = self._env, self._env.now, self._actor(obs)
         reading = now.readings[self._output.name]
-        values = {"state": now.joint_pos, "touch": reading if reading.ndim == 3 else reading[:, -1], "policy_action": action}
-        values["action"] = env.actuation.commanded(action)
+        touch = reading if reading.ndim == 3 else reading[:, -1]  # of stacked samples the newest
+        values = {"state": now.joint_pos, "touch": touch, "policy_action": action, "action": env.actuation.commanded(action)}
         self.row = {name: value.detach().cpu().numpy().copy() for name, value in values.items()}
         return action
 
@@ -175,10 +175,8 @@ def of_run(
         raise TgdslError(f"{file}: {len(arrays['time'])} steps, expected two at least")
     model, sizes = scene_model(touch.plan.scene), (arrays["qpos"].shape[-1], arrays["ctrl"].shape[-1])
     if sizes != (model.nq, model.nu):
-        raise TgdslError(
-            f"{file}: {sizes[0]} positions and {sizes[1]} controls, its document now has {model.nq} and {model.nu}: "
-            "record it again"
-        )
+        problem = f"{sizes[0]} positions and {sizes[1]} controls, its document now has {model.nq} and {model.nu}"
+        raise TgdslError(f"{file}: {problem}: record it again")
     actuators = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
     joints = model.actuator_trnid[actuators, 0]
     step = float(np.median(np.diff(arrays["time"])))

@@ -96,7 +96,6 @@ def _array(pa: Any, values: np.ndarray) -> Any:
 
 
 def _statistics(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return an episode's statistics over its frames, as LeRobot has them."""
     keep, values = values.ndim == 1, values.astype(np.float64)
     result = {name: getattr(values, name)(axis=0, keepdims=keep) for name in ("min", "max", "mean", "std")}
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0, keepdims=keep)

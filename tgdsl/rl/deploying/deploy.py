@@ -139,14 +139,7 @@ class Report:
 
 
 class Deployment:
-    """A policy on a source: what it takes, seen before anything is connected.
-
-    Attributes:
-        prepared: The policy and its task.
-        source: The source, as `tgdsl.connect` takes it.
-        has_scene: Whether it has a scene, so that the task can judge.
-        moves: Whether set-points go to joints.
-    """
+    """A policy on a source: what it takes, seen before anything is connected."""
 
     def __init__(
         self,
@@ -292,7 +285,6 @@ class Deployment:
     def _episode(
         self, episode: int, connection: Connection, policy: Policy, num_steps: int | None, scene: TaskScene | None
     ) -> Iterator[HandMoment]:
-        """Make the steps of one episode."""
         late = getattr(connection.source, "num_late_steps", 0)
         hand = Hand(self.prepared, connection, scene, is_exact=self.has_scene and not self._is_emulated)
         hand.begin(self._start, self.moves)

@@ -168,11 +168,8 @@ def empty_step(score: float = math.nan) -> Step:
 class TaskScene(SteppedScene):
     """One environment of a task: its objects, pushes and drives are simulated, and the task judges what happens.
 
-    An episode that is over stands still until it is reset.
-
-    Attributes:
-        goal: What the task asks for now.
-        last_step: What the task says: of the instant that the readings are of.
+    An episode that is over stands still until it is reset. `goal` is what the task asks for now, `last_step` what it says
+    of the instant that the readings are of.
     """
 
     def __init__(self, env: TouchEnv):
@@ -220,12 +217,8 @@ class Hand:
 
     Targets are those of an `Actuation` whose drives are ideal: what a real drive does with them is the hand's affair.
 
-    Attributes:
-        action: The last action, from −1 to 1; zero at the start.
-        steps: Control steps so far.
-        age_s: How old the sample was of which the last observations were made [s]; None where nothing runs in real time.
-        inference_s: Time from then until the set-points were there [s].
-        seconds: Time that the last control step took [s].
+    `age_s` is how old the sample was of which the last observations were made, None where nothing runs in real time,
+    `inference_s` the time from then until the set-points were there, `seconds` what the last control step took [s].
     """
 
     def __init__(self, prepared: Prepared, connection: Connection, scene: TaskScene | None, is_exact: bool):
@@ -241,7 +234,7 @@ class Hand:
         self._measures = is_exact and spec.joint_vel == "measured"
         self._speeds: groups.MeasuredVelocity | None = None
         self._began = 0.0
-        self.action = torch.zeros((1, len(self._rows)), dtype=torch.float64)
+        self.action = torch.zeros((1, len(self._rows)), dtype=torch.float64)  # the last one, from −1 to 1
         self.steps = 0
         self.age_s: float | None = None
         self.inference_s = self.seconds = 0.0

@@ -148,7 +148,6 @@ class _Trials:
         return qpos
 
     def _close(self, count: Int[Tensor, " env"], start: Float[Tensor, "env nq"]) -> None:
-        """Close the hands while the objects are held."""
         sim, spec, draws, num = self.sim, self.spec, self._draws, len(self.joints)
         begin = start[:, self._joint]
         end = self._closed + self._spread * draws.uniform("end", count, num, -1.0, 1.0).double()

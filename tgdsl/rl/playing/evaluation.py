@@ -82,18 +82,8 @@ def evaluate_each(
 ) -> list[Evaluation]:
     """Let an actor act, and return how good that was in each block of environments.
 
-    Each environment's first episodes count, as many of each, so that short ones do not count more often than long ones.
-
-    Args:
-        env: The environments; they begin again.
-        actor: Who acts.
-        blocks: How many blocks they are: as many environments each, one block after the other.
-        episodes: How many episodes count of each block.
-        seed: What all that is random in the environments follows from.
-        progress: Called with the number of episodes that have ended.
-
-    Raises:
-        TgdslError: If no episode is asked for.
+    Each environment's first episodes count, as many of each, so that short ones do not count more often than long ones. Blocks
+    are of as many environments each, one block after the other; `episodes` count of each.
     """
     if episodes < 1:
         raise TgdslError(f"found {episodes} episodes, expected at least 1")
@@ -119,28 +109,25 @@ def evaluate_each(
             progress(f"evaluating: {blocks * episodes - left:,} of {blocks * episodes:,} episodes")
             if not left:
                 break
-    results = []
-    for block_sums, gait in zip(sums.view(6, blocks, size).sum(dim=2).T.tolist(), meter.gaits(), strict=True):
-        scores, squares, whole, returns, steps, faults = block_sums
-        score, held = scores / episodes, whole / episodes
-        results.append(
-            Evaluation(
-                task=env.spec.task,
-                unit=env.task.score_unit,
-                episodes=episodes,
-                envs=min(size, episodes),
-                seed=seed,
-                score=score,
-                score_interval=mean_interval(score, squares, episodes),
-                held=held,
-                held_interval=share_interval(held, episodes),
-                episode_return=returns / episodes,
-                seconds=steps / episodes * env.control_step,
-                faults=round(faults),
-                gait=gait,
-            )
+    block_sums = sums.view(6, blocks, size).sum(dim=2).T.tolist()
+    return [
+        Evaluation(
+            task=env.spec.task,
+            unit=env.task.score_unit,
+            episodes=episodes,
+            envs=min(size, episodes),
+            seed=seed,
+            score=scores / episodes,
+            score_interval=mean_interval(scores / episodes, squares, episodes),
+            held=whole / episodes,
+            held_interval=share_interval(whole / episodes, episodes),
+            episode_return=returns / episodes,
+            seconds=steps / episodes * env.control_step,
+            faults=round(faults),
+            gait=gait,
         )
-    return results
+        for (scores, squares, whole, returns, steps, faults), gait in zip(block_sums, meter.gaits(), strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -163,24 +150,23 @@ class Requirement:
 
 def parse_requirements(text: str) -> list[Requirement]:
     """Return what a text requires, its parts separated by commas: `coasting<0.1, penetration<2 mm, held>=95 %`."""
-    return [_requirement(part.strip()) for part in text.split(",")]
-
-
-def _requirement(part: str) -> Requirement:
-    match = _PART.match(part)
-    if not match:
-        expected = 'expected NAME<VALUE, such as "coasting<0.1, penetration<2 mm", with <, <=, > or >='
-        raise TgdslError(f'--require "{part}": {expected}')
-    name, value = match["name"], match["value"]
-    if name not in DIMENSIONS:
-        raise TgdslError(f'--require "{part}": nothing is called "{name}"; {did_you_mean(name, DIMENSIONS, "names")}')
-    dimension = DIMENSIONS[name]
-    is_percent = dimension == SHARE and value.endswith("%")
-    try:
-        bound = parse(value.removesuffix("%") if is_percent else value, "number" if dimension == SHARE else dimension)
-    except ValueError as error:
-        raise TgdslError(f'--require "{part}": {error}') from error
-    return Requirement(part, name, match["sign"], 0.01 * bound if is_percent else bound)
+    requirements = []
+    for part in map(str.strip, text.split(",")):
+        match = _PART.match(part)
+        if not match:
+            expected = 'expected NAME<VALUE, such as "coasting<0.1, penetration<2 mm", with <, <=, > or >='
+            raise TgdslError(f'--require "{part}": {expected}')
+        name, value = match["name"], match["value"]
+        if name not in DIMENSIONS:
+            raise TgdslError(f'--require "{part}": nothing is called "{name}"; {did_you_mean(name, DIMENSIONS, "names")}')
+        dimension = DIMENSIONS[name]
+        is_percent = dimension == SHARE and value.endswith("%")
+        try:
+            bound = parse(value.removesuffix("%") if is_percent else value, "number" if dimension == SHARE else dimension)
+        except ValueError as error:
+            raise TgdslError(f'--require "{part}": {error}') from error
+        requirements.append(Requirement(part, name, match["sign"], 0.01 * bound if is_percent else bound))
+    return requirements
 
 
 def mean_interval(mean: float, squares: float, num: int) -> tuple[float, float]:

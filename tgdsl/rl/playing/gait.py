@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import torch
 from jaxtyping import Bool, Float
@@ -116,9 +116,7 @@ class GaitMeter:
         self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(device)
         self._limit, self._rated = (torch.from_numpy(value).to(device) for value in (actuators.limit, actuators.top_speed))
         sizes = {"penetration": 1, "force": len(setup.links), "speed": 1, "spin": 1, "joint_speed": len(actuators.names)}
-        ends = [0]
-        for size in sizes.values():
-            ends.append(ends[-1] + size)
+        ends = [0, *accumulate(sizes.values())]
         self._rows = {name: slice(*pair) for name, pair in zip(sizes, pairwise(ends), strict=True)}
         self._counts = torch.zeros((blocks, ends[-1], NUM_BINS), dtype=torch.int64, device=device)
         block = torch.arange(num, device=device) // (num // blocks)
@@ -153,9 +151,7 @@ class GaitMeter:
         for name, value in numbers.items():
             self._sums[name] += torch.where(counts, value.double(), 0.0)
         self._saturated += torch.where(counts[:, None], is_saturated.double(), 0.0)
-        motion = torch.stack(
-            [vector_norm(velocity.double(), dim=1) for velocity in (now.object.linvel, now.object.angvel)], dim=1
-        )
+        motion = torch.stack([vector_norm(v.double(), dim=1) for v in (now.object.linvel, now.object.angvel)], dim=1)
         self._most = torch.where(counts[:, None], torch.maximum(self._most, motion), self._most)
         depth = -now.distance.double()
         deepest = depth.amax(dim=1, keepdim=True) if depth.shape[1] else torch.zeros_like(motion[:, :1])
@@ -171,17 +167,16 @@ class GaitMeter:
 
     def gaits(self) -> list[Gait]:
         """Return how the policy of each block moves its object."""
-        size = self._env.num_envs // self._blocks
-        sums = {name: value.view(self._blocks, size).sum(dim=1).tolist() for name, value in self._sums.items()}
-        saturated = self._saturated.view(self._blocks, size, -1).sum(dim=1).tolist()
-        most, counts = self._most.view(self._blocks, size, 2).amax(dim=1).tolist(), self._counts.cpu()
+        blocks = self._blocks
+        sums = {name: value.view(blocks, -1).sum(dim=1).tolist() for name, value in self._sums.items()}
+        saturated = self._saturated.view(blocks, -1, len(self._joints)).sum(dim=1).tolist()
+        most, counts = self._most.view(blocks, -1, 2).amax(dim=1).tolist(), self._counts.cpu()
         return [
             self._gait({name: value[i] for name, value in sums.items()}, saturated[i], most[i], counts[i])
-            for i in range(self._blocks)
+            for i in range(blocks)
         ]
 
     def _gait(self, sums: dict[str, float], saturated: list[float], most: list[float], counts: Tensor) -> Gait:
-        """Return the gait of one block, by its sums."""
         steps, limits, rated = sums["steps"], self._limit.tolist(), self._rated.tolist()
         parts = {name: counts[rows] for name, rows in self._rows.items()}
         has_limits, has_fingers = any(map(math.isfinite, limits)) and steps > 0, bool(self._fingers.any()) and steps > 0

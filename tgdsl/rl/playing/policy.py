@@ -239,11 +239,9 @@ def actor_groups(
 
 
 class Policy(Actor):
-    """A learned policy that acts in some environments.
+    """A learned policy that acts in some environments: takes `groups` of observations, in their order.
 
-    Attributes:
-        groups: Groups of observations that it takes, in their order.
-        std: Standard deviation of its actions while it was learned; None if its card does not have it.
+    `std` is the standard deviation of its actions while it was learned, None if its card does not have it.
     """
 
     def __init__(

@@ -33,7 +33,6 @@ class Record:
         return np.concatenate(self._columns[name])
 
     def __len__(self) -> int:
-        """Return how many times rows of the first column were added."""
         return len(next(iter(self._columns.values()), ()))
 
     def add_rows(self, columns: Mapping[str, Column]) -> None:

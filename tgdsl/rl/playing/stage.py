@@ -28,10 +28,9 @@ class TaskStage(Stage):
         """Begin the first episode of all environments again."""
         self.env.reset(self._seed)
         self._actor.begin(torch.ones(self.num_envs, dtype=torch.bool, device=self.env.sim.qpos.device))
-        self._moments, self._moment = rollout(self._actor, self.env), None
+        self._moments = rollout(self._actor, self.env)
+        self._moment: Moment | None = None
         self.time, self.readings = 0.0, self.env.now.readings
-
-    _moment: Moment | None
 
     def advance(self) -> None:
         """Let the actor act once."""

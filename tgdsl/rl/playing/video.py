@@ -83,7 +83,6 @@ def _frames(
 
 
 def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
-    """Return what draws."""
     drawn = copy.copy(model)
     drawn.vis.global_.offwidth, drawn.vis.global_.offheight = WIDTH, HEIGHT
     try:
@@ -96,7 +95,6 @@ def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
 
 
 def _encoder() -> str:
-    """Return the path of ffmpeg's program."""
     try:
         import imageio_ffmpeg
 
@@ -106,7 +104,6 @@ def _encoder() -> str:
 
 
 def _encode(encoder: str, frames: Iterable[Frame], rate: float, file: Path, target: Path) -> None:
-    """Write frames as H.264."""
     input_options = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{rate:.9g}", "-i", "-"]
     output_options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file)]
     command = [encoder, "-y", "-v", "error", *input_options, *output_options]

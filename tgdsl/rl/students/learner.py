@@ -78,15 +78,7 @@ LEAST_STD = 1e-3  # least deviation of the teacher's actions by which an error i
 
 
 class Rollout:
-    """Students of one stack in the blocks of `rows` environments that begin with environment `first`.
-
-    Attributes:
-        seen: Groups of observations of each.
-        memory: Their memory now, (student, row, memory).
-        begun: Their memory at the start of the rollout.
-        x: Their observations in it, (step, student, row, feature).
-        before: Their actions in it, (step, student, row, joint).
-    """
+    """Students of one stack in the blocks of `rows` environments that begin with environment `first`; `seen` by each."""
 
     def __init__(
         self,
@@ -101,7 +93,9 @@ class Rollout:
         self.keys, self.seen, self.first, self.rows = keys, seen, first, rows
         self.stack = Stack(networks, [key.seed for key in keys], spec.learning_rate, spec.max_grad_norm, device)
         shape = (len(keys), rows)
+        # what they remember now, and remembered at the start of the rollout: (student, row, memory)
         self.memory, self.begun = (torch.zeros((*shape, self.stack.memory), device=device) for _ in range(2))
+        # their observations and actions in the rollout: (step, student, row, …)
         self.x = torch.zeros((spec.steps, *shape, networks.num_features), device=device)
         self.before = torch.zeros((spec.steps, *shape, networks.actions), device=device)
 
@@ -128,12 +122,7 @@ def joined(values: Shaped[Tensor, "step student row feature"]) -> Shaped[Tensor,
 
 
 class Distiller(Learning):
-    """Teaches students.
-
-    Attributes:
-        rollouts: The students by stack, in the order of their blocks.
-        keys: The students, in the same order.
-    """
+    """Teaches students: `keys`, by stack `rollouts`, in the order of their blocks."""
 
     rates = "distill.learning_rate"
 
@@ -207,11 +196,9 @@ class Distiller(Learning):
 
     def student(self, index: int) -> Student:
         """Return a copy of a student, on the CPU, by its number among `keys`."""
-        for rollout in self.rollouts:
-            if index < len(rollout.keys):
-                return rollout.stack.student(index)
-            index -= len(rollout.keys)
-        raise IndexError(index)
+        stacked = [(rollout.stack, i) for rollout in self.rollouts for i in range(len(rollout.keys))]
+        stack, place = stacked[index]
+        return stack.student(place)
 
     def acting(self) -> Actor:
         """Return who acts in all environments: each student in its block, from now on by the weights that it has now."""
@@ -220,7 +207,6 @@ class Distiller(Learning):
     # What is captured
 
     def _choose(self) -> None:
-        """Compute the teacher's actions and those of each student."""
         with torch.no_grad():
             acting = [partial(self._act, rollout, x) for rollout, x in zip(self.rollouts, self._inputs, strict=True)]
             self._beside([lambda: self._label.copy_(self._teacher(self._seen)), *acting])
@@ -330,7 +316,6 @@ class Distiller(Learning):
         return numbers
 
     def _allocate(self) -> None:
-        """Make room for a rollout, and what is captured."""
         env, spec, device = self.env, self._spec, self.env.device
         num, actions, steps = env.num_envs, env.num_actions, spec.steps
         seen = dict.fromkeys((*self._teacher.groups, *(name for names in self.groups.values() for name in names)))

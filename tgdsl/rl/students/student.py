@@ -70,11 +70,7 @@ def mlp(size: int, hidden: tuple[int, ...], output: int) -> nn.Sequential:
 
 def network(size: int, encoder: Encoder) -> Embedding:
     """Return the network that embeds a group of some size."""
-    if encoder.kind == "mlp":
-        return Mlp(size, encoder)
-    if encoder.kind == "lstm":
-        return Lstm(size, encoder)
-    return Convolution(encoder) if encoder.kind == "cnn" else RecurrentConvolution(encoder)
+    return {"mlp": Mlp, "lstm": Lstm, "cnn": Convolution, "convrnn": RecurrentConvolution}[encoder.kind](size, encoder)
 
 
 class Embedding(nn.Module):
@@ -115,36 +111,28 @@ class Lstm(Embedding):
 class Images(Embedding):
     """What networks of images have in common: features as images of links, with a channel that tells where there are taxels."""
 
+    cells: Tensor
+    mask: Tensor
+
     def __init__(self, grid: Grid):
         super().__init__()
         self.grid = grid
         cells = torch.tensor(grid.taxels).view(grid.shape)
         self.register_buffer("cells", cells.clamp(min=0), persistent=False)
-        self.register_buffer("mask", (cells >= 0).to(torch.get_default_dtype()), persistent=False)
-
-    def images(self, x: Tensor) -> Tensor:
-        """Return images, 0 where there is no taxel."""
-        by_channel = x.unflatten(1, (self.grid.channels, self.grid.num_taxels))
-        cells: Tensor = self.cells  # pyright: ignore[reportAssignmentType]
-        result = by_channel[:, :, cells.flatten()].unflatten(2, self.grid.shape)
-        return result.transpose(1, 2) * self.masks()
-
-    def masks(self) -> Tensor:
-        """Return 1 where there is a taxel, else 0."""
-        mask: Tensor = self.mask  # pyright: ignore[reportAssignmentType]
-        return mask[:, None]
+        mask = (cells >= 0).to(torch.get_default_dtype())[:, None]  # 1 where there is a taxel
+        self.register_buffer("mask", mask, persistent=False)
 
     def marked(self, x: Tensor) -> Tensor:
-        """Return the images of all links and environments, and as their last channel the mask."""
-        images = self.images(x)
-        mask = self.masks().expand(x.shape[0], -1, -1, -1, -1)
-        return torch.cat([images, mask], dim=2).flatten(0, 1)
+        """Return the images of all links and environments, 0 where there is no taxel, and as their last channel the mask."""
+        by_channel = x.unflatten(1, (self.grid.channels, self.grid.num_taxels))
+        images = by_channel[:, :, self.cells.flatten()].unflatten(2, self.grid.shape).transpose(1, 2) * self.mask
+        return torch.cat([images, self.mask.expand(x.shape[0], -1, -1, -1, -1)], dim=2).flatten(0, 1)
 
 
 class Convolution(Images):
     """Convolutions, the same ones of all links, then a projection of all that they find."""
 
-    def __init__(self, encoder: Encoder):
+    def __init__(self, size: int, encoder: Encoder):
         assert encoder.grid is not None
         super().__init__(encoder.grid)
         channels = (encoder.grid.channels + 1, *encoder.hidden)
@@ -156,19 +144,19 @@ class Convolution(Images):
         images = self.marked(x)
         for layer in self.layers:
             images = nn.functional.elu(layer(images))
-        images = images.unflatten(0, (x.shape[0], -1)) * self.masks()
+        images = images.unflatten(0, (x.shape[0], -1)) * self.mask
         return self.projection(images.flatten(1)), memory
 
 
 class RecurrentConvolution(Images):
     """Long short-term memory whose products are convolutions, gates layer-normed per image; then a projection."""
 
-    def __init__(self, encoder: Encoder):
+    def __init__(self, size: int, encoder: Encoder):
         assert encoder.grid is not None
         super().__init__(encoder.grid)
         self.width, cells = encoder.hidden[0], len(encoder.grid.taxels)
-        size = encoder.grid.channels + 1 + self.width
-        self.gates = nn.Conv2d(size, 4 * self.width, encoder.kernel, padding=encoder.kernel // 2, bias=False)
+        channels = encoder.grid.channels + 1 + self.width
+        self.gates = nn.Conv2d(channels, 4 * self.width, encoder.kernel, padding=encoder.kernel // 2, bias=False)
         self.norm = nn.LayerNorm([4 * self.width, *encoder.grid.shape[1:]])
         self.projection, self.memory = nn.Linear(self.width * cells, encoder.size), 2 * self.width * cells
 
@@ -176,7 +164,7 @@ class RecurrentConvolution(Images):
         links, *image = self.grid.shape
         state = memory.unflatten(1, (2, links, self.width, *image)).transpose(0, 1).flatten(1, 2)
         h, c = gated(self.norm(self.gates(torch.cat([self.marked(x), state[0]], dim=1))), state[1])
-        state = torch.stack([h, c]).unflatten(1, (x.shape[0], links)) * self.masks()
+        state = torch.stack([h, c]).unflatten(1, (x.shape[0], links)) * self.mask
         return self.projection(state[0].flatten(1)), state.transpose(0, 1).flatten(1)
 
 
@@ -213,12 +201,10 @@ class StudentOutput(NamedTuple):
 
 
 class Student(nn.Module):
-    """A student.
+    """A student; it remembers `memory` numbers of an episode."""
 
-    Attributes:
-        architecture: Its networks.
-        memory: How many numbers it remembers of an episode.
-    """
+    mean: Tensor
+    var: Tensor
 
     def __init__(self, architecture: Architecture):
         super().__init__()
@@ -233,9 +219,7 @@ class Student(nn.Module):
 
     def forward(self, x: Tensor, memory: Tensor) -> StudentOutput:
         architecture = self.architecture
-        mean: Any = self.mean
-        scale: Any = self.var.sqrt() + architecture.eps  # pyright: ignore[reportCallIssue]
-        normal = ((x - mean) / scale).clamp(-architecture.clip, architecture.clip)
+        normal = ((x - self.mean) / (self.var.sqrt() + architecture.eps)).clamp(-architecture.clip, architecture.clip)
         parts = normal.split([size for size, _ in architecture.groups], dim=1)
         memories = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
         embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, memories, strict=True)]
@@ -316,12 +300,8 @@ NORM_EPS = 1e-6  # what `torch.nn.utils.clip_grad_norm_` adds to a norm
 class Stack:
     """Students of one architecture.
 
-    Attributes:
-        memory: How many numbers each remembers of an episode.
-        parameters: Their weights by name, (student, …).
-        buffers: Means and variances by which they normalise what they see, in the same way: copies of `moments`.
-        seen: Moments of what they have seen, in float64, and the number of rows of each.
-        moments: Mean and variance of it, (student, feature): views.
+    `parameters` are their weights by name, (student, …); `buffers`, in the same way, means and variances by which they
+    normalise what they see: copies of `moments`, float64 views of `seen`, (student, feature).
     """
 
     def __init__(
@@ -398,8 +378,7 @@ class Stack:
             if current[part].keys() != state[part].keys():
                 raise RuntimeError(f"its {part} are {', '.join(state[part])}")
             for name, value in current[part].items():
-                shape = state[part][name].shape
-                if shape != value.shape:
+                if (shape := state[part][name].shape) != value.shape:
                     raise RuntimeError(f"{name} is {tuple(shape)}, not {tuple(value.shape)}")
         with torch.no_grad():
             for part in ("networks", "seen"):

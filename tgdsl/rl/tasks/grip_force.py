@@ -216,7 +216,6 @@ class GripForce(Task[GripForceSpec]):
 
 
 def _keyframes(spec: GripForceSpec, setup: Setup, field: str) -> Float[Tensor, "variant number"]:
-    """Return `qpos` or `ctrl` of the starts."""
     if len(spec.starts) != setup.num_variants:
         problem = f"{len(spec.starts)} starts, and the object has {setup.num_variants} variants"
         raise LowerError(problem, "starts", "expected a keyframe for each")

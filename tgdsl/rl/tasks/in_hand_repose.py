@@ -223,7 +223,6 @@ class InHandRepose(Task[InHandReposeSpec]):
         return (self.episode << 32) | self.reached
 
     def _most_steps(self) -> Int[Tensor, " env"] | int:
-        """Return how many control steps there are for each goal."""
         low, high = self.spec.goal_timeout
         if low == high:
             return round(low / self.setup.control_step)

@@ -156,7 +156,6 @@ class InPalmRotate(Task[InPalmRotateSpec]):
             self._note_pay(now, step)
 
     def _note_pay(self, now: Now, step: Float[Tensor, " env"]) -> None:
-        """Note what progress pays now, and which share of it was paid since the goal before."""
         forth = step.clamp(min=0.0)
         self.pay.copy_(self.holding.pay(now))
         self.forth += forth

@@ -40,11 +40,7 @@ class HoldSpec(SpecModel):
 
 
 class Holding:
-    """Says where the object is held, and what its progress pays.
-
-    Attributes:
-        pays_in_full: Whether progress always pays the same.
-    """
+    """Says where the object is held, and what its progress pays; it always pays the same if it `pays_in_full`."""
 
     def __init__(self, spec: HoldSpec, setup: Setup):
         self.spec, self.pays_in_full = spec, isinstance(spec.coasting_pay, float) and spec.coasting_pay == 1.0
@@ -70,7 +66,6 @@ def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray,
 
 
 def _joints_above(model: mujoco.MjModel, body: int) -> set[int]:
-    """Return the hinges and slides that move a body."""
     result: set[int] = set()
     while body:
         first = int(model.body_jntadr[body])

@@ -233,7 +233,6 @@ class Screwdriver(Task[ScrewdriverSpec]):
 
 
 def _upright(setup: Setup, tip: str) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-    """Return where the object's body and its tip are in the keyframe [m]."""
     state = mujoco.MjData(setup.model)
     state.qpos[:] = setup.qpos.cpu().numpy()
     mujoco.mj_kinematics(setup.model, state)

@@ -46,7 +46,7 @@ class RunFolder:
     """The files of a run, at its `path`."""
 
     def __init__(self, path: Path):
-        self.path, self.run, self.curve = path, path / "run.json", path / "curve.csv"
+        self.path, self.run, self.curve, self.board = path, path / "run.json", path / "curve.csv", path / "events.out.tfevents"
         self.checkpoint, self.policy, self.evaluation = (
             path / name for name in ("checkpoint.pt", "policy.pt", "evaluation.json")
         )

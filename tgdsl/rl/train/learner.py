@@ -13,7 +13,7 @@ import io
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -87,22 +87,15 @@ class Iteration:
 class Learning(Actor):
     """Environments and who learns in them, iteration by iteration: a rollout in which it acts, and an update.
 
-    On a GPU the host waits once per iteration, but for captures at the first ones.
-
-    Attributes:
-        groups: Groups of observations of each network.
-        iteration: Number of iterations so far.
-        samples: How many control steps these took, over all processes and environments.
-        rates: What of the document makes smaller steps.
+    On a GPU the host waits once per iteration, but for captures at the first ones. `groups` are the groups of observations of
+    each network, `samples` the control steps so far, over all processes and environments.
     """
 
-    rates: ClassVar[str]
+    rates: ClassVar[str]  # what of the document makes smaller steps
     groups: dict[str, list[str]]
-    std: list[float] | None = None
-    """Standard deviation of its actions."""
+    std: list[float] | None = None  # standard deviation of its actions
 
     def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
-        """Take the environments of this process; `steps` control steps are a rollout."""
         self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
         self._num_steps, self._desynchronise, self._has_begun = steps, desynchronise, False
         self._tally = EpisodeTally()
@@ -234,10 +227,11 @@ def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[st
     """Return the groups of observations of actor, critic and, if there is one, random network distillation."""
     train = loaded.spec.train
     privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
-    actor = _given(loaded, groups, ("actor",)) or [name for name in privileged if name != PROPS]
-    result = {"actor": actor, "critic": _given(loaded, groups, ("critic",)) or privileged}
+    actor = _named(loaded, groups, ("actor",), train.actor) or [name for name in privileged if name != PROPS]
+    result = {"actor": actor, "critic": _named(loaded, groups, ("critic",), train.critic) or privileged}
     if train.rnd != "off":
-        result["rnd_state"] = _given(loaded, groups, ("rnd", "groups")) or ([STATE] if STATE in groups else actor)
+        default = [STATE] if STATE in groups else actor
+        result["rnd_state"] = _named(loaded, groups, ("rnd", "groups"), train.rnd.groups) or default
     return result
 
 
@@ -256,11 +250,9 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
     gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian", "init_std": networks.initial_std}
     algorithm = {name: getattr(train, own) for name, own in PPO_OPTIONS.items()}
     algorithm |= {"class_name": "tgdsl.rl.train.ppo:CapturedPPO", "schedule": "adaptive" if train.adaptive else "fixed"}
-    rnd = (
-        None
-        if train.rnd == "off"
-        else normalisation
-        | {
+    rnd = None
+    if train.rnd != "off":
+        rnd = normalisation | {
             "weight": train.rnd.weight,
             "num_outputs": train.rnd.outputs,
             "predictor_hidden_dims": list(train.rnd.predictor),
@@ -269,7 +261,6 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
             "reward_normalization": True,
             "learning_rate": train.rnd.learning_rate,
         }
-    )
     return {
         "num_steps_per_env": train.steps,
         "save_interval": 1000,
@@ -281,18 +272,15 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
     }
 
 
-def _given(loaded: LoadedTask, groups: Mapping[str, int], place: tuple[str, ...]) -> list[str]:
+def _named(loaded: LoadedTask, groups: Mapping[str, int], place: tuple[str, ...], names: Sequence[str] | None) -> list[str]:
     """Return the groups that a document names; none if it names none."""
-    result: Any = loaded.spec.train
-    for key in place:
-        result = getattr(result, key)
-    for i, name in enumerate(result or ()):
+    for i, name in enumerate(names or ()):
         if name not in groups:
             problem = f'there is no group of observations "{name}"'
             raise loaded.error(("train", *place, i), problem, did_you_mean(name, groups, "groups"))
         if groups[name] == 0:
             raise loaded.error(("train", *place, i), f'the group of observations "{name}" is empty')
-    return list(result or ())
+    return list(names or ())
 
 
 class Learner(Learning):

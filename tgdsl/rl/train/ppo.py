@@ -193,7 +193,6 @@ class CapturedPPO(PPO):
         copy_each([self._obs[name] for name in names], [obs[name] for name in names])
 
     def _policy(self, obs: TensorDict) -> Distribution:
-        """Return the policy's distribution."""
         actor = self.actor
         assert actor.distribution is not None
         with torch.autocast(**self._autocast):
@@ -266,7 +265,6 @@ class CapturedPPO(PPO):
             self.losses += torch.stack([value, surrogate, entropy, error]).detach()
 
     def _take_step(self) -> None:
-        """Adapt the learning rate, and make a step of the optimisers."""
         with torch.no_grad():
             if self.schedule == "adaptive" and self.desired_kl is not None:
                 kl, rate = self._kl[0], self.rate
@@ -284,7 +282,6 @@ class CapturedPPO(PPO):
 
 
 def _refuse(actor: MLPModel, critic: MLPModel, options: dict[str, Any]) -> None:
-    """Refuse what cannot be captured."""
     names = ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")
     wrong = [name for name in names if options.get(name)]
     wrong += ["recurrent networks"] if actor.is_recurrent or critic.is_recurrent else []

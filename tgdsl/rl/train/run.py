@@ -15,11 +15,11 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from types import FrameType
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -65,31 +65,6 @@ class ProgressBar:
         sys.stdout.flush()
 
 
-class Board:
-    """TensorBoard's file of a run, if TensorBoard is installed."""
-
-    def __init__(self, folder: Path, done: int):
-        self.writer: Any = None
-        self._file = folder / "events.out.tfevents"
-        with contextlib.suppress(ImportError), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of its own packages
-            from torch.utils.tensorboard import SummaryWriter
-
-            self.writer = SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
-
-    def add(self, metrics: Mapping[str, float], iteration: int) -> None:
-        """Add an iteration's numbers."""
-        with as_file_error(self._file):
-            for name, value in metrics.items() if self.writer else ():
-                self.writer.add_scalar(name, value, iteration)
-
-    def close(self) -> None:
-        """Write what has not been written."""
-        with as_file_error(self._file):
-            if self.writer:
-                self.writer.close()
-
-
 class DivergedError(TgdslError):
     """A policy whose losses, or whose state, are no numbers any more."""
 
@@ -98,51 +73,41 @@ Show = Callable[[Mapping[str, float | int], float], None]
 """Called with an iteration, as `curve.csv` has it, and the time that is left [s]."""
 
 
-class StopRequest:
-    """Notes the first SIGINT (Ctrl-C) or SIGTERM, so that work can end at a good place; the second acts as it did before."""
+@contextlib.contextmanager
+def stop_requests() -> Iterator[list[signal.Signals]]:
+    """Yield a list that gets the first SIGINT (Ctrl-C) or SIGTERM, to end work at a good place; the second acts as before."""
+    received: list[signal.Signals] = []
+    handlers: dict[signal.Signals, Any] = {}
 
-    signal: signal.Signals | None = None
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(signal.Signals(number))
+        restore_handlers()
 
-    def __init__(self) -> None:
-        self._before: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():  # Python lets no other thread handle signals
-            self._before = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for signal_number, handler in self._before.items():
+    def restore_handlers() -> None:
+        for signal_number, handler in handlers.items():
             signal.signal(signal_number, handler)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.signal = signal.Signals(number)
-        self.__exit__()
+    if threading.current_thread() is threading.main_thread():  # Python lets no other thread handle signals
+        handlers.update({number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)})
+    try:
+        yield received
+    finally:
+        restore_handlers()
 
 
 class Run:
-    """A run in its folder.
-
-    Attributes:
-        seconds: How long it has learned [s]; to make environments and to evaluate is not learning.
-        stopped_by: The signal that has ended `learn`; None: none has.
-    """
+    """A run in its folder; `seconds` of learning do not count what it takes to make environments and to evaluate."""
 
     def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
         """Write the first checkpoint: a folder or disk that cannot take it is found now."""
         self.learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
         self._rate, self._samples, self._saved = 0.0, learner.samples, learner.iteration
-        self.stopped_by: signal.Signals | None = None
+        self.stopped_by: signal.Signals | None = None  # the signal that has ended `learn`
         self._writes = learner.ranks.is_first
         if self._writes:
             folder.keep_rows(learner.iteration)
         self.save()
-        self._board = Board(folder.path, learner.iteration) if self._writes else None
-
-    @property
-    def has_board(self) -> bool:
-        """Whether this process writes for TensorBoard."""
-        return self._board is not None and self._board.writer is not None
+        self.board = _board(folder.path, learner.iteration) if self._writes else None
 
     def save(self) -> None:
         """Write a checkpoint; of several processes the first one does."""
@@ -176,20 +141,20 @@ class Run:
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
         """
         try:
-            with StopRequest() as request:
-                self._iterate(iterations, seconds, show, request)
-            self.stopped_by = request.signal
+            with stop_requests() as received:
+                self._iterate(iterations, seconds, show, received)
+            self.stopped_by = received[0] if received else None
         except FileError as error:
             checkpoint = f"{self._folder.checkpoint} is whole, of iteration {self._saved}"
             raise FileError(
                 error.file, f"{error.reason}; {checkpoint}; --resume {self._folder.path} goes on from it"
             ) from error
         finally:
-            if self._board is not None:
-                self._board.close()
+            if self.board is not None:
+                with as_file_error(self._folder.board):
+                    self.board.close()
 
-    def _iterate(self, iterations: int, seconds: float, show: Show | None, request: StopRequest) -> None:
-        """Make iterations until enough were made, time is over or someone asks to stop."""
+    def _iterate(self, iterations: int, seconds: float, show: Show | None, received: Sequence[signal.Signals]) -> None:
         learner, seconds_before = self.learner, self.seconds
         begun = saved = time.monotonic()
         is_over = learner.iteration >= iterations or seconds <= 0.0
@@ -201,7 +166,7 @@ class Run:
             self.seconds = seconds_before + now - begun
             self._refuse_diverged(iteration)
             self._tell(iteration, now - start, iterations, seconds - (now - begun), show)
-            is_over = learner.iteration >= iterations or now - begun >= seconds or request.signal is not None
+            is_over = learner.iteration >= iterations or now - begun >= seconds or bool(received)
             is_due = is_over or now - saved + (now - start) > self._every
             is_over, is_due = learner.ranks.agreed((is_over, is_due), learner.env.device)
             if is_due:
@@ -230,8 +195,10 @@ class Run:
             "episodes": iteration.episodes,
         }
         self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **iteration.metrics})
-        if self._board is not None:
-            self._board.add(iteration.metrics | perf, learner.iteration)
+        if self.board is not None:
+            with as_file_error(self._folder.board):
+                for name, value in (iteration.metrics | perf).items():
+                    self.board.add_scalar(name, value, learner.iteration)
         if show is not None:
             show(row | iteration.metrics, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
 
@@ -243,6 +210,15 @@ class Run:
                 f"iteration {self.learner.iteration}: {problem}; {self._folder.checkpoint} is from before: try a smaller "
                 f"{self.learner.rates}"
             )
+
+
+def _board(folder: Path, done: int) -> Any:
+    """Return what writes for TensorBoard; None if that is not installed."""
+    with contextlib.suppress(ImportError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its own packages
+        from torch.utils.tensorboard import SummaryWriter
+
+        return SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
 
 
 def end_if_stopped(run: Run, command: str) -> None:
