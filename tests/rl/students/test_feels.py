@@ -106,4 +106,4 @@ def test_images_of_a_network_are_those_of_the_module(make, placement):
     for link, (image, mask) in enumerate(zip(images.values(), masks.values(), strict=True)):
         rows, columns = mask.shape
         assert torch.equal(found[:, link, :, :rows, :columns], image)
-        assert float(Images(grid).masks()[link].sum()) == float(mask.sum())
+        assert float(Images(grid).mask[link].sum()) == float(mask.sum())

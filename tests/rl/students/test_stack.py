@@ -187,7 +187,7 @@ def test_cells_without_a_taxel_tell_nothing_and_each_taxel_does(kind):
     embedding, memory = own(x, torch.zeros(1, own.memory))
     (gradient,) = torch.autograd.grad(embedding.sum(), x, retain_graph=True)
     assert (gradient != 0).all()
-    images, mask = own.images(x), own.masks()
+    images, mask = own.images(x), own.mask
     assert images.shape == (1, 2, 2, 3, 2) and float(mask.sum()) == 7
     assert torch.equal(images[0, 1, :, 1, 1], torch.zeros(2)) and torch.equal(images[0, 1, :, 0, 1], x[0, [5, 12]])
     if kind == "convrnn":

@@ -122,11 +122,15 @@ class Images(Embedding):
         mask = (cells >= 0).to(torch.get_default_dtype())[:, None]  # 1 where there is a taxel
         self.register_buffer("mask", mask, persistent=False)
 
-    def marked(self, x: Tensor) -> Tensor:
-        """Return the images of all links and environments, 0 where there is no taxel, and as their last channel the mask."""
+    def images(self, x: Tensor) -> Tensor:
+        """Return images of all environments and links, 0 where there is no taxel."""
         by_channel = x.unflatten(1, (self.grid.channels, self.grid.num_taxels))
-        images = by_channel[:, :, self.cells.flatten()].unflatten(2, self.grid.shape).transpose(1, 2) * self.mask
-        return torch.cat([images, self.mask.expand(x.shape[0], -1, -1, -1, -1)], dim=2).flatten(0, 1)
+        return by_channel[:, :, self.cells.flatten()].unflatten(2, self.grid.shape).transpose(1, 2) * self.mask
+
+    def marked(self, x: Tensor) -> Tensor:
+        """Return the images of all links and environments, and as their last channel the mask."""
+        mask = self.mask.expand(x.shape[0], -1, -1, -1, -1)
+        return torch.cat([self.images(x), mask], dim=2).flatten(0, 1)
 
 
 class Convolution(Images):
