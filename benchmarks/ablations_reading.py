@@ -37,8 +37,7 @@ from tgdsl.files.write import atomic_write, with_folder
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import PER_LINK, Felt, num_variants, types_of
-from tgdsl.rl.students.keys import NONE
-from tgdsl.rl.students.teacher import Teacher
+from tgdsl.rl.students.keys import NONE, Teacher
 
 FORCE = "priv_force"
 """The group whose first number is the force [N]."""

@@ -40,9 +40,8 @@ from tgdsl.files.write import atomic_write, check_writable, with_folder
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.sensed import num_variants
-from tgdsl.rl.students.keys import StudentKey, check_blocks, feels, student_keys
+from tgdsl.rl.students.keys import StudentKey, Teacher, check_blocks, feels, student_keys
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.teacher import Teacher
 
 ROOT = Path(__file__).parents[1]
 ALONE = "force_torque"

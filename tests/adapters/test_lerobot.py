@@ -18,8 +18,7 @@ import zarr
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from mcap.reader import make_reader
 
-from tgdsl.rl.datasets.episode import Episode, Header, LinkTaxels, frames
-from tgdsl.rl.datasets.writers import write_lerobot, write_mcap, write_zarr
+from tgdsl.rl.datasets.dataset import Episode, Header, LinkTaxels, frames, write_lerobot, write_mcap, write_zarr
 
 
 def made_up():

@@ -15,7 +15,7 @@ from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
-    from tgdsl.rl.datasets.episode import Episode, Header
+    from tgdsl.rl.datasets.dataset import Episode, Header
 
 Input = Annotated[
     tyro.conf.Positional[Path],
@@ -68,7 +68,7 @@ class ExportDataset:
     def run(self) -> None:
         """Read or play the episodes, and write them."""
         from tgdsl.files.write import as_file_error, check_writable, with_folder
-        from tgdsl.rl.datasets.writers import write_lerobot, write_mcap, write_zarr
+        from tgdsl.rl.datasets.dataset import write_lerobot, write_mcap, write_zarr
 
         out = self.out or Path("out") / f"{self.input.stem}_{self.to}"
         if out.exists():

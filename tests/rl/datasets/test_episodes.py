@@ -9,7 +9,7 @@ from small_tasks import small_task
 
 import tgdsl
 from tgdsl.errors import TgdslError
-from tgdsl.rl.datasets.episode import Episode, Header, LinkTaxels, features, frames
+from tgdsl.rl.datasets.dataset import Episode, Header, LinkTaxels, features, frames
 from tgdsl.rl.datasets.sources import of_deployment, of_environments, of_log, of_run
 from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.env import TouchEnv

@@ -8,9 +8,8 @@ from written_teachers import FindRidge, teacher
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.evaluation import evaluate_each
-from tgdsl.rl.students.keys import feels, student_keys
+from tgdsl.rl.students.keys import Teacher, feels, student_keys
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.teacher import Teacher
 
 TASK = Path(__file__).parents[3] / "examples" / "tasks" / "find_ridge.yaml"
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

@@ -13,9 +13,8 @@ from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.evaluation import evaluate, evaluate_each
 from tgdsl.rl.playing.policy import policy_for, read_policy
 from tgdsl.rl.sensed import Felt
-from tgdsl.rl.students.keys import feels, student_keys
+from tgdsl.rl.students.keys import Teacher, feels, student_keys
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.teacher import Teacher
 from tgdsl.rl.train.folder import CheckpointError, read_checkpoint, write_checkpoint
 from tgdsl.rl.train.run import restore, state_of
 

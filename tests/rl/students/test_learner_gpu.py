@@ -7,9 +7,8 @@ from written_teachers import teacher
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.students.keys import feels, student_keys
+from tgdsl.rl.students.keys import Teacher, feels, student_keys
 from tgdsl.rl.students.learner import Distiller
-from tgdsl.rl.students.teacher import Teacher
 from tgdsl.rl.train.graphs import Captured, SideBySide
 
 pytestmark = [

@@ -15,10 +15,9 @@ from written_teachers import teacher
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.students import learner
-from tgdsl.rl.students.keys import feels, student_keys
+from tgdsl.rl.students.keys import Teacher, feels, student_keys
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import Stack, Student
-from tgdsl.rl.students.teacher import Teacher
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 UPDATES = 1e-9  # float64, 18 steps of Adam

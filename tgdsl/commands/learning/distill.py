@@ -195,8 +195,7 @@ class _Part:
         """
         from tgdsl.rl.load import load_task
         from tgdsl.rl.sensed import check_felt, num_variants
-        from tgdsl.rl.students.keys import check_blocks, feels, student_keys
-        from tgdsl.rl.students.teacher import Teacher, students_task
+        from tgdsl.rl.students.keys import Teacher, check_blocks, feels, student_keys, students_task
         from tgdsl.rl.train.folder import RunFolder
 
         self._command, self.resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)

@@ -20,7 +20,7 @@ from tgdsl.errors import TgdslError, did_you_mean, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.module.taxels import Columns
-from tgdsl.rl.datasets.episode import EPS, FORCE, Episode, Header, LinkTaxels
+from tgdsl.rl.datasets.dataset import EPS, FORCE, Episode, Header, LinkTaxels
 from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.deploying.hand import EMULATED
 from tgdsl.rl.env import TouchEnv

@@ -24,10 +24,9 @@ from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.evaluation import Evaluation
 from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
-from tgdsl.rl.students.keys import StudentKey
+from tgdsl.rl.students.keys import StudentKey, own_task
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import acting, deployed
-from tgdsl.rl.students.teacher import own_task
 
 
 class Row(NamedTuple):
