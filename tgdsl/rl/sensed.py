@@ -64,8 +64,7 @@ class Sensed:
     touch: TactileModule
     felt: str | None  # name of the sensor that the policy feels; None if it feels nothing
     contact: str | None  # name of the `link_contact` sensor; None if the task takes none
-    channels: tuple[str, ...]
-    """Its channels: the force is among them, and the normal force if the task wants it."""
+    channels: tuple[str, ...]  # its channels: the force is among them, and the normal force if the task wants it
     distance: str | None  # name of the `surface_distance` sensor; None if the task takes none
     object: str  # body of the task's object in the scene
     by_kind: Mapping[str, str]  # name of the sensor of each kind that the task looks at

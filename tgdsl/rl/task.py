@@ -88,8 +88,7 @@ class Setup:
     """How far each environment's object reaches below its body's origin when it stands upright [m]."""
     variant: Int[Tensor, " env"]  # which of its variants each environment's object is, from 0
     num_variants: int  # how many there are; 1 if the object has none
-    friction: Float[Tensor, " env"]
-    """Coefficient of sliding friction of each object: a live tensor, redrawn before `reset`."""
+    friction: Float[Tensor, " env"]  # coefficient of sliding friction of each object: a live tensor, redrawn before `reset`
     mass: Float[Tensor, " env"]  # mass of each object [kg], in the same way
     scene_start: Float[Tensor, "env nq"]  # `start` before anything is random
     scene_friction: Float[Tensor, " env"]  # `friction` before anything is random
@@ -123,8 +122,7 @@ class Now:
     joint_vel: Float[Tensor, "env joint"]  # their velocities [rad/s]
     target: Float[Tensor, "env joint"]  # position targets of their drives after the last action [rad]
     torque: Float[Tensor, "env joint"]  # what their drives exert [N·m]
-    action: Float[Tensor, "env joint"]
-    """Last action, from −1 to 1; zero at the start of an episode."""
+    action: Float[Tensor, "env joint"]  # last action, from −1 to 1; zero at the start of an episode
     last_action: Float[Tensor, "env joint"]  # action of the control step before
     link_force: Float[Tensor, "env link 3"]
     """The object's force on each link, in the link's frame [N]; no links if the task takes no `link_contact`."""
@@ -148,8 +146,7 @@ class HandNow:
     joint_pos: Float[Tensor, "env joint"]  # positions of the joints that the policy moves [rad]
     joint_vel: Float[Tensor, "env joint"]  # their velocities [rad/s]
     target: Float[Tensor, "env joint"]  # position targets of their drives after the last action [rad]
-    action: Float[Tensor, "env joint"]
-    """Last action, from −1 to 1; zero at the start of an episode."""
+    action: Float[Tensor, "env joint"]  # last action, from −1 to 1; zero at the start of an episode
     steps: int  # control steps since the start of the episode
     control_step: float  # duration of a control step Δt [s]
     goal: Float[Tensor, "env goal"]  # the goal, as `Task.asked` returns it
