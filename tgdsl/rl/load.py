@@ -99,9 +99,8 @@ def _terms(source: Source, folder: Path, task: type[Task[Any]], spec: TaskSpec, 
         if isinstance(term, RewardTerm) and getattr(getattr(spec, "rewards", None), name, None) is not None:
             problems.append(source.problem(place, f'the task has a term "{name}"', f"set `rewards.{name}`", on_key=True))
         elif isinstance(term, ObservationTerm) and name in SHARED_GROUPS:
-            problems.append(
-                source.problem(place, f'all tasks have a group "{name}"', "give the term another name", on_key=True)
-            )
+            problem = f'all tasks have a group "{name}"'
+            problems.append(source.problem(place, problem, "give the term another name", on_key=True))
         elif isinstance(term, Term):
             terms[name] = term
     owners = number_owners(task, spec, terms)
@@ -129,9 +128,9 @@ def number_owners(task: type[Task[Any]], spec: TaskSpec, terms: Mapping[str, Ter
     models = {name: getattr(spec, name) for name in own}
     models |= {f"terms.{name}": term for name, term in terms.items() if not isinstance(term, CurriculumTerm)}
     for path, model in models.items():
-        if isinstance(model, SpecModel):
-            constants = model.constants if isinstance(model, Term) else ()
-            owners |= {f"{path}.{key}": model for key, value in model if isinstance(value, float) and key not in constants}
+        constants = model.constants if isinstance(model, Term) else ()
+        numbers = model if isinstance(model, SpecModel) else ()
+        owners |= {f"{path}.{key}": model for key, value in numbers if isinstance(value, float) and key not in constants}
     return owners
 
 

@@ -100,9 +100,8 @@ def make_setup(
     heights = torch.tensor(heights, dtype=sim.qpos.dtype)[torch.arange(sim.num_envs) % num_variants].to(sim.qpos.device)
     start, free = sim.qpos[0].repeat(sim.num_envs, 1), free_qpos(sim.model, sensed.object)
     if free is not None:
-        start[:, free.start + 2] += heights - half_height(
-            SceneModels(sensed.touch.plan.scene).model({}), sensed.object, keyframe
-        )
+        plain_model = SceneModels(sensed.touch.plan.scene).model({})
+        start[:, free.start + 2] += heights - half_height(plain_model, sensed.object, keyframe)
     return Setup(
         num_envs=sim.num_envs,
         device=sim.qpos.device,

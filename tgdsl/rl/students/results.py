@@ -57,23 +57,13 @@ def rows_of(
     kinds: dict[tuple[str, str, str], list[Evaluation]] = {}
     for key, evaluation in zip(keys, evaluations, strict=True):
         kinds.setdefault(key.kind, []).append(evaluation)
-    return [
-        Row(
-            type=type_,
-            placement=placement,
-            resolution=resolution,
-            noise=noise,
-            seeds=len(of_kind),
-            score=fmean(each.score for each in of_kind),
-            low=interval(of_kind)[0],
-            high=interval(of_kind)[1],
-            held=fmean(each.held for each in of_kind),
-            episodes=sum(each.episodes for each in of_kind),
-            samples=samples,
-            minutes=minutes,
-        )
-        for (type_, placement, noise), of_kind in kinds.items()
-    ]
+    rows = []
+    for (type_, placement, noise), each in kinds.items():
+        score, held = fmean(own.score for own in each), fmean(own.held for own in each)
+        low, high = interval(each)
+        episodes = sum(own.episodes for own in each)
+        rows.append(Row(type_, placement, resolution, noise, len(each), score, low, high, held, episodes, samples, minutes))
+    return rows
 
 
 def interval(evaluations: Sequence[Evaluation]) -> tuple[float, float]:
