@@ -53,9 +53,9 @@ def schedule(seed: int, calls: int):
         yield reset.tolist(), read.tolist(), bool(rng.random() < 0.5)
 
 
-@pytest.fixture(params=[True, False], ids=["all_rows", "few_rows"])
+@pytest.fixture(params=[True, False], ids=["with_grad", "without_grad"])
 def with_grad(request):
-    """With derivatives the rows of all environments are computed; without them, of few environments theirs alone."""
+    """With derivatives and without them."""
     with torch.set_grad_enabled(request.param):
         yield request.param
 

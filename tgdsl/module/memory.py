@@ -21,7 +21,7 @@ from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
 from tgdsl.sensors.base import UNTIMED, Context, Kind
 from tgdsl.sensors.noise.random import Stream, kind_stream, sensor_key, streams
 from tgdsl.sensors.noise.stage import Now
-from tgdsl.tensors.env_ids import broadcast_over, few_ids
+from tgdsl.tensors.env_ids import broadcast_over
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.on_host import HostCopy
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
@@ -29,7 +29,6 @@ from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 Tensors = dict[str, Tensor]
 Window = Float[Tensor, "env step channel row"]
 WINDOW, KEPT = "history/", "kept/"  # buffers `history/<reading>`, a window; `kept/<reading>`, the last reading
-ENV = "clock/env"  # numbers of the environments that are read, counted from this module's first; only where not all are
 SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")  # what all environments have in common
 EVERY = 16  # on a GPU one call in so many is checked: a small kernel takes as long to launch as a module's own
 _INT64 = 2**63
@@ -196,7 +195,7 @@ class Clock(HookedModule):
 def _env(memory: Mapping[str, Tensor]) -> Tensor:
     """Return the numbers of the environments that are read, (env,), counted over all processes."""
     age = memory["clock/age"]
-    return (memory[ENV] if ENV in memory else torch.arange(age.shape[0], device=age.device)) + memory["clock/first_env"]
+    return torch.arange(age.shape[0], device=age.device) + memory["clock/first_env"]
 
 
 def _drop(module: HookedModule, prefix: str) -> None:
@@ -490,40 +489,3 @@ def chosen_rows(
         elif f"{WINDOW}{name}" in memory:
             result[name] = reduced(selected[f"{WINDOW}{name}"], "stack")
     return result, selected
-
-
-def few_rows(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
-    """Return the environments of a mask, if they are on a CPU and few enough to be read as a batch of their own.
-
-    One alone is read twice: compiled code that serves every batch from two on is then not made again for it.
-    """
-    rows = None if torch.is_grad_enabled() else few_ids(mask)
-    if rows is None or not len(rows):
-        return None
-    return rows if len(rows) > 1 else rows.repeat(2)
-
-
-def read_rows(
-    core: Callable[[Tensors, Tensors], Tensors],
-    rows: Int[Tensor, " n"],
-    tensors: Mapping[str, Tensor],
-    memory: Mapping[str, Tensor],
-) -> Tensors:
-    """Read some environments, put their new state in the place of the old one, and return the readings of all.
-
-    `core` returns new state as `state/<name>`, and then readings as `reading/<name>`.
-    """
-    held = {name: value if name in SHARED else value[rows] for name, value in memory.items()}
-    readings: Tensors = {}
-    for path, value in core(dict(tensors), held | {ENV: rows}).items():
-        part, _, name = path.partition("/")
-        if part == "state" and value.ndim < memory[name].ndim:
-            memory[name].index_put_((rows, held["clock/step"] % memory[name].shape[1]), value)
-        elif part == "state":
-            memory[name][rows] = value
-        elif f"{KEPT}{name}" in memory:
-            memory[f"{KEPT}{name}"][rows] = value.transpose(-2, -1)
-            readings[name] = memory[f"{KEPT}{name}"].clone().transpose(-2, -1)
-        else:
-            readings[name] = reduced(memory[f"{WINDOW}{name}"].clone(), "stack")
-    return readings

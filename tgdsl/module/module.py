@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable, TaxelTables
@@ -24,7 +24,7 @@ from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.export.program import EXAMPLE_ENVS, Signature, Step, export_step, format_of
-from tgdsl.module.memory import Memory, chosen_rows, few_rows, kept, read_rows, store, stored
+from tgdsl.module.memory import Memory, chosen_rows, kept, store, stored
 from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, observe, outputs_of
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
 from tgdsl.module.state import Incoming, SceneState, example_state
@@ -161,16 +161,6 @@ class TactileModule(HookedModule):
         self.record_outputs(readings)
         return self.memory.with_views(readings)
 
-    def read_few(self, state: SceneState, rows: Int[Tensor, " n"], num_envs: int) -> dict[str, Tensor]:
-        """Do what a call with a mask of so many environments does, from a state of some alone, which `few_rows` has named."""
-        self.constants.refresh()
-        tensors = self.incoming.tensors(state, self.dtype, self.device)
-        self.memory.keep_last(num_envs)
-        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
-        readings = read_rows(self.calls.of(self.flat_core), rows, tensors, memory)
-        self.record_outputs(readings)
-        return self.memory.with_views(readings)
-
     def record_outputs(self, readings: Mapping[str, Tensor]) -> None:
         """Note what a call has handed out; for who replays a captured graph of calls in their place."""
         self.memory.cache_readings(readings)
@@ -286,10 +276,6 @@ class TactileModule(HookedModule):
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
-        rows = few_rows(tensors["mask"]) if name == "advance_some" else None
-        if rows is not None:
-            some = {name: value[rows] if value.ndim else value for name, value in tensors.items() if name != "mask"}
-            return read_rows(self.calls.of(self.flat_core), rows, some, memory)
         result = self.calls.of(getattr(self, name))(tensors, memory)
         return {name: result[name] for name in self.plan.readings()}
 
@@ -304,12 +290,6 @@ class TactileModule(HookedModule):
         readings, updated = chosen_rows(tensors["mask"], *self.core(tensors, memory), memory)
         store(memory, updated | kept(readings, memory))
         return readings
-
-    def flat_core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the new state of `core` as `state/<name>`, and its readings as `reading/<name>`."""
-        readings, updated = self.core(tensors, memory)
-        outputs = {f"state/{name}": value for name, value in updated.items()}
-        return outputs | {f"reading/{name}": readings[name] for name in self.plan.readings()}
 
     def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and leave the state as it is."""

@@ -22,19 +22,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
-from tgdsl.module.memory import few_rows
 from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
-from tgdsl.runtime.simulators.fields import Rows, StateReader
+from tgdsl.runtime.simulators.fields import StateReader
 from tgdsl.runtime.simulators.machine import checked_device, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id, geoms_of
 from tgdsl.runtime.simulators.objects import PER_ENV, EnvObjects, ObjectProperties, RigidObject, refuse_other_fields
 from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, NewValues, StateTable
 from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
-from tgdsl.tensors.env_ids import EnvIds, env_mask
 
 if TYPE_CHECKING:
     import mujoco.batch
@@ -309,18 +307,6 @@ class BatchSimulation(Simulation):
     def env_model(self, env: int) -> mujoco.MjModel:
         return self.batch.get_model(env)
 
-    def read(self, env_ids: EnvIds | None = None) -> dict[str, Tensor]:
-        """Return the module's readings: see `Simulation.read`. Of few environments only these states are gathered."""
-        if env_ids is None or self._touch.inputs.substeps > 1 or self._touch.device.type != "cpu":
-            return super().read(env_ids)
-        mask = env_mask(env_ids, self.num_envs, self._device)
-        rows = few_rows(mask)
-        if rows is None:
-            return super().read(mask)
-        self._refuse_if_closed()
-        state = self._start_contacts.applied_to(self._state(self.control_step, rows), rows=rows)
-        return self._touch.read_few(state, rows, self.num_envs)
-
     def _open_device(self, device: str, options: SimOptions) -> torch.device:
         if tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 17):
             problem = f"MuJoCo {mujoco.__version__} has no `mujoco.batch`, by which tgdsl simulates on a CPU"
@@ -359,9 +345,8 @@ class BatchSimulation(Simulation):
         if self._objects is not None:
             self.properties.use_models(self._objects.models())
 
-    def _contacts(self, rows: Rows) -> dict[str, Tensor]:
-        data = self._sources["sensordata"]
-        return self._sensors.read(data if rows is None else data[rows])
+    def _contacts(self) -> dict[str, Tensor]:
+        return self._sensors.read(self._sources["sensordata"])
 
     def _refresh(self) -> None: ...
 

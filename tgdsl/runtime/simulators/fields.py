@@ -18,7 +18,6 @@ from tgdsl.errors import SimulationError, listed
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.model_ids import element_id
 
-Rows = Int[Tensor, " n"] | None  # rows of environments to read; None: all
 POSES = ("xpos", "xquat", "cvel", "subtree_com")  # arrays that poses and velocities of bodies are read from
 MOVED = {"joint_pos": "qpos", "joint_vel": "qvel", "last_action": "ctrl"}
 """Fields of a state that a physics step, or its caller, moves on, and the arrays that they are read from."""
@@ -50,12 +49,11 @@ class StateReader:
         self.arrays = (*POSES, *(array for array, _ in self._joints.values()))
         self.moved = tuple(array for name, (array, _) in self._joints.items() if name in MOVED)
 
-    def read(self, arrays: Mapping[str, Tensor], rows: Rows = None) -> dict[str, Float[Tensor, "env item ..."]]:
-        """Return the fields that the module wants, of all or some environments."""
+    def read(self, arrays: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env item ..."]]:
+        """Return the fields that the module wants."""
 
         def take(name: str, ids: Int[Tensor, " n"]) -> Tensor:
-            array = arrays[name] if rows is None else arrays[name][rows]
-            return array.index_select(1, ids)
+            return arrays[name].index_select(1, ids)
 
         fields, values = self._fields, dict[str, Tensor]()
         if "body_pos" in fields:

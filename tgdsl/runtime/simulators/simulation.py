@@ -23,7 +23,7 @@ from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults, OnFault
-from tgdsl.runtime.simulators.fields import Rows, StateReader, warn_of_mocap
+from tgdsl.runtime.simulators.fields import StateReader, warn_of_mocap
 from tgdsl.runtime.simulators.model_ids import Joints, keyframe_id
 from tgdsl.runtime.simulators.objects import EnvHeat, EnvObjects, ObjectProperties, SharedMeshModels, Values
 from tgdsl.runtime.simulators.state_values import (
@@ -508,8 +508,8 @@ class Simulation(ABC):
         """Make the environments and the live arrays that readers read; `model`, `_objects` and `_watch` are there."""
 
     @abstractmethod
-    def _contacts(self, rows: Rows) -> dict[str, Tensor]:
-        """Return the contacts that the module wants by field, of all or some environments."""
+    def _contacts(self) -> dict[str, Tensor]:
+        """Return the contacts that the module wants by field."""
 
     @abstractmethod
     def _refresh(self) -> None:
@@ -535,17 +535,15 @@ class Simulation(ABC):
     def _use_objects(self, objects: EnvObjects) -> None:
         """Simulate the objects that were chosen."""
 
-    def _state(self, dt: float, rows: Rows = None) -> SceneState:
+    def _state(self, dt: float) -> SceneState:
         self._refresh()
-        return self._gathered(dt, rows).to(self._touch.device)
+        return self._gathered(dt).to(self._touch.device)
 
-    def _gathered(self, dt: float, rows: Rows = None) -> SceneState:
+    def _gathered(self, dt: float) -> SceneState:
         """Return the fields that the module wants from the arrays as they are, on the physics' device; `dt` in s."""
         values: dict[str, Any] = self.heat.read() | {"time": self._instant.clone()}
         values |= {name: field.clone() for name, field in self._object_fields.items()}
-        if rows is not None:
-            values = {name: value[rows] for name, value in values.items()}
-        values |= self._reader.read(self._sources, rows) | self._contacts(rows) | {"dt": dt}
+        values |= self._reader.read(self._sources) | self._contacts() | {"dt": dt}
         return SceneState(**{name: value for name, value in values.items() if name in (*self._touch.inputs.fields, "time")})
 
     def _begin_step(self, control: Control) -> None:

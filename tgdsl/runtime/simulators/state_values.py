@@ -214,10 +214,8 @@ class StartContacts:
             self.values[name] = torch.where(broadcast_over(chosen, new), new, old.to(new.dtype))
         self.is_placed = chosen.clone() if self.is_placed is None else self.is_placed | chosen
 
-    def applied_to(
-        self, state: SceneState, is_stored: bool = True, rows: Int[Tensor, " n"] | slice = slice(None)
-    ) -> SceneState:
-        """Return a state, of all or some rows, in which placed environments have the contacts of their start.
+    def applied_to(self, state: SceneState, is_stored: bool = True) -> SceneState:
+        """Return a state in which placed environments have the contacts of their start.
 
         Unless `is_stored`, the stored ones are not of this state's pairs and joints, and all are zero.
         """
@@ -227,8 +225,8 @@ class StartContacts:
         for name in FIELDS:
             if (now := getattr(state, name)) is not None:
                 start = self.values.get(name) if is_stored else None
-                value = torch.zeros_like(now) if start is None else start[rows].to(now.device, now.dtype)
-                values[name] = torch.where(broadcast_over(self.is_placed[rows].to(now.device), now), value, now)
+                value = torch.zeros_like(now) if start is None else start.to(now.device, now.dtype)
+                values[name] = torch.where(broadcast_over(self.is_placed.to(now.device), now), value, now)
         return dataclasses.replace(state, **values)
 
     def _fitting(self, name: str, value: Tensor, chosen: Bool[Tensor, " env"]) -> Tensor:

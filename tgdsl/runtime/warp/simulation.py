@@ -17,7 +17,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, listed
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.faults import BAD_VALUES, DIVERGED, NO_ROOM, EnvFaults
-from tgdsl.runtime.simulators.fields import FORCES, POSES, Rows, StateReader
+from tgdsl.runtime.simulators.fields import FORCES, POSES, StateReader
 from tgdsl.runtime.simulators.objects import PER_ENV, EnvObjects
 from tgdsl.runtime.simulators.simulation import SimOptions, Simulation, refuse_two_instants
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Control, NewValues, StateTable
@@ -297,7 +297,7 @@ class WarpSimulation(Simulation):
         self._held: tuple[object, ...] = ()
         self._driven = self.drive
 
-    def _contacts(self, rows: Rows) -> dict[str, Tensor]:
+    def _contacts(self) -> dict[str, Tensor]:
         return self._pairs.read()
 
     def _use_objects(self, objects: EnvObjects) -> None:
