@@ -20,7 +20,6 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Plane, Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
 from tgdsl.quantities.reference import ReferenceScene
-from tgdsl.tensors.on_host import on_host
 
 
 class ContactPoints(NamedTuple):
@@ -92,7 +91,7 @@ def contacts_of(
     """Bring the contacts of a state into the frames of the bodies, in the state's dtype, and then cast them."""
     quat = state["body_quat"].index_select(1, bodies)
     whole = _of_pairs(state["contact_netforce"], index)
-    *rotation, x, y, z = on_host(_in_frame, quat, whole.sum(dim=2))
+    *rotation, x, y, z = _in_frame(quat, whole.sum(dim=2))
     net = x, y, z
     if not all(name in state for name in SLOT_FIELDS):  # some of them may be there for another quantity
         none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)

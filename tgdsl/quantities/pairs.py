@@ -15,7 +15,6 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Plane, Rot, Vec
-from tgdsl.tensors.on_host import on_host
 
 Array = TypeVar("Array")
 
@@ -89,7 +88,7 @@ def relate(
     """
     velocities = () if linvel is None or angvel is None else (linvel, angvel)
     fields = (quat, pos, *velocities)
-    parts = on_host(_related, *(field.index_select(1, bodies) for bodies in (link, target) for field in fields))
+    parts = _related(*(field.index_select(1, bodies) for bodies in (link, target) for field in fields))
     is_moving = len(parts) > 12
     parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
     # Stacked, they are stored once per pair; a compiler that fuses would else form them again for every taxel.

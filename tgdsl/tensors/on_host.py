@@ -1,35 +1,12 @@
-"""Few numbers on the host: arithmetic by NumPy, and a look at those of a GPU without waiting for it."""
+"""Few numbers on the host: those of a GPU without waiting for it, and operations by one thread."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
-
-from tgdsl.tensors.env_ids import is_cheap_to_read
-
-MOST = 2**15  # of more numbers torch shares an operation out among its threads
-
-
-def on_host(work: Callable[..., Iterable[Any]], *given: Tensor) -> list[Tensor]:
-    """Return what a function makes of tensors; it gets NumPy's arrays where that is as good: see `is_cheap_to_read`.
-
-    NumPy takes a third of the time that an operation of torch's takes, and makes the same bytes.
-
-    Args:
-        work: Takes tensors or arrays, and may use +, −, ·, / and indices alone: those round alike.
-        *given: The tensors, all on one device.
-    """
-    is_plain = all(type(own) is Tensor for own in given)  # a class of one's own is to see what is done
-    if not is_plain or not is_cheap_to_read(given[0]) or given[0].numel() > MOST:
-        return list(work(*given))
-    with np.errstate(all="ignore"):  # torch warns of no number either
-        made = work(*(own.detach().numpy() for own in given))
-    return [torch.from_numpy(own) for own in made]
 
 
 class HostCopy:
