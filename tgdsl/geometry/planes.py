@@ -2,7 +2,7 @@
 
 A vector is a tuple `(x, y, z)` of equally shaped tensors, a rotation a tuple of nine, row by row. Written so, every
 operation is pointwise and a compiler fuses a whole sensor into one loop; a trailing axis of 3 costs several times more.
-What adds and multiplies alone takes NumPy's arrays too: see `tensors.on_host`.
+What adds and multiplies alone takes NumPy's arrays too.
 """
 
 from __future__ import annotations
