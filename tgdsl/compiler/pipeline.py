@@ -68,16 +68,10 @@ def compile_document(
     choice: Choice = UNCHOSEN,
     scene: Model | None = None,
 ) -> Compiled:
-    """Compile a document to its Plan, and return the values that the Plan follows from with it.
+    """Compile a document to its Plan, and return the values that the Plan follows from with it: see `tgdsl.compile`.
 
-    Args:
-        document: A YAML file, or the same as a mapping.
-        overrides: By dotted path YAML text, or a plain value, set before anything is read: `{"resolution": "high"}`.
-        kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
-        progress: Called with a line of text for each long job.
-        sensors: Names of the document's sensors that are wanted; default: all.
-        choice: What was chosen where sensors have an `accuracy`: see `tuning.compile`, which chooses.
-        scene: The scene, in place of the document's.
+    `sensors` names those that are wanted (default: all); `choice` is for sensors with an `accuracy`; `scene` is taken in place
+    of the document's.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.

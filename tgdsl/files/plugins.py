@@ -17,21 +17,13 @@ Wrong = Callable[[object], str]  # returns why something is no such thing, or no
 def known(
     group: str, what: str, argument: str, own: Sequence[Thing], given: Sequence[Thing], wrong: Wrong
 ) -> tuple[Thing, ...]:
-    """Return all things of a sort: those of tgdsl, of installed packages by package and name, and those that are given.
+    """Return all things of a sort: those of tgdsl (`own`), of installed packages, and the caller's (`given`).
 
-    An installed one that cannot be had is left out, with a warning, the first time. Of those given an installed package may
-    bring some too.
-
-    Args:
-        group: Group of the entry points.
-        what: What one is called: "kind".
-        argument: Name of the argument by which a caller gives some: "kinds".
-        own: Those of tgdsl; each has a `name`.
-        given: The caller's.
-        wrong: Says what is no such thing.
+    An installed one that cannot be had is left out, with a warning, the first time. An installed package may bring some of
+    those given, too. `what` is what one is called, "kind", and `argument` that by which a caller gives some, "kinds".
 
     Raises:
-        TgdslError: If two have one name, or one that is given is none.
+        TgdslError: If two have one name, or one that is given is none: `wrong` says what.
     """
     result: dict[str, tuple[Any, str]] = {}
     of_tgdsl = [(thing, "tgdsl") for thing in own]

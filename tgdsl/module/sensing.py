@@ -94,16 +94,11 @@ def sense(
 ) -> tuple[Tensors, Tensors]:
     """Return the readings of all sensors, and their new state: a pure function, traceable in one graph.
 
-    Args:
-        sensing: What to compute with.
-        own: The plan's parts, bound to constants.
-        tensors: The fields of `SceneState` that `inputs` names; those of earlier substeps as `substep/<i>/<field>`.
-        memory: State by `sensor:name`, each (env, …), and the clock's.
-        dtype: Dtype of the readings.
+    `own` has the plan's parts, bound to constants; `tensors` the fields of `SceneState` that `inputs` names, those of earlier
+    substeps as `substep/<i>/<field>`; `memory` the state by `sensor:name`, each (env, …), and the clock's.
 
-    Returns:
-        Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
-        what is new: (env, …). A kernel may write new state over the old, which is then not returned.
+    Readings are by name, with signals before their noise as `<sensor>/signal`. The new state has of a ring, (env, call, …), its
+    new entry, (env, …). A kernel may write new state over the old, which is then not returned.
     """
     plan, dt = sensing.plan, tensors.get("dt")
     nows = sensing.clock.nows(memory, dt)

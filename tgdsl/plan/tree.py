@@ -80,13 +80,7 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def restored(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the tree of a type that `flatten` made plain.
-
-    Args:
-        kind: The type: a dataclass, maybe generic, or what its fields may be.
-        plain: What JSON held.
-        arrays: The arrays by name.
-    """
+    """Return the tree of a type, a dataclass, maybe generic, or what its fields may be, that `flatten` made plain."""
     origin = get_origin(kind) or kind
     if plain is None:
         return None

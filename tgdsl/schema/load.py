@@ -109,18 +109,11 @@ def load(
     sensors: Collection[str] | None = None,
     has_scene: bool = False,
 ) -> Loaded:
-    """Read a document and its layout.
+    """Read a document and its layout, with the problems found so far: call `raise_problems` when all stages have added theirs.
 
-    Args:
-        document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
-        overrides: Values to set first by dotted path, as YAML text or plain, such as `{"resolution": "high"}`.
-        kinds: The sensor kinds that the document may use.
-        needs_sensors: Whether it is a mistake to have none.
-        sensors: Names of those that are wanted, the others being left out but for those that they read; default: all.
-        has_scene: Whether a scene is given: the document then needs no model.
-
-    Returns:
-        The document with the problems found so far: call `raise_problems` when all stages have added theirs.
+    File names in a mapping are relative to the working folder. `overrides` are set first, by dotted path, as YAML text or
+    plain. `sensors` names those that are wanted, the others being left out but for those that they read. `has_scene`: a scene
+    is given, so that the document needs no model.
 
     Raises:
         SpecError: If so much is wrong that no further stage can look at it.

@@ -30,21 +30,12 @@ def select(
     group: str | None = None,
     elsewhere: Sequence[str] = (),
 ) -> list[int]:
-    """Return the candidates that a selection takes, in the candidates' order.
+    """Return the candidates that a selection takes, as ascending indices; each candidate answers to several names.
 
-    Args:
-        selection: What to include and exclude.
-        candidates: The names that each candidate answers to.
-        groups: Named selections that may stand in place of names, also within one another. In its own definition a group's name
-            means the link that is called so.
-        report: Called for each pattern of the selection itself that matches nothing. Wildcards and groups in `exclude` may, so
-            that one selection serves several robots; a plain name may not.
-        group: The selection's own name, if it is a group: that it contains itself is reported too, and that another holds no
-            link is not where that one's own patterns match none.
-        elsewhere: Names that no candidate has but something else, so that to exclude them is no mistake.
-
-    Returns:
-        Indices of the chosen candidates, ascending.
+    `groups` may stand in place of names, also within one another; in its own definition a group's name means the link that is
+    called so. `report` is called for each pattern of the selection that matches nothing. Wildcards and groups in `exclude` may,
+    so that one selection serves several robots; a plain name may not, unless something `elsewhere` has it. Of a selection that
+    is itself a `group` it is reported too that it contains itself.
     """
     known = [*groups, *(name for names in candidates for name in names)]
     for i, pattern in enumerate(selection.include):

@@ -117,11 +117,7 @@ def full_scale_error(found: Tensor, expected: np.ndarray) -> np.ndarray:
 def row_errors(found: Tensor, reference: ReferenceModule, state: SceneState, enough: float = 0.0) -> np.ndarray:
     """Return the error of each row over full scale (env, *sample, row); the reference then remembers this state.
 
-    Args:
-        found: Readings.
-        reference: The reference of the sensor.
-        state: What was read.
-        enough: Errors up to this need no look at the other sides of ties.
+    Where errors are `enough` or less, the other sides of ties are not looked at.
     """
     shifts = [np.zeros(3)] + [sign * TIE_SHIFT * axis for axis in np.eye(3) for sign in (1, -1)]
     worst = np.full(tuple(found.shape[:-1]), np.inf)

@@ -47,14 +47,10 @@ class Verdict:
 
 
 def verify(path: Path, touch: TactileModule, num_calls: int = NUM_CALLS) -> Verdict:
-    """Compare an exported file with the module on random states, in a process that cannot import tgdsl.
+    """Compare an exported file with its module, on the CPU, on random states, in a process that cannot import tgdsl.
 
-    Memory is carried from call to call, and some environments begin an episode at every ninth call.
-
-    Args:
-        path: The file.
-        touch: The module that it was exported from, on the CPU; seeded as it was then.
-        num_calls: How many calls.
+    The module is seeded as at the export. Memory is carried from call to call, and some environments begin an episode at every
+    ninth call.
     """
     signature = read_signature(path)
     if signature.taxels_id != touch.taxels_id:
