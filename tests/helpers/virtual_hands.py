@@ -149,7 +149,7 @@ class _Event(threading.Event):
 
 class _Reader(HandReader):
     def __init__(
-        self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion | None, time: VirtualTime
+        self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion, time: VirtualTime
     ):
         super().__init__(client, connect, motion)
         self._time, self.changed, self._stopping = time, _Condition(time), _Event(time)
@@ -187,7 +187,7 @@ def virtual_hand(
         port._check()
         return SerialClient(port, Addresses(), timing, counters, clock=time.monotonic)
 
-    own = _Reader(connect(SerialCounters()), connect, Motion(motion) if motion else None, time)
+    own = _Reader(connect(SerialCounters()), connect, Motion(motion), time)
     own.start()
     opened = XHand1(own, timing)
     try:

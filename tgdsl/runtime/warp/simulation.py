@@ -318,8 +318,13 @@ class WarpSimulation(Simulation):
         self._finish_step()
 
     def _finish_step(self, is_evaluated: bool = False) -> None:
-        self._note_step(is_evaluated)
-        if self._stream.is_capturing:
+        """Take note, on the host, that all environments were stepped, and whether restarted ones were evaluated."""
+        is_capturing = self._stream.is_capturing
+        if not is_capturing:
+            self._has_stale = False
+        if self._faults.on_fault == "reset" and not is_evaluated:
+            self._note_stale()
+        if is_capturing:
             return
         self._touch.incoming.slot_watch.warn()
         to_raise, totals = self._faults.polled()
@@ -356,13 +361,6 @@ class WarpSimulation(Simulation):
             self._restart()
             self._faults.note_restarted(is_faulty)
 
-    def _note_step(self, is_evaluated: bool) -> None:
-        """Take note, on the host, that all environments were stepped, and whether restarted ones were evaluated."""
-        if not self._stream.is_capturing:
-            self._has_stale = False
-        if self._faults.on_fault == "reset" and not is_evaluated:
-            self._note_stale()
-
     def _begin_episodes(self, mask: Bool[Tensor, " env"], new: NewValues, *, finds_contacts: bool) -> None:
         """Restart some environments, with values."""
         self._is_reset.copy_(mask)
@@ -381,9 +379,7 @@ class WarpSimulation(Simulation):
                 is_put = mask & ~new.is_bad
                 self._faults.note(BAD_VALUES, mask & new.is_bad)
             for name, values in new.values.items():
-                array = self._arrays[name]
-                if array.numel():
-                    put_rows(array, is_put, values)
+                put_rows(self._arrays[name], is_put, values)
 
     def _evaluate(self, mask: Bool[Tensor, " env"]) -> None:
         self._is_stale |= mask
@@ -411,30 +407,36 @@ class WarpSimulation(Simulation):
             self._refresh()
 
     def _evaluate_stale(self) -> None:
-        """Evaluate all environments where they are now, then give those that are not stale back their earlier instant."""
+        """Evaluate all environments where they are now; those that are not stale keep their earlier instant."""
+
+        def evaluate() -> None:
+            for _ in range(2 if self._has_loops else 1):
+                self._mjw.forward(self.warp_model, self.warp_data)
+            self._pairs.update(self.warp_model, self.warp_data)
+
         arrays = {name: self._arrays[name] for name in (*_DERIVED, "history")} | self._pairs.arrays
-        arrays = {name: array for name, array in arrays.items() if array.numel()}
-        earlier = _copied(arrays)
-        for _ in range(2 if self._has_loops else 1):
-            self._mjw.forward(self.warp_model, self.warp_data)
-        self._pairs.update(self.warp_model, self.warp_data)
-        self._give_back(self._is_stale, earlier, arrays)
+        self._evaluate_rows(self._is_stale, arrays, evaluate)
         self._is_stale.zero_()
 
     def _evaluate_poses(self) -> None:
         """Evaluate poses and velocities of the environments that were just reset: for a `GraphedCall`."""
-        arrays = {name: self._arrays[name] for name in _DERIVED if self._arrays[name].numel()}
-        earlier = _copied(arrays)
-        for evaluate in (self._mjw.kinematics, self._mjw.com_pos, self._mjw.com_vel):
-            evaluate(self.warp_model, self.warp_data)
-        self._give_back(self._is_reset, earlier, arrays)
+
+        def evaluate() -> None:
+            for part in (self._mjw.kinematics, self._mjw.com_pos, self._mjw.com_vel):
+                part(self.warp_model, self.warp_data)
+
+        self._evaluate_rows(self._is_reset, {name: self._arrays[name] for name in _DERIVED}, evaluate)
         self._is_stale &= ~self._is_reset
 
-    def _give_back(self, is_new: Bool[Tensor, " env"], earlier: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
-        """Give environments that are not new back what they had, and take the joints of those that are."""
+    def _evaluate_rows(self, is_new: Bool[Tensor, " env"], arrays: Mapping[str, Tensor], evaluate: Callable[[], None]) -> None:
+        """Evaluate all environments, give those that are not new back what they had, and take the joints of the new ones."""
+        filled = [array for array in arrays.values() if array.numel()]
+        earlier = [torch.empty_like(array) for array in filled]
+        copy_each(earlier, filled)
+        evaluate()
         is_old = ~is_new
-        for name, old in earlier.items():
-            put_rows(arrays[name], is_old, old)
+        for array, old in zip(filled, earlier, strict=True):
+            put_rows(array, is_old, old)
         for name, kept in self._kept.items():
             put_rows(kept, is_new, self._arrays[name])
 
@@ -449,18 +451,8 @@ class WarpSimulation(Simulation):
 
     def _restart(self) -> None:
         for name, start in self._start_arrays.items():
-            array = self._arrays[name]
-            if array.numel():
-                put_rows(array, self._is_reset, start)
-        for name in _VELOCITIES:
-            array = self._arrays[name]
-            if array.numel():  # a NaN there would come back in the next evaluation
-                put_rows(array, self._is_reset, 0.0)
+            put_rows(self._arrays[name], self._is_reset, start)
+        for name in _VELOCITIES:  # a NaN there would come back in the next evaluation
+            put_rows(self._arrays[name], self._is_reset, 0.0)
         self._faults.clear(self._is_reset)
         self._is_stale |= self._is_reset
-
-
-def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    copies = {name: torch.empty_like(array) for name, array in arrays.items()}
-    copy_each(list(copies.values()), list(arrays.values()))
-    return copies

@@ -20,12 +20,10 @@ from tgdsl.runtime.xhand1.wire.errors import (
     HandDisconnectedError,
     HandError,
     HandTimeoutError,
-    MotionError,
     ProtocolError,
 )
 from tgdsl.runtime.xhand1.wire.protocol import (
     JOINTS,
-    NUM_JOINTS,
     PASSIVE,
     STATE_SIZE,
     Command,
@@ -60,7 +58,7 @@ class Reading:
 class HandReader(threading.Thread):
     """Exchanges without end, and notifies `changed` of every reading and failure."""
 
-    def __init__(self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion | None):
+    def __init__(self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion):
         super().__init__(name="xhand1", daemon=True)
         self.changed = threading.Condition()  # lock of all that follows
         self.reading: Reading | None = None  # the newest
@@ -96,7 +94,7 @@ class HandReader(threading.Thread):
         try:
             client = self._connected()
             with self.changed:
-                joints = PASSIVE if self.motion is None else self.motion.joints(time.monotonic())
+                joints = self.motion.joints(time.monotonic())
             reply = self._exchange(client, joints)
             state = _plausible(decode_state(reply.payload))
         except HandError as error:
@@ -124,8 +122,7 @@ class HandReader(threading.Thread):
         self._drop_if_gone(error)
         self._post_passive()
         with self.changed:
-            if self.motion is not None:
-                self.motion.fail(error)
+            self.motion.fail(error)
             self.failure = error, time.monotonic()
             self.changed.notify_all()
         if self._client is None:
@@ -221,7 +218,7 @@ class XHand1:
         def connect(counters: SerialCounters) -> SerialClient:
             return SerialClient(open_port(device, timing.baud), addresses, timing, counters)
 
-        reader = HandReader(connect(SerialCounters()), connect, Motion(motion) if motion else None)
+        reader = HandReader(connect(SerialCounters()), connect, Motion(motion))
         reader.start()
         hand = cls(reader, timing, max_age_s)
         try:
@@ -261,37 +258,32 @@ class XHand1:
         with reader.changed:
             if reader.ended is not None:
                 raise reader.ended
-            if reader.motion is None:
-                raise MotionError("this hand was opened for reading alone; to move it, open it with motion=MotionLimits(...)")
-            angles = np.asarray(target, dtype=np.float64)
-            if angles.shape != (NUM_JOINTS,):
-                raise reader.motion.stop(MotionError(f"the target has shape {angles.shape}, expected ({NUM_JOINTS},)"))
             reading = reader.reading
             is_known = reading is not None and reading.age_s(now) <= self._max_age_s
-            reader.motion.command(angles, now, reading.state.position.astype(np.float64) if reading and is_known else None)
+            measured = reading.state.position.astype(np.float64) if reading and is_known else None
+            reader.motion.command(np.asarray(target, dtype=np.float64), now, measured)
 
     def relax(self) -> None:
         """Make the hand passive until the next command; one that was stopped stays so until `resume`."""
         with self._reader.changed:
-            if self._reader.motion is not None:
-                self._reader.motion.relax()
+            self._reader.motion.relax()
 
     def resume(self) -> None:
         """Allow commands again after the hand was made passive; it stays passive until the next one."""
         with self._reader.changed:
-            if self._reader.motion is not None:
-                self._reader.motion.resume()
+            self._reader.motion.resume()
 
     @property
     def stopped(self) -> HandError | None:
         """Why the hand was made passive; None if it was not."""
         with self._reader.changed:
-            return None if self._reader.motion is None else self._reader.motion.stopped
+            return self._reader.motion.stopped
 
     @property
     def watchdog_s(self) -> float | None:
         """Time within which commands must follow one another [s]; None if the hand was opened for reading alone."""
-        return None if self._reader.motion is None else self._reader.motion.limits.watchdog_s
+        limits = self._reader.motion.limits
+        return None if limits is None else limits.watchdog_s
 
     @property
     def counters(self) -> SerialCounters:

@@ -126,9 +126,12 @@ def _actuator(model: mujoco.MjModel, name: str, joint: int) -> int:
 
 
 class Motion:
-    """The set-points of a hand that may move. The first starts from where the joints are; each moves at a limited speed."""
+    """The set-points of a hand. The first starts from where the joints are; each moves at a limited speed.
 
-    def __init__(self, limits: MotionLimits):
+    Without limits every command is refused, so that there is never a set-point.
+    """
+
+    def __init__(self, limits: MotionLimits | None):
         self.limits = limits
         self.stopped: HandError | None = None  # why the hand was made passive; None if it was not
         self._target: JointArray | None = None
@@ -143,7 +146,11 @@ class Motion:
             HandError: If the hand was stopped, of the kind that stopped it.
             WatchdogError: If the last command is too long ago. The hand is then passive.
         """
+        if self.limits is None:
+            raise MotionError("this hand was opened for reading alone; to move it, open it with motion=MotionLimits(...)")
         self._watch(now)
+        if target.shape != (NUM_JOINTS,):
+            raise self.stop(MotionError(f"the target has shape {target.shape}, expected ({NUM_JOINTS},)"))
         if self.stopped is not None:
             raise type(self.stopped)(f"the hand was made passive: {self.stopped}; call resume() to go on")
         lower, upper = np.array(self.limits.lower), np.array(self.limits.upper)
@@ -161,9 +168,9 @@ class Motion:
     def joints(self, now: float) -> tuple[JointCommand, ...]:
         """Return what to send now: set-points one step on, or `PASSIVE`."""
         self._watch(now)
-        if self._target is None:
-            return PASSIVE
         limits = self.limits
+        if self._target is None or limits is None:
+            return PASSIVE
         reach = np.array(limits.speed) * min(max(now - self._stepped_at, 0.0), _LONGEST_STEP_S)
         self._setpoint = np.clip(self._target, self._setpoint - reach, self._setpoint + reach)
         self._stepped_at = now
@@ -193,6 +200,6 @@ class Motion:
 
     def _watch(self, now: float) -> None:
         waited = now - self._commanded_at
-        if self._target is not None and waited > self.limits.watchdog_s:
+        if self._target is not None and self.limits is not None and waited > self.limits.watchdog_s:
             allowed = 1e3 * self.limits.watchdog_s
             self.stop(WatchdogError(f"no command came for {1e3 * waited:.0f} ms, expected one every {allowed:.0f} ms"))
