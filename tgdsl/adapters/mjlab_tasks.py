@@ -227,10 +227,7 @@ def env_cfg() -> ManagerBasedRlEnvCfg:
             "drop": RewardTermCfg(func=mdp.is_terminated, weight=-100.0),
             "action_rate": RewardTermCfg(func=mdp.action_rate_l2, weight=-5e-4),
         },
-        terminations={
-            "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
-            "drop": TerminationTermCfg(func=drop),
-        },
+        terminations={"time_out": TerminationTermCfg(func=mdp.time_out, time_out=True), "drop": TerminationTermCfg(func=drop)},
         sim=SimulationCfg(
             nconmax=64, njmax=256, mujoco=MujocoCfg(timestep=0.005, cone="elliptic", impratio=10.0, iterations=10)
         ),

@@ -9,7 +9,6 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from tgdsl.errors import ObservationError
 from tgdsl.module.module import TactileModule
+from tgdsl.runtime.closable import Closable
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
@@ -48,7 +48,7 @@ class Source(Protocol):
         ...
 
 
-class Connection(ABC):
+class Connection(Closable, ABC):
     """A source, as a policy sees it. Use it as a context manager, or call `close`.
 
     A kind of source supplies `read`, and where it differs `send`, `restart` and `concerns`.
@@ -144,12 +144,6 @@ class Connection(ABC):
             HandError: If a hand was moving and did not confirm that it is passive.
         """
         self.source.close()
-
-    def __enter__(self) -> Connection:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 class SimulationConnection(Connection):

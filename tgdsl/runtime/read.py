@@ -25,11 +25,7 @@ _CONTACT_ARRAYS = ("geom", "pos", "dist", "includemargin", "efc_address")
 
 
 def read_mujoco(
-    touch: TactileModule,
-    model: mujoco.MjModel,
-    data: mujoco.MjData | Sequence[mujoco.MjData],
-    *,
-    inputs: Inputs | None = None,
+    touch: TactileModule, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData], *, inputs: Inputs | None = None
 ) -> SceneState:
     """Return the state of a scene that is stepped by `mujoco.mj_step`, (env, …), float64, on the module's device.
 

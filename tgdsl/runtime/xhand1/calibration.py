@@ -11,6 +11,7 @@ Shapes: `finger` thumb, index, middle, ring, pinky.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -65,15 +66,10 @@ class FingersSpec(SpecModel):
     """All fingertips."""
 
     thumb: FingerSpec
-    """The thumb's."""
     index: FingerSpec
-    """The index finger's."""
     middle: FingerSpec
-    """The middle finger's."""
     ring: FingerSpec
-    """The ring finger's."""
     pinky: FingerSpec
-    """The pinky's."""
 
 
 class CalibrationSpec(SpecModel):
@@ -99,6 +95,7 @@ class CalibrationSpec(SpecModel):
 
 
 _REQUIRED = ("tgdsl", "fingers")
+_PARTS = ("scale", "rotation", "bias", "tare")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,15 +130,13 @@ class Calibration:
 
     def text(self) -> str:
         """Return the YAML that `load_calibration` reads."""
-        quoted = self.hand.replace("'", "''")
-        lines = ["tgdsl: 1", *([f"hand: '{quoted}'"] if self.hand else []), f"units: {self.units}"]
-        if self.contact_threshold is not None:
-            lines.append(f"contact_threshold: {self.contact_threshold!r}")
+        lines = ["tgdsl: 1", f"units: {self.units}"]
+        lines += [f"hand: {json.dumps(self.hand, ensure_ascii=False)}"] if self.hand else []
+        lines += [] if self.contact_threshold is None else [f"contact_threshold: {self.contact_threshold!r}"]
         lines.append("fingers:")
         for i, name in enumerate(FINGERS):
-            lines += [f"  {name}:", f"    scale: {_row(self.scale[i])}"]
-            lines += [f"    rotation: [{', '.join(_row(row) for row in self.rotation[i])}]"]
-            lines += [f"    bias: {_row(self.bias[i])}", f"    tare: {_row(self.tare[i])}"]
+            lines.append(f"  {name}:")
+            lines += [f"    {part}: {json.dumps(getattr(self, part)[i].tolist())}" for part in _PARTS]
         return "\n".join(lines) + "\n"
 
 
@@ -170,7 +165,3 @@ def _calibration(spec: CalibrationSpec) -> Calibration:
         spec.hand or "",
         spec.contact_threshold,
     )
-
-
-def _row(values: Float[np.ndarray, " axis"]) -> str:
-    return f"[{', '.join(repr(float(value)) for value in values)}]"

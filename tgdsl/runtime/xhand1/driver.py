@@ -7,21 +7,15 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.runtime.closable import Closable
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
 from tgdsl.runtime.xhand1.wire.client import Addresses, Port, Reply, SerialClient, SerialCounters, SerialPort, SerialTiming
-from tgdsl.runtime.xhand1.wire.errors import (
-    HandClosedError,
-    HandDisconnectedError,
-    HandError,
-    HandTimeoutError,
-    ProtocolError,
-)
+from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, HandTimeoutError, ProtocolError
 from tgdsl.runtime.xhand1.wire.protocol import (
     JOINTS,
     PASSIVE,
@@ -174,7 +168,7 @@ class Tare(NamedTuple):
     num_frames: int
 
 
-class XHand1:
+class XHand1(Closable):
     """A hand that is being read. Use it as a context manager, or call `close`.
 
     A thread exchanges with the hand all the time. Unless motion limits were given, every exchange asks for mode 0 with no gain
@@ -321,12 +315,6 @@ class XHand1:
             raise HandError(f"{problem}: switch the hand's power off if it moves")
         if (error := self._reader.left_driven) is not None:
             raise HandError(f"the hand did not confirm that it is passive: switch its power off ({error})") from error
-
-    def __enter__(self) -> XHand1:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
     def _is_new(self, reading: Reading | None) -> bool:
         return reading is not None and reading.sequence > self._last_sequence and reading.age_s() <= self._max_age_s

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from tgdsl.errors import StateError
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.closable import Closable
 from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
@@ -101,7 +102,7 @@ class HandSample:
         )
 
 
-class HandSource(ABC):
+class HandSource(Closable, ABC):
     """A hand, or the log of one, that steps as one environment."""
 
     NAME: str
@@ -156,11 +157,6 @@ class HandSource(ABC):
 
     def resume(self) -> None:
         """Let a hand move again after an error made it passive."""
-        return
-
-    @abstractmethod
-    def close(self) -> None:
-        """Release the hand or the log."""
 
 
 class XHand1Source(HandSource):

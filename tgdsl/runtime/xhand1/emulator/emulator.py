@@ -16,12 +16,12 @@ import tty
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.runtime.closable import Closable
 from tgdsl.runtime.xhand1.wire.client import BAUD
 from tgdsl.runtime.xhand1.wire.errors import HandError, ProtocolError
 from tgdsl.runtime.xhand1.wire.protocol import (
@@ -198,7 +198,7 @@ class EmulatedLine:
         self._parser = FrameParser()
 
 
-class Emulator:
+class Emulator(Closable):
     """A thread that lets an emulated hand answer on a pseudo-terminal, as fast as a line of its baud rate would."""
 
     def __init__(self, hand: EmulatedHand | None = None, *, line: EmulatedLine | None = None):
@@ -236,12 +236,6 @@ class Emulator:
             self._unplug()
             self._folder.cleanup()
             self.check()
-
-    def __enter__(self) -> Emulator:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
     def _plug(self) -> None:
         if self._ends is None:

@@ -14,7 +14,6 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,7 +24,6 @@ from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.observations import observations
 from tgdsl.observations.observations import HAND_ONLY
-from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedObservation
 from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
@@ -45,37 +43,21 @@ _POLL_S = 0.001
 _LATE_S = 0.2  # physics that is later than this is not made up for [s]
 
 
-class _Place(NamedTuple):
-    """Where a finger's force stands among the features of an observation."""
-
-    term: HandTerm
-    link: int
-
-    def force(self, features: Float[Tensor, " feature"]) -> Float[np.ndarray, " axis"]:
-        by_axis = features.reshape(3, len(self.term.fingers))[:, self.link].double().cpu().numpy()
-        return by_axis[np.argsort(self.term.axes)]
-
-    def operator(self, plan: Plan) -> tuple[str | None, bytes]:
-        """Return the reading and the matrix that gave the force, to compare."""
-        planned = self.term.planned
-        matrix = plan.arrays[f"observations/{planned.group}/{planned.index}/operator"]
-        columns = matrix.reshape(len(matrix), 3, len(self.term.fingers))[:, np.argsort(self.term.axes), self.link]
-        return planned.reading, np.ascontiguousarray(columns).tobytes()
-
-
 class SimulatedTips:
     """Forces on the fingertips: the aggregate forces that a module observes in its own scene."""
 
     def __init__(self, touch: TactileModule, terms: Sequence[HandTerm]):
         """Find the observation of each fingertip's force; an error names those that the emulator cannot give."""
         self._touch = touch
-        self._places: dict[int, _Place] = {}
+        self._places: dict[int, tuple[HandTerm, int]] = {}  # by finger: an observation of its force, and which of its links
         for term in terms:
             if term.planned.type in HAND_ONLY:
                 raise ObservationError(f"{term.label}: the emulator cannot give it: where the hand's taxels are is not known")
-            if term.planned.type == "agg_force":
-                for link, finger in enumerate(term.fingers):
-                    self._take(finger, _Place(term, link))
+            for link, finger in enumerate(term.fingers if term.planned.type == "agg_force" else ()):
+                known, at = self._places.setdefault(finger, (term, link))
+                if self._operator(known, at) != self._operator(term, link):
+                    problem = f"{known.label} and {term.label} differ, but the hand has one force on its {FINGERS[finger]}"
+                    raise ObservationError(f"{problem}; give them the same `scale` and sensor")
         for term in terms:
             missing = [FINGERS[finger] for finger in term.fingers if finger not in self._places]
             if missing:
@@ -86,20 +68,22 @@ class SimulatedTips:
         """Return the force on each fingertip, along its link's axes [unit of `agg_force`]; 0 where none is observed."""
         result = np.zeros((len(FINGERS), 3))
         features: dict[PlannedObservation, Tensor] = {}
-        for finger, place in self._places.items():
-            planned = place.term.planned
+        for finger, (term, link) in self._places.items():
+            planned = term.planned
             if planned not in features:
                 constants = self._touch.constants.tree["observations"][planned.key]
                 reading = last_step(readings[str(planned.reading)])
                 features[planned] = observations.observe(planned.type, reading, planned.channels, constants)[0]
-            result[finger] = place.force(features[planned])
+            by_axis = features[planned].reshape(3, len(term.fingers))[:, link].double().cpu().numpy()
+            result[finger] = by_axis[np.argsort(term.axes)]
         return result
 
-    def _take(self, finger: int, place: _Place) -> None:
-        known = self._places.setdefault(finger, place)
-        if known.operator(self._touch.plan) != place.operator(self._touch.plan):
-            problem = f"{known.term.label} and {place.term.label} differ, but the hand has one force on its {FINGERS[finger]}"
-            raise ObservationError(f"{problem}; give them the same `scale` and sensor")
+    def _operator(self, term: HandTerm, link: int) -> tuple[str | None, bytes]:
+        """Return the reading and the matrix that give the force on a link, to compare."""
+        planned = term.planned
+        matrix = self._touch.plan.arrays[f"observations/{planned.group}/{planned.index}/operator"]
+        columns = matrix.reshape(len(matrix), 3, len(term.fingers))[:, np.argsort(term.axes), link]
+        return planned.reading, np.ascontiguousarray(columns).tobytes()
 
 
 class SimulatedBody(Body):

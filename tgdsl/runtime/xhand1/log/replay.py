@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import NoReturn
 
 import numpy as np
@@ -126,12 +125,6 @@ class ReplaySource(HandSource):
         self._readings = iter(())
         self._now = self._end
         self._next_reading, self._next_fault = self.log.num_readings, len(self.log.faults)
-
-    def __enter__(self) -> ReplaySource:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
     def _restart(self) -> None:
         """Count steps from now, and deliver the first reading that was asked for from then on."""

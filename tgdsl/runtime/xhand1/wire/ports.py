@@ -28,11 +28,7 @@ class FoundHand(NamedTuple):
 
 
 def find_hands(
-    device: str,
-    hand_ids: Iterable[int] = range(8),
-    *,
-    timing: SerialTiming | None = None,
-    open_port: _OpenPort = SerialPort,
+    device: str, hand_ids: Iterable[int] = range(8), *, timing: SerialTiming | None = None, open_port: _OpenPort = SerialPort
 ) -> tuple[FoundHand, ...]:
     """Ask each id on a port for its version and return those that answer."""
     timing = timing or SerialTiming()

@@ -77,16 +77,7 @@ def crc16(data: bytes | bytearray | memoryview) -> int:
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """Return a frame's bytes.
-
-    Raises:
-        ProtocolError: If a number does not fit its field, or the command writes firmware.
-    """
-    for name, value in (("source", frame.source), ("destination", frame.destination), ("command", frame.command)):
-        if not 0 <= value <= 0xFF:
-            raise ProtocolError(f"{name} is {value}, expected 0 to 255")
-    if len(frame.payload) > MAX_PAYLOAD:
-        raise ProtocolError(f"the payload has {len(frame.payload)} bytes, expected at most {MAX_PAYLOAD}")
+    """Return a frame's bytes; a command that writes firmware is refused."""
     if frame.command in FIRMWARE_COMMANDS:
         raise ProtocolError(f"command {frame.command:#04x} writes firmware; it is never sent")
     head = struct.pack("<2sBBBH", HEADER, frame.source, frame.destination, frame.command, len(frame.payload))
