@@ -203,7 +203,9 @@ def contacts_by_pair(
         SimulationError: If the engine lacks a body or geom, or several names match it.
     """
     rows = pair_rows(inputs, geoms if isinstance(geoms, Geoms) else Geoms(tuple(geoms)))
-    row_of_pair, link_of_geom, row_of_geoms = (_on_device(table, pos.device) for table in (rows[0], rows[2], rows[3]))
+    row_of_pair, link_of_geom, row_of_geoms = (
+        torch.from_numpy(table).to(pos.device) for table in (rows.row_of_pair, rows.link_of_geom, rows.row_of_geoms)
+    )
     is_contact = (force != 0).any(dim=-1) if is_contact is None else is_contact
     is_contact = is_contact & (pairs >= 0).all(dim=-1)
     one, other = pairs.long().clamp(min=0).T
@@ -239,10 +241,6 @@ def contacts_by_pair(
             filled = pos.new_zeros(bins * inputs.slots + 1, 3).index_copy_(0, place, slotted[name])
             fields[name] = filled[:-1].view(num_envs, -1, inputs.slots, 3)
     return {name: value[:, row_of_pair] for name, value in fields.items()}
-
-
-def _on_device(table: np.ndarray, device: torch.device) -> Tensor:
-    return torch.from_numpy(table).to(device)
 
 
 def _ranks(key: Int[Tensor, " n"]) -> Int[Tensor, " n"]:

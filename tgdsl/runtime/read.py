@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -122,20 +122,12 @@ def _warp_reader(
     return GraphedCall(stream, state)
 
 
-class _Held(NamedTuple):
-    """A reader, and what it was made of."""
-
-    inputs: Inputs
-    scene: tuple[Any, ...]
-    reader: Any
-
-
-_HELD: weakref.WeakKeyDictionary[TactileModule, _Held] = weakref.WeakKeyDictionary()
-"""The last reader of each module: names are looked up when it is first used with a scene."""
+_HELD: weakref.WeakKeyDictionary[TactileModule, tuple[Inputs, tuple[Any, ...], Any]] = weakref.WeakKeyDictionary()
+"""The last reader of each module, and its inputs and scene: names are looked up when it is first used with a scene."""
 
 
 def _reader(touch: TactileModule, inputs: Inputs, scene: tuple[Any, ...], make: Callable[[], Any]) -> Any:
     held = _HELD.get(touch)
-    if held is None or held.inputs != inputs or [*map(id, held.scene)] != [*map(id, scene)]:
-        held = _HELD[touch] = _Held(inputs, scene, make())
-    return held.reader
+    if held is None or held[0] != inputs or [*map(id, held[1])] != [*map(id, scene)]:
+        held = _HELD[touch] = inputs, scene, make()
+    return held[2]
