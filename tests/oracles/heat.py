@@ -11,7 +11,8 @@ from oracles.comparison import Values, field
 from oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state, heated
 from oracles.setups.scenes import folder
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.sensors.temperature_grid.shares import Boxes, conductances
+from tgdsl.sensors.temperature_grid.patch_flow import conductances
+from tgdsl.sensors.temperature_grid.rows import Boxes
 
 STEEL = MATERIALS["steel"]
 ALPHA = STEEL.conductivity / (STEEL.density * STEEL.specific_heat)

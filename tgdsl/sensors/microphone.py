@@ -8,9 +8,8 @@ in metres from the source, at the instant of emission, to the microphone, and c 
 `sensors.upstream`: K samples, the last one at the step's end. So it reads a block of K samples, of each step of a call.
 
 - Time: a_i is exact at the ends of steps (`age_of_sound`), where source and microphone move evenly in between, and linear
-within a
-  step. So a tone of frequency f is heard at f (1 − v_m/c)/(1 + v_s/c), with the speeds v_m and v_s of microphone and source
-  away from one another.
+  within a step. So a tone of frequency f is heard at f (1 − v_m/c)/(1 + v_s/c), with the speeds v_m and v_s of microphone and
+  source away from one another.
 - Between samples it is interpolated by 24 of them (`delayed`), exact up to 0.4 of the sample rate. These look ahead, so
   that sound arrives at least 12 samples after its emission: from sources nearer than 12 c/f_s it is late, but as loud as at
   their distance.

@@ -19,7 +19,8 @@ def test_aluminium_on_warm_rubber_warms_as_two_solids_do():
 
 def test_a_patch_that_covers_the_face_is_not_constricted():
     """Then half a cell is all that heat passes; so it is for a larger one, and one that stands over is moved in."""
-    from tgdsl.sensors.temperature_grid.shares import Boxes, conductances
+    from tgdsl.sensors.temperature_grid.patch_flow import conductances
+    from tgdsl.sensors.temperature_grid.rows import Boxes
 
     def column(*values):
         return tuple(torch.tensor([v], dtype=torch.float64) for v in values)

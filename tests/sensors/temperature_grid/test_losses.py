@@ -10,7 +10,7 @@ from oracles.setups.boxes import cells_of, heat_module, heat_state, heated
 import tgdsl
 from tgdsl.errors import CoarseCellsWarning
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.sensors.temperature_grid.resolution import lost_error
+from tgdsl.sensors.temperature_grid.spec import lost_error
 
 
 def test_a_hot_block_stays_hot_for_a_second():

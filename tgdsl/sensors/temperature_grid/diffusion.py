@@ -45,17 +45,12 @@ class Modes(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """What a step adds along one axis, or along some that follow one another.
+    """What a step adds along one axis, or along some that follow one another."""
 
-    Attributes:
-        gains: G, symmetric (env, row, to, from) [1].
-        leaves: Sums of its columns, what is added to all cells of what one holds (env, row, from) [1].
-        is_there: 1 for the cells that a row has (row, cell).
-    """
-
-    gains: Float[Tensor, "env row to from"]
+    gains: Float[Tensor, "env row to from"]  # G, symmetric (env, row, to, from) [1]
+    # sums of its columns, what is added to all cells of what one holds (env, row, from) [1]
     leaves: Float[Tensor, "env row from"]
-    is_there: Float[Tensor, "row cell"]
+    is_there: Float[Tensor, "row cell"]  # 1 for the cells that a row has (row, cell)
 
 
 class Spread(NamedTuple):

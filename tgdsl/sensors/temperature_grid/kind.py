@@ -8,7 +8,7 @@ of Δt does, one after the other:
    each cell or q A_i at a face, all exact in time (`diffusion`), and contact with bodies and links for all of them at once,
    C_i θ̇_i = Σ_n g_in (φ_n − θ_i) (`conduction`): exact for steady flows and between bodies of one temperature, else with two
    numbers for a flow's course in the step (`response`); g_in from the patches' areas, both conductivities and the constriction
-   of heat to a small spot (`shares`).
+   of heat to a small spot (`patch_flow`).
 
     y ← T + (y − T_before) e^(−Δt/τ) − (T − T_before)(1 − e^(−Δt/τ)) τ/Δt                                  [°C]
 
@@ -28,7 +28,7 @@ contact [J]; `<sensor>/objects` the same of each object, with its temperature.
 
 Source: Incropera et al., *Fundamentals of Heat and Mass Transfer*; Johnson, *Contact Mechanics*, 4.2 (Hertz); the order of
 steps and the lag are the paper's. Departures from it: fluxes act on areas, conduction is implicit, the area of a point contact
-is an area, and the lag is exact: see `paper` for the printed formulas.
+is an area, and the lag is exact: see `paper_step` for the printed formulas.
 
 Limits: a link is a solid box; material where the box stands over counts, and exposed faces are the box's. Patches do not shade
 faces from losses.
@@ -50,12 +50,10 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.patches import ContactPatches, is_cell, outer_areas, tables
 from tgdsl.sensors.base import Axis, Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.noise import BASE
-from tgdsl.sensors.temperature_grid import grids
-from tgdsl.sensors.temperature_grid.advance import Heat, advanced
 from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
 from tgdsl.sensors.temperature_grid.reference import reference
-from tgdsl.sensors.temperature_grid.resolution import warn_of_coarse
-from tgdsl.sensors.temperature_grid.spec import TemperatureGridSpec, alternatives
+from tgdsl.sensors.temperature_grid.spec import TemperatureGridSpec, alternatives, boxes_of, counts, warn_of_coarse
+from tgdsl.sensors.temperature_grid.step import Heat, advanced
 
 HEAT = tuple(Channel(name, "J") for name in ("stored", "source", "radiation", "convection", "contact"))
 OBJECTS = (Channel("temperature", "degC"), *(Channel(name, "J") for name in ("stored", "radiation", "convection", "contact")))
@@ -63,8 +61,8 @@ OBJECTS = (Channel("temperature", "degC"), *(Channel(name, "J") for name in ("st
 
 def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Divide the links' boxes into cells; what of a step does not depend on Δt is computed."""
-    boxes = grids.boxes(spec, layout, surface_of)
-    count, size = grids.counts(spec, boxes), boxes[:, 1] - boxes[:, 0]
+    boxes = boxes_of(spec, layout, surface_of)
+    count, size = counts(spec, boxes), boxes[:, 1] - boxes[:, 0]
     there = is_cell(count)
     made_of = [spec.material_of(link.name) for link in layout.links]
     conductivity = np.array([own.conductivity for own in made_of])
@@ -137,7 +135,6 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
 
 
 def _emissivities(spec: TemperatureGridSpec, made_of: list[Material]) -> Float[np.ndarray, " row"]:
-    """Return ε of each link; 0 where nothing radiates."""
     if spec.emissivity is None:
         return np.zeros(len(made_of))
     return np.array([own.emissivity if spec.emissivity == "material" else spec.emissivity for own in made_of])
@@ -158,12 +155,10 @@ def _films(
 
 
 def _radiated(spec: TemperatureGridSpec, made_of: list[Material]) -> Float[np.ndarray, " row"]:
-    """Return 4εσ T_a³ of each link [W/(m²·K)]."""
     return 4.0 * stefan_boltzmann() * _emissivities(spec, made_of) * (spec.ambient + zero_celsius()) ** 3
 
 
 def _needs_stiffness(spec: TemperatureGridSpec, made_of: list[Material]) -> bool:
-    """Return whether the area of a contact follows from the object's stiffness alone, as some link has none."""
     return spec.contact_area == "manifold" and any(own.youngs_modulus is None for own in made_of)
 
 

@@ -1,25 +1,142 @@
-"""From patches to conductances: their areas, and what stands in series with the cells of a link.
+"""How a patch joins the cells of a box: which of them, and with what conductance.
+
+A patch is taken for a square of its area A across its normal, about its centre, moved into the box where it would stand over.
+It sees the temperature that is interpolated linearly between the centres of cells and constant beyond the last one: cell i
+takes the share w_i of it, products of one factor per axis.
+
+    G = 2 k A/d + 4 k a φ/(1 + ρ/2) · (1 + ¾ ρ (2q − 1) max(0, 1 − 2ρ)),   ρ = a/Δ,   a = √(A/π)          [W/K]
+
+is its conductance to the cells. The first term is that of half a cell, d thick along the normal, below the patch, in the shares
+w_i. The second is the constriction of heat towards a spot that is smaller than a cell, Δ the side of one across the normal: of
+a small spot alone it is that of an isothermal disc on a half-space, 4ka; it fades as cells resolve the spot, and stands at the
+patch's four edges, each with the part φ of it that is not within half a cell of the box's own end, where heat cannot spread: a
+patch that covers the face has none. q = Σ w_i² across the normal tells how many cells share the spot [1]. Beyond ρ/2, which
+follows from the resistance of the cells' own grid at large ρ, the last factor was fitted to that grid's Green's function: a
+disc on a half-space of cells has its closed-form resistance 1/4ka to 1.5 %, for Δ from a/4 to 10 a and wherever it is.
+
+Source: Carslaw and Jaeger, *Conduction of Heat in Solids*, 8.2, for the disc.
+
+Shapes: `env` environments, `row` rows of cells, `side` sides of patches on each, `cell` cells along an axis.
+
+From patches to conductances: their areas, and what stands in series with the cells of a link.
 
     A = max(A_polygon, π (3 F / (4 E* κ))^(2/3)),   1/E* = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂,   κ = 1/R₁ + 1/R₂     [m²]
     G_o = 2 k_o A/D + 4 k_o a φ/(1 + a/2D),   D = V^(1/3),   φ = max(0, 1 − √A/D)                            [W/K]
 
-G_o is what a body of one temperature conducts from the patch to its middle, by the formula of `shares` for a cube of its volume
-in one cell. Source: Johnson, *Contact Mechanics*, 4.2.
+G_o is what a body of one temperature conducts from the patch to its middle, by the formula of `conductances` for a cube of its
+volume in one cell. Source: Johnson, *Contact Mechanics*, 4.2.
 
 Shapes: `env` environments, `body` links, `object` objects, `row` rows of cells, `side` sides of patches on each.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
-from tgdsl.sensors.temperature_grid.rows import Rows, num_cells
-from tgdsl.sensors.temperature_grid.shares import conductances
+from tgdsl.sensors.temperature_grid.rows import Boxes, Rows, num_cells
+
+
+def least_width() -> float:
+    """Return the least half-width of a patch along an axis [cells]: from there on shares are those of a point."""
+    return 0.05
+
+
+class Axis(NamedTuple):
+    """Along one axis: shares of cells and of both edges (…, cell), Σ w², and the part of the patch that is in the box [1]."""
+
+    shares: Tensor
+    edges: Tensor
+    squared: Tensor
+    within: Tensor
+
+
+def conductances(
+    area: Tensor, pos: Vec, normal: Vec, conductivity: Tensor, boxes: Boxes, num_cells: tuple[int, int, int]
+) -> Tensor:
+    """Return the conductance between each side of a patch and each cell (env, row, side, x, y, z) [W/K].
+
+    Args:
+        area: Area of each patch (env, row, side) [m²]; 0 where there is none.
+        pos: Its centre in the row's frame, planes [m].
+        normal: Its unit normal, planes.
+        conductivity: k of each row (env, row) [W/(m·K)].
+        boxes: The rows' boxes.
+        num_cells: Cells along each axis, padded.
+    """
+    is_any = area > 0
+    safe = torch.where(is_any, area, 1e-6)
+    side, across, parts = torch.sqrt(safe), planes.vec((1.0 - n * n).clamp(min=0.0) for n in normal), []
+    for a in range(3):
+        corner, step, count = (value[..., None] for value in (boxes.corner[a], boxes.step[a], boxes.count[a]))
+        half = 0.5 * side * planes.safe_sqrt(across[a])
+        parts.append(_along((pos[a] - corner) / step, half / step, count, num_cells[a]))
+    within = parts[0].within * parts[1].within * parts[2].within
+    fit = safe * within
+    k = conductivity[..., None]
+    depth = sum(n * n * step[..., None] for n, step in zip(normal, boxes.step, strict=True))
+    volume = (boxes.step[0] * boxes.step[1] * boxes.step[2])[..., None]
+    radius = torch.sqrt(fit / planes.pi())
+    rho = radius * torch.sqrt(depth / volume)
+    few = torch.ones_like(area)
+    for part, own in zip(parts, across, strict=True):
+        few = few * (1.0 - own * (1.0 - part.squared))
+    fitted = 1.0 + 0.75 * rho * (2.0 * few - 1.0) * (1.0 - 2.0 * rho).clamp(min=0.0)
+    cover = torch.where(is_any, 2.0 * k * fit / depth, 0.0)
+    spot = torch.where(is_any, 4.0 * k * radius / (1.0 + 0.5 * rho) * fitted, 0.0)
+    return _spread(cover, spot, across, parts)
+
+
+def _spread(cover: Tensor, spot: Tensor, across: Vec, parts: list[Axis]) -> Tensor:
+    """Return conductances shared out: those of what is covered by the shares, those of the spot at its edges."""
+    (x, y, z), (ex, ey, ez) = ([getattr(part, name) for part in parts] for name in ("shares", "edges"))
+    x, ex = (part[..., :, None, None] for part in (x, ex))
+    y, ey = (part[..., None, :, None] for part in (y, ey))
+    z, ez = (part[..., None, None, :] for part in (z, ez))
+    tx, ty, tz = ((0.5 * spot * own)[..., None, None, None] for own in across)
+    body = cover[..., None, None, None]
+    return x * (y * (body * z + tz * ez) + ty * ey * z) + tx * ex * y * z
+
+
+def _along(centre: Tensor, half: Tensor, length: Tensor, num_cells: int) -> Axis:
+    """Return what a patch is along one axis; all lengths in cells."""
+    is_wide = half > 0
+    middle = 0.5 * length
+    fits = torch.minimum(half, middle)
+    within = torch.where(is_wide, fits / torch.where(is_wide, half, 1.0), 1.0)
+    width = torch.minimum(fits.clamp(min=least_width()), middle)
+    centre = torch.minimum(torch.maximum(centre, fits), length - fits)
+    about = torch.minimum(torch.maximum(centre, width), length - width)
+    place = torch.arange(num_cells, device=half.device, dtype=half.dtype) + 0.5
+    top = length - 0.5
+    low, high = about - width, about + width
+    covered = _below(_clamped(high, top)[..., None] - place) - _below(_clamped(low, top)[..., None] - place)
+    before = (0.5 - low).clamp(min=0.0) - (0.5 - high).clamp(min=0.0)
+    after = (high - top).clamp(min=0.0) - (low - top).clamp(min=0.0)
+    is_last = (place - top[..., None]).abs() < 0.25
+    covered = covered + torch.where(place < 1.0, before[..., None], 0.0) + torch.where(is_last, after[..., None], 0.0)
+    shares = covered / (2.0 * width)[..., None]
+    ends = centre - fits, centre + fits
+    is_open = (2.0 * ends[0]).clamp(0.0, 1.0), (2.0 * (length - ends[1])).clamp(0.0, 1.0)
+    at = [(1.0 - (_clamped(end, top)[..., None] - place).abs()).clamp(min=0.0) for end in ends]
+    edges = 0.5 * (is_open[0][..., None] * at[0] + is_open[1][..., None] * at[1])
+    return Axis(shares, edges, (shares * shares).sum(dim=-1), within)
+
+
+def _clamped(point: Tensor, top: Tensor) -> Tensor:
+    return torch.minimum(point.clamp(min=0.5), top)
+
+
+def _below(offset: Tensor) -> Tensor:
+    offset = offset.clamp(-1.0, 1.0)
+    return offset * (1.0 - 0.5 * offset.abs())
 
 
 def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
@@ -56,7 +173,6 @@ def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants) -> Tenso
 
 
 def _of_sides(patches: ContactPatch, plane: Tensor) -> Tensor:
-    """Return what each side has of a plane (env, body, object), as (env, row, side); 0 where there is none."""
     return plane if patches.topology.is_plain else pad(plane.flatten(1), (0, 1))[:, patches.sides["pair"]]
 
 
@@ -79,7 +195,6 @@ def resistance(area: Tensor, patches: ContactPatch, lumped: tuple[int, ...], con
 
 
 def _of_objects(factors: list[float], like: Tensor) -> Tensor:
-    """Return a factor of each object (object,): filled on the device, as a CUDA graph cannot hold a copy from the host."""
     return torch.stack([like.new_full((), factor) for factor in factors])
 
 

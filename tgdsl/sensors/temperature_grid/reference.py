@@ -14,8 +14,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities.patches import ContactPatches, ReferenceObject, ReferencePatch, ReferencePatches
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceContext, ReferenceState
-from tgdsl.sensors.temperature_grid.grids import counts
-from tgdsl.sensors.temperature_grid.spec import FACES, Face, TemperatureGridSpec
+from tgdsl.sensors.temperature_grid.spec import FACES, Face, TemperatureGridSpec, counts
 
 SIGMA, KELVIN = 5.670374419e-8, 273.15
 
@@ -213,7 +212,6 @@ def _coefficient(spec: TemperatureGridSpec, block: Block, above: np.ndarray | fl
 
 
 def _film(spec: TemperatureGridSpec, block: Block) -> np.ndarray:
-    """Return u₀ by axis [W/(m²·K)]: what surfaces near ambient lose to it."""
     total = float(_coefficient(spec, block, 0.0))
     return np.array([total / (1 + total * block.resistance(axis)) for axis in range(3)])
 
@@ -437,7 +435,7 @@ def _inside(block: Block, own: ReferenceObject, area: float) -> float:
 
 
 def _conductances(block: Block, area: float, pos: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the conductance between a patch and each cell of a box, in C order [W/K]: the equation of `shares`."""
+    """Return the conductance between a patch and each cell of a box, in C order [W/K]: the equation of `patch_flow`."""
     assert block.count is not None
     half = 0.5 * np.sqrt(area) * np.sqrt(np.maximum(0.0, 1 - normal**2)) / block.step
     axes = [_axis((pos[a] - block.corner[a]) / block.step[a], half[a], block.count[a]) for a in range(3)]

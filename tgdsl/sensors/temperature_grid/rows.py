@@ -13,38 +13,33 @@ from torch.nn.functional import pad
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.patches import ContactPatch
+from tgdsl.quantities.patches import ContactPatch, Topology
 from tgdsl.sensors.base import Constants
 from tgdsl.sensors.temperature_grid.diffusion import Modes
-from tgdsl.sensors.temperature_grid.shares import Boxes
+
+
+class Boxes(NamedTuple):
+    """Boxes of rows, planes (row,): lowest corner, sides and cells' sides [m]; number of cells along each axis."""
+
+    corner: Vec
+    size: Vec
+    step: Vec
+    count: Vec
 
 
 class Rows(NamedTuple):
-    """What rows are made of.
+    """What rows are made of."""
 
-    Attributes:
-        conductivity: k (env, row) [W/(m·K)].
-        diffusivity: α = k/(ρc) (env, row) [m²/s].
-        capacity: Heat capacity of a cell (env, row) [J/K].
-        emissivity: ε (env, row) [1]; None if nothing radiates.
-        ends: How many exposed faces across an axis cells along it have (row, cell).
-        resistance: That between a cell and such a face (env, row) [m²·K/W]: see `losses`.
-        film: What the modes lose at such a face (row,) [W/(m²·K)]; None if nothing.
-        film_radiated: The share of it that is radiation (row,) [1].
-        boxes: The boxes.
-        modes: Modes along each axis.
-    """
-
-    conductivity: Tensor
-    diffusivity: Tensor
-    capacity: Tensor
-    emissivity: Tensor | None
-    ends: Vec
-    resistance: Vec
-    film: Vec | None
-    film_radiated: Tensor | None
-    boxes: Boxes
-    modes: tuple[Modes, Modes, Modes]
+    conductivity: Tensor  # k (env, row) [W/(m·K)]
+    diffusivity: Tensor  # α = k/(ρc) (env, row) [m²/s]
+    capacity: Tensor  # heat capacity of a cell (env, row) [J/K]
+    emissivity: Tensor | None  # ε (env, row) [1]; None if nothing radiates
+    ends: Vec  # how many exposed faces across an axis cells along it have (row, cell)
+    resistance: Vec  # that between a cell and such a face (env, row) [m²·K/W]: see `losses`
+    film: Vec | None  # what the modes lose at such a face (row,) [W/(m²·K)]; None if nothing
+    film_radiated: Tensor | None  # the share of it that is radiation (row,) [1]
+    boxes: Boxes  # the boxes
+    modes: tuple[Modes, Modes, Modes]  # modes along each axis
 
     @property
     def rates(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,3 +134,78 @@ def _joined(links: Tensor, objects: Tensor) -> Tensor:
         lack = [want - found for want, found in zip(shape, table.shape[1:], strict=True)]
         parts.append(pad(table, [n for lacking in reversed(lack) for n in (0, lacking)]))
     return torch.cat(parts)
+
+
+def gained_by_objects(objects: Tensor, where: Topology, nodes: Tensor, grids: Tensor) -> Tensor:
+    """Return what each object's cells gained (env, object, x, y, z) [K].
+
+    Args:
+        objects: Their temperatures, for the shape.
+        where: Which object is what.
+        nodes: Gains of those of one temperature (env, node).
+        grids: Gains of those with cells (env, grid, …), padded to the links' cells too.
+    """
+    if where.is_plain and objects.shape[2:].numel() == 1:
+        return nodes[:, :, None, None, None]
+    size, parts = tuple(objects.shape[-3:]), []
+    x, y, z = size
+    none = torch.zeros_like(objects[:, 0])
+    for i in range(where.num_objects):
+        if i in where.lumped:
+            parts.append(padded(nodes[:, where.lumped.index(i), None, None, None], (x, y, z)))
+        elif i in where.grids:
+            parts.append(grids[:, where.grids.index(i), :x, :y, :z])
+        else:
+            parts.append(none)  # a link of the sensor
+    return torch.stack(parts, dim=1)
+
+
+def is_object_cell(objects: Tensor, where: Topology) -> Tensor:
+    """Return 1 for the cells that each object has (object, x, y, z)."""
+    result = torch.zeros(objects.shape[1:], dtype=objects.dtype, device=objects.device)
+    for i, (x, y, z) in enumerate(where.cells):
+        if where.links[i] < 0:
+            result[i, :x, :y, :z].fill_(1.0)
+    return result
+
+
+def account(
+    objects: Tensor,
+    patches: ContactPatch,
+    capacity: Tensor,
+    got: tuple[Tensor, ...],
+    nodes_got: tuple[Tensor, ...],
+    links: Tensor,
+) -> tuple[Tensor, ...]:
+    """Return mean temperature [K], what they hold, and got from radiation, convection and contact [J], (env, object) each.
+
+    Args:
+        objects: Temperatures of their cells (env, object, x, y, z).
+        patches: What they are made of.
+        capacity: Heat capacity of a row's cells (env, row) [J/K].
+        got: What rows got from source, radiation, convection and contact (env, row) each [J].
+        nodes_got: What nodes got from the last three (env, node) each [J].
+        links: Mean temperature of the links (env, link) [K].
+    """
+    where = patches.topology
+    if not where.num_objects:
+        return ()
+    heat = patches.objects.volumetric_heat * patches.objects.volume
+    if where.is_plain:
+        own = objects[:, :, 0, 0, 0]
+        return own, own * torch.where(torch.isfinite(heat), heat, 0.0), *nodes_got
+    columns: list[tuple[Tensor, ...]] = []
+    for i in range(where.num_objects):
+        if i in where.lumped:
+            own = objects[:, i, 0, 0, 0]
+            capacity_of = torch.where(torch.isfinite(heat[:, i]), heat[:, i], 0.0)
+            columns.append((own, own * capacity_of, *(part[:, where.lumped.index(i)] for part in nodes_got)))
+        elif i in where.grids:
+            row, cells = where.num_bodies + where.grids.index(i), where.cells[i]
+            total = objects[:, i].sum(dim=(-3, -2, -1))
+            mean = total / (cells[0] * cells[1] * cells[2])
+            columns.append((mean, total * capacity[:, row], *(part[:, row] for part in got[1:])))
+        else:  # a link of the sensor, whose own report has its heat
+            own = links[:, where.links[i]]
+            columns.append((own, *[torch.zeros_like(own)] * 4))
+    return tuple(torch.stack(part, dim=1) for part in zip(*columns, strict=True))

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
+import numpy as np
+from jaxtyping import Float, Int
 from pydantic import Field, StrictInt, model_validator
 
+from tgdsl.errors import CoarseCellsWarning, LowerError
 from tgdsl.fields.materials import Material, MaterialField
 from tgdsl.fields.models import Area, PositiveLength, Quantity, SpecModel, Temperature, Usual
 from tgdsl.fields.regions import Region
-from tgdsl.sensors.base import Alternative, LinkSpec
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.patches import is_cell, tables
+from tgdsl.sensors.base import Alternative, LinkSpec, SurfaceOf
 
 Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "-z", "+z")
@@ -138,3 +144,147 @@ def alternatives(spec: TemperatureGridSpec) -> list[Alternative]:
 
     schemes = [Alternative(scheme, {"scheme": scheme}) for scheme in ("semi_implicit", "spectral", "exact")]
     return [resolved("cells of twice the size", 2.0), *schemes, resolved("cells of half the size", 0.5)]
+
+
+MOST = 1_000_000  # cells that a sensor has at most, each link counted as if it had as many along each axis as the one with most
+
+
+def boxes_of(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> Float[np.ndarray, "row 2 3"]:
+    """Return the lowest and highest corner of each link's box in its body's frame [m].
+
+    Raises:
+        LowerError: If two links are one body, or a box has no volume.
+    """
+    if len(layout.bodies) != len(layout.links):
+        raise LowerError(
+            "two of its links are one body", field="links", hint="name the body, or choose a part of it by `region`"
+        )
+    results = []
+    for link in layout.links:
+        surface = surface_of(link.name, spec.region)
+        used = surface.vertices[np.unique(surface.faces)]
+        low, high = used.min(axis=0), used.max(axis=0)
+        if not (high - low > 1e-9).all():
+            raise LowerError(f'the box of link "{link.name}" has no volume', field="links", hint="a link needs a solid")
+        results.append((low, high))
+    return np.array(results)
+
+
+def counts(spec: TemperatureGridSpec, corners: Float[np.ndarray, "row 2 3"]) -> Int[np.ndarray, "row 3"]:
+    """Return how many cells each box has along each axis.
+
+    Raises:
+        LowerError: If there are more than `MOST`.
+    """
+    if spec.cells is not None:
+        result = np.tile(np.array(spec.cells, dtype=np.int64), (len(corners), 1))
+    else:
+        assert spec.spacing is not None
+        result = np.maximum(1, np.ceil((corners[:, 1] - corners[:, 0]) / spec.spacing - 1e-9).astype(np.int64))
+    # Rows are padded to the longest along each axis.
+    if (total := len(result) * float(np.prod(result.max(axis=0, initial=1), dtype=np.float64))) > MOST:
+        field = "cells" if spec.spacing is None else "spacing"
+        raise LowerError(
+            f"its links have {total:.3g} cells, expected at most {MOST:,}", field=field, hint="use fewer, larger cells"
+        )
+    return result
+
+
+def centres(count: Int[np.ndarray, "row 3"], corners: Float[np.ndarray, "row 2 3"]) -> Float[np.ndarray, "cell 3"]:
+    """Return the centres of all cells, row after row, in their bodies' frames [m]."""
+    step = (corners[:, 1] - corners[:, 0]) / count
+    row, *at = np.nonzero(is_cell(count))
+    return corners[row, 0] + (np.stack(at, axis=1) + 0.5) * step[row]
+
+
+LARGEST_ERROR = 0.01  # error of the heat lost up to which cells are fine enough [1]
+EARLY = 0.5  # when they are compared, in time constants of the cells: two fifths of the heat are lost then
+MOST_CELLS = 64  # cells along an axis that are tried
+
+
+def warn_of_coarse(
+    names: Sequence[str],
+    count: Int[np.ndarray, "row 3"],
+    size: Float[np.ndarray, "row 3"],
+    exposed: Sequence[str],
+    conductivity: Float[np.ndarray, " row"],
+    film: Float[np.ndarray, " row"],
+) -> None:
+    """Warn of the link whose cells err most, and name the cells that would do.
+
+    Args:
+        names: The links.
+        count: Their cells along each axis.
+        size: Sides of their boxes [m].
+        exposed: Faces that lose heat.
+        conductivity: k [W/(m·K)].
+        film: Heat transfer coefficient of a face near ambient [W/(m²·K)].
+    """
+    errors = [abs(lost_error(*row, exposed)) for row in zip(count, size, film / conductivity, strict=True)]
+    worst = int(np.argmax(errors))
+    if errors[worst] <= LARGEST_ERROR:
+        return
+    across = np.array([any(face[1] == axis for face in exposed) for axis in "xyz"])
+    size, ratio = size[worst], film[worst] / conductivity[worst]
+    enough = f"more than {MOST_CELLS} along an axis would be needed"
+    for most in range(2, MOST_CELLS + 1):
+        finer = np.where(across, np.maximum(count[worst], most), count[worst])
+        if abs(lost_error(finer, size, ratio, exposed)) <= LARGEST_ERROR:
+            enough = f"{_times(finer)} cells hold {100 * LARGEST_ERROR:g} %"
+            break
+    problem = f"what its faces lose is {100 * errors[worst]:.2g} % wrong with {_times(count[worst])} cells"
+    warnings.warn(f"heat of {names[worst]}: {problem}; {enough}", CoarseCellsWarning, stacklevel=2)
+
+
+def _times(count: Int[np.ndarray, " axis"]) -> str:
+    return " × ".join(str(number) for number in count.tolist())
+
+
+def lost_error(
+    count: Int[np.ndarray, " axis"], size: Float[np.ndarray, " axis"], ratio: float, exposed: Sequence[str]
+) -> float:
+    """Return the relative error of the heat that cells have lost after `EARLY`.
+
+    How well cells hold what their faces lose: against the closed form of a box that cools from one temperature.
+
+        θ̄ = Π_a Σ_m 4 sin² β/(β (2β + sin 2β)) e^(−β² αt/L²),   β tan β = hL/k                                          [1]
+
+    is the mean of what is left of a box, a product over the axes with exposed faces, L the box's side along one, or half of it
+    if both of its faces are exposed. Cells leave the sum of their own modes. They are compared when two fifths of the heat are
+    lost. Cells begin with an even flow to the face, and the solid with a steeper one: that is what cells too large for Bi =
+    hL/k miss.
+
+    Source: Carslaw and Jaeger, *Conduction of Heat in Solids*, 3.11; Incropera et al., 5.5 and 5.8.
+
+    Shapes: `row` links, `axis` x, y and z.
+
+    Args:
+        count: Cells along each axis.
+        size: Sides of the box [m].
+        ratio: Heat transfer coefficient of its faces over conductivity [1/m].
+        exposed: The faces.
+    """
+    ends = np.array([sum(face[1] == axis for face in exposed) for axis in "xyz"])
+    step = size / count
+    loss = ratio * step / (1.0 + ratio * step / 2.0 * (1.0 - ends / (3.0 * count)))
+    slowest = tables(count[None], size[None], exposed, loss[None])
+    rates = [slowest[f"square_{axis}"][0] / step[a] ** 2 for a, axis in enumerate("xyz")]
+    time = EARLY / sum(own.min() for own in rates)
+    ours, exact = 1.0, 1.0
+    for a, axis in enumerate("xyz"):
+        ours *= float(slowest[f"total_{axis}"][0] ** 2 @ np.exp(-rates[a] * time)) / count[a]
+        if ends[a]:
+            exact *= _slab_left(ratio * size[a] / ends[a], time / (size[a] / ends[a]) ** 2)
+    return (1.0 - ours) / (1.0 - exact) - 1.0
+
+
+def _slab_left(biot: float, fourier: float, count: int = 40) -> float:
+    """Return the mean of a slab that began at 1 and loses heat at one of its faces."""
+    low, high = np.pi * np.arange(count), np.pi * (np.arange(count) + 0.5)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        is_below = middle * np.sin(middle) * (-1.0) ** np.arange(count) < biot * np.cos(middle) * (-1.0) ** np.arange(count)
+        low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
+    beta = 0.5 * (low + high)
+    share = 4.0 * np.sin(beta) ** 2 / (beta * (2.0 * beta + np.sin(2.0 * beta)))
+    return float(share @ np.exp(-(beta**2) * fourier))

@@ -13,31 +13,34 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.quantities.patches import ContactPatch
-from tgdsl.sensors.base import Constants
+from tgdsl.sensors.base import Constants, Context, State
 from tgdsl.sensors.temperature_grid import conduction, diffusion, losses
+from tgdsl.sensors.temperature_grid.conduction import decays, response, whole
+from tgdsl.sensors.temperature_grid.losses import paper_step
 from tgdsl.sensors.temperature_grid.patch_flow import patch_area, patch_flow, resistance
-from tgdsl.sensors.temperature_grid.response import decays, response, whole
-from tgdsl.sensors.temperature_grid.rows import Rows, is_there, num_cells, of_cells, padded
+from tgdsl.sensors.temperature_grid.rows import (
+    Rows,
+    account,
+    gained_by_objects,
+    is_object_cell,
+    is_there,
+    num_cells,
+    of_cells,
+    padded,
+    rows_of,
+)
 from tgdsl.tensors.operations import Operation
 
-LARGEST_BLOCK = 2048
-"""Rows × cells, each the next power of two, that the kernel takes."""
+LARGEST_BLOCK = 2048  # rows × cells, each the next power of two, that the kernel takes
 
 
 class Stepped(NamedTuple):
-    """What a step does.
+    """What a step does."""
 
-    Attributes:
-        cells: What the cells gain (env, row, x, y, z) [K].
-        nodes: What the nodes gain (env, node) [K].
-        got: What rows got from source, radiation, convection and contact (env, row) each [J].
-        nodes_got: What nodes got from radiation, convection and contact (env, node) each [J].
-    """
-
-    cells: Tensor
-    nodes: Tensor
-    got: tuple[Tensor, ...]
-    nodes_got: tuple[Tensor, ...]
+    cells: Tensor  # what the cells gain (env, row, x, y, z) [K]
+    nodes: Tensor  # what the nodes gain (env, node) [K]
+    got: tuple[Tensor, ...]  # what rows got from source, radiation, convection and contact (env, row) each [J]
+    nodes_got: tuple[Tensor, ...]  # what nodes got from radiation, convection and contact (env, node) each [J]
 
 
 def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> Stepped:
@@ -100,12 +103,7 @@ def _in_modes(
     inverse: Tensor,
     made: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return what conduction, linear losses, contact and a source, made in all of the step [K], do at once.
-
-    Returns:
-        What cells gain (env, row, x, y, z) and what of it came through faces (env, row) [K], and what rows (env, row) and
-        nodes (env, node) got from contact [J].
-    """
+    """Return what conduction, linear losses, contact and a source, made in all of the step [K], do at once."""
     is_implicit = "is_semi_implicit" in constants
     less, capacity = decays(_exponents(rows, dt), is_implicit), rows.capacity[..., None, None, None]
     phi, parts = whole(less), diffusion.to_modes(cells, rows.modes)
@@ -162,7 +160,6 @@ def _of_nodes(patches: ContactPatch, of_objects: Tensor) -> Tensor:
 
 
 def _made(rows: Rows, patches: ContactPatch, constants: Constants) -> Tensor:
-    """Return the heat that is made in each cell (row, x, y, z) [W]; objects make none."""
     made, more = padded(constants["source"], num_cells(rows)), len(patches.topology.grids)
     return torch.cat([made, made.new_zeros((more, *made.shape[1:]))]) if more else made
 
@@ -181,12 +178,10 @@ def _exponents(rows: Rows, dt: Tensor) -> Tensor:
 
 
 def _inverse(patches: ContactPatch) -> Tensor:
-    """Return one over each object's heat capacity [K/J]; 0 for what keeps its temperature."""
     return 1.0 / (patches.objects.volumetric_heat * patches.objects.volume)
 
 
 def _joules(gained: Tensor, inverse: Tensor) -> Tensor:
-    """Return the heat of a gain of temperature [J]; that of what keeps its temperature is not known, and 0."""
     is_finite = inverse > 0
     return torch.where(is_finite, gained, 0.0) / torch.where(is_finite, inverse, 1.0)
 
@@ -234,3 +229,87 @@ def is_small(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, co
 
 
 HEAT_STEP = Operation("heat_step", step, _by_kernel, _inputs, is_small)
+
+
+class Heat(NamedTuple):
+    """What there is after a step, above ambient."""
+
+    cells: Tensor  # temperatures of the links' cells (env, link, x, y, z), and `cells_low` what these lack [K]
+    cells_low: Tensor  # see `cells`
+    objects: Tensor  # the same of the objects' cells, (env, object, x, y, z); of an object of one temperature the first
+    objects_low: Tensor  # what these lack [K]
+    stored: Tensor  # what links hold (env, link) [J]
+    gained: tuple[Tensor, ...]  # what they got from source, radiation, convection and contact, (env, link) each [J]
+    # mean temperature [K], what they hold, and got from radiation, convection and contact [J], (env, object) each; empty
+    # without objects
+    of_objects: tuple[Tensor, ...]
+
+
+def advanced(patches: ContactPatch, context: Context, constants: Constants, state: State) -> Heat:
+    """Return what there is at a call; at the first one after a reset that is the start."""
+    rows = rows_of(constants, patches, any(f"is_{name}" in constants for name in ("spectral", "semi_implicit", "paper")))
+    where, lumped, grids = patches.topology, list(patches.topology.lumped), list(patches.topology.grids)
+    cells, cells_low = state["cells"], state["cells_low"]
+    objects = objects_low = cells.new_zeros((cells.shape[0], 0, 1, 1, 1))
+    if where.num_objects:
+        most = [max(own[axis] for own in where.cells) for axis in range(3)]
+        objects, objects_low = (state[name].reshape(cells.shape[0], -1, *most) for name in ("objects", "objects_low"))
+    all_cells = _with_objects(cells, objects[:, grids], rows) if grids else cells
+    nodes = objects[:, :, 0, 0, 0] if where.is_plain else objects[:, lumped, 0, 0, 0]
+    if "is_paper" in constants:
+        made = _as_printed(all_cells, nodes, objects, rows, patches, constants, context.dt)
+    else:
+        made = HEAT_STEP(all_cells, nodes, rows, patches, constants, context.dt)
+    is_first = context.is_first[..., None, None, None]
+    links, extra = made.cells[:, : where.num_bodies], made.cells[:, where.num_bodies :]
+    x, y, z = cells.shape[2:]
+    begun = constants["start"] * constants["is_cell"]
+    cells, cells_low = _sum(cells, cells_low, links[:, :, :x, :y, :z], begun, is_first)
+    if where.num_objects:
+        gained = gained_by_objects(objects, where, made.nodes, extra)
+        start = torch.where(patches.objects.has_start > 0, patches.objects.start - constants["ambient"], 0.0)
+        begun = start[..., None, None, None] * is_object_cell(objects, where)
+        objects, objects_low = _sum(objects, objects_low, gained, begun, is_first)
+    calm = context.is_first
+    got, nodes_got = (tuple(torch.where(calm, 0.0, part) for part in parts) for parts in (made.got, made.nodes_got))
+    num = where.num_bodies
+    total = cells.sum(dim=(-3, -2, -1)) + cells_low.sum(dim=(-3, -2, -1))
+    of_links = tuple(part[:, :num] for part in got)
+    mean = total / constants["number"]
+    of_objects = account(objects + objects_low, patches, rows.capacity, got, nodes_got, mean)
+    return Heat(cells, cells_low, objects, objects_low, total * rows.capacity[:, :num], of_links, of_objects)
+
+
+def _with_objects(cells: Tensor, objects: Tensor, rows: Rows) -> Tensor:
+    size = num_cells(rows)
+    x, y, z = size
+    return torch.cat([padded(cells, size), padded(objects[..., :x, :y, :z], size)], dim=1)
+
+
+def _sum(high: Tensor, low: Tensor, gained: Tensor, begun: Tensor, is_first: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a compensated sum, or the start (Knuth's two-sum)."""
+    more = low + gained
+    total = high + more
+    kept = total - high
+    rest = (high - (total - kept)) + (more - kept)
+    return torch.where(is_first, begun, total), torch.where(is_first, 0.0, rest)
+
+
+def _as_printed(
+    cells: Tensor,
+    nodes: Tensor,
+    objects: Tensor,
+    rows: Rows,
+    patches: ContactPatch,
+    constants: Constants,
+    dt: Tensor,
+) -> Stepped:
+    """Return what a step does by the paper's formulas: the objects keep their temperatures."""
+    where = patches.topology
+    means = cells.sum(dim=(-3, -2, -1)) / is_there(rows).sum(dim=(-3, -2, -1))
+    others = [objects[:, i, 0, 0, 0] if own < 0 else means[:, own] for i, own in enumerate(where.links)]
+    beside = torch.stack(others, dim=1) if others else objects.flatten(1)
+    spread, made, radiated, blown, touched = paper_step(cells, beside, rows, patches, constants, dt)
+    got = tuple(part.sum(dim=(-3, -2, -1)) * rows.capacity for part in (made, radiated, blown, touched))
+    idle = torch.zeros_like(nodes)
+    return Stepped(spread + made + radiated + blown + touched, idle, got, (idle, idle, idle))

@@ -21,19 +21,15 @@ from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
 from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
-from tgdsl.sensors.temperature_grid.shares import least_width
+from tgdsl.sensors.temperature_grid.patch_flow import least_width
 
 SIGMA, ZERO = tl.constexpr(stefan_boltzmann()), tl.constexpr(zero_celsius())
 LEAST = tl.constexpr(least_width())
 PI = tl.constexpr(3.141592653589793)
-UNROLLED = tl.constexpr(8)
-"""Modes up to which they are written out one by one."""
-MAX_PAIRS = 32
-"""Pairs of a program, where boxes are small: one for each thread of a warp."""
-MAX_NUMBERS = 2048
-"""Numbers of a program's block, unless one environment has more."""
-OF_WARP = 256
-"""Numbers of a block for each warp. Between warps, sums go through shared memory."""
+UNROLLED = tl.constexpr(8)  # modes up to which they are written out one by one
+MAX_PAIRS = 32  # pairs of a program, where boxes are small: one for each thread of a warp
+MAX_NUMBERS = 2048  # numbers of a program's block, unless one environment has more
+OF_WARP = 256  # numbers of a block for each warp. Between warps, sums go through shared memory.
 
 
 @triton_op("tgdsl::heat_step", mutates_args={})
@@ -242,20 +238,17 @@ def step_kernel(
 
 @triton.jit
 def _at(plane, at, is_there):
-    """Load a plane; 0 where there is nothing."""
     return tl.load(plane + at, is_there, 0.0)
 
 
 @triton.jit
 def _box(boxes, row, AXIS: tl.constexpr):
-    """Return the lowest corner, the cells' side and their number along an axis (P)."""
     at = boxes + 9 * row + AXIS
     return tl.load(at), tl.load(at + 3), tl.load(at + 6)
 
 
 @triton.jit
 def _is_there(box, place):
-    """Return which cells a row has along an axis (C, P)."""
     return place[:, None].to(tl.float32) < box[2][None, :]
 
 
@@ -403,14 +396,13 @@ def _decayed(above, rate, glowing, step):
 
 @triton.jit
 def _radiated(above, glow, around):
-    """Return the heat transfer coefficient of radiation."""
     hot = above + around
     return glow * (hot + around) * (hot * hot + around * around)
 
 
 @triton.jit
 def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there):
-    """Return the conductances between patches and cells (C, P) [W/K]: see `shares`."""
+    """Return the conductances between patches and cells (C, P) [W/K]: see `patch_flow`."""
     is_any = size > 0
     safe = tl.where(is_any, size, 1e-6)
     edge = 0.5 * tl.sqrt(safe)
@@ -464,13 +456,11 @@ def _along(pos, normal, edge, box, place, is_first_of_others):
 
 @triton.jit
 def _inside(point, top):
-    """Return the nearest point between the centres of the first and the last cell."""
     return tl.minimum(tl.maximum(point, 0.5), top)
 
 
 @triton.jit
 def _below(offset):
-    """Return the integral of a cell's weight up to `offset` beyond its centre, less that up to the centre."""
     offset = tl.minimum(tl.maximum(offset, -1.0), 1.0)
     return offset * (1.0 - 0.5 * tl.abs(offset))
 
@@ -518,6 +508,5 @@ def _touched(
 
 @triton.jit
 def _inverted(a, b, c, d):
-    """Return the inverse of a matrix of two by two."""
     over = 1.0 / (a * d - b * c)
     return d * over, -b * over, -c * over, a * over
