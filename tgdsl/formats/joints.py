@@ -43,8 +43,9 @@ def robot_joints(robot: Model, scene: Model) -> RobotJoints:
     scalar_ids = [i for i in robot_ids if model.jnt_type[i] in (_SLIDE, _HINGE)]
     actuators, driven = [], []
     for i in range(model.nu):
-        joints = [joint for joint in _joints_of(model, i) if joint in robot_ids]
-        if joints or _bodies_of(model, i) & bodies:
+        targets, on = _targets(model, i)
+        joints = [joint for joint in targets if joint in robot_ids]
+        if joints or on & bodies:
             acting = [joint for joint in joints if joint in scalar_ids]
             actuators.append(Actuator(model.actuator(i).name, i, tuple(model.joint(joint).name for joint in acting)))
             driven += acting
@@ -59,29 +60,19 @@ def robot_joints(robot: Model, scene: Model) -> RobotJoints:
     )
 
 
-def _joints_of(model: mujoco.MjModel, actuator: int) -> Sequence[int]:
-    """Return the joints that an actuator acts on directly or by a fixed tendon."""
+def _targets(model: mujoco.MjModel, actuator: int) -> tuple[Sequence[int], set[str]]:
+    """Return the joints that an actuator acts on, directly or by a fixed tendon, and else the bodies on which it acts."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind in _JOINT_DRIVES:
-        return [target]
-    if kind != mujoco.mjtTrn.mjTRN_TENDON:
-        return []
-    path = slice(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
-    is_joint = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_JOINT
-    return np.asarray(model.wrap_objid[path])[is_joint].tolist()
-
-
-def _bodies_of(model: mujoco.MjModel, actuator: int) -> set[str]:
-    """Return the bodies that an actuator without joints acts on: by sites, a spatial tendon, or adhesion."""
-    kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+        return [target], set()
+    joints, bodies = [], []
     if kind == mujoco.mjtTrn.mjTRN_BODY:
-        results = [target]
+        bodies = [target]
     elif kind in _SITE_DRIVES:
-        results = [int(model.site_bodyid[target])]
+        bodies = [model.site_bodyid[target]]
     elif kind == mujoco.mjtTrn.mjTRN_TENDON:
         path = slice(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
-        is_site = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
-        results = model.site_bodyid[np.asarray(model.wrap_objid[path])[is_site]].tolist()
-    else:
-        results = []
-    return {model.body(i).name for i in results}
+        types, ids = model.wrap_type[path], np.asarray(model.wrap_objid[path])
+        joints = ids[types == mujoco.mjtWrap.mjWRAP_JOINT].tolist()
+        bodies = model.site_bodyid[ids[types == mujoco.mjtWrap.mjWRAP_SITE]].tolist()
+    return joints, {model.body(int(i)).name for i in bodies}

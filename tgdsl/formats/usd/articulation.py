@@ -21,7 +21,7 @@ from itertools import combinations
 from tgdsl.formats.usd.attributes import SELF_COLLISION, read_attributes
 from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import Joint
-from tgdsl.formats.usd.stage import Prim, Stage
+from tgdsl.formats.usd.stage import Prim, Stage, is_within
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,8 @@ class SpanningTree:
                 roots = [TreeNode(body, None, None) for body in held] or [TreeNode(_end(anchor, None) or "", None, anchor)]
                 self._extend(roots)
         while waiting:
-            group, root = self._attached(waiting) or self._floating(waiting)
+            floating = min(waiting, key=lambda group: not self._root(group)[1])
+            group, root = self._attached(waiting) or (floating, TreeNode(self._root(floating)[0], None, None))
             waiting.remove(group)
             self._extend([root])
         self.nodes = {body: self._stacked(self.nodes[body]) for body in self._depth_first(None)}
@@ -97,12 +98,13 @@ class SpanningTree:
         return replace(node, joint=first, stacked=tuple(rest))
 
     def _rank(self, path: str) -> int:
-        return 0 if path in self._roots else 1 if any(path.startswith(f"{root}/") for root in self._roots) else 2
+        return 0 if path in self._roots else 1 if any(is_within(path, root) for root in self._roots) else 2
 
     def _groups(self) -> list[list[str]]:
         """Return connected components over articulated joints, in stage order, and keep the joints that close no loop."""
         group_of = {body: [body] for body in self._kinematic}
-        for joint in sorted(self._joints, key=_loop_priority):
+        # By what is lost if they close a loop: an equality constraint can neither slide, nor be driven or limited.
+        for joint in sorted(self._joints, key=lambda joint: (joint.kind != "slide", joint.drive is None, joint.range is None)):
             first, second = joint.bodies
             if first is not None and second is not None and not joint.is_excluded and group_of[first] is not group_of[second]:
                 group_of[first] += group_of[second]
@@ -131,10 +133,6 @@ class SpanningTree:
                         return group, TreeNode(body, parent, joint)
         return None
 
-    def _floating(self, waiting: list[list[str]]) -> tuple[list[str], TreeNode]:
-        group = min(waiting, key=lambda group: not self._root(group)[1])
-        return group, TreeNode(self._root(group)[0], None, None)
-
     def _extend(self, roots: list[TreeNode]) -> None:
         """Add roots and, breadth first, their descendants."""
         self.nodes |= {root.body: root for root in roots}
@@ -146,10 +144,6 @@ class SpanningTree:
                 if body is not None and body not in self.nodes:
                     self.nodes[body] = TreeNode(body, parent, joint)
                     queue.append(body)
-
-
-def _loop_priority(joint: Joint) -> tuple[bool, bool, bool]:
-    return joint.kind != "slide", joint.drive is None, joint.range is None
 
 
 def _end(joint: Joint | None, other: str | None) -> str | None:
@@ -180,7 +174,7 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], we
     filters = _Filters(stage, joints, geoms)
     colliders = filters.colliders
     result: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
-    filtered = filters.of_colliders()
+    filtered = filters.of_groups() | filters.listed_pairs()
     owners = [owner for owner, paths in colliders.items() if paths]
     for first, second in combinations(owners, 2) if filtered else ():
         pairs = [frozenset((a, b)) for a in colliders[first] for b in colliders[second]]
@@ -208,11 +202,11 @@ class _Filters:
 
     def of_joints(self) -> set[Pair]:
         """Return pairs of bodies that a joint keeps apart."""
-        result = set()
+        result, static = set(), self.colliders.get(None, ())
         for joint in self.joints:
             if joint.is_filtering and None not in joint.bodies:
                 result.add(frozenset(joint.bodies))
-            elif joint.is_filtering and any(target and self._static(target) for target in joint.targets):
+            elif joint.is_filtering and any(is_within(path, target) for target in joint.targets if target for path in static):
                 self.stage.drop(
                     "joints do not keep their bodies from colliding with the static prims that they are attached to", joint.prim
                 )
@@ -227,10 +221,7 @@ class _Filters:
                 result |= {frozenset(pair) for pair in combinations(self._articulation(str(prim.GetPath())), 2)}
         return result
 
-    def of_colliders(self) -> dict[frozenset[str], Prim]:
-        return self._groups() | self._listed_pairs()
-
-    def _listed_pairs(self) -> dict[frozenset[str], Prim]:
+    def listed_pairs(self) -> dict[frozenset[str], Prim]:
         stage, sources = self.stage, {}
         for prim in stage.prims:
             if not stage.has(prim, "PhysicsFilteredPairsAPI"):
@@ -258,17 +249,14 @@ class _Filters:
 
     def _articulation(self, root: str) -> list[str]:
         """Return the bodies of an articulation: those at and below its root, and all that joints connect with them."""
-        result = {body for body in self.colliders if body is not None and (body == root or body.startswith(f"{root}/"))}
+        result = {body for body in self.colliders if body is not None and is_within(body, root)}
         links = [joint.bodies for joint in self.joints if not joint.is_excluded and None not in joint.bodies]
         result |= {body for joint in self.joints if joint.path == root for body in joint.bodies if body is not None}
         while new := {body for pair in links if result & set(pair) for body in pair if body is not None} - result:
             result |= new
         return [body for body in self.colliders if body in result and body is not None]
 
-    def _static(self, path: str) -> bool:
-        return any(collider == path or collider.startswith(f"{path}/") for collider in self.colliders.get(None, ()))
-
-    def _groups(self) -> dict[frozenset[str], Prim]:
+    def of_groups(self) -> dict[frozenset[str], Prim]:
         physics, sources = self.stage.pxr.UsdPhysics, {}
         groups = [prim for prim in self.stage.prims if prim.IsA(physics.CollisionGroup)]
         table = physics.CollisionGroup.ComputeCollisionGroupTable(self.stage.usd) if groups else None

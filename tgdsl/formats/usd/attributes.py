@@ -235,7 +235,7 @@ def units(stage: Stage, is_angular: bool) -> dict[str, float]:
         "effort": kilogram * metre * (metre if is_angular else 1.0),
         "damping": inertia / (math.radians(1) if is_angular else 1.0),
         "position": angle,
-        "mjcf angle": math.radians(1) if is_angular and stage.is_mjcf_in_degrees else 1.0,
+        "mjcf angle": math.radians(1) if is_angular and stage.compiler("angle") != "radian" else 1.0,
     }
 
 
@@ -277,7 +277,7 @@ def with_limits(stage: Stage, attributes: dict[str, str], pairs: Iterable[str]) 
         if attributes.get(f"{name}limited", "auto") != "auto":
             continue
         attributes.pop(f"{name}limited", None)
-        if f"{name}range" in attributes and not stage.is_mjcf_autolimited:
+        if f"{name}range" in attributes and stage.compiler("autoLimits") is False:
             attributes[f"{name}limited"] = "false"
     return attributes
 

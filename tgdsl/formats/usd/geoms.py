@@ -60,7 +60,10 @@ def read_sites(stage: Stage) -> list[Site]:
             continue
         body, pose, attributes = stage.owners[str(prim.GetPath())], stage.frame(prim)[0], read_attributes(stage, prim, SITE)
         if prim.GetTypeName() in SCHEMAS:
-            pose, drawn = _drawn_site(stage, prim, pose)
+            shape, color = shape_of(stage, prim, stage.pose(prim)), _color(stage, prim)
+            drawn = {} if color is None else {"rgba": text_of(color.tolist())}
+            if shape.kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box"):
+                pose, drawn = shape.pose, drawn | {"type": shape.kind, "size": text_of(shape.size)}
             attributes = drawn | attributes
         sites.append(Site(prim, body, stage.in_body(pose, body), attributes))
     return sites
@@ -70,23 +73,12 @@ def _is_site(stage: Stage, prim: Prim) -> bool:
     return bool(read_custom(stage, prim, "site")) or stage.has(prim, "NewtonSiteAPI")
 
 
-def _drawn_site(stage: Stage, prim: Prim, pose: Matrix) -> tuple[Matrix, dict[str, str]]:
-    """Return the frame [m] of a site that is a gprim, and how it is drawn."""
-    shape, color = shape_of(stage, prim, stage.pose(prim)), _color(stage, prim)
-    result = {} if color is None else {"rgba": text_of(color.tolist())}
-    if shape.kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box"):
-        return shape.pose, result | {"type": shape.kind, "size": text_of(shape.size)}
-    return pose, result
-
-
 def read_gprims(stage: Stage) -> list[Gprim]:
     """Read all colliders and all that is visible."""
     geoms: list[Gprim] = []
     instancer = "//"  # what is below a point instancer is only there as its instances
     for prim in stage.prims:
-        if str(prim.GetPath()).startswith(instancer):
-            continue
-        if _is_site(stage, prim):
+        if str(prim.GetPath()).startswith(instancer) or _is_site(stage, prim):
             continue
         is_collider = stage.has(prim, "PhysicsCollisionAPI") and bool(stage.value(prim, "physics:collisionEnabled"))
         is_shape = prim.GetTypeName() in SCHEMAS

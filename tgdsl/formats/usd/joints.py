@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.formats.usd.attributes import JOINT, read_attributes, read_custom, units, with_limits
-from tgdsl.formats.usd.stage import Matrix, Prim, Stage
+from tgdsl.formats.usd.stage import Matrix, Prim, Stage, is_within
 
 INFINITE = 1e30  # limits of this magnitude and more are infinite: the largest float32 is often written for infinity
 ROUNDING = 1e-6  # a drive's damping below this share of the joint's own, which was subtracted from it, is rounding of float32
@@ -172,7 +172,7 @@ def _is_filtering(stage: Stage, prim: Prim) -> bool | None:
 
 def _is_stackable(stage: Stage, prim: Prim, targets: tuple[str, str]) -> bool:
     paths = (str(prim.GetPath()), *targets)
-    is_adding = any(path == root or path.startswith(f"{root}/") for root in stage.mobility_roots for path in paths)
+    is_adding = any(is_within(path, root) for root in stage.mobility_roots for path in paths)
     return is_adding or stage.has(prim, "MjcJointAPI")  # every joint of MuJoCo adds a motion
 
 

@@ -45,16 +45,7 @@ from tgdsl.errors import RobotError
 from tgdsl.formats.model import Model
 from tgdsl.formats.usd.actuators import read_actuators, read_keyframes, read_tendons, servos_of
 from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, exclusions, filtered_pairs
-from tgdsl.formats.usd.attributes import (
-    BODY,
-    COMPILER,
-    FLAG,
-    FLAGS,
-    OPTION,
-    read_attributes,
-    read_custom,
-    text_of,
-)
+from tgdsl.formats.usd.attributes import BODY, COMPILER, FLAG, FLAGS, OPTION, read_attributes, read_custom, text_of
 from tgdsl.formats.usd.equalities import (
     constraint_attributes,
     put_in_order,
@@ -408,27 +399,18 @@ def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[st
     if "timestep" not in option.attrib and "NewtonSceneAPI" in scene.GetPrimTypeInfo().GetAppliedAPISchemas():
         option.set("timestep", text_of(NEWTON_TIMESTEP))
     compiler.attrib |= read_attributes(stage, scene, COMPILER)
-    _note_compiler(stage, scene)
-    return _flags(stage, scene)
-
-
-def _flags(stage: Stage, scene: Prim) -> dict[str, str]:
+    if stage.compiler("inertiaFromGeom") == "true":
+        stage.drop("mjc:compiler:inertiaFromGeom is true; masses are those that bodies and colliders state", scene)
+    ends = [stage.compiler(f"inertiaGroupRange:{end}") for end in ("min", "max")]
+    if (ends[0] or 0) > 0 or (ends[1] is not None and ends[1] < 5):
+        stage.drop("mjc:compiler:inertiaGroupRange was dropped: all colliders have a mass, in whatever group", scene)
+    stage.note(scene, "mjc:compiler:angle", "mjc:compiler:autoLimits")  # read where they matter
     flags = {str(name): key for key in FLAGS for name in read_custom(stage, scene, key) or ()}
     for name, value in read_attributes(stage, scene, FLAG).items():
         said = "enable" if value == "true" else "disable"
         if flags.setdefault(name, said) != said:
             stage.drop(f"mjc:flag:{name} was dropped, which contradicts tgdsl:{flags[name]}", scene)
     return flags
-
-
-def _note_compiler(stage: Stage, scene: Prim) -> None:
-    """Take note of settings of MuJoCo's compiler that the reader of the stage has done, or cannot do."""
-    if stage.authored(scene, "mjc:compiler:inertiaFromGeom") == "true":
-        stage.drop("mjc:compiler:inertiaFromGeom is true; masses are those that bodies and colliders state", scene)
-    ends = [stage.authored(scene, f"mjc:compiler:inertiaGroupRange:{end}") for end in ("min", "max")]
-    if (ends[0] or 0) > 0 or (ends[1] is not None and ends[1] < 5):
-        stage.drop("mjc:compiler:inertiaGroupRange was dropped: all colliders have a mass, in whatever group", scene)
-    stage.note(scene, "mjc:compiler:angle", "mjc:compiler:autoLimits")  # read where they matter
 
 
 def _gravity(stage: Stage, scene: Prim) -> str:

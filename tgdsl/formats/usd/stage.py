@@ -108,13 +108,9 @@ class Stage:
     def scenes(self) -> tuple[Prim, ...]:
         return tuple(prim for prim in self.prims if prim.IsA(self.pxr.UsdPhysics.Scene))
 
-    @cached_property
-    def is_mjcf_in_degrees(self) -> bool:
-        return not self.scenes or self.authored(self.scenes[0], "mjc:compiler:angle") != "radian"
-
-    @cached_property
-    def is_mjcf_autolimited(self) -> bool:
-        return not self.scenes or self.authored(self.scenes[0], "mjc:compiler:autoLimits") is not False
+    def compiler(self, name: str) -> Any:
+        """Return a setting of MuJoCo's compiler, or None if no scene has it."""
+        return self.authored(self.scenes[0], f"mjc:compiler:{name}") if self.scenes else None
 
     @cached_property
     def mobility_roots(self) -> tuple[str, ...]:
@@ -222,6 +218,10 @@ class Stage:
             paths.append(path)
 
 
+def is_within(path: str, root: str) -> bool:
+    return path == root or path.startswith(f"{root}/")
+
+
 def _is_rounded(exact: Any, value: Any) -> bool:
     """Return whether a value in float32 is what one in double rounds to."""
     if isinstance(value, float):
@@ -256,9 +256,13 @@ def open_stage(path: Path) -> Iterator[Stage]:
         try:
             usd = modules.Usd.Stage.Open(str(path))
         except modules.Tf.ErrorException as error:
-            raise RobotError(f"{path}: not a USD file: {_message(error)}") from error
+            lines = [line.partition(" : ")[2].strip("' ") for line in str(error).splitlines() if " : " in line]
+            reason = " ".join("; ".join(dict.fromkeys(lines)).split())  # without file names and lines of USD's sources
+            raise RobotError(f"{path}: not a USD file: {reason}") from error
+        errors = usd.GetCompositionErrors()  # references, payloads or sublayers that do not resolve: USD only prints a line
+        if problems := sorted({f"{e.rootSite.path}: {' '.join(str(e).split()).rstrip('.')}" for e in errors}):
+            raise RobotError(f"{path}: {listed(problems)}")
         stage = Stage(path, usd, modules)
-        _check_composition(stage)
         yield stage
         for problem, paths in stage.dropped.items():
             warnings.warn(f"{path}: {problem}: {listed(paths)}", stacklevel=4)
@@ -267,20 +271,6 @@ def open_stage(path: Path) -> Iterator[Stage]:
     finally:
         printed.TakeUncoalescedDiagnostics()  # what is left in the delegate is printed when it goes
         del printed
-
-
-def _message(error: Exception) -> str:
-    lines = [line.partition(" : ")[2].strip("' ") for line in str(error).splitlines() if " : " in line]
-    return " ".join("; ".join(dict.fromkeys(lines)).split())
-
-
-def _check_composition(stage: Stage) -> None:
-    """Refuse a stage with references, payloads or sublayers that do not resolve: USD only prints a line."""
-    problems = sorted(
-        {f"{error.rootSite.path}: {' '.join(str(error).split()).rstrip('.')}" for error in stage.usd.GetCompositionErrors()}
-    )
-    if problems:
-        raise RobotError(f"{stage.file}: {listed(problems)}")
 
 
 @dataclass(frozen=True)
