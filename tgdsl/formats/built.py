@@ -33,9 +33,6 @@ def built_scene(scene: Any) -> Model:
     Geometry is that of the given scene to the last bit. The MJCF beside it, for simulations of the artefact, has six digits if
     it is of an `MjSpec`; textures are left behind.
 
-    Args:
-        scene: An `mujoco.MjSpec`, which is left as it is, an `mujoco.MjModel` or a `pxr.Usd.Stage`.
-
     Raises:
         RobotError: If MuJoCo cannot compile the scene, or an `MjModel` has something that only its `MjSpec` tells.
         TgdslError: If it is something else.

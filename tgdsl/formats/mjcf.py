@@ -85,10 +85,6 @@ def write_mjcf(text: str, out: Path) -> None:
 
     Nothing half-written is left behind.
 
-    Args:
-        text: MJCF, its meshes in line.
-        out: The MJCF file. It is replaced if it is there, and so are meshes of the same names; other files are left alone.
-
     Raises:
         FileError: If it cannot be written.
     """

@@ -31,10 +31,7 @@ def _write_usd(model: Model, out: Path) -> None:
     write_usd(model, out)
 
 
-READERS: Mapping[str, Reader] = {
-    ".urdf": read_urdf,
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _read_usd),
-}
+READERS: Mapping[str, Reader] = {".urdf": read_urdf, **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _read_usd)}
 """By a file's ending, in lower case; any other file is XML, whose root element tells."""
 
 

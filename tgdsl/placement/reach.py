@@ -125,13 +125,7 @@ class Colliders:
 
 
 def reach(colliders: Colliders, layout: Layout, ignored: Collection[int] = ()) -> Reach:
-    """Return what the colliding geoms of a robot leave of each taxel; inactive fillers (radius 0) are left as they are.
-
-    Args:
-        colliders: The robot's.
-        layout: The taxels.
-        ignored: Bodies that are no links, such as objects, by their indices.
-    """
+    """Return what the colliding geoms of a robot leave of each taxel; inactive fillers (radius 0) are left as they are."""
     count, model = layout.num_taxels, colliders.robot.compiled
     result = Reach(np.ones(count, bool), np.full(count, -np.inf), np.zeros(count, bool), np.full(count, -1))
     for place, name in enumerate(layout.bodies):
@@ -149,13 +143,7 @@ def reach(colliders: Colliders, layout: Layout, ignored: Collection[int] = ()) -
 
 
 def unfelt(colliders: Colliders, layout: Layout, reached: Reach) -> tuple[Unfelt, ...]:
-    """Return the taxels that cannot feel by link and reason; each taxel is in one record.
-
-    Args:
-        colliders: The robot's.
-        layout: The taxels.
-        reached: Their reach; callers that know which bodies meet an object replace `is_collided`.
-    """
+    """Return the taxels that cannot feel by link and reason; each taxel is in one record."""
     records: list[Unfelt] = []
     is_buried = reached.is_collided & reached.is_buried
     is_covered = reached.is_collided & ~reached.is_buried & (reached.cover >= 0)

@@ -58,10 +58,6 @@ def with_colliders(spec: mujoco.MjSpec, colliders: Sequence[Collider]) -> mujoco
     These stay, to be seen. Masses and inertias are not changed. What a geom in contact is besides its shape, such as friction,
     a link's colliders have of the first of them.
 
-    Args:
-        spec: The scene.
-        colliders: Those of all links.
-
     Raises:
         RobotError: If the scene lacks a body, or one has no geom that collides; if what a link shall go on meeting meets it by
             `contype` of the link's geoms alone, or by an explicit pair of geoms.

@@ -127,11 +127,6 @@ def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: M
     MuJoCo lays its data out alike: those that a variant lacks weigh nothing, are not seen, and collide only with what has a bit
     of `conaffinity` that nothing has. A custom number of each geom's says whether it is lacking: its looks, which are the
     template's, do not. Bodies whose inertia the scene does not give have that of their own geoms.
-
-    Args:
-        spec: The scene.
-        objects: The objects.
-        choices: What each is like, by its name; default: its first variant.
     """
     new = {target.body for target in objects if spec.geom(placeholder_name(target.body)) is not None}
     weighed = new | {target.body for target in objects if target.types and not spec.body(target.body).explicitinertial}

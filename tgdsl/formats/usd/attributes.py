@@ -162,10 +162,7 @@ GEOM: Table = {
     "gap": mjc("gap", Source("newton:contactGap", "length", neutral=-math.inf), array="geom_gap"),
     **GROUP,
 }
-SITE: Table = {
-    **{name: Row(f"site_{name}") for name in ("type", "size", "rgba")},
-    "group": mjc("group", array="site_group"),
-}
+SITE: Table = {**{name: Row(f"site_{name}") for name in ("type", "size", "rgba")}, "group": mjc("group", array="site_group")}
 FRICTION: Table = {
     "torsional": mjc("torsionalfriction", Source("newton:torsionalFriction", "length")),
     "rolling": mjc("rollingfriction", Source("newton:rollingFriction", "length")),

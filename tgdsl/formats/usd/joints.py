@@ -145,6 +145,10 @@ def _joint(stage: Stage, prim: Prim) -> Joint:
         shared_damping = float(read_custom(stage, prim, "damping") or 0.0)  # only `tgdsl:damping` is part of the drive's
         drive, joint_damping = _read_drive(stage, prim, instance, kind, shared_damping)
         attributes |= {"damping": repr(joint_damping)} if shared_damping else {}
+    is_mujoco_scene = bool(stage.scenes) and stage.has(stage.scenes[0], "MjcSceneAPI")
+    is_silent = is_mujoco_scene and stage.authored(prim, "physics:collisionEnabled") is None
+    paths = (str(prim.GetPath()), target0, target1)
+    is_adding = any(is_within(path, root) for root in stage.mobility_roots for path in paths)
     return Joint(
         path=str(prim.GetPath()),
         prim=prim,
@@ -156,24 +160,12 @@ def _joint(stage: Stage, prim: Prim) -> Joint:
         range=limits,
         drive=drive,
         is_excluded=bool(stage.value(prim, "physics:excludeFromArticulation")),
-        is_filtering=_is_filtering(stage, prim),
-        is_stackable=kind in ("hinge", "slide", "ball") and _is_stackable(stage, prim, (target0, target1)),
+        is_filtering=None if is_silent else not stage.value(prim, "physics:collisionEnabled"),
+        is_stackable=kind in ("hinge", "slide", "ball") and (is_adding or stage.has(prim, "MjcJointAPI")),
         constraint=_constraint(stage, prim),
         is_active=bool(stage.value(prim, "physics:jointEnabled")),
         mjcf_attributes=attributes,
     )
-
-
-def _is_filtering(stage: Stage, prim: Prim) -> bool | None:
-    if stage.scenes and stage.has(stage.scenes[0], "MjcSceneAPI") and stage.authored(prim, "physics:collisionEnabled") is None:
-        return None
-    return not stage.value(prim, "physics:collisionEnabled")
-
-
-def _is_stackable(stage: Stage, prim: Prim, targets: tuple[str, str]) -> bool:
-    paths = (str(prim.GetPath()), *targets)
-    is_adding = any(is_within(path, root) for root in stage.mobility_roots for path in paths)
-    return is_adding or stage.has(prim, "MjcJointAPI")  # every joint of MuJoCo adds a motion
 
 
 def _constraint(stage: Stage, prim: Prim) -> str:

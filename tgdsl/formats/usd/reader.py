@@ -154,11 +154,7 @@ def _has_mass(robot: _Robot, path: str) -> bool:
 
 
 class _Mjcf:
-    """The MJCF of a robot.
-
-    Attributes:
-        root: The whole model.
-    """
+    """The MJCF of a robot."""
 
     def __init__(self, robot: _Robot):
         stage = self._stage = robot.stage

@@ -70,10 +70,6 @@ def write_usd(model: Model, out: Path) -> None:
 
     Warns of each thing of the model that USD does not hold, after the file is written.
 
-    Args:
-        model: The robot or scene.
-        out: The stage to write: `.usda` is text, `.usdc` and `.usd` are binary.
-
     Raises:
         RobotError: If USD cannot express the model, or the file cannot be written.
     """

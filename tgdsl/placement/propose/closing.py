@@ -230,7 +230,9 @@ class Closing:
         self.tree, self.hand, self.poses = tree, hand, Poses(tree, hand)
         self.chain = {s: i for i, chain in enumerate(hand.chains) for s in chain}
         independent = self.poses.independent if hand.length <= MAX_FINGER else ()
-        candidates = [joint for joint in independent if self._can_close(joint)]
+        limited = [j for j in independent if tree.model.jnt_limited[j] and self.segment(j) in tree.carries]
+        spans = {j: float(np.ptp(tree.model.jnt_range[j])) for j in limited}
+        candidates = [j for j in limited if int(tree.model.jnt_type[j]) != _HINGE or spans[j] >= MIN_BEND]
         self.rotations = {joint: self._rotations(joint) for joint in candidates}
         self.lean = {joint: self._lean(joint) for joint in candidates}
         self.sense = self._curling()
@@ -253,12 +255,6 @@ class Closing:
 
     def segment(self, joint: int) -> int:
         return self.tree.segment[int(self.tree.model.jnt_bodyid[joint])]
-
-    def _can_close(self, joint: int) -> bool:
-        model = self.tree.model
-        if not model.jnt_limited[joint] or not self.tree.carries & {self.segment(joint)}:
-            return False
-        return int(model.jnt_type[joint]) != _HINGE or bool(np.ptp(model.jnt_range[joint]) >= MIN_BEND)
 
     def _range(self, joint: int) -> tuple[float, float]:
         low, high = self.tree.model.jnt_range[joint].tolist()

@@ -332,11 +332,7 @@ def palm_parts(flexion: Flexion) -> list[int]:
 
 
 class PalmFront:
-    """A palm and what is fixed to it, seen from where an object comes.
-
-    Attributes:
-        flexion: The hand.
-    """
+    """A palm and what is fixed to it, seen from where an object comes."""
 
     def __init__(self, flexion: Flexion):
         """Find the outline of what the fingers sweep."""

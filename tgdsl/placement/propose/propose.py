@@ -89,20 +89,9 @@ class Proposal:
 
 
 def propose(
-    robot: Model,
-    density: float,
-    with_groups: bool = True,
-    include: Sequence[str] = (),
-    progress: Progress = silent,
+    robot: Model, density: float, with_groups: bool = True, include: Sequence[str] = (), progress: Progress = silent
 ) -> Proposal:
     """Return a layout for a robot; the same robot gives the same layout.
-
-    Args:
-        robot: The robot.
-        density: Taxels per area at `med` [1/m²].
-        with_groups: Whether to propose link groups.
-        include: Names or shell wildcards of links outside its hands that are to have taxels too.
-        progress: Called with a line of text for each long job.
 
     Raises:
         TgdslError: If no link can be sampled, if the density asks for more taxels than a link can have, or if a name to include

@@ -60,15 +60,6 @@ def new_layout(
 ) -> list[str]:
     """Propose a layout for a robot and write it; return what to tell the user.
 
-    Args:
-        robot: The robot.
-        density: Taxels per area at `med`, such as `4/cm2`.
-        with_groups: Whether to propose link groups.
-        out: The file.
-        is_forced: Whether it may be replaced.
-        include: Names or shell wildcards of links outside the hands that are to have taxels too.
-        progress: Called with a line of text for each long job.
-
     Raises:
         TgdslError: If the density is none, the file is there already or cannot be written, the robot has no link that can carry
             taxels, or a name to include matches none.
@@ -101,12 +92,7 @@ def new_layout(
 
 
 def layout_text(proposal: Proposal, robot: str) -> str:
-    """Return the file's text; the same proposal gives the same text.
-
-    Args:
-        proposal: The layout.
-        robot: How the text calls the robot.
-    """
+    """Return the file's text; the same proposal gives the same text."""
     parts = [_HEADER.format(robot=quoted(robot), density=proposal.density * 1e-4)]
     parts += [f"# Left out: {line}\n" for line in _by_reason(proposal.left_out)]
     parts += [] if proposal.is_collided else [f"# Mind: {_NOT_COLLIDED}.\n"]

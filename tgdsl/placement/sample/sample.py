@@ -50,14 +50,6 @@ def sample(
 ) -> Samples:
     """Return the taxels that a placement puts on a link's surface; the same input gives the same bytes.
 
-    Args:
-        surface: The link's triangles, in the body frame.
-        placement: How to sample them.
-        folder: Where a file of points is looked up.
-        link: The link's name, by which its points are found in a file of several links.
-        is_covered: Returns which points other solids cover; an `exposed` placement leaves them out.
-        pools: Points to choose from on the same surface, drawn for other placements; those that are drawn are added.
-
     Raises:
         SampleError: If the surface, or the file of points, cannot satisfy the placement.
     """
