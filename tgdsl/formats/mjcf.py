@@ -93,7 +93,10 @@ def write_mjcf(text: str, out: Path) -> None:
     names: list[str] = []
     for mesh in root.iterfind("asset/mesh[@vertex]"):
         name = _file_name(mesh.get("name", ""), names)
-        contents[folder / name] = _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")).encode()
+        points, corners = mesh.attrib.pop("vertex").split(), [int(index) + 1 for index in mesh.attrib.pop("face").split()]
+        lines = [f"v {' '.join(points[i : i + 3])}" for i in range(0, len(points), 3)]
+        lines += [f"f {' '.join(map(str, corners[i : i + 3]))}" for i in range(0, len(corners), 3)]
+        contents[folder / name] = "\n".join([*lines, ""]).encode()
         mesh.set("file", name)
     if names:
         root.findall("compiler")[0].set("meshdir", folder.name)
@@ -111,10 +114,3 @@ def _file_name(name: str, taken: list[str]) -> str:
         file = f"{stem}_{number}.obj"
     taken.append(file)
     return file
-
-
-def _wavefront(vertices: str, faces: str) -> str:
-    points, corners = vertices.split(), [int(index) + 1 for index in faces.split()]
-    lines = [f"v {' '.join(points[i : i + 3])}" for i in range(0, len(points), 3)]
-    lines += [f"f {' '.join(map(str, corners[i : i + 3]))}" for i in range(0, len(corners), 3)]
-    return "\n".join([*lines, ""])

@@ -28,11 +28,8 @@ _POSITIVE = ("timestep", "impratio")
 _MOST = 2**31 - 1  # MuJoCo's integers have 32 bits
 
 
-def option_names() -> tuple[str, ...]:
-    return tuple(sorted(name for name in dir(mujoco.MjOption) if not name.startswith("_") and name not in _METHODS))
-
-
-_METHODS = {name for name in dir(mujoco.MjOption) if callable(getattr(mujoco.MjOption, name, None))}
+_METHODS = {name for name in dir(mujoco.MjOption) if name.startswith("_") or callable(getattr(mujoco.MjOption, name, None))}
+OPTION_NAMES = tuple(sorted(set(dir(mujoco.MjOption)) - _METHODS))
 
 
 def set_options(spec: mujoco.MjSpec, options: Options) -> None:
@@ -85,7 +82,7 @@ def _contact(name: str, given: Any, timestep: float, disabled: int) -> list[floa
 
 def _value(option: Any, name: str, given: Any) -> Any:
     """Return the value of an option as MuJoCo has it."""
-    known = (*option_names(), *CONTACTS)
+    known = (*OPTION_NAMES, *CONTACTS)
     if name not in known:
         raise SimulationError(f'MuJoCo has no option "{name}"; {did_you_mean(name, known, "options")}')
     if name in KEYWORDS:

@@ -14,23 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from tgdsl.formats.usd.attributes import (
-    ACTUATOR,
-    DRAWN,
-    FREE,
-    KEY,
-    LIMITS,
-    SERVO,
-    TENDON,
-    StageWriter,
-    author,
-    read_attributes,
-    read_custom,
-    set_custom,
-    set_sources,
-    text_of,
-    with_limits,
-)
+from tgdsl.formats.usd import attributes as attr
 from tgdsl.formats.usd.joints import Drive, Joint
 from tgdsl.formats.usd.stage import Names, Prim, Stage, unique_names, usd_modules
 
@@ -74,8 +58,8 @@ def _mjc_actuator(stage: Stage, prim: Prim, names: Names, name: str) -> Actuator
     targets, slider, reference = (
         [str(path) for path in stage.targets(prim, f"mjc:{kind}")] for kind in ("target", "sliderSite", "refSite")
     )
-    is_in_parent, order = bool(stage.authored(prim, "mjc:jointInParent")), read_custom(stage, prim, "order")
-    attributes = with_limits(stage, read_attributes(stage, prim, ACTUATOR), LIMITS)
+    is_in_parent, order = bool(stage.authored(prim, "mjc:jointInParent")), attr.read_custom(stage, prim, "order")
+    attributes = attr.with_limits(stage, attr.read_attributes(stage, prim, attr.ACTUATOR), attr.LIMITS)
     target = targets[0] if targets else ""
     kinds = {
         "jointinparent" if is_in_parent else "joint": names.moving,
@@ -106,15 +90,15 @@ def _newton_actuator(stage: Stage, prim: Prim, names: Names, name: str) -> Actua
     if len(targets) > 1:
         stage.drop(TOO_MANY, prim)
     is_angular = stage.usd.GetPrimAtPath(targets[0]).GetTypeName() != "PhysicsPrismaticJoint"
-    values = {key: float(value) for key, value in read_attributes(stage, prim, SERVO, is_angular).items()}
+    values = {key: float(value) for key, value in attr.read_attributes(stage, prim, attr.SERVO, is_angular).items()}
     kp, kd, constant = (values.get(key, 0.0) for key in ("kp", "kd", "constant"))
     if not (stage.has(prim, "NewtonPDControlAPI") or stage.has(prim, "NewtonPIDControlAPI")) or not (kp or kd):
         stage.drop("NewtonActuators were dropped that are no PD control with gains", prim)
         return None
     attributes = {"name": name, "joint": names.moving[targets[0]], "biastype": "affine", "gainprm": repr(kp or kd)}
-    attributes["biasprm"] = text_of([constant, 0.0 - kp, 0.0 - kd])
+    attributes["biasprm"] = attr.text_of([constant, 0.0 - kp, 0.0 - kd])
     if "most" in values:
-        attributes["forcerange"] = text_of([-values["most"], values["most"]])
+        attributes["forcerange"] = attr.text_of([-values["most"], values["most"]])
     return Actuator(attributes, targets[0], math.inf)
 
 
@@ -149,25 +133,25 @@ def _servo(joint: Joint, drive: Drive, name: str, taken: set[str]) -> Actuator:
     taken.add(unique)
     attributes, gear = {"name": unique, "joint": name}, drive.gear
     if gear != 1.0:
-        attributes["gear"] = text_of([gear])
+        attributes["gear"] = attr.text_of([gear])
     if drive.control is not None:
-        attributes["ctrlrange"] = text_of(sorted(end * gear for end in drive.control))
+        attributes["ctrlrange"] = attr.text_of(sorted(end * gear for end in drive.control))
     if not math.isinf(drive.max_force):
         limit = drive.max_force / abs(gear)
-        attributes["forcerange"] = text_of([-limit, limit])
+        attributes["forcerange"] = attr.text_of([-limit, limit])
     stiffness, damping = drive.stiffness / gear**2, drive.damping / gear**2
-    kp, kv = text_of([stiffness]), text_of([damping])
+    kp, kv = attr.text_of([stiffness]), attr.text_of([damping])
     if not stiffness:
         return Actuator(attributes | {"kv": kv}, joint.path, drive.order, drive.target_velocity * gear, "velocity")
     if not drive.target_velocity:
         return Actuator(attributes | {"kp": kp, "kv": kv}, joint.path, drive.order, drive.target * gear, "position")
     # A spring whose damper pulls towards a speed: a position actuator with a constant force.
-    bias = text_of([damping * drive.target_velocity * gear, -stiffness, -damping])
+    bias = attr.text_of([damping * drive.target_velocity * gear, -stiffness, -damping])
     attributes |= {"gainprm": kp, "biastype": "affine", "biasprm": bias}
     return Actuator(attributes, joint.path, drive.order, drive.target * gear)
 
 
-def write_actuators(writer: StageWriter, actuators: list[int]) -> None:
+def write_actuators(writer: attr.StageWriter, actuators: list[int]) -> None:
     """Write actuators, by MuJoCo's indices, as prims; say which are left out."""
     model = writer.model
     for actuator in actuators:
@@ -179,25 +163,25 @@ def write_actuators(writer: StageWriter, actuators: list[int]) -> None:
             writer.unsupported.append(f"{writer.file}: {shown} is {reason}: left out")
             continue
         prim = writer.define("MjcActuator", name or "actuator", name)
-        set_custom(prim, "order", actuator)
+        attr.set_custom(prim, "order", actuator)
         for relationship, target in ends.items():
             prim.CreateRelationship(f"mjc:{relationship}", custom=False).SetTargets([target])
-        set_sources(prim, ACTUATOR, model, actuator)
+        attr.set_sources(prim, attr.ACTUATOR, model, actuator)
         if kind == TRN["SLIDERCRANK"]:
-            author(prim, "mjc:crankLength", float(model.actuator_cranklength[actuator]))
+            attr.author(prim, "mjc:crankLength", float(model.actuator_cranklength[actuator]))
         if kind == TRN["JOINTINPARENT"]:
-            author(prim, "mjc:jointInParent", True)
+            attr.author(prim, "mjc:jointInParent", True)
         if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_USER:
-            author(prim, "mjc:actDim", int(model.actuator_actnum[actuator]))
+            attr.author(prim, "mjc:actDim", int(model.actuator_actnum[actuator]))
         if samples := int(model.actuator_history[actuator, 0]):
-            set_custom(prim, "nsample", samples)
+            attr.set_custom(prim, "nsample", samples)
 
 
-def _ends(writer: StageWriter, actuator: int, kind: int) -> dict[str, str] | None:
+def _ends(writer: attr.StageWriter, actuator: int, kind: int) -> dict[str, str] | None:
     """Return what an actuator acts on, by the relationships' names; None if there is no prim for it."""
     model, (first, second) = writer.model, writer.model.actuator_trnid[actuator].tolist()
     if kind in (TRN["JOINT"], TRN["JOINTINPARENT"]):
-        is_there = first in writer.joints and model.jnt_type[first] != FREE
+        is_there = first in writer.joints and model.jnt_type[first] != attr.FREE
         return {"target": str(writer.joints[first].GetPath())} if is_there else None
     if kind == TRN["SITE"]:
         reference = {"refSite": writer.sites[second]} if second >= 0 else {}
@@ -224,8 +208,8 @@ def read_tendons(stage: Stage, tendon: ET.Element, names: Names) -> None:
 
 def _tendon(stage: Stage, prim: Prim, names: Names) -> ET.Element | None:
     is_fixed = str(stage.value(prim, "mjc:type")) == "fixed"
-    attributes = with_limits(stage, read_attributes(stage, prim, TENDON), ("", "actuatorfrc"))
-    drawn = read_attributes(stage, prim, DRAWN)
+    attributes = attr.with_limits(stage, attr.read_attributes(stage, prim, attr.TENDON), ("", "actuatorfrc"))
+    drawn = attr.read_attributes(stage, prim, attr.DRAWN)
     attributes |= {} if is_fixed else drawn
     targets = [str(path) for path in stage.targets(prim, "mjc:path")]
     order = _array(stage, prim, "path:indices") or list(range(len(targets)))
@@ -273,19 +257,19 @@ def _spatial(stage: Stage, prim: Prim, names: Names, element: ET.Element, path: 
     return element
 
 
-def write_tendons(writer: StageWriter) -> None:
+def write_tendons(writer: attr.StageWriter) -> None:
     """Write all tendons."""
     model, gf = writer.model, usd_modules().Gf
     for tendon in range(model.ntendon):
         name = model.tendon(tendon).name
         prim = writer.define("MjcTendon", name or "tendon", name)
         writer.tendons[tendon] = str(prim.GetPath())
-        set_sources(prim, {**TENDON, **DRAWN}, model, tendon)
-        author(prim, "mjc:rgba", gf.Vec4f(*model.tendon_rgba[tendon].tolist()), "Color4f")
+        attr.set_sources(prim, {**attr.TENDON, **attr.DRAWN}, model, tendon)
+        attr.author(prim, "mjc:rgba", gf.Vec4f(*model.tendon_rgba[tendon].tolist()), "Color4f")
         _write_path(writer, tendon, prim)
 
 
-def _write_path(writer: StageWriter, tendon: int, prim: Any) -> None:
+def _write_path(writer: attr.StageWriter, tendon: int, prim: Any) -> None:
     """Write what a tendon passes over: targets once each, then their order, segments between pulleys, and side sites."""
     model = writer.model
     start = int(model.tendon_adr[tendon])
@@ -308,16 +292,16 @@ def _write_path(writer: StageWriter, tendon: int, prim: Any) -> None:
         sides += [side] if side and side not in sides else []
         beside.append(sides.index(side) if side else -1)
     prim.CreateRelationship("mjc:path", custom=False).SetTargets(targets)
-    author(prim, "mjc:type", "fixed" if is_fixed else "spatial")
-    author(prim, "mjc:path:indices", indices)
+    attr.author(prim, "mjc:type", "fixed" if is_fixed else "spatial")
+    attr.author(prim, "mjc:path:indices", indices)
     if is_fixed:
-        author(prim, "mjc:path:coef", coefficients)
+        attr.author(prim, "mjc:path:coef", coefficients)
         return
-    author(prim, "mjc:path:segments", segments)
-    author(prim, "mjc:path:divisors", divisors)
+    attr.author(prim, "mjc:path:segments", segments)
+    attr.author(prim, "mjc:path:divisors", divisors)
     if sides:
         prim.CreateRelationship("mjc:sideSites", custom=False).SetTargets(sides)
-        author(prim, "mjc:sideSites:indices", beside)
+        attr.author(prim, "mjc:sideSites:indices", beside)
 
 
 def read_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None:
@@ -332,7 +316,7 @@ def read_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None
     for key in [key for key in keyframe if key.get("name") in names.values()]:
         keyframe.remove(key)  # the stage's own overrules what was made of its poses
     for prim in prims:
-        attributes = {name: value for name, value in read_attributes(stage, prim, KEY).items() if value}
+        attributes = {name: value for name, value in attr.read_attributes(stage, prim, attr.KEY).items() if value}
         wrong = [name for name, value in attributes.items() if len(value.split()) != sizes[name]]
         if wrong:
             stage.drop(f"keyframes were dropped whose {', '.join(wrong)} is not of the model's size", prim)
@@ -340,7 +324,7 @@ def read_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None
         ET.SubElement(keyframe, "key", {"name": names[str(prim.GetPath())]} | attributes)
 
 
-def write_keyframes(writer: StageWriter) -> None:
+def write_keyframes(writer: attr.StageWriter) -> None:
     for key in range(writer.model.nkey):
         name = writer.model.key(key).name
-        set_sources(writer.define("MjcKeyframe", name or "keyframe", name), KEY, writer.model, key)
+        attr.set_sources(writer.define("MjcKeyframe", name or "keyframe", name), attr.KEY, writer.model, key)

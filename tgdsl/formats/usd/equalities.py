@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -24,19 +23,7 @@ from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import listed
-from tgdsl.formats.usd.attributes import (
-    EQUALITY,
-    MIMIC,
-    WELD,
-    StageWriter,
-    author,
-    default_model,
-    read_attributes,
-    read_custom,
-    set_custom,
-    set_number,
-    text_of,
-)
+from tgdsl.formats.usd import attributes as attr
 from tgdsl.formats.usd.joints import Joint
 from tgdsl.formats.usd.stage import NAMESPACE, Matrix, Names, Prim, Stage, usd_modules
 
@@ -61,14 +48,14 @@ def shifted(coefficients: Float[np.ndarray, " 5"], follower: float, leader: floa
 def read_couplings(stage: Stage, equality: ET.Element, joints: Iterable[Joint], names: Mapping[str, str]) -> None:
     """Add the constraint of each joint that follows another."""
     joints = list(joints)
-    references = {joint.path: joint.reference if read_custom(stage, joint.prim, "ref") else 0.0 for joint in joints}
+    references = {joint.path: joint.reference if attr.read_custom(stage, joint.prim, "ref") else 0.0 for joint in joints}
     for joint in joints:
         prim = joint.prim
         if any("Mimic" in schema and not schema.startswith("Newton") for schema in stage.schemas(prim)):
             stage.drop("couplings between joints (mimic) were dropped", prim)
         if not stage.has(prim, "NewtonMimicAPI"):
             continue
-        authored = read_attributes(stage, prim, MIMIC, is_angular=joint.kind == "hinge")
+        authored = attr.read_attributes(stage, prim, attr.MIMIC, is_angular=joint.kind == "hinge")
         leaders = []
         for name in ("mjc:target", "newton:mimicJoint"):
             targets = [str(path) for path in stage.targets(prim, name)]
@@ -83,10 +70,10 @@ def read_couplings(stage: Stage, equality: ET.Element, joints: Iterable[Joint], 
         attributes = {"joint1": names[joint.path], "joint2": names[leaders[0]]}
         positions = np.array([float(authored.get(str(i), usual)) for i, usual in enumerate(USUAL)])
         displacements = shifted(positions, -references[joint.path], -references[leaders[0]])
-        attributes["polycoef"] = text_of(displacements.tolist())
+        attributes["polycoef"] = attr.text_of(displacements.tolist())
         if stage.authored(prim, "newton:mimicEnabled") is False:
             attributes["active"] = "false"
-        attributes |= read_attributes(stage, prim, EQUALITY)
+        attributes |= attr.read_attributes(stage, prim, attr.EQUALITY)
         _add(stage, equality, "joint", prim, names[joint.path], attributes)
 
 
@@ -94,7 +81,7 @@ def read_polynomials(stage: Stage, equality: ET.Element, names: Names) -> None:
     """Add the constraints that only tgdsl's attributes describe."""
     ends = {"joint": names.scalars, "tendon": names.tendons}
     for prim in stage.prims:
-        if prim.GetTypeName() != "Scope" or (coefficients := read_custom(stage, prim, "polycoef")) is None:
+        if prim.GetTypeName() != "Scope" or (coefficients := attr.read_custom(stage, prim, "polycoef")) is None:
             continue
         paths = [str(path) for end in (1, 2) for path in stage.targets(prim, f"{NAMESPACE}end{end}")]
         tag = next((tag for tag, names_by_path in ends.items() if paths and all(path in names_by_path for path in paths)), None)
@@ -102,10 +89,10 @@ def read_polynomials(stage: Stage, equality: ET.Element, names: Names) -> None:
             stage.drop("equality constraints were dropped whose ends are no joints or tendons of the model", prim)
             continue
         attributes = {f"{tag}{number}": ends[tag][path] for number, path in enumerate(paths, start=1)}
-        attributes["polycoef"] = text_of(list(coefficients))
-        if read_custom(stage, prim, "active") is False:
+        attributes["polycoef"] = attr.text_of(list(coefficients))
+        if attr.read_custom(stage, prim, "active") is False:
             attributes["active"] = "false"
-        _add(stage, equality, tag, prim, prim.GetName(), attributes | read_attributes(stage, prim, EQUALITY))
+        _add(stage, equality, tag, prim, prim.GetName(), attributes | attr.read_attributes(stage, prim, attr.EQUALITY))
 
 
 def read_exact_constraint(stage: Stage, equality: ET.Element, joint: Joint, names: Names, sites: Mapping[str, Matrix]) -> bool:
@@ -118,40 +105,36 @@ def read_exact_constraint(stage: Stage, equality: ET.Element, joint: Joint, name
     )
     if is_on_sites:
         attributes = {"site1": names.sites[joint.targets[0]], "site2": names.sites[joint.targets[1]]}
-    elif read_custom(stage, joint.prim, "equality") is None:
+    elif attr.read_custom(stage, joint.prim, "equality") is None:
         return False
     else:
         one, two = ("world" if body is None else names.bodies[body] for body in joint.bodies)
-        attributes = {"body1": one, "body2": two, "anchor": text_of((second if is_weld else first)[:3, 3].tolist())}
+        attributes = {"body1": one, "body2": two, "anchor": attr.text_of((second if is_weld else first)[:3, 3].tolist())}
         if is_weld:
             turn = Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_quat(canonical=True, scalar_first=True)
-            attributes["relpose"] = text_of([*first[:3, 3].tolist(), *turn.tolist()])
+            attributes["relpose"] = attr.text_of([*first[:3, 3].tolist(), *turn.tolist()])
     attributes |= constraint_attributes(stage, joint)
     _add(stage, equality, "weld" if is_weld else "connect", joint.prim, names.joints[joint.path], attributes)
     return True
 
 
 def constraint_attributes(stage: Stage, joint: Joint) -> dict[str, str]:
-    table = WELD if joint.constraint == "MjcEqualityWeldAPI" else EQUALITY
-    return ({} if joint.is_active else {"active": "false"}) | read_attributes(stage, joint.prim, table)
+    table = attr.WELD if joint.constraint == "MjcEqualityWeldAPI" else attr.EQUALITY
+    return ({} if joint.is_active else {"active": "false"}) | attr.read_attributes(stage, joint.prim, table)
 
 
 def _add(stage: Stage, equality: ET.Element, tag: str, prim: Prim, name: str, attributes: Mapping[str, str]) -> None:
     """Add a constraint under the name that it had, or one like the name given."""
     taken = {element.get("name") for element in equality}
-    unique = str(read_custom(stage, prim, "equality_name") or name)
+    unique = str(attr.read_custom(stage, prim, "equality_name") or name)
     while unique in taken:
         unique += "_"
-    place = read_custom(stage, prim, "equality")
+    place = attr.read_custom(stage, prim, "equality")
     order = {} if place is None else {ORDER: str(int(place))}
     ET.SubElement(equality, tag, {"name": unique, **attributes, **order})
 
 
-def put_in_order(equality: ET.Element) -> None:
-    equality[:] = sorted(equality, key=lambda element: float(element.attrib.pop(ORDER, math.inf)))
-
-
-def write_equalities(writer: StageWriter) -> None:
+def write_equalities(writer: attr.StageWriter) -> None:
     """Write all equality constraints; say which are left out. All bodies, sites, joints and tendons are there."""
     model, followers = writer.model, set[int]()
     for equality in range(model.neq):
@@ -169,15 +152,15 @@ def write_equalities(writer: StageWriter) -> None:
             constraint = f'equality constraint "{name}"' if name else f"unnamed equality constraint {equality}"
             writer.unsupported.append(f"{writer.file}: {constraint} is of a flex, which USD does not have: left out")
             continue
-        set_custom(prim, "equality", equality)
-        set_custom(prim, "equality_name", name)
-        for attribute in EQUALITY:
+        attr.set_custom(prim, "equality", equality)
+        attr.set_custom(prim, "equality_name", name)
+        for attribute in attr.EQUALITY:
             value = getattr(model, f"eq_{attribute}")[equality]
-            if not np.array_equal(value, getattr(default_model(), f"jnt_{attribute}")[0]):
-                author(prim, f"mjc:{attribute}", value.tolist())
+            if not np.array_equal(value, getattr(attr.default_model(), f"jnt_{attribute}")[0]):
+                attr.author(prim, f"mjc:{attribute}", value.tolist())
 
 
-def _write_closing_joint(writer: StageWriter, equality: int, is_weld: bool) -> Any:
+def _write_closing_joint(writer: attr.StageWriter, equality: int, is_weld: bool) -> Any:
     """Write a `connect` or `weld`; its frames are where MuJoCo holds both ends together."""
     model, physics = writer.model, usd_modules().UsdPhysics
     schema, kind = (physics.FixedJoint, "Weld") if is_weld else (physics.SphericalJoint, "Connect")
@@ -193,17 +176,17 @@ def _write_closing_joint(writer: StageWriter, equality: int, is_weld: bool) -> A
     points = (data[3:6], data[0:3]) if is_weld else (data[0:3], data[3:6])
     turn = data[6:10] if is_weld and data[6:10].any() else np.array([1.0, 0.0, 0.0, 0.0])
     for number, (point, quat) in enumerate(zip(points, (turn, np.array([1.0, 0.0, 0.0, 0.0])), strict=True)):
-        set_number(getattr(made, f"CreateLocalPos{number}Attr")(), point)
-        set_number(getattr(made, f"CreateLocalRot{number}Attr")(), quat)
+        attr.set_number(getattr(made, f"CreateLocalPos{number}Attr")(), point)
+        attr.set_number(getattr(made, f"CreateLocalRot{number}Attr")(), quat)
     made.CreateExcludeFromArticulationAttr(True)
     made.CreateCollisionEnabledAttr(True)
     made.CreateJointEnabledAttr(bool(model.eq_active0[equality]))
     if is_weld and model.eq_data[equality, 10] != 1.0:
-        set_number(_float(prim, "mjc:torqueScale"), model.eq_data[equality, 10])
+        attr.set_number(_float(prim, "mjc:torqueScale"), model.eq_data[equality, 10])
     return prim
 
 
-def _write_mimic(writer: StageWriter, equality: int) -> Any:
+def _write_mimic(writer: attr.StageWriter, equality: int) -> Any:
     """Write a joint that follows another on the follower's prim."""
     model = writer.model
     follower, leader = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
@@ -216,15 +199,15 @@ def _write_mimic(writer: StageWriter, equality: int) -> Any:
     for power, coefficient in enumerate(shifted(model.eq_data[equality, :5], *starts).tolist()):
         if power < NEWTON_COEFFICIENTS:
             unit = np.degrees(1.0) if is_hinge and power == 0 else 1.0
-            set_number(_float(prim, f"newton:mimicCoef{power}"), coefficient * unit)
+            attr.set_number(_float(prim, f"newton:mimicCoef{power}"), coefficient * unit)
         elif coefficient:
-            author(prim, f"mjc:coef{power}", coefficient)
+            attr.author(prim, f"mjc:coef{power}", coefficient)
     if not model.eq_active0[equality]:
-        author(prim, "newton:mimicEnabled", False)
+        attr.author(prim, "newton:mimicEnabled", False)
     return prim
 
 
-def _write_polynomial(writer: StageWriter, equality: int, paths: Mapping[int, str]) -> Any:
+def _write_polynomial(writer: attr.StageWriter, equality: int, paths: Mapping[int, str]) -> Any:
     """Write what no schema has: MJCF's values, and what they are of."""
     model = writer.model
     path = writer.path(writer.scope, model.equality(equality).name or "equality")
@@ -233,9 +216,9 @@ def _write_polynomial(writer: StageWriter, equality: int, paths: Mapping[int, st
         index = int(getattr(model, f"eq_obj{end}id")[equality])
         if index >= 0:
             prim.CreateRelationship(f"{NAMESPACE}end{end}", custom=True).SetTargets([paths[index]])
-    set_custom(prim, "polycoef", model.eq_data[equality, :5].tolist())
+    attr.set_custom(prim, "polycoef", model.eq_data[equality, :5].tolist())
     if not model.eq_active0[equality]:
-        set_custom(prim, "active", False)
+        attr.set_custom(prim, "active", False)
     return prim
 
 

@@ -47,8 +47,8 @@ from tgdsl.formats.usd.actuators import read_actuators, read_keyframes, read_ten
 from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, exclusions, filtered_pairs
 from tgdsl.formats.usd.attributes import BODY, COMPILER, FLAG, FLAGS, OPTION, read_attributes, read_custom, text_of
 from tgdsl.formats.usd.equalities import (
+    ORDER,
     constraint_attributes,
-    put_in_order,
     read_couplings,
     read_exact_constraint,
     read_polynomials,
@@ -182,7 +182,8 @@ class _Mjcf:
         read_couplings(stage, self._equality, robot.joints, self._names.scalars)
         read_tendons(stage, tendon, self._names)
         read_polynomials(stage, self._equality, self._names)
-        put_in_order(self._equality)
+        # As `export` found them; the others come after.
+        self._equality[:] = sorted(self._equality, key=lambda element: float(element.attrib.pop(ORDER, math.inf)))
         self._add_actuators(actuator, keyframe)
         read_keyframes(stage, self.root, keyframe)
         for empty in [element for element in self.root if len(element) == 0 and not element.attrib]:

@@ -29,30 +29,14 @@ from scipy.spatial.transform import Rotation
 from tgdsl.errors import FileError, RobotError, listed
 from tgdsl.files.write import atomic_path
 from tgdsl.formats.model import SHAPE_NAMES, Model
+from tgdsl.formats.usd import attributes as attr
 from tgdsl.formats.usd.actuators import write_actuators, write_keyframes, write_tendons
-from tgdsl.formats.usd.attributes import (
-    FLAGS,
-    FREE,
-    GEOM,
-    KNOWN_FLAGS,
-    MESH,
-    OPTION,
-    SITE,
-    StageWriter,
-    default_model,
-    file_vertices,
-    flag_names,
-    rounded,
-    set_custom,
-    set_customs,
-    set_number,
-)
 from tgdsl.formats.usd.equalities import write_equalities
 from tgdsl.formats.usd.stage import usd_modules
 from tgdsl.formats.usd.write_joints import add_drives, add_joint
 
 ELLIPSOID, PLANE, MESH_GEOM = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("ELLIPSOID", "PLANE", "MESH"))
-MASKS = {name: GEOM[name] for name in ("contype", "conaffinity")}  # custom attributes of visuals too
+MASKS = {name: attr.GEOM[name] for name in ("contype", "conaffinity")}  # custom attributes of visuals too
 PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom: if a material is there too, the material's shows
 SCHEMAS = {
     "box": "Cube",
@@ -73,7 +57,7 @@ def write_usd(model: Model, out: Path) -> None:
     Raises:
         RobotError: If USD cannot express the model, or the file cannot be written.
     """
-    writer = StageWriter(model.file, model.spec, model.compiled, usd_modules().Usd.Stage.CreateInMemory())
+    writer = attr.StageWriter(model.file, model.spec, model.compiled, usd_modules().Usd.Stage.CreateInMemory())
     _add_scene(writer)
     writer.scope, writer.materials = (writer.path(writer.root, name) for name in ("joints", "materials"))
     _add_bodies(writer)
@@ -89,7 +73,7 @@ def write_usd(model: Model, out: Path) -> None:
         warnings.warn(message, stacklevel=3)
 
 
-def _add_scene(writer: StageWriter) -> None:
+def _add_scene(writer: attr.StageWriter) -> None:
     """Write units, gravity and the default prim."""
     u, model, stage = usd_modules(), writer.model, writer.stage
     u.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -98,26 +82,26 @@ def _add_scene(writer: StageWriter) -> None:
     name = model.names[: model.names.index(b"\0")].decode()
     writer.root = writer.path("", name)
     root = u.UsdGeom.Xform.Define(stage, writer.root).GetPrim()
-    set_custom(root, "name", name)
+    attr.set_custom(root, "name", name)
     stage.SetDefaultPrim(root)
-    if np.any(model.jnt_type != FREE):
+    if np.any(model.jnt_type != attr.FREE):
         u.UsdPhysics.ArticulationRootAPI.Apply(root)
     is_weightless = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     gravity = np.zeros(3) if is_weightless else model.opt.gravity
     strength = float(np.linalg.norm(gravity))
     scene = u.UsdPhysics.Scene.Define(stage, writer.path("", "physicsScene"))
-    set_number(scene.CreateGravityMagnitudeAttr(), strength)
-    set_number(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
+    attr.set_number(scene.CreateGravityMagnitudeAttr(), strength)
+    attr.set_number(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
     # A scene of a stage that this one is layered into may have a schema with another default.
-    set_custom(scene.GetPrim(), "timestep", float(model.opt.timestep))
-    set_customs(scene.GetPrim(), OPTION, model.opt, default_model().opt)
-    for key in FLAGS:
+    attr.set_custom(scene.GetPrim(), "timestep", float(model.opt.timestep))
+    attr.set_customs(scene.GetPrim(), attr.OPTION, model.opt, attr.default_model().opt)
+    for key in attr.FLAGS:
         bits = int(getattr(model.opt, f"{key}flags"))
-        if names := [name for name, bit in flag_names(key).items() if bits & bit and name not in KNOWN_FLAGS]:
-            set_custom(scene.GetPrim(), key, names)
+        if names := [name for name, bit in attr.flag_names(key).items() if bits & bit and name not in attr.KNOWN_FLAGS]:
+            attr.set_custom(scene.GetPrim(), key, names)
 
 
-def _add_bodies(writer: StageWriter) -> None:
+def _add_bodies(writer: attr.StageWriter) -> None:
     """Write every body at its world pose at `qpos0`, with its mass, geoms and sites."""
     u, model = usd_modules(), writer.model
     state = mujoco.MjData(model)
@@ -131,9 +115,9 @@ def _add_bodies(writer: StageWriter) -> None:
         writer.bodies[body] = path
         prim = u.UsdGeom.Xform.Define(writer.stage, path).GetPrim()
         if body:
-            set_custom(prim, "name", model.body(body).name)
+            attr.set_custom(prim, "name", model.body(body).name)
             if model.body_gravcomp[body]:
-                set_custom(prim, "gravcomp", float(model.body_gravcomp[body]))
+                attr.set_custom(prim, "gravcomp", float(model.body_gravcomp[body]))
             _set_pose(prim, state.xpos[body], state.xquat[body])
             _add_mass(writer, body, prim)
         for geom in np.flatnonzero(model.geom_bodyid == body).tolist():
@@ -143,39 +127,39 @@ def _add_bodies(writer: StageWriter) -> None:
             prim = u.UsdGeom.Xform.Define(writer.stage, writer.path(path, name or "site")).GetPrim()
             writer.sites[site] = str(prim.GetPath())
             _set_pose(prim, model.site_pos[site], model.site_quat[site])
-            set_custom(prim, "site", True)
-            set_custom(prim, "name", name)
-            set_customs(prim, SITE, model, default_model(), site)
+            attr.set_custom(prim, "site", True)
+            attr.set_custom(prim, "name", name)
+            attr.set_customs(prim, attr.SITE, model, attr.default_model(), site)
 
 
 def _set_pose(prim: Any, pos: np.ndarray, quat: np.ndarray, scale: np.ndarray | None = None) -> None:
     """Give a prim its position [m], rotation (w x y z) and scale in its parent's frame, in double precision."""
     u = usd_modules()
     xform, double = u.UsdGeom.Xformable(prim), u.UsdGeom.XformOp.PrecisionDouble
-    xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*rounded(pos).tolist()))
-    xform.AddOrientOp(double).Set(u.Gf.Quatd(*rounded(quat).tolist()))
+    xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*attr.rounded(pos).tolist()))
+    xform.AddOrientOp(double).Set(u.Gf.Quatd(*attr.rounded(quat).tolist()))
     if scale is not None:
         xform.AddScaleOp(double).Set(u.Gf.Vec3d(*scale.tolist()))
 
 
-def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
+def _add_mass(writer: attr.StageWriter, body: int, prim: Any) -> None:
     u, model = usd_modules(), writer.model
     rigid = u.UsdPhysics.RigidBodyAPI.Apply(prim)
     if model.body_mocapid[body] >= 0:
         rigid.CreateKinematicEnabledAttr(True)
     mass = u.UsdPhysics.MassAPI.Apply(prim)
-    set_number(mass.CreateMassAttr(), model.body_mass[body])
-    set_number(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
+    attr.set_number(mass.CreateMassAttr(), model.body_mass[body])
+    attr.set_number(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
     if not model.body_inertia[body].all():
         # Of a body that has none, USD wants neither the moments nor their axes, and makes both, or its mass, of its colliders.
         values = [model.body_mass[body], *model.body_inertia[body], *model.body_iquat[body]]
-        set_custom(prim, "inertial", [float(value) for value in values])
+        attr.set_custom(prim, "inertial", [float(value) for value in values])
         return
-    set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
-    set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
+    attr.set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
+    attr.set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
 
 
-def _add_geom(writer: StageWriter, geom: int) -> None:
+def _add_geom(writer: attr.StageWriter, geom: int) -> None:
     model, u = writer.model, usd_modules()
     shape, scale = _define(writer, geom)
     prim = shape.GetPrim()
@@ -186,7 +170,7 @@ def _add_geom(writer: StageWriter, geom: int) -> None:
         turn = Rotation.from_quat(quat, scalar_first=True) * Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).inv()
         pos, quat = pos - turn.apply(model.mesh_pos[mesh]), turn.as_quat(canonical=True, scalar_first=True)
     _set_pose(prim, pos, quat, scale)
-    set_custom(prim, "name", model.geom(geom).name)
+    attr.set_custom(prim, "name", model.geom(geom).name)
     rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     if material >= 0 and np.array_equal(rgba, np.array(PLAIN_RGBA, dtype=rgba.dtype)):
         rgba = model.mat_rgba[material]
@@ -195,7 +179,7 @@ def _add_geom(writer: StageWriter, geom: int) -> None:
     if opacity != 1.0:
         shape.CreateDisplayOpacityAttr([opacity])
     is_colliding = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-    set_customs(prim, GEOM if is_colliding else MASKS, model, default_model(), geom)
+    attr.set_customs(prim, attr.GEOM if is_colliding else MASKS, model, attr.default_model(), geom)
     if is_colliding:
         u.UsdPhysics.CollisionAPI.Apply(prim)
         if prim.IsA(u.UsdGeom.Mesh):
@@ -204,7 +188,7 @@ def _add_geom(writer: StageWriter, geom: int) -> None:
         u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(surface, materialPurpose="physics")
 
 
-def _define(writer: StageWriter, geom: int) -> tuple[Any, np.ndarray | None]:
+def _define(writer: attr.StageWriter, geom: int) -> tuple[Any, np.ndarray | None]:
     """Define a geom's prim without its pose; return its schema, and the scale that it wants."""
     model, shapes = writer.model, usd_modules().UsdGeom
     kind, size = SHAPE_NAMES.get(int(model.geom_type[geom]), "unknown"), model.geom_size[geom]
@@ -232,33 +216,33 @@ def _define(writer: StageWriter, geom: int) -> tuple[Any, np.ndarray | None]:
     return shape, size if kind in ("box", "ellipsoid") else None
 
 
-def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
+def _add_triangles(writer: attr.StageWriter, geom: int, shape: Any) -> None:
     """Write a mesh's triangles as its file has them, and what MuJoCo makes of them."""
     model, mesh, u = writer.model, int(writer.model.geom_dataid[geom]), usd_modules()
-    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(file_vertices(model, mesh)))
+    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(attr.file_vertices(model, mesh)))
     first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     shape.CreateFaceVertexIndicesAttr(u.Vt.IntArray.FromNumpy(model.mesh_face[first : first + count].astype(np.int32).ravel()))
     shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
     shape.CreateSubdivisionSchemeAttr("none")
     name = model.mesh(mesh).name
-    set_custom(shape.GetPrim(), "mesh", name)
+    attr.set_custom(shape.GetPrim(), "mesh", name)
     default = mujoco.MjSpec().add_mesh(inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)  # as the importer takes meshes
-    set_customs(shape.GetPrim(), MESH, writer.spec.mesh(name), default)
+    attr.set_customs(shape.GetPrim(), attr.MESH, writer.spec.mesh(name), default)
 
 
-def _material(writer: StageWriter, friction: float) -> Any:
+def _material(writer: attr.StageWriter, friction: float) -> Any:
     """Return the physics material of a sliding friction; geoms of the same friction share it."""
     u = usd_modules()
     if friction not in writer.frictions:
         material = u.UsdShade.Material.Define(writer.stage, writer.path(writer.materials, f"friction_{friction!r}"))
         surface = u.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-        set_number(surface.CreateStaticFrictionAttr(), friction)
-        set_number(surface.CreateDynamicFrictionAttr(), friction)
+        attr.set_number(surface.CreateStaticFrictionAttr(), friction)
+        attr.set_number(surface.CreateDynamicFrictionAttr(), friction)
         writer.frictions[friction] = material
     return writer.frictions[friction]
 
 
-def _add_joints(writer: StageWriter) -> None:
+def _add_joints(writer: attr.StageWriter) -> None:
     model = writer.model
     excluded = _excluded(model)
     usd_modules().UsdGeom.Scope.Define(writer.stage, writer.scope)
@@ -283,7 +267,7 @@ def _never_collide(model: mujoco.MjModel, one: int, two: int) -> bool:
     return any(int(model.body_weldid[model.body_parentid[child]]) == parent for child, parent in ((one, two), (two, one)))
 
 
-def _add_filters(writer: StageWriter) -> None:
+def _add_filters(writer: attr.StageWriter) -> None:
     """Write the pairs of bodies that do not collide and that USD would not know of.
 
     MuJoCo's own filter sees bodies that are welded together as one, USD's joints only the two that they join.
@@ -305,7 +289,7 @@ def _add_filters(writer: StageWriter) -> None:
         filtered.CreateFilteredPairsRel().SetTargets(others)
 
 
-def _unsupported_elements(writer: StageWriter) -> list[str]:
+def _unsupported_elements(writer: attr.StageWriter) -> list[str]:
     """Return one message for each kind of thing that the model has and USD does not."""
     model = writer.model
     polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.tendon_stiffnesspoly, model.tendon_dampingpoly)

@@ -18,29 +18,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.usd.attributes import (
-    BALL,
-    FREE,
-    HINGE,
-    JOINT,
-    SLIDE,
-    StageWriter,
-    default_model,
-    rounded,
-    set_custom,
-    set_customs,
-    set_number,
-)
+from tgdsl.formats.usd import attributes as attr
 from tgdsl.formats.usd.joints import Drive
 from tgdsl.formats.usd.stage import usd_modules
 
 JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 NO_DYNAMICS, FIXED_GAIN = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
 AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
-SCHEMAS = {BALL: "SphericalJoint", SLIDE: "PrismaticJoint", HINGE: "RevoluteJoint"}
+SCHEMAS = {attr.BALL: "SphericalJoint", attr.SLIDE: "PrismaticJoint", attr.HINGE: "RevoluteJoint"}
 
 
-def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
+def add_joint(writer: attr.StageWriter, body: int, collides: bool) -> None:
     """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap)."""
     model, count = writer.model, int(writer.model.body_jntnum[body])
     if count > 1:
@@ -50,15 +38,15 @@ def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
         )
     joint = int(model.body_jntadr[body]) if count else -1
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
-    if kind == FREE or model.body_mocapid[body] >= 0:
+    if kind == attr.FREE or model.body_mocapid[body] >= 0:
         if joint >= 0:
-            set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
+            attr.set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
         return
     name = model.joint(joint).name if joint >= 0 else ""
     physics = usd_modules().UsdPhysics
     path = writer.path(writer.scope, name or f"{writer.body_name(body)}_{'fixed' if joint < 0 else 'joint'}")
     made = getattr(physics, SCHEMAS.get(kind, "FixedJoint")).Define(writer.stage, path)
-    set_custom(made.GetPrim(), "name", name)
+    attr.set_custom(made.GetPrim(), "name", name)
     parent = int(model.body_parentid[body])
     if parent:  # a joint without its first body holds the second in the world
         made.CreateBody0Rel().SetTargets([writer.bodies[parent]])
@@ -68,35 +56,35 @@ def add_joint(writer: StageWriter, body: int, collides: bool) -> None:
     _frames(writer, body, joint, made)
     if joint < 0:
         return
-    if kind in (SLIDE, HINGE):
+    if kind in (attr.SLIDE, attr.HINGE):
         made.CreateAxisAttr("X")
         low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-math.inf, math.inf)
-        unit = math.degrees(1.0) if kind == HINGE else 1.0
-        set_number(made.CreateLowerLimitAttr(), low * unit)
-        set_number(made.CreateUpperLimitAttr(), high * unit)
+        unit = math.degrees(1.0) if kind == attr.HINGE else 1.0
+        attr.set_number(made.CreateLowerLimitAttr(), low * unit)
+        attr.set_number(made.CreateUpperLimitAttr(), high * unit)
     _passive(model, joint, made.GetPrim())
     writer.joints[joint] = made
 
 
-def _frames(writer: StageWriter, body: int, joint: int, made: Any) -> None:
+def _frames(writer: attr.StageWriter, body: int, joint: int, made: Any) -> None:
     model = writer.model
     pos, turn = np.zeros(3), Rotation.identity()
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
     if joint >= 0:
         pos = model.jnt_pos[joint]
-    if kind in (SLIDE, HINGE):
+    if kind in (attr.SLIDE, attr.HINGE):
         turn = _x_to(model.jnt_axis[joint])
     child = Rotation.from_quat(model.body_quat[body], scalar_first=True)
     parent_pos, parent_turn = model.body_pos[body] + child.apply(pos), child * turn
-    rest = float(model.qpos0[model.jnt_qposadr[joint]]) if kind in (SLIDE, HINGE) else 0.0
-    if kind == SLIDE:
+    rest = float(model.qpos0[model.jnt_qposadr[joint]]) if kind in (attr.SLIDE, attr.HINGE) else 0.0
+    if kind == attr.SLIDE:
         parent_pos = parent_pos - parent_turn.apply([rest, 0.0, 0.0])
-    elif kind == HINGE:
+    elif kind == attr.HINGE:
         parent_turn = parent_turn * Rotation.from_rotvec([-rest, 0.0, 0.0])
     for number, (place, rotation) in enumerate(((parent_pos, parent_turn), (pos, turn))):
         quat = rotation.as_quat(canonical=True, scalar_first=True)
-        set_number(getattr(made, f"CreateLocalPos{number}Attr")(), rounded(place))
-        set_number(getattr(made, f"CreateLocalRot{number}Attr")(), rounded(quat))
+        attr.set_number(getattr(made, f"CreateLocalPos{number}Attr")(), attr.rounded(place))
+        attr.set_number(getattr(made, f"CreateLocalRot{number}Attr")(), attr.rounded(quat))
 
 
 def _x_to(axis: np.ndarray) -> Rotation:
@@ -109,30 +97,30 @@ def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
     """Write a joint's armature, dry friction and damping, in SI units; of the first two PhysX has attributes, USD has none."""
     first = int(model.jnt_dofadr[joint])
     for prefix, index in (("jnt", joint), ("dof", first)):
-        rows = {name: row for name, row in JOINT.items() if row.array.startswith(prefix)}
-        set_customs(prim, rows, model, default_model(), index)
+        rows = {name: row for name, row in attr.JOINT.items() if row.array.startswith(prefix)}
+        attr.set_customs(prim, rows, model, attr.default_model(), index)
     start = float(model.qpos0[model.jnt_qposadr[joint]])
-    if start and model.jnt_type[joint] in (SLIDE, HINGE):
-        set_custom(prim, "ref", start)
-    if model.jnt_stiffness[joint] and model.jnt_type[joint] in (SLIDE, HINGE):
-        set_custom(prim, "springref", float(model.qpos_spring[model.jnt_qposadr[joint]]))
-    if model.jnt_type[joint] == BALL and model.jnt_limited[joint]:
-        set_custom(prim, "range", model.jnt_range[joint].tolist())
+    if start and model.jnt_type[joint] in (attr.SLIDE, attr.HINGE):
+        attr.set_custom(prim, "ref", start)
+    if model.jnt_stiffness[joint] and model.jnt_type[joint] in (attr.SLIDE, attr.HINGE):
+        attr.set_custom(prim, "springref", float(model.qpos_spring[model.jnt_qposadr[joint]]))
+    if model.jnt_type[joint] == attr.BALL and model.jnt_limited[joint]:
+        attr.set_custom(prim, "range", model.jnt_range[joint].tolist())
     known = {"armature": model.dof_armature[first], "jointFriction": model.dof_frictionloss[first]}
     if any(known.values()):
         prim.AddAppliedSchema("PhysxJointAPI")  # Omniverse reads the attributes only of a prim that says so
     for key, value in known.items():
         if value:
             attribute = prim.CreateAttribute(f"physxJoint:{key}", usd_modules().Sdf.ValueTypeNames.Float, custom=True)
-            set_number(attribute, value)
+            attr.set_number(attribute, value)
     damping = float(model.dof_damping[first])
     if damping:
-        set_custom(prim, "damping", damping)
-    if damping and model.jnt_type[joint] in (SLIDE, HINGE):
+        attr.set_custom(prim, "damping", damping)
+    if damping and model.jnt_type[joint] in (attr.SLIDE, attr.HINGE):
         _drive(model, joint, Drive(0.0, 0.0, math.inf), prim)
 
 
-def add_drives(writer: StageWriter) -> list[int]:
+def add_drives(writer: attr.StageWriter) -> list[int]:
     """Write the actuators that USD has drives for; return the others, which need prims of their own."""
     model, joints, driven = writer.model, writer.joints, dict[int, int]()
     for actuator in range(model.nu):
@@ -141,16 +129,16 @@ def add_drives(writer: StageWriter) -> list[int]:
             continue
         driven[joint] = actuator
         _drive(model, joint, servo, joints[joint].GetPrim())
-        set_custom(joints[joint].GetPrim(), "actuator", model.actuator(actuator).name)
+        attr.set_custom(joints[joint].GetPrim(), "actuator", model.actuator(actuator).name)
     left = [actuator for actuator in range(model.nu) if actuator not in driven.values()]
     if left or list(driven) != sorted(driven):
         for joint, actuator in driven.items():
-            set_custom(joints[joint].GetPrim(), "order", actuator)
+            attr.set_custom(joints[joint].GetPrim(), "order", actuator)
     for joint in joints:
         if model.jnt_actfrclimited[joint]:
-            set_custom(joints[joint].GetPrim(), "actuatorfrcrange", model.jnt_actfrcrange[joint].tolist())
+            attr.set_custom(joints[joint].GetPrim(), "actuatorfrcrange", model.jnt_actfrcrange[joint].tolist())
             if joint in driven and model.actuator_forcelimited[driven[joint]]:
-                set_custom(joints[joint].GetPrim(), "forcerange", model.actuator_forcerange[driven[joint]].tolist())
+                attr.set_custom(joints[joint].GetPrim(), "forcerange", model.actuator_forcerange[driven[joint]].tolist())
     return left
 
 
@@ -160,13 +148,14 @@ def _servo(model: mujoco.MjModel, actuator: int) -> Drive | None:
     if kinds != (NO_DYNAMICS, FIXED_GAIN, AFFINE_BIAS) or model.actuator_trntype[actuator] not in JOINT_TRANSMISSIONS:
         return None
     joint = int(model.actuator_trnid[actuator, 0])
-    if model.jnt_type[joint] not in (SLIDE, HINGE):
+    if model.jnt_type[joint] not in (attr.SLIDE, attr.HINGE):
         return None
     gain, gear = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_gear[actuator, 0])
     offset, stiffness, damping = (0.0 - model.actuator_biasprm[actuator, :3]).tolist()
     is_position, is_velocity = stiffness == gain, stiffness == 0 and damping == gain
     low, high = model.actuator_forcerange[actuator].tolist()
-    if (model.actuator_forcelimited[actuator] and low != -high) or _has_more(model, actuator):
+    more = (model.actuator_delay, model.actuator_history, model.actuator_armature, model.actuator_damping)
+    if (model.actuator_forcelimited[actuator] and low != -high) or any(np.any(array[actuator]) for array in more):
         return None
     if offset or gain <= 0 or not gear or not (is_position or is_velocity):
         return None
@@ -182,21 +171,16 @@ def _servo(model: mujoco.MjModel, actuator: int) -> Drive | None:
     )
 
 
-def _has_more(model: mujoco.MjModel, actuator: int) -> bool:
-    arrays = (model.actuator_delay, model.actuator_history, model.actuator_armature, model.actuator_damping)
-    return any(np.any(array[actuator]) for array in arrays)
-
-
 def _drive(model: mujoco.MjModel, joint: int, servo: Drive, prim: Any) -> None:
     """Write a servo as a joint's drive, or write it over the drive that is there."""
-    is_hinge = model.jnt_type[joint] == HINGE
+    is_hinge = model.jnt_type[joint] == attr.HINGE
     unit = math.radians(1.0) if is_hinge else 1.0  # an angular drive counts in degrees
     drive = usd_modules().UsdPhysics.DriveAPI.Apply(prim, "angular" if is_hinge else "linear")
     drive.CreateTypeAttr("force")
-    set_number(drive.CreateStiffnessAttr(), servo.stiffness * unit)
-    set_number(drive.CreateDampingAttr(), (servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
-    set_number(drive.CreateMaxForceAttr(), servo.max_force)
+    attr.set_number(drive.CreateStiffnessAttr(), servo.stiffness * unit)
+    attr.set_number(drive.CreateDampingAttr(), (servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
+    attr.set_number(drive.CreateMaxForceAttr(), servo.max_force)
     if servo.control:
-        set_custom(prim, "ctrlrange", servo.control)
+        attr.set_custom(prim, "ctrlrange", servo.control)
     if servo.gear != 1.0:
-        set_custom(prim, "gear", servo.gear)
+        attr.set_custom(prim, "gear", servo.gear)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
@@ -66,14 +65,11 @@ class Proposal:
     is_collided: bool  # whether the simulator collides its links; else none of them
     is_misread: bool = False  # whether limits of its hinges look like radians that were read as degrees
 
-    def radius_mm(self, resolution: str) -> float:
-        """Return the sensing radius at a resolution, to two digits [mm]."""
-        return float(f"{1e3 * COVERING / np.sqrt(self.density * FACTORS[resolution]):.2g}")
-
     def placement(self, link: LinkProposal, resolution: str) -> dict[str, Any]:
         """Return how a link is sampled, as the grammar has it."""
         result: dict[str, Any] = {"method": "poisson", "count": link.counts[resolution]}
-        result |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
+        radius_mm = float(f"{1e3 * COVERING / np.sqrt(self.density * FACTORS[resolution]):.2g}")
+        result |= {"radius": f"{radius_mm:g} mm", **link.options}
         if link.facing is not None:
             facing = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
             result["region"] = facing
@@ -113,7 +109,9 @@ def propose(
         if name in surfaces
     )
     groups = _groups(flexions, names, tuple(surfaces)) if with_groups else {}
-    shared, is_misread = _shared(robot, tuple(surfaces)), angles_are_misread(robot.compiled)
+    # A selection by a link's name also takes other links' geoms and meshes of that name.
+    elsewhere = {name for geom in robot.geoms if geom.body in surfaces for name in geom.names if name != geom.body}
+    shared, is_misread = tuple(name for name in surfaces if name in elsewhere), angles_are_misread(robot.compiled)
     return Proposal(density, groups, links, left_out, shared, sampler.is_collided, is_misread)
 
 
@@ -225,7 +223,8 @@ def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box | None, den
     share, facing, doubt = 1.0, side.facing, side.doubt
     if facing is not None:
         pool = surface.pool
-        is_in = _faces(pool.normal, facing)
+        direction = np.array(facing) / np.linalg.norm(facing)
+        is_in = pool.normal @ direction >= np.cos(np.radians(WITHIN_DEG))
         if box is not None:
             is_in &= ((pool.pos >= box[0]) & (pool.pos <= box[1])).all(axis=1)
         share = float(pool.point_area[is_in].sum()) / pool.area
@@ -239,11 +238,6 @@ def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box | None, den
             f'link "{name}" would have {max(counts.values())} taxels, expected at most {MAX_COUNT}; lower the density'
         )
     return LinkProposal(name, area, facing, doubt, counts, surface.options, box)
-
-
-def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool[np.ndarray, " n"]:
-    direction = np.array(facing) / np.linalg.norm(facing)
-    return normals @ direction >= np.cos(np.radians(WITHIN_DEG))
 
 
 def _groups(flexions: Sequence[Flexion], names: dict[int, str], links: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
@@ -272,8 +266,3 @@ def _groups(flexions: Sequence[Flexion], names: dict[int, str], links: tuple[str
 
 def escaped(name: str) -> str:
     return re.sub(r"[*?\[]", r"[\g<0>]", name)
-
-
-def _shared(robot: Model, links: tuple[str, ...]) -> tuple[str, ...]:
-    elsewhere = {name for geom in robot.geoms if geom.body in links for name in geom.names if name != geom.body}
-    return tuple(name for name in links if name in elsewhere)
