@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from tgdsl.fields.models import Selection
@@ -45,16 +45,12 @@ def _table(layout: Layout) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)
-    writer.writerows(_rows(layout))
-    return text.getvalue()
-
-
-def _rows(layout: Layout) -> Iterator[list[str]]:
     for i in range(layout.num_taxels):
         cell = [str(n) for n in layout.cell[i].tolist()] if layout.cell[i].min() >= 0 else ["", ""]
         numbers = [*layout.pos[i], *layout.normal[i], *layout.tangent[i], layout.radius[i]]
         area = repr(float(layout.area[i])) if layout.area[i] > 0 else ""  # of a filler that covers nothing
-        yield [layout.links[layout.link_id[i]].name, *cell, *(repr(float(number)) for number in numbers), area]
+        writer.writerow([layout.links[layout.link_id[i]].name, *cell, *(repr(float(number)) for number in numbers), area])
+    return text.getvalue()
 
 
 def _text(spec: LayoutSpec, layouts: Mapping[str, Layout], tables: Mapping[str, str], origin: str) -> str:

@@ -25,7 +25,7 @@ Where MuJoCo leaves a choice:
   MuJoCo's own filter of parents (`mjc:flag:filterparent`) decides.
 - Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2; or as `mjc:group` says.
 - Materials' looks, subdivision, holes of meshes and what is not drawn by default are left out. Whatever else is authored and
-  nobody has read is warned of, by attribute and prim (`audit.py`).
+  nobody has read is warned of, by attribute and prim (`note_unread`).
 - Custom attributes `tgdsl:` that `export` writes are read back, in SI units and radians whatever those of the stage.
 """
 

@@ -391,8 +391,12 @@ def note_unread(stage: Stage) -> None:
     """Record what was authored and not read, for the warnings when the stage is closed. Nothing may be read after this."""
     for prim in stage.prims:
         kind = str(prim.GetTypeName())
-        if kind.startswith(DRAWN_TYPES) or kind.endswith("Light") or _is_off(stage, prim):
+        if kind.startswith(DRAWN_TYPES) or kind.endswith("Light"):
             continue
+        is_collider, is_joint = stage.has(prim, "PhysicsCollisionAPI"), prim.IsA(stage.pxr.UsdPhysics.Joint)
+        switches = (("physics:jointEnabled", is_joint), ("physics:collisionEnabled", is_collider))
+        if any(is_there and stage.value(prim, name) is False for name, is_there in switches):
+            continue  # what is disabled has no meaning
         if stage.owners[str(prim.GetPath())] is None:  # the world's parts have no mass
             stage.note(prim, *MASS)
         if kind not in KNOWN_TYPES:
@@ -404,12 +408,6 @@ def note_unread(stage: Stage) -> None:
                 stage.drop(f"the API schema {base} was dropped", prim)
         for name in _unread(stage, prim):
             stage.drop(f"{name} was dropped, which means nothing here", prim)
-
-
-def _is_off(stage: Stage, prim: Prim) -> bool:
-    enabled = [("physics:jointEnabled", prim.IsA(stage.pxr.UsdPhysics.Joint))]
-    enabled += [("physics:collisionEnabled", stage.has(prim, "PhysicsCollisionAPI"))]
-    return any(is_there and stage.value(prim, name) is False for name, is_there in enabled)
 
 
 def _unread(stage: Stage, prim: Prim) -> Iterator[str]:

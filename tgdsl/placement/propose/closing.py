@@ -106,7 +106,8 @@ class Poses:
         basis = list(rows[sizes > INDEPENDENT * max(float(sizes.max(initial=0.0)), 1e-9)])
         place = {int(dof): i for i, dof in enumerate(self.dofs)}
         driven, result = _driven(self.model), []
-        for joint in sorted(self.joints, key=lambda j: (not self.model.jnt_limited[j], j not in driven, self._depth(j), j)):
+        depth = {j: len(self.tree.path(self.tree.segment[int(self.model.jnt_bodyid[j])])) for j in self.joints}
+        for joint in sorted(self.joints, key=lambda j: (not self.model.jnt_limited[j], j not in driven, depth[j], j)):
             row = np.zeros(len(self.dofs))
             row[place[int(self.model.jnt_dofadr[joint])]] = 1.0
             for other in basis:
@@ -115,9 +116,6 @@ class Poses:
                 basis.append(row / size)
                 result.append(joint)
         return sorted(result)
-
-    def _depth(self, joint: int) -> int:
-        return len(self.tree.path(self.tree.segment[int(self.model.jnt_bodyid[joint])]))
 
     def _equalities(self, segments: set[int], joints: set[int]) -> list[int]:
         """Return the active equalities that bind joints of the hand to one another."""
@@ -349,8 +347,11 @@ class Closing:
             beyond = [other for other in path if other != joint and self.segment(joint) in path[other][1:]]
             if beyond and not any(abs(cosine) > PARALLEL for other in beyond for cosine in self._cosines(joint, other)):
                 axes += [(joint, self.chain[self.segment(i)], axis) for i, axis in self.rotations[joint].items()]
-        if axes and {chain for _, chain, _ in axes} == set(self.chain.values()) and _are_around([axis for _, _, axis in axes]):
-            return {one for one, _, _ in axes}
+        if axes and {chain for _, chain, _ in axes} == set(self.chain.values()):
+            # As lines, are they spread evenly around a third direction, as spokes are?
+            spread = np.linalg.eigvalsh(np.mean([np.outer(axis, axis) for _, _, axis in axes], axis=0))
+            if spread[1] > EVENLY:
+                return {one for one, _, _ in axes}
         return {
             one
             for one, chain, axis in axes
@@ -358,7 +359,10 @@ class Closing:
         }
 
     def _motion(self, joint: int, half: float, whole: float) -> Motion | None:
-        gain = self.hand.closes or (half + whole if _is_clear(half, whole) else 0.0)
+        # With the other joints half closed and closed: both agree, or one by far outweighs the other.
+        small, large = sorted((abs(half), abs(whole)))
+        is_clear = large > MIN_CLOSING and (half * whole > 0 or small < 0.5 * large)
+        gain = self.hand.closes or (half + whole if is_clear else 0.0)
         sense, lean = self.sense.get(joint, 0.0), self.lean[joint] if abs(self.lean[joint]) == 1.0 else 0.0
         siblings = [j for j in self.sense if self.chain[self.segment(j)] == self.chain[self.segment(joint)]]
         doubt = self.tree.doubt
@@ -391,13 +395,3 @@ class Closing:
         data = self.poses.kinematics(self.poses.pose(values))
         bodies = [*self.hand.tips, *([self.hand.palm] if self.hand.palm is not None else [])]
         return np.array([self.tree.centre(body, data) for body in bodies]).reshape(-1, 3)
-
-
-def _is_clear(half: float, whole: float) -> bool:
-    small, large = sorted((abs(half), abs(whole)))
-    return large > MIN_CLOSING and (half * whole > 0 or small < 0.5 * large)
-
-
-def _are_around(axes: Sequence[Float[np.ndarray, " 3"]]) -> bool:
-    spread = np.linalg.eigvalsh(np.mean([np.outer(axis, axis) for axis in axes], axis=0))
-    return bool(spread[1] > EVENLY)

@@ -3,9 +3,8 @@
 A point is on the outer surface if it is in no solid component (by winding numbers) and is visible from far away: pockets
 may be joined to the outside by a pinhole.
 
-Poisson-disk samplers of pymeshlab and libigl are unseeded and have no exact count (libigl's blue noise of one radius on one
-sphere: 84 to 92 points), trimesh's rejects points within a radius; none knows a region, and all follow the mesh's order of
-faces. So the pool is drawn on lines that are fixed in space (`lattice`), or on request by pymeshlab's stratified sampling of
+Poisson-disk samplers of pymeshlab, libigl and trimesh have no exact count and no region, and follow the mesh's order of faces.
+So the pool is drawn on lines that are fixed in space (`lattice`), or on request by pymeshlab's stratified sampling of
 triangles, which draws no random numbers. Each point has a priority, and points are taken by dart throwing in the order of
 their priorities: at one spacing, or, for an exact count, at spacings that fall along a fixed series
 until there are enough. Hence a mesh whose vertices are off by rounding gives the same samples: a decision changes only where a
