@@ -19,17 +19,7 @@ from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
 
 LEAST_INERTIA = 1e-9  # least principal moment of a body whose inertia, as its file has it, is that of no real body [kg·m²]
-SHAPE_NAMES: dict[int, str] = {
-    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
-    mujoco.mjtGeom.mjGEOM_HFIELD: "hfield",
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-    mujoco.mjtGeom.mjGEOM_SDF: "sdf",
-}
+SHAPE_NAMES = {int(kind): name.removeprefix("mjGEOM_").lower() for name, kind in mujoco.mjtGeom.__members__.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,12 +17,7 @@ from tgdsl.schema.select import select
 
 _HEADER = ("body", "joints", "geoms", "area [cm²]", "mass [g]", "groups")
 _NUMBERS = (3, 4)
-_JOINTS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): "free",
-    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
-    int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
-    int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
-}
+_JOINTS = ("free", "ball", "slide", "hinge")  # in the order of mjtJoint
 
 
 def links_table(robot: Model, layout: Path | None = None) -> list[str]:
