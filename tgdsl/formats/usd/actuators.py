@@ -42,22 +42,18 @@ def read_actuators(stage: Stage, names: Names) -> list[Actuator]:
     prims = [prim for prim in stage.prims if prim.GetTypeName() in (MJC_ACTUATOR, NEWTON_ACTUATOR)]
     prim_names = unique_names(stage, prims)
     results: list[Actuator] = []
-    for prim in (prim for prim in prims if prim.GetTypeName() == MJC_ACTUATOR):
-        if actuator := _mjc_actuator(stage, prim, names, prim_names[str(prim.GetPath())]):
+    for prim in sorted(prims, key=lambda prim: prim.GetTypeName() != MJC_ACTUATOR):
+        is_newton = prim.GetTypeName() == NEWTON_ACTUATOR
+        actuator = (_newton_actuator if is_newton else _mjc_actuator)(stage, prim, names, prim_names[str(prim.GetPath())])
+        if actuator and is_newton and actuator.joint in [other.joint for other in results]:
+            stage.drop("NewtonActuators were dropped whose joint has an MjcActuator", prim)
+        elif actuator:
             results.append(actuator)
-    for prim in (prim for prim in prims if prim.GetTypeName() == NEWTON_ACTUATOR):
-        if actuator := _newton_actuator(stage, prim, names, prim_names[str(prim.GetPath())]):
-            if actuator.joint in [other.joint for other in results]:
-                stage.drop("NewtonActuators were dropped whose joint has an MjcActuator", prim)
-            else:
-                results.append(actuator)
     return results
 
 
 def _mjc_actuator(stage: Stage, prim: Prim, names: Names, name: str) -> Actuator | None:
-    targets, slider, reference = (
-        [str(path) for path in stage.targets(prim, f"mjc:{kind}")] for kind in ("target", "sliderSite", "refSite")
-    )
+    targets, slider, reference = (stage.targets(prim, f"mjc:{kind}") for kind in ("target", "sliderSite", "refSite"))
     is_in_parent, order = bool(stage.authored(prim, "mjc:jointInParent")), attr.read_custom(stage, prim, "order")
     attributes = attr.with_limits(stage, attr.read_attributes(stage, prim, attr.ACTUATOR), attr.LIMITS)
     target = targets[0] if targets else ""
@@ -83,7 +79,7 @@ def _mjc_actuator(stage: Stage, prim: Prim, names: Names, name: str) -> Actuator
 
 def _newton_actuator(stage: Stage, prim: Prim, names: Names, name: str) -> Actuator | None:
     """Return effort = constant + kp (target - q) - kd v as an actuator; without kp the control is the target velocity."""
-    targets = [str(path) for path in stage.targets(prim, "newton:targets")]
+    targets = stage.targets(prim, "newton:targets")
     if not targets or targets[0] not in names.moving:
         stage.drop(NO_TARGET, prim)
         return None
@@ -107,12 +103,10 @@ def servos_of(stage: Stage, joints: Iterable[Joint], prims: Sequence[Actuator], 
     results, of_joint = list[Actuator](), {actuator.joint: actuator for actuator in prims if actuator.joint}
     taken = {actuator.attributes["name"] for actuator in prims}
     for joint in joints:
-        other = of_joint.get(joint.path)
-        if joint.drive is None:
-            continue
-        if other is None or not math.isinf(joint.drive.order):
-            results.append(_servo(joint, joint.drive, names.joints[joint.path], taken))
-        elif not _is_same_servo(joint.drive, other):
+        drive, other = joint.drive, of_joint.get(joint.path)
+        if drive and (other is None or not math.isinf(drive.order)):
+            results.append(_servo(joint, drive, names.joints[joint.path], taken))
+        elif drive and other and not _is_same_servo(drive, other):
             stage.drop("drives were dropped, which contradict the actuator prims of their joints", joint.prim)
     return results
 
@@ -209,9 +203,9 @@ def read_tendons(stage: Stage, tendon: ET.Element, names: Names) -> None:
 def _tendon(stage: Stage, prim: Prim, names: Names) -> ET.Element | None:
     is_fixed = str(stage.value(prim, "mjc:type")) == "fixed"
     attributes = attr.with_limits(stage, attr.read_attributes(stage, prim, attr.TENDON), ("", "actuatorfrc"))
-    drawn = attr.read_attributes(stage, prim, attr.DRAWN)
+    drawn = attr.read_attributes(stage, prim, attr.DRAWN)  # a fixed one is not drawn
     attributes |= {} if is_fixed else drawn
-    targets = [str(path) for path in stage.targets(prim, "mjc:path")]
+    targets = stage.targets(prim, "mjc:path")
     order = _array(stage, prim, "path:indices") or list(range(len(targets)))
     if not order or max(order) >= len(targets) or min(order) < 0:
         raise stage.error(prim, f"mjc:path:indices is {order}; mjc:path has {len(targets)} targets")
@@ -235,7 +229,7 @@ def _spatial(stage: Stage, prim: Prim, names: Names, element: ET.Element, path: 
     """Add the sites, geoms and pulleys of a spatial tendon; return it if all are there, side sites included."""
     segments, divisors = _array(stage, prim, "path:segments") or [0] * len(path), _array(stage, prim, "path:divisors")
     beside = _array(stage, prim, "sideSites:indices") or [-1] * len(path)
-    sides = [str(side) for side in stage.targets(prim, "mjc:sideSites")]
+    sides = stage.targets(prim, "mjc:sideSites")
     for name, values in (("path:segments", segments), ("sideSites:indices", beside)):
         if len(values) != len(path):
             raise stage.error(prim, f"mjc:{name} has {len(values)} numbers; the path has {len(path)} points")

@@ -58,7 +58,7 @@ def read_couplings(stage: Stage, equality: ET.Element, joints: Iterable[Joint], 
         authored = attr.read_attributes(stage, prim, attr.MIMIC, is_angular=joint.kind == "hinge")
         leaders = []
         for name in ("mjc:target", "newton:mimicJoint"):
-            targets = [str(path) for path in stage.targets(prim, name)]
+            targets = stage.targets(prim, name)
             if len(targets) > 1:
                 raise stage.error(prim, f"{name} has {len(targets)} targets, {listed(targets)}; expected one, which it follows")
             leaders += targets
@@ -83,7 +83,7 @@ def read_polynomials(stage: Stage, equality: ET.Element, names: Names) -> None:
     for prim in stage.prims:
         if prim.GetTypeName() != "Scope" or (coefficients := attr.read_custom(stage, prim, "polycoef")) is None:
             continue
-        paths = [str(path) for end in (1, 2) for path in stage.targets(prim, f"{NAMESPACE}end{end}")]
+        paths = [path for end in (1, 2) for path in stage.targets(prim, f"{NAMESPACE}end{end}")]
         tag = next((tag for tag, names_by_path in ends.items() if paths and all(path in names_by_path for path in paths)), None)
         if tag is None:
             stage.drop("equality constraints were dropped whose ends are no joints or tendons of the model", prim)

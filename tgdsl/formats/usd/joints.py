@@ -251,7 +251,7 @@ def _side(stage: Stage, prim: Prim, side: int) -> tuple[str | None, Matrix, str]
     if not np.isfinite(local).all():
         raise stage.error(prim, f"physics:localPos{side} is not finite")
     frame = frame @ local
-    return body, stage.in_body(frame, body), str(targets[0]) if targets else ""
+    return body, stage.in_body(frame, body), targets[0] if targets else ""
 
 
 def rotation_of(stage: Stage, prim: Prim, name: str) -> Rotation:

@@ -154,10 +154,11 @@ class Stage:
         self.note(prim, name)
         return self.value(prim, name) if attribute and attribute.HasAuthoredValue() else None
 
-    def targets(self, prim: Prim, name: str) -> list[Any]:
+    def targets(self, prim: Prim, name: str) -> list[str]:
+        """Return the paths that a relationship names, through those that it forwards to."""
         self.note(prim, name)
         relationship = prim.GetRelationship(name)
-        return list(relationship.GetForwardedTargets()) if relationship else []
+        return [str(path) for path in relationship.GetForwardedTargets()] if relationship else []
 
     def note(self, prim: Prim, *names: str) -> None:
         path = str(prim.GetPath())
