@@ -28,8 +28,7 @@ class Actuator:
 class RobotJoints:
     """A robot's joints and actuators."""
 
-    # names of its hinges and slides: first the actuated ones, in the order of the actuators, then the others
-    joints: tuple[str, ...]
+    joints: tuple[str, ...]  # hinges and slides: first the actuated ones, in the order of the actuators
     num_actuated: int  # how many of them have an actuator
     slides: frozenset[str]  # those that are slides
     others: tuple[str, ...]  # names of its ball and free joints

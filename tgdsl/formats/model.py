@@ -31,8 +31,7 @@ class Model:
     compiled: mujoco.MjModel  # MuJoCo's compiled model
     is_rounded: bool  # whether `mjcf` has six digits, as of URDF
     mjcf: str = ""  # the MJCF that it was turned into, if its file is no MJCF; else empty
-    # files of meshes that `spec` has in memory, in another format, by their names there
-    rewritten: Mapping[str, Path] = field(default_factory=dict)
+    rewritten: Mapping[str, Path] = field(default_factory=dict)  # files of meshes that `spec` has rewritten in memory
 
     def changed(self, change: Callable[[mujoco.MjSpec], object]) -> Model:
         """Return the model with a change of its spec, recompiled."""

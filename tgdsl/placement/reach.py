@@ -33,13 +33,10 @@ _UNBOUNDED = ("plane", "hfield", "sdf", "unknown")
 class Reach:
     """What the colliding geoms of a robot leave of each taxel."""
 
-    # whether any geom of the taxel's body can be in a contact; of a contact sensor only these count
-    is_collided: Bool[np.ndarray, " taxel"]
-    # how deep the taxel is inside one geom of its own rigid link [m]; at most 0 if it is inside none
-    depth: Float[np.ndarray, " taxel"]
+    is_collided: Bool[np.ndarray, " taxel"]  # whether any geom of the taxel's body can be in a contact
+    depth: Float[np.ndarray, " taxel"]  # in its own rigid link [m]; at most 0 outside
     is_buried: Bool[np.ndarray, " taxel"]  # whether its whole ball is inside its own rigid link
-    # the body of another link that it is inside of, by MuJoCo's index; −1 if it is inside none
-    cover: Int[np.ndarray, " taxel"]
+    cover: Int[np.ndarray, " taxel"]  # index of the body of another link that it is inside of; −1 if none
 
 
 class Colliders:

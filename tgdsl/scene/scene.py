@@ -21,8 +21,7 @@ from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.options import Options, set_options
 
 FORCED, IF_NEEDED = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE, mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-WEIGHED = ("type", "size", "pos", "quat", "density", "mass", "meshname")
-"""What a geom's mass and inertia depend on, but for its mesh."""
+WEIGHED = ("type", "size", "pos", "quat", "density", "mass", "meshname")  # what a geom's mass and inertia depend on
 
 
 def weigh(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:

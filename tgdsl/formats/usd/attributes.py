@@ -32,8 +32,7 @@ from tgdsl.formats.usd.stage import NAMESPACE, Prim, Stage, usd_modules
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
 DECIMALS = 14  # decimals of positions and rotations: those beyond are rounding, which differs from machine to machine
 AGREEMENT = 1e-5  # relative difference up to which two sources say the same: some attributes are float32
-TOKENS = {"euler": "Euler", "rk4": "RK4", "pgs": "PGS", "cg": "CG", "newton": "Newton"}
-"""MjcPhysics' tokens that MJCF spells otherwise."""
+TOKENS = {"euler": "Euler", "rk4": "RK4", "pgs": "PGS", "cg": "CG", "newton": "Newton"}  # MJCF's spelling of MjcPhysics' tokens
 
 
 def _keywords(enum: Any) -> tuple[str, ...]:
@@ -90,8 +89,7 @@ class Source:
 class Row:
     """Where the value of an MJCF attribute is."""
 
-    # array of `MjModel`, or field of `MjOption` or `MjsMesh`, from which it is written; empty if not by the table
-    array: str = ""
+    array: str = ""  # of `MjModel`, `MjOption` or `MjsMesh`; empty if it is not written by the table
     sources: tuple[Source, ...] = ()  # USD attributes, most specific first; `tgdsl:<MJCF's name>` always comes before them
 
 
@@ -212,8 +210,7 @@ TENDON: Table = {
     "actuatorfrclimited": mjc("actuatorfrclimited", array="tendon_actfrclimited"),
     "actuatorfrcrange": mjc("actuatorfrcrange", array="tendon_actfrcrange", is_range=True),
 }
-DRAWN: Table = {"rgba": mjc("rgba"), "width": mjc("width", array="tendon_width")}
-"""Of a spatial tendon; a fixed one is not drawn."""
+DRAWN: Table = {"rgba": mjc("rgba"), "width": mjc("width", array="tendon_width")}  # of a spatial tendon
 KEY: Table = {
     "time": Row("key_time"),
     **{name: mjc(name, array=f"key_{name}") for name in ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")},
@@ -375,8 +372,7 @@ class StageWriter:
     root: str = ""  # path of the default prim
     scope: str = ""  # path of the scope that holds joints and what acts on them
     materials: str = ""  # path of the scope that holds physics materials
-    # path of each body's prim by MuJoCo's index; the world's is there only if it holds something
-    bodies: dict[int, str] = field(default_factory=dict)
+    bodies: dict[int, str] = field(default_factory=dict)  # path of each body's prim, by MuJoCo's index
     sites: dict[int, str] = field(default_factory=dict)  # path of each site's prim, by MuJoCo's index
     geoms: dict[int, str] = field(default_factory=dict)  # path of each geom's prim, by MuJoCo's index
     joints: dict[int, Any] = field(default_factory=dict)  # schema of each joint that can move, by MuJoCo's index

@@ -16,8 +16,7 @@ from tgdsl.formats.usd.joints import rotation_of
 from tgdsl.formats.usd.shapes import SCHEMAS, Shape, collision_shape, shape_of
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
-MASS_MODELS = ("legacy", "convex", "exact", "shell")
-"""Ways in which MuJoCo takes the mass of a mesh; `shell` is there for all shapes."""
+MASS_MODELS = ("legacy", "convex", "exact", "shell")  # of a mesh, in MuJoCo; `shell` of any shape
 MASKS = ("tgdsl:contype", "tgdsl:conaffinity")
 FRICTIONS = ("dynamicFriction", "staticFriction")  # coefficients of a physics material, the one that MuJoCo gets first
 
@@ -189,8 +188,7 @@ class Inertial:
     mass: float  # [kg]
     centre: Vector  # centre of mass [m]
     tensor: Tensor  # inertia about it [kg·m²]
-    # principal moments [kg·m²] and the rotation of their axes, if they are given in an order of their own
-    axes: tuple[Vector, Rotation] | None = None
+    axes: tuple[Vector, Rotation] | None = None  # principal moments [kg·m²] and their axes, in the given order
 
     def principal(self) -> tuple[Vector, Rotation]:
         """Return the principal moments [kg·m²] and the rotation of their axes."""

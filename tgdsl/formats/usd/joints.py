@@ -57,8 +57,7 @@ class Joint:
     range: Range | None  # least and greatest position [rad or m], or None if it has no limits
     drive: Drive | None  # what drives it
     is_excluded: bool  # whether it is kept out of the articulation
-    # whether the bodies must not collide; None leaves it to MuJoCo's own filter of parents and children
-    is_filtering: bool | None
+    is_filtering: bool | None  # whether the bodies must not collide; None: MuJoCo's filter decides
     is_stackable: bool  # whether it adds its motion to that of other joints between the same two bodies
     constraint: str  # if it is an equality constraint of MuJoCo, its schema; or empty
     is_active: bool  # whether that constraint is active

@@ -60,8 +60,7 @@ from tgdsl.formats.usd.stage import NAME_ATTRIBUTE, Matrix, Names, Prim, Stage, 
 
 AXIS_ARM = 0.05  # distance between the two connect constraints along the axis of a revolute joint that closes a loop [m]
 REST_TOLERANCE = 1e-6  # largest authored position without a keyframe [rad or m]: it is rounding of float32
-VISIBLE, VISUAL, HIDDEN = "0", "2", "3"
-"""Groups of geoms: colliders that are visible, visuals that do not collide, what is not visible."""
+VISIBLE, VISUAL, HIDDEN = "0", "2", "3"  # groups of visible colliders, of visuals that do not collide, of what is invisible
 FRICTION = (1.0, 0.005, 0.0001)  # MuJoCo's default friction of a geom
 
 

@@ -61,8 +61,7 @@ class Stage:
     usd: Any  # the `pxr.Usd.Stage`
     pxr: Any  # the modules of usd-core
     dropped: dict[str, list[str]] = field(default_factory=dict)  # prim paths by what was dropped of them, in the order found
-    # path of the prim and name of each attribute and relationship that was read
-    read: set[tuple[str, str]] = field(default_factory=set)
+    read: set[tuple[str, str]] = field(default_factory=set)  # paths of prims and names of properties that were read
 
     @cached_property
     def metres_per_unit(self) -> float:

@@ -199,8 +199,7 @@ SYMMETRIC = 0.05  # limits are the same both ways if their middle is nearer to z
 MIN_CLOSING = 0.03  # least share by which the tips must draw nearer for an end of a joint's range to count as closed
 MIN_BEND = np.radians(29.9)  # a hinge that turns by less than this does not close a finger, but shapes a palm
 PARALLEL = 0.7  # least cosine of the angle between two axes about which a finger curls
-EVENLY = 0.4
-"""Mean squared cosine of axes to the second direction of their plane from which on they are spokes: 1/2 if evenly spread."""
+EVENLY = 0.4  # least second eigenvalue of the axes of spokes: 1/2 if evenly spread
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 

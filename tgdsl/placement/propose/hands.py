@@ -90,8 +90,7 @@ def _servo_limits(model: mujoco.MjModel) -> dict[int, tuple[float, float]]:
 
 
 MAX_FINGER = 0.35  # a longer chain is an arm or a leg, of which nothing closes [m]
-MAX_STEM = 1.5
-"""Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
+MAX_STEM = 1.5  # largest stem of a hand, in lengths of the longest chain beyond it
 MIN_TIP = 0.1  # least surface of a fingertip, as a share of the largest body fixed to it
 JAW_REACH = 0.5  # a fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed
 MIN_JAW_TURN, MAX_JAW_TURN = np.radians(19.9), np.radians(200.1)
@@ -214,8 +213,7 @@ class Hand:
 
     base: int  # segment from which the chains part; 0 if that is the world
     mounts: list[int]  # bodies of it that have surface; where chains part, without those before the one that carries them
-    # the largest of these, of those that carry all chains if any does; None if there is none or only one chain
-    palm: int | None
+    palm: int | None  # the largest mount, of those that carry all chains if any does; None without one or with one chain
     chains: list[list[int]]  # segments of each chain
     tips: list[int]  # bodies at the ends of the chains
     fingers: list[int]  # all bodies that move against the base, tips included

@@ -49,8 +49,7 @@ class LinkProposal:
     doubt: str  # what speaks against that side, or why there is none; empty if nothing does
     counts: dict[str, int]  # number of taxels at each resolution
     options: Options  # options by which taxels are where they can feel
-    # lower and upper corner of what is no tower beside the hand, in the link's frame [m]; None if it is all of it
-    box: Box | None = None
+    box: Box | None = None  # corners of the part without a tower, in the link's frame [m]; None: all of it
 
 
 @dataclass(frozen=True)

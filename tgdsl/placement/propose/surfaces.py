@@ -24,8 +24,7 @@ from tgdsl.surfaces.surface import Surface
 NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
 HIDDEN = "behind what is fixed in front of it; --include adds it"
 COVERED = "all of it is inside other links in the initial state"
-MAX_MARKER = 2e-5
-"""A link with no more surface than this only marks a place, such as a ball of a millimetre at a fingertip [m²]."""
+MAX_MARKER = 2e-5  # largest surface of a marker, such as a ball of a millimetre at a fingertip [m²]
 MIN_AREA = 1e-8  # a surface smaller than this is degenerate [m²]
 _NO_AREA = "a surface without area"
 _ANYWHERE = Region(is_geom=None, facings=(), boxes=(), spheres=())

@@ -45,8 +45,7 @@ _MISREAD = (
 )
 _NO_PALM = "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n"
 
-USUAL_DENSITY = (100.0, math.inf)
-"""Taxels per area below which another unit was most likely meant [1/m²]: one per square decimetre."""
+USUAL_DENSITY = (100.0, math.inf)  # below one per dm² another unit was most likely meant [1/m²]
 
 
 def new_layout(

@@ -35,8 +35,7 @@ DIRECTIONS, FIRST_DIRECTIONS = 100, 10
 """Directions from which points are looked at: what none of them sees is a pocket that nothing outside can touch. Whether what
 the first ones do not see is inside of solids is found before it is looked at from the others."""
 PER_SAMPLE = 50  # points per sample by which the area of each sample is measured; also the density of the pool for a spacing
-MIN_POOL, MAX_POOL = 10_000, 400_000
-"""Bounds of the number of points in a pool; more are drawn only where an exact count needs them."""
+MIN_POOL, MAX_POOL = 10_000, 400_000  # points in a pool; more are drawn only where an exact count needs them
 MANY = 30  # points by which the area of a piece is known well enough to set it right for this piece alone
 FIRST_SPACING, SPACING_RATIO = 0.81, 0.99
 """Of an exact count: the largest first spacing, relative to the hexagonal packing's, at which nearly all samples fit; and each

@@ -22,8 +22,7 @@ from tgdsl.surfaces.region import Covered, Region, unit
 from tgdsl.surfaces.surface import Surface
 
 MIN_COSINE = 0.1  # a grid cell on a steep face counts at most 1/0.1 times its projected area
-ROUNDED = 1e-14
-"""Largest rounding of a squared length, and of the cosine of a normal and a tangent that was projected across it."""
+ROUNDED = 1e-14  # largest rounding of a squared length, and of the cosine of a normal and its tangent
 MAX_DENSITY = poisson.MAX_POOL / poisson.PER_SAMPLE
 """Largest area per squared spacing: about 0.7 times as many samples fit, and the pool resolves no finer spacing."""
 
