@@ -213,7 +213,7 @@ def row_tables(plan: Plan) -> dict[str, TaxelTable]:
             if axis.name == "taxel":
                 result[reading.name] = taxel_table(plan.layout_of(sensor))
                 continue
-            columns = {name: np.array(texts) for name, texts in axis.texts.items()} | axis.numbers
+            columns = {**{name: np.array(texts) for name, texts in axis.texts.items()}, **axis.numbers}
             result[reading.name] = _structured(columns or {"row": np.arange(axis.size)}, axis.size)
     return result
 

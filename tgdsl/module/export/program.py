@@ -167,8 +167,8 @@ def export_step(step: Step, path: Path, to: File, options: dict[str, Any], sourc
     program, text = _traced(flat, step.plan), {Path(ENTRY).stem: signature.to_json()}
     with atomic_path(path) as temporary:
         if to == "onnx":
-            names = ([port.name for port in ports] for ports in (inputs, results))
-            write_onnx(_without_strides(program), *names, text, temporary)
+            given, returned = ([port.name for port in ports] for ports in (inputs, results))
+            write_onnx(_without_strides(program), given, returned, text, temporary)
         elif to == "pt2":
             torch.export.save(program, str(temporary), extra_files={ENTRY: signature.to_json()})
         else:
