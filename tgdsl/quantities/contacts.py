@@ -155,7 +155,7 @@ def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceContacts:
-    """The solver's contacts, each in the frame of its body: `request.ContactPoints` as a list."""
+    """The solver's contacts, each in the frame of its body: `ContactPoints` as a list."""
 
     body: Int[np.ndarray, " contact"]  # which body each is on
     pos: Float[np.ndarray, "contact 3"]  # contact points [m]

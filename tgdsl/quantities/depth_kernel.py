@@ -1,6 +1,6 @@
 """Points of an object in the links' frames, and how deep in the links' own surfaces, on a GPU, in one kernel.
 
-It is what `points.with_points` finds of one geom of the links, where that is a grid. A program takes a link of an environment
+It is what `points.link_points` finds of one geom of the links, where that is a grid. A program takes a link of an environment
 and all points, a block after the other. Nothing is looked up where the gate is closed or a whole block is outside the grid.
 Outside the distance reads +∞ and its gradient 0: grids hold all distances that those who ask for points want to know.
 

@@ -43,7 +43,7 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True, eq=False)
 class FieldTable(Generic[Array]):
-    """Fields of moments, one after the other: see `moments.MomentField`."""
+    """Fields of moments, one after the other: see `MomentField`."""
 
     values: Array  # at the nodes, float32, (node, channel)
     first: Array  # index of each field's node (0, 0, 0), (table,)
@@ -56,7 +56,7 @@ class FieldTable(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class CloudTable(Generic[Array]):
-    """Points and lists of those within reach, one cloud after the other: see `moments.PointCloud`."""
+    """Points and lists of those within reach, one cloud after the other: see `PointCloud`."""
 
     points: Array  # places [m], (3, row); the last one is out of reach of everything
     weight: Array  # surface that each point stands for [m²], (variant,)

@@ -1,7 +1,7 @@
 """Moments from a field on a GPU, in one kernel: each probe's place in the object's frame, the lookup, the way back.
 
-It is what `nearby.with_moments` computes for an object with a field and without planes. The four numbers of a node are one load
-of 16 bytes. Nothing is loaded for a probe that is inactive or outside the lattice: it reads zero.
+It is what `moment_sums.felt_moments` computes for an object with a field and without planes. The four numbers of a node are one
+load of 16 bytes. Nothing is loaded for a probe that is inactive or outside the lattice: it reads zero.
 
 Shapes: `env` environments, `taxel` probes, `pair` pairs of the object, `node` nodes of all its fields, `*point` broadcasts with
 (env, taxel).

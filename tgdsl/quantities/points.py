@@ -57,7 +57,7 @@ class LinkPoints(NamedTuple):
     """Points sampled on one object, in the frames of the links that they may meet; planes (env, link, point)."""
 
     taxels: tuple[tuple[int, int], ...]  # first of each link's taxels, and one beyond the last
-    tiles: Int[Tensor, "tile 3"]  # what `points.point_tiles` returns of them
+    tiles: Int[Tensor, "tile 3"]  # what `point_tiles` returns of them
     pos: Vec  # where they are now [m]; a compiler stores them
     # signed distance to the link's own surface [m]; +∞ where the gate is closed, and maybe where it is beyond what the sensors
     # asked for
@@ -154,7 +154,7 @@ class MetObject(Generic[Array]):
     taxels: tuple[tuple[int, int], ...]  # first of each link's taxels among the use's, and one beyond the last
     pair: Array  # index of the pair of each link and the object among all pairs, (link,)
     link: Array  # `links` as an array, (link,)
-    tiles: Array  # what `points.point_tiles` returns of the taxels, (tile, 3)
+    tiles: Array  # what `point_tiles` returns of the taxels, (tile, 3)
 
 
 @dataclass(frozen=True, eq=False)
