@@ -56,7 +56,7 @@ def nothing_held(meeting):
 def by_kernel(meeting, stick_slip, state):
     """Return the active points, and change the state in place, as `shear_loads` has the kernel do on a GPU."""
     from tgdsl.quantities.depth_kernel import grid_tables
-    from tgdsl.sensors.elastomer.points_kernel import advance_anchors
+    from tgdsl.sensors.elastomer.anchor_kernel import advance_anchors
 
     (rotation, offset, _, gate), source = meeting
     places, numbers = torch.stack(source.points)[:, :, 0], [part for part in stick_slip if part is not None]

@@ -174,7 +174,7 @@ def _shear_loads_by_kernel(
     objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
 ) -> tuple[list[ShearLoad], dict[str, Tensor]]:
     from tgdsl.quantities.depth_kernel import grid_tables
-    from tgdsl.sensors.elastomer.points_kernel import advance_anchors
+    from tgdsl.sensors.elastomer.anchor_kernel import advance_anchors
 
     loads, first = [], 0
     numbers = [part for part in stick_slip if isinstance(part, Tensor)]
@@ -265,10 +265,10 @@ def point_sum(load: ShearLoad, markers: Markers) -> Vec:
 
 
 def _point_sum_by_kernel(load: ShearLoad, markers: Markers) -> Vec:
-    from tgdsl.sensors.elastomer import points_kernel
+    from tgdsl.sensors.elastomer import point_sum_kernel
 
     where = list(load.pos), list(load.strength), load.count, load.tiles, tile_size(load.taxels)
-    result = points_kernel.point_sum(*where, list(markers.pos), list(markers.normal), markers.falloff)
+    result = point_sum_kernel.point_sum(*where, list(markers.pos), list(markers.normal), markers.falloff)
     return planes.vec(result.unbind())
 
 
