@@ -32,14 +32,8 @@ import numpy as np
 from hand_checks import check
 from PIL import Image
 
-from tgdsl.commands.compile import Compile
-from tgdsl.commands.explain import Explain
-from tgdsl.commands.export_usd import ExportUsd
-from tgdsl.commands.import_ import Import
-from tgdsl.commands.layout.new import New
-from tgdsl.commands.links import Links
-from tgdsl.commands.render import Render
-from tgdsl.commands.run import Run
+from tgdsl.commands.documents import Compile, Explain, Run
+from tgdsl.commands.robots import ExportUsd, Import, Links, New, Render
 from tgdsl.compiler.pipeline import placed
 from tgdsl.errors import TgdslError
 from tgdsl.formats.robot import load_model

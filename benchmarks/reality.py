@@ -22,8 +22,7 @@ import numpy as np
 import tyro
 
 import tgdsl
-from tgdsl.calibration.compare import Comparison
-from tgdsl.calibration.fit import Fit
+from tgdsl.calibration.fit import Comparison, Fit
 from tgdsl.calibration.problem import ReadingMap
 
 PX = 18.8e3

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tgdsl import testing as testing
-    from tgdsl.calibration.compare import compare as compare
     from tgdsl.calibration.fit import calibrate as calibrate
+    from tgdsl.calibration.fit import compare as compare
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import ArtifactError as ArtifactError
     from tgdsl.errors import FileError as FileError
@@ -64,7 +64,7 @@ _PLACES = {
     "WarpSimulation": "runtime.warp",
     "bodies_by_name": "runtime.by_name",
     "calibrate": "calibration.fit",
-    "compare": "calibration.compare",
+    "compare": "calibration.fit",
     "check_taxels": "module.taxels",
     "compile": "tuning.compile",
     "connect": "runtime.connect",

@@ -83,7 +83,7 @@ def test_lowered_again_is_compiled_again(path):
     fields |= velocities(states["time"], fields)
     found = model._read("touch", fields, states["time"])
     assert np.array_equal(found, readings(path, states))
-    model.set(model.start)
+    model.set([parameter.start for parameter in model.parameters])
     assert np.array_equal(model._read("touch", fields, states["time"]), readings(path, states, {}))
 
 

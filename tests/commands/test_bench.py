@@ -56,9 +56,9 @@ def test_without_a_document_there_are_oracles_and_hard_cases(here, tmp_path, mon
 
 
 def test_an_installed_package_says_that_oracles_need_a_clone(here, tmp_path, monkeypatch):
-    from tgdsl.commands.report import sheets
+    from tgdsl.commands import report
 
-    monkeypatch.setattr(sheets, "__file__", str(tmp_path / "site-packages" / "tgdsl" / "commands" / "report" / "sheets.py"))
+    monkeypatch.setattr(report, "__file__", str(tmp_path / "site-packages" / "tgdsl" / "commands" / "report.py"))
     for option in ("--oracles", "--hard"):
         code, said, error = here(tmp_path, "bench", option)
         assert code == 2 and not said

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from tgdsl.commands.listen import Listen
+from tgdsl.commands.documents import Listen
 from tgdsl.errors import TgdslError
 
 SCENE = """<mujoco><option timestep=".001"/><default><geom solref=".006 .5"/></default><worldbody>

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tgdsl.commands.learning.distill import Distill
-from tgdsl.commands.learning.train import Train
+from tgdsl.commands.distill import Distill
+from tgdsl.commands.train import Train
 
 FOLDER = Path(__file__).parents[2] / "examples" / "tasks" / "published"
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")

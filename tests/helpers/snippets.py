@@ -15,7 +15,7 @@ from pathlib import Path
 import tyro
 
 from tgdsl.commands.cli import Command
-from tgdsl.commands.learning.sweep_document import load_sweep
+from tgdsl.commands.sweep_document import load_sweep
 from tgdsl.rl.load import load_task
 from tgdsl.schema.load import load, load_layout
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from packaging.requirements import Requirement
 
-from tgdsl.commands.report.doctor import Doctor
+from tgdsl.commands.report import Doctor
 from tgdsl.report import doctor
 from tgdsl.report.doctor import CPP, DEVELOPMENT, WITHOUT, Package, examine, findings, folder_size, packages
 

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 import tgdsl
 from tgdsl.view.boxes import boxes_of, is_boxed
+from tgdsl.view.markers import Pose
 from tgdsl.view.overview import drawing as overview_drawing
 from tgdsl.view.overview import drawn_outputs, overview
 from tgdsl.view.style import WARMTH
 from tgdsl.view.table import table
-from tgdsl.view.taxels import Pose
 
 TOLERANCE = 1e-12  # metres: a rotation and a sum in float64
 SIDES = {"a": [0.03, 0.02, 0.01], "b": [0.02, 0.02, 0.02]}

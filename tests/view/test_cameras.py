@@ -11,13 +11,12 @@ import tgdsl
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.rollout import held_controls, rollout
 from tgdsl.view.cameras import VIEWS, ViewError, angles_of, best_camera, camera_of, facing_camera
-from tgdsl.view.markers import Markers, markers_of, touched
+from tgdsl.view.markers import Markers, Pose, markers_of, touched
 from tgdsl.view.meshes import mesh_of
 from tgdsl.view.picture import drawing as picture_of
 from tgdsl.view.picture import picture
 from tgdsl.view.raster import Camera
 from tgdsl.view.table import table
-from tgdsl.view.taxels import Pose
 
 FINGER = """
 <mujoco>

@@ -157,7 +157,7 @@ def test_a_loop_of_ones_own_is_drawn_at_most_thirty_times_a_second(document):
 
 
 def recorded(document: Path, folder: Path) -> Path:
-    from tgdsl.commands.run import Run
+    from tgdsl.commands.documents import Run
 
     Run(document, keyframes=("up",), seconds=0.3, out=folder).run()
     return folder / "readings.npz"

@@ -16,11 +16,10 @@ from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.view.cameras import facing_camera, pose_of
-from tgdsl.view.markers import Markers, markers_of
+from tgdsl.view.markers import Markers, Pose, is_visible, markers_of
 from tgdsl.view.meshes import mesh_of
 from tgdsl.view.picture import drawing, picture, short_names
 from tgdsl.view.raster import Camera, rasterise
-from tgdsl.view.taxels import Pose, is_visible
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 
@@ -100,13 +99,13 @@ def test_colours_exactly_the_taxels_that_read(touch, sim, readings, env: int) ->
 
 def test_magnitude_is_the_norm_over_channels_of_one_unit(touch, sim, readings) -> None:
     shown = markers(touch, sim, readings, "touch")
-    assert shown.label == "|force| [N]"
+    assert shown.colour_label.startswith("|force| [N] ")
     np.testing.assert_allclose(shown.value, readings["touch"][0, :, :3].norm(dim=-1), rtol=1e-6)
 
 
 def test_small_values_get_a_prefix(touch, sim, readings) -> None:
     shown = markers(touch, sim, readings, "depth")
-    assert shown.label == "depth [mm]"
+    assert shown.colour_label.startswith("depth [mm] ")
     np.testing.assert_allclose(shown.value, 1e3 * readings["depth"][0, :, 0].double(), rtol=1e-6)
 
 

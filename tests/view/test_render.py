@@ -13,9 +13,8 @@ from tgdsl.compiler.pipeline import placed
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.view.cameras import VIEWS, camera_of, pose_of
-from tgdsl.view.discs import discs, group_of, legend, radii
-from tgdsl.view.render import HEIGHT, MIN_SIZE, drawing, render
-from tgdsl.view.taxels import Pose, taxels_of
+from tgdsl.view.markers import Pose, taxels_of
+from tgdsl.view.render import HEIGHT, MIN_SIZE, discs, drawing, group_of, legend, radii, render
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 

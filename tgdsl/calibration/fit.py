@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.stats import qmc
 
 from tgdsl.calibration import checks
@@ -24,6 +25,10 @@ from tgdsl.calibration.recordings import Arrays, load_recording
 from tgdsl.compiler.pipeline import Document
 from tgdsl.console.tables import text_table
 from tgdsl.errors import TgdslError
+from tgdsl.fields.models import SpecModel
+from tgdsl.files.write import atomic_write
+from tgdsl.schema.load import read_spec
+from tgdsl.schema.yaml import with_values
 from tgdsl.sensors import Kind
 
 CONTINUED = 3  # starts that are followed to their minimum
@@ -85,9 +90,6 @@ class Fit:
         Raises:
             TgdslError: If the document is a mapping, or the file would be in another folder, where its paths lead nowhere.
         """
-        from tgdsl.files.write import atomic_write
-        from tgdsl.schema.yaml import with_values
-
         source = self.problem.model.document
         if isinstance(source, Mapping):
             raise TgdslError("the document is a mapping; set its values from `fit.parameters`")
@@ -261,3 +263,74 @@ def _warnings(
         if part.columns.shape[1] and 1 - e.alone > e.alone - e.error:
             notes.append(f"{name}: the reading's own map explains more (1 → {e.alone:.3f}) than the sensor (→ {e.error:.3f})")
     return tuple(notes)
+
+
+class CandidateSpec(SpecModel):
+    """A model to compare: changes of the document, and what is fitted."""
+
+    set: dict[str, Any] = {}
+    """Values by dotted path, as `--set` takes them."""
+    fit: tuple[str, ...] = ()
+    """Parameters, as `--fit` takes them."""
+
+
+class ComparisonSpec(SpecModel):
+    """Models to compare."""
+
+    tgdsl: Literal[1]
+    """Version of the grammar."""
+    compare: Annotated[dict[str, CandidateSpec], Field(min_length=1)]
+    """The models by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Fits of several models to the same recordings, by name. `print(comparison)` shows one table."""
+
+    fits: Mapping[str, Fit]
+
+    def __str__(self) -> str:
+        rows = []
+        for name, fit in self.fits.items():
+            values = ", ".join(f"{path} {fitted.value:.4g}" for path, fitted in fit.parameters.items())
+            rows += [(name, e.recording, e.reading, *e.texts(3), values) for e in fit.errors]
+        head = ("model", "recording", "reading", "error", "held out", "floor", "without a sensor", "parameters")
+        notes = [f"{name}: {text}" for name, fit in self.fits.items() for text in fit.warnings]
+        return "\n".join([text_table(head, rows), *([""] if notes else []), *notes])
+
+
+def compare(
+    document: Document,
+    recordings: Sequence[str | Path | Arrays] | str | Path | Arrays,
+    models: str | Path | Mapping[str, Mapping[str, Any]],
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Comparison:
+    """Fit several kernels or kinds to the same recordings.
+
+        tgdsl: 1
+        compare:
+          half space:
+            set: {sensors.skin: {kind: elastomer, kernel: half_space, ...}}
+            fit: [skin.poissons_ratio]
+          as written: {}
+
+    Args:
+        document: A YAML file, or the same as a mapping.
+        recordings: What to fit them to, as `tgdsl.calibrate` takes them.
+        models: A YAML file with `compare:`, or what stands there as a mapping: by name `set` and `fit`.
+        overrides: Values by dotted path, for all models.
+        options: Other options of `tgdsl.calibrate`, for all models.
+
+    Raises:
+        SpecError: All mistakes in the file, the document or a recording.
+        TgdslError: As `tgdsl.calibrate`.
+    """
+    source = {"tgdsl": 1, "compare": models} if isinstance(models, Mapping) else Path(models)
+    spec, _ = read_spec(source, ComparisonSpec, ("tgdsl", "compare"))
+    fits = {
+        name: calibrate(document, recordings, each.fit, overrides={**(overrides or {}), **each.set}, **options)
+        for name, each in spec.compare.items()
+    }
+    return Comparison(fits)

@@ -67,19 +67,9 @@ class Model:
     """A document whose parameters can be changed."""
 
     def __init__(
-        self,
-        document: Document,
-        fit: Sequence[str],
-        overrides: Mapping[str, Any] | None = None,
-        kinds: Sequence[Kind] = (),
+        self, document: Document, fit: Sequence[str], overrides: Mapping[str, Any] | None = None, kinds: Sequence[Kind] = ()
     ):
-        """Compile a document.
-
-        Args:
-            document: A YAML file, or the same as a mapping.
-            fit: Parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`.
-            overrides: Values by dotted path, as `tgdsl.compile` takes them.
-            kinds: Your own kinds.
+        """Compile a document; `fit`: parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`.
 
         Raises:
             SpecError: All mistakes in the document.
@@ -93,16 +83,10 @@ class Model:
             raise TgdslError(f"{twice[0]} is to be fitted twice")
         self._values = tuple(parameter.start for parameter in self.parameters)
 
-    @property
-    def start(self) -> tuple[float, ...]:
-        """Values of the parameters in the document."""
-        return tuple(parameter.start for parameter in self.parameters)
-
     def set(self, values: Sequence[float]) -> None:
         """Give the parameters other values; those of the last steps of a search are not lowered again.
 
-        Raises:
-            InfeasibleError: If the sensor cannot have them.
+        Raises `InfeasibleError` if the sensor cannot have them.
         """
         values = tuple(map(float, values))
         if values == self._values:
@@ -122,27 +106,20 @@ class Model:
         self._values = values
 
     def predicted(self, recording: Recording, target: Target, fields: Mapping[str, np.ndarray], clock: float) -> np.ndarray:
-        """Return what the sensor would have read (sample, row, channel).
+        """Return what the sensor would have read (sample, row, channel) for a target.
 
-        Args:
-            recording: The recording.
-            target: One of its targets.
-            fields: The recording's states, shifted as its nuisances say.
-            clock: What to add to the target's times [s].
+        `fields` are the recording's states, shifted as its nuisances say; `clock` [s] is added to the target's times.
         """
         time = target.time if target.zero is None else np.union1d(target.time, [target.zero])
-        states = recording.state_at(time + clock, self._with_velocities(recording, fields))
+        missing = [name for name in DERIVED if name in self.module.inputs.fields and name not in fields]
+        if missing:
+            derived = velocities(recording.time, fields)
+            fields = {**fields, **{name: derived[name] for name in missing}}
+        states = recording.state_at(time + clock, fields)
         values = self._read(target.reading, states, time)[:, :, list(target.channels)]
         if target.zero is not None:
             values = (values - values[np.searchsorted(time, target.zero)])[np.searchsorted(time, target.time)]
         return values
-
-    def _with_velocities(self, recording: Recording, fields: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        missing = [name for name in DERIVED if name in self.module.inputs.fields and name not in fields]
-        if not missing:
-            return fields
-        derived = velocities(recording.time, fields)
-        return {**fields, **{name: derived[name] for name in missing}}
 
     def _read(self, reading: str, states: Mapping[str, np.ndarray], time: np.ndarray) -> np.ndarray:
         wanted = self.module.inputs.fields
@@ -227,7 +204,7 @@ class Model:
 
 def _bounded(path: str, start: float, quantity: Quantity, usual: Usual | None, span: str, unit: str) -> Parameter:
     """Return a parameter with the bounds of its field, within those that a user gives."""
-    least = quantity.ge if quantity.ge is not None else quantity.gt if quantity.gt is not None else -math.inf
+    least = next((bound for bound in (quantity.ge, quantity.gt) if bound is not None), -math.inf)
     most = math.inf if quantity.le is None else quantity.le
     if span:
         parts = span.split(":")

@@ -10,13 +10,10 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from tgdsl.calibration.checks import TargetErrors
 from tgdsl.calibration.problem import Part, Problem, Solution
-from tgdsl.files.write import atomic_open, with_folder
-from tgdsl.view.style import DPI, FAINT, INK
+from tgdsl.view.style import FAINT, INK, new_figure, save_figure
 
 MEASURED, FITTED, RESIDUAL = "#3d5a80", "#c8553d", "#588157"
 _PANEL = (5.0, 4.4)
@@ -26,8 +23,7 @@ MOST_LINES = 3
 def picture(problem: Problem, solution: Solution, errors: Sequence[TargetErrors], path: Path) -> Path:
     """Draw each target and its fit, left, and the residuals, right; return the path of the PNG file."""
     num = len(problem.parts)
-    figure = Figure(figsize=(2 * _PANEL[0], num * _PANEL[1]), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(2 * _PANEL[0], num * _PANEL[1], layout="constrained")
     panels = figure.subplots(num, 2, squeeze=False)
     for i, (part, error) in enumerate(zip(problem.parts, errors, strict=True)):
         draw = _field if part.target.value.shape[0] == 1 and problem.places[error.reading] is not None else _lines
@@ -36,9 +32,7 @@ def picture(problem: Problem, solution: Solution, errors: Sequence[TargetErrors]
         title = f"{Path(error.recording).name}: {error.reading}, relative RMSE {error.error:.3f}{held}"
         panels[i, 0].set_title(title, loc="left", fontsize=11, color=INK)
         panels[i, 1].set_title("residual: fit − measured", loc="left", fontsize=11, color=INK)
-    with atomic_open(with_folder(path)) as file:
-        figure.savefig(file, format="png")
-    return path
+    return save_figure(figure, path)
 
 
 def _field(panels: Sequence[Axes], part: Part, fitted: np.ndarray, places: np.ndarray | None, unit: str) -> None:

@@ -23,7 +23,7 @@ from tgdsl.calibration.recordings import Recording, Target
 from tgdsl.errors import TgdslError
 
 ReadingMap = Literal["none", "offset", "scale", "affine"]
-STEP = 3e-4  # step of finite differences in x: small to a range and to a prior's width, large to the error of a tabulated field
+STEP = 3e-4  # of finite differences in x: small to a range and to a prior's width, large to the error of a tabulated field
 WIDTHS = 6.0  # largest nuisance, in standard deviations
 LINEAR = 1e-7  # relative deviation from a straight line up to which a reading is linear in a parameter
 Weights = Sequence[Float[np.ndarray, " number"]]
@@ -43,12 +43,11 @@ class Part(NamedTuple):
     """One target of one recording, flat."""
 
     recording: int  # which recording it is of
-    target: Target  # the target
-    value: Float[np.ndarray, " number"]  # its numbers
-    weight: Float[np.ndarray, " number"]  # their weights
-    # what the reading's own map adds per unit of its coefficients, (number, coefficient)
-    columns: Float[np.ndarray, "number coefficient"]
-    names: tuple[str, ...]  # names of the coefficients
+    target: Target
+    value: Float[np.ndarray, " number"]
+    weight: Float[np.ndarray, " number"]
+    columns: Float[np.ndarray, "number coefficient"]  # what the reading's own map adds per unit of its coefficients
+    names: tuple[str, ...]  # of the coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,22 +78,13 @@ class Problem:
     ):
         """Collect the unknowns.
 
-        Args:
-            model: The model.
-            recordings: What to fit it to.
-            reading: What map of its own each recording's reading may have, of all readings or by their names.
-            gain: Whether each recording has a gain of its own.
+        Each recording's reading may have a map of its own, of all readings or by their names, and a gain of its own.
         """
         self.model, self.recordings, self.gain = model, tuple(recordings), gain
-        self.places = places = {t.reading: _places(model, t.reading) for r in recordings for t in r.targets}
+        self.places = {t.reading: _places(model, t.reading) for r in recordings for t in r.targets}
+        maps: Mapping[str, ReadingMap] = reading if isinstance(reading, Mapping) else dict.fromkeys(self.places, reading)
         self.parts = tuple(
-            _part(
-                i,
-                target,
-                reading if isinstance(reading, str) else reading.get(target.reading, "none"),
-                places[target.reading],
-                model,
-            )
+            _part(i, target, maps.get(target.reading, "none"), self.places[target.reading], model)
             for i, recording in enumerate(recordings)
             for target in recording.targets
         )
@@ -102,35 +92,18 @@ class Problem:
         self.sigma = np.array([max(part.target.floor, 0.3 * _rms(part.value, part.weight)) for part in self.parts])
         self._robust = [np.ones_like(part.value) for part in self.parts]
         self.linear: tuple[int, ...] = ()
-        num = sum(int((part.weight > 0).sum()) for part in self.parts)
-        self.num_numbers, wanted = num, len(self.names) + sum(part.columns.shape[1] + gain for part in self.parts)
-        if num <= wanted:
-            names = ", ".join(recording.name for recording in recordings)
-            raise TgdslError(
-                f"{names}: {num} numbers in all, expected more than the {wanted} unknowns: {', '.join(self.names)}"
-            )
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the unknowns."""
-        return (*(p.path for p in self.model.parameters), *(nuisance.label for nuisance in self.nuisances))
-
-    @property
-    def num_parameters(self) -> int:
-        """Number of parameters; the nuisances follow them in x."""
-        return len(self.model.parameters)
-
-    @property
-    def start(self) -> Float[np.ndarray, " unknown"]:
-        """The unknowns as the document and the recordings have them."""
-        places = [p.place(p.start) for p in self.model.parameters]
-        return np.array([*places, *np.zeros(len(self.nuisances))])
-
-    @property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of x."""
+        self.num_parameters = len(model.parameters)  # the nuisances follow them in x
+        self.names = (*(p.path for p in model.parameters), *(nuisance.label for nuisance in self.nuisances))
         free = np.full(len(self.nuisances), WIDTHS)
-        return np.concatenate([np.zeros(self.num_parameters), -free]), np.concatenate([np.ones(self.num_parameters), free])
+        self.bounds = np.append(np.zeros(self.num_parameters), -free), np.append(np.ones(self.num_parameters), free)
+        # the unknowns as the document and the recordings have them
+        self.start = np.append([p.place(p.start) for p in model.parameters], np.zeros(len(self.nuisances)))
+        self.num_numbers = sum(int((part.weight > 0).sum()) for part in self.parts)
+        wanted = len(self.names) + sum(part.columns.shape[1] + gain for part in self.parts)
+        if self.num_numbers <= wanted:
+            names = ", ".join(recording.name for recording in recordings)
+            problem = f"{self.num_numbers} numbers in all, expected more than the {wanted} unknowns: {', '.join(self.names)}"
+            raise TgdslError(f"{names}: {problem}")
 
     def values(self, x: np.ndarray) -> tuple[float, ...]:
         """Return the parameters at x."""
@@ -167,11 +140,10 @@ class Problem:
         """Find the parameters in which all readings are linear, alone and together; a recording's gain stands for them."""
         if self.gain:
             return
-        start, found = self.start, []
-        base = np.concatenate(self.predicted(start))
+        base, found = np.concatenate(self.predicted(self.start)), []
 
         def change(*js: int, by: float = 1.0) -> np.ndarray:
-            x = start.copy()
+            x = self.start.copy()
             for j in js:
                 x[j] = self.model.parameters[j].place(self._beside(j, by))
             return np.concatenate(self.predicted(x)) - base
@@ -193,35 +165,9 @@ class Problem:
         return p.start + part * np.copysign(size, reach)
 
     def solve(self, x: np.ndarray, weights: Weights, are_fixed: bool = False) -> Solution:
-        """Return the solution at x, what is linear solved for.
-
-        Args:
-            x: The unknowns.
-            weights: Weights of each part.
-            are_fixed: Whether linear parameters are those of x.
-        """
-        solved = () if are_fixed else self.linear
-        x = x.copy()
-        for j in solved:
-            x[j] = self.model.parameters[j].place(self.model.parameters[j].start)
-        base, slopes = self.predicted(x), []
-        for j in solved:
-            beside, p = x.copy(), self.model.parameters[j]
-            beside[j] = p.place(self._beside(j, 1.0))
-            run = self._beside(j, 1.0) - p.start
-            slopes.append([(one - zero) / run for one, zero in zip(self.predicted(beside), base, strict=True)])
+        """Return the solution at x, what is linear solved for, but linear parameters if `are_fixed`."""
         root = [np.sqrt(w) / sigma for w, sigma in zip(weights, self.sigma, strict=True)]
-        if solved:
-            left = [self._projected(i, part.value - base[i], root[i]) for i, part in enumerate(self.parts)]
-            right = [[self._projected(i, slope[i], root[i]) for i in range(len(self.parts))] for slope in slopes]
-            matrix = np.stack([np.concatenate(column) for column in right], axis=1)
-            size = np.linalg.norm(matrix, axis=0)
-            size = np.where(size > 1e-12 * np.linalg.norm(np.concatenate(left)), size, np.inf)  # of no effect: no step
-            limits = np.array([[p.low - p.start, p.high - p.start] for p in (self.model.parameters[j] for j in solved)]).T
-            steps = lsq_linear(matrix / size, np.concatenate(left), limits * np.where(np.isinf(size), 1.0, size)).x / size
-            for j, step, slope in zip(solved, steps, slopes, strict=True):
-                x[j] = self.model.parameters[j].place(self.model.parameters[j].start + step)
-                base = [value + step * part for value, part in zip(base, slope, strict=True)]
+        x, base = self._solve_linear(x.copy(), root) if self.linear and not are_fixed else (x.copy(), self.predicted(x))
         predicted, coefficients, residuals = [], [], []
         for i, part in enumerate(self.parts):
             columns = np.column_stack([part.columns, base[i]]) if self.gain else part.columns
@@ -233,17 +179,39 @@ class Problem:
         residual = np.concatenate([*residuals, x[self.num_parameters :]])
         return Solution(x, residual, tuple(predicted), tuple(coefficients))
 
+    def _solve_linear(self, x: np.ndarray, root: Weights) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return x with the linear parameters solved for, and the readings there."""
+        parameters = [self.model.parameters[j] for j in self.linear]
+        for j, p in zip(self.linear, parameters, strict=True):
+            x[j] = p.place(p.start)
+        base, slopes = self.predicted(x), []
+        for j, p in zip(self.linear, parameters, strict=True):
+            beside, value = x.copy(), self._beside(j, 1.0)
+            beside[j] = p.place(value)
+            slopes.append([(one - zero) / (value - p.start) for one, zero in zip(self.predicted(beside), base, strict=True)])
+        left = np.concatenate([self._projected(i, part.value - base[i], root[i]) for i, part in enumerate(self.parts)])
+        right = [[self._projected(i, slope[i], root[i]) for i in range(len(self.parts))] for slope in slopes]
+        matrix = np.stack([np.concatenate(column) for column in right], axis=1)
+        size = np.linalg.norm(matrix, axis=0)
+        size = np.where(size > 1e-12 * np.linalg.norm(left), size, np.inf)  # of no effect: no step
+        limits = np.array([[p.low - p.start, p.high - p.start] for p in parameters]).T
+        steps = lsq_linear(matrix / size, left, limits * np.where(np.isinf(size), 1.0, size)).x / size
+        for j, p, step, slope in zip(self.linear, parameters, steps, slopes, strict=True):
+            x[j] = p.place(p.start + step)
+            base = [value + step * part for value, part in zip(base, slope, strict=True)]
+        return x, base
+
     def _projected(self, i: int, value: np.ndarray, root: np.ndarray) -> np.ndarray:
+        """Return weighted numbers less what a part's own map can explain of them."""
         columns, value = self.parts[i].columns * root[:, None], value * root
         return value - columns @ np.linalg.lstsq(columns, value, rcond=None)[0]
 
     def jacobian(self, x: np.ndarray, weights: Weights, free: Sequence[int], are_fixed: bool = False) -> np.ndarray:
         """Return the derivatives of the residuals by some unknowns, by forward differences within the bounds."""
-        _, high = self.bounds
         base, columns = self.solve(x, weights, are_fixed).residual, []
         for j in free:
             beside = x.copy()
-            beside[j] += STEP if x[j] + STEP <= high[j] else -STEP
+            beside[j] += STEP if x[j] + STEP <= self.bounds[1][j] else -STEP
             columns.append((self.solve(beside, weights, are_fixed).residual - base) / (beside[j] - x[j]))
         return np.stack(columns, axis=1) if columns else np.zeros((len(base), 0))
 
@@ -276,10 +244,9 @@ class Problem:
             result[free] = part
             return result
 
-        inside = np.clip(x[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         result = least_squares(
             lambda part: self.solve(whole(part), weights, are_fixed).residual,
-            inside,
+            np.clip(x[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low)),
             jac=lambda part: self.jacobian(whole(part), weights, free, are_fixed),  # type: ignore[arg-type]
             bounds=(low, high),
             x_scale="jac",
@@ -331,6 +298,7 @@ def _clock(target: Target) -> str:
 
 
 def _places(model: Model, reading: str) -> np.ndarray | None:
+    """Return where a reading's rows are in their link's frame (row, 3) [m]; None if they have no place."""
     table = model.module.rows.get(reading)
     return np.asarray(table["pos"]) if table is not None and "pos" in (table.dtype.names or ()) else None
 
@@ -340,42 +308,37 @@ def _part(i: int, target: Target, reading: ReadingMap, places: np.ndarray | None
     output = next(output for output in model.module.outputs if output.name == target.reading)
     channels = [output.channels[channel] for channel in target.channels]
     samples, rows, num = target.value.shape
-    columns, names = [], []
-
-    def add(name: str, of_row: np.ndarray) -> None:
-        names.append(name)
-        columns.append(np.broadcast_to(of_row, target.value.shape).reshape(-1))
-
+    columns: dict[str, np.ndarray] = {}  # of the rows and channels, by the coefficient's name
     eye = np.eye(num)
     if reading != "none":
-        for c, channel in enumerate(channels):
-            add(f"offset {channel}", eye[c])
+        columns |= {f"offset {channel}": eye[c] for c, channel in enumerate(channels)}
     if reading in ("scale", "affine"):
         if places is None:
             raise TgdslError(f"reading: {reading}: the rows of {target.reading} have no places, expected offset")
         centred = places - places.mean(axis=0)
+    if reading == "scale":
         axes = ["xyz".index(channel[-1]) if channel[-2:] in ("_x", "_y", "_z") else -1 for channel in channels]
-        if reading == "scale":
-            if min(axes) < 0:
-                raise TgdslError(f"reading: scale: {', '.join(channels)} are not along x, y, z; expected offset or affine")
-            add("scale", centred[:, axes])
-        else:
-            _, spread, directions = np.linalg.svd(centred, full_matrices=False)
-            for direction in directions[spread > 1e-6 * spread[0]]:
-                name = "".join(f"{value:+.2g}{axis}" for value, axis in zip(direction, "xyz", strict=True) if abs(value) > 1e-9)
-                for c, channel in enumerate(channels):
-                    add(f"{channel} along {name}", (centred @ direction)[:, None] * eye[c])
-    stacked = np.stack(columns, axis=1) if columns else np.zeros((samples * rows * num, 0))
-    return Part(i, target, target.value.reshape(-1), target.weight.reshape(-1), stacked, tuple(names))
+        if min(axes) < 0:
+            raise TgdslError(f"reading: scale: {', '.join(channels)} are not along x, y, z; expected offset or affine")
+        columns["scale"] = centred[:, axes]
+    if reading == "affine":
+        _, spread, directions = np.linalg.svd(centred, full_matrices=False)
+        for direction in directions[spread > 1e-6 * spread[0]]:
+            name = "".join(f"{value:+.2g}{axis}" for value, axis in zip(direction, "xyz", strict=True) if abs(value) > 1e-9)
+            along = (centred @ direction)[:, None]
+            columns |= {f"{channel} along {name}": along * eye[c] for c, channel in enumerate(channels)}
+    stacked = [np.broadcast_to(column, target.value.shape).reshape(-1) for column in columns.values()]
+    matrix = np.stack(stacked, axis=1) if stacked else np.zeros((samples * rows * num, 0))
+    return Part(i, target, target.value.reshape(-1), target.weight.reshape(-1), matrix, tuple(columns))
 
 
 def _nuisances(i: int, recording: Recording, model: Model) -> list[Nuisance]:
     result = []
     for name, width in recording.widths.items():
-        first = model.module.inputs.names.get({"body_pos": "body", "body_quat": "body"}.get(name, ""), ())
+        bodies = model.module.inputs.names["body"] if name in ("body_pos", "body_quat") else ()
         for index in map(tuple, np.argwhere(width > 0).tolist()):
             step, *rest = index
-            what = f"{first[rest[0]]}" if first else str(rest[0])
+            what = f"{bodies[rest[0]]}" if bodies else str(rest[0])
             axis = "" if len(rest) < 2 else f".{'xyz'[rest[1]]}" if name == "body_pos" else f"[{rest[1]}]"
             when = "" if len(width) == 1 else f"@{step}"
             place = (-1 if len(width) == 1 else step, *rest)

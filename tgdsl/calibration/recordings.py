@@ -105,13 +105,9 @@ def velocities(time: np.ndarray, fields: Arrays) -> dict[str, np.ndarray]:
 def load_recording(
     source: str | Path | Arrays, inputs: Inputs, outputs: Mapping[str, Output], name: str = "<arrays>"
 ) -> Recording:
-    """Read a recording for a module.
+    """Read a recording for a module that reads `inputs` and returns `outputs`, by name.
 
-    Args:
-        source: A `.npz` file, a YAML document of CSV files, or arrays.
-        inputs: What the module reads.
-        outputs: The module's readings, by name.
-        name: What to call arrays.
+    The source is a `.npz` file, a YAML document of CSV files, or arrays, whose `name` stands in messages.
 
     Raises:
         SpecError: All that is wrong with it, by its keys.
@@ -125,10 +121,10 @@ def load_recording(
 
 
 def _arrays(source: str | Path | Arrays, name: str) -> dict[str, np.ndarray]:
+    if not isinstance(source, Mapping) and Path(source).suffix in (".yaml", ".yml"):
+        source = read_tables(source)
     if isinstance(source, Mapping):
         return {key: np.asarray(value) for key, value in source.items()}
-    if Path(source).suffix in (".yaml", ".yml"):
-        return {key: np.asarray(value) for key, value in read_tables(source).items()}
     try:
         with np.load(source) as file:
             return dict(file)
@@ -139,7 +135,7 @@ def _arrays(source: str | Path | Arrays, name: str) -> dict[str, np.ndarray]:
 
 @dataclass
 class _Reader:
-    """Reads one recording and notes all that is wrong with it."""
+    """Reads one recording and notes all that is wrong with it; what is wrong is read as an empty array, or None."""
 
     name: str
     arrays: dict[str, np.ndarray]
@@ -148,32 +144,36 @@ class _Reader:
     problems: list[Problem] = field(default_factory=list)
 
     def note(self, key: str, what: str, hint: str = "") -> None:
-        self.problems.append(Problem(self.name, 0, 0, key, what, hint))
+        problem = Problem(self.name, 0, 0, key, what, hint)
+        if problem not in self.problems:
+            self.problems.append(problem)
+
+    def note_first(self, key: str, value: np.ndarray, is_bad: np.ndarray, end: str, hint: str) -> bool:
+        """Note the first bad entry of an array; return whether there is any."""
+        bad = np.argwhere(is_bad)
+        if len(bad):
+            self.note(key, f"[{', '.join(map(str, bad[0]))}] is {value[tuple(bad[0])]}{end.format(num=len(bad))}", hint)
+        return len(bad) > 0
 
     def recording(self) -> Recording:
-        self._check_keys()
-        time = self._clock("time", "clock of the states")
-        fields = {name: self._field(name, len(time)) for name in self.inputs.fields if name != "dt" and name in self.arrays}
-        for name in self.inputs.fields:
-            if name not in fields and name != "dt" and DERIVED.get(name) not in self.arrays:
-                self.note(name, "this field is missing", f"the module reads {', '.join(self.inputs.fields)}")
-        widths = {}
-        for key in (key for key in self.arrays if key.startswith("width:")):
-            if (name := key.removeprefix("width:")) in fields:
-                widths[name] = self._width(key, name, fields[name])
-        readings = [key.removeprefix("target:") for key in self.arrays if key.startswith("target:")]
-        if not readings:
-            self.note("", "there is no target", f"expected target:<reading>, of {', '.join(self.outputs)}")
-        targets = [target for name in readings if (target := self._target(name, time)) is not None]
-        return Recording(Path(self.name).name, time, fields, widths, tuple(targets))
-
-    def _check_keys(self) -> None:
         known = {"time", *SHAPES, *NAMES_OF.values(), *(f"width:{name}" for name in SHAPES)}
         known |= {f"{what}:{name}" for what in OF_TARGET for name in self.outputs}
         for key in self.arrays:
             what, _, name = key.partition(":")
             if key not in known and (what not in OF_TARGET[1:] or f"target:{name}" not in self.arrays):
                 self.note(key, "unknown key", did_you_mean(key, known, "keys"))
+        time = self._clock("time", "clock of the states")
+        wanted = [name for name in self.inputs.fields if name != "dt"]
+        fields = {name: self._field(name, len(time)) for name in wanted if name in self.arrays}
+        for name in wanted:
+            if name not in fields and DERIVED.get(name) not in self.arrays:
+                self.note(name, "this field is missing", f"the module reads {', '.join(self.inputs.fields)}")
+        widths = {name: self._width(name, value) for name, value in fields.items() if f"width:{name}" in self.arrays}
+        readings = [key.removeprefix("target:") for key in self.arrays if key.startswith("target:")]
+        if not readings:
+            self.note("", "there is no target", f"expected target:<reading>, of {', '.join(self.outputs)}")
+        targets = [target for name in readings if (target := self._target(name, time)) is not None]
+        return Recording(Path(self.name).name, time, fields, widths, tuple(targets))
 
     def _numbers(self, key: str) -> np.ndarray | None:
         value = self.arrays[key]
@@ -190,10 +190,8 @@ class _Reader:
         if time is None or time.ndim != 1 or not len(time):
             self.note(key, f"found shape {self.arrays[key].shape}, expected times [s]")
             return np.zeros(0)
-        if (bad := np.flatnonzero(~np.isfinite(time))).size:
-            self.note(key, f"[{bad[0]}] is {time[bad[0]]}, expected a time")
-        elif (bad := np.flatnonzero(np.diff(time) <= 0)).size:
-            i = int(bad[0])
+        if not self.note_first(key, time, ~np.isfinite(time), "", "expected a time") and (np.diff(time) <= 0).any():
+            i = int(np.argmax(np.diff(time) <= 0))
             self.note(key, f"[{i + 1}] is {time[i + 1]:g} s after {time[i]:g} s", "expected ascending times: sort the samples")
         return time
 
@@ -201,44 +199,37 @@ class _Reader:
         value, shape = self._numbers(name), SHAPES[name]
         if value is None:
             return np.zeros(0)
-        sizes = [self.inputs.sizes[part] if isinstance(part, str) else part for part in shape]
-        if (bad := np.argwhere(~np.isfinite(value))).size:
-            place = ", ".join(map(str, bad[0]))
-            self.note(name, f"[{place}] is {value[tuple(bad[0])]}", "expected a finite number: leave the step out")
-        elif name == "body_quat" and (bad := np.argwhere(abs(np.linalg.norm(value, axis=-1) - 1) > ROUNDING)).size:
-            place = ", ".join(map(str, bad[0]))
-            self.note(name, f"[{place}] is {value[tuple(bad[0])]}", "expected a quaternion of length 1, w first")
-        axis = shape[0]
-        order = self._order(str(axis), NAMES_OF[str(axis)])
-        if order is not None and value.ndim > 1 and value.shape[1] == len(self.arrays[NAMES_OF[str(axis)]]):
-            value = value[:, order]
-        if num_steps and value.shape != (num_steps, *sizes):
-            expected = ", ".join(map(str, (num_steps, *sizes)))
-            names = f"; {axis}: {listed(self.inputs.names[str(axis)])}"
-            self.note(name, f"found shape {value.shape}, expected ({expected}){names}")
+        hint = "expected a finite number: leave the step out"
+        if not self.note_first(name, value, ~np.isfinite(value), "", hint) and name == "body_quat":
+            is_bad = abs(np.linalg.norm(value, axis=-1) - 1) > ROUNDING
+            self.note_first(name, value, is_bad, "", "expected a quaternion of length 1, w first")
+        value = self._ordered(name, value) if value.ndim > 1 else value
+        expected = (num_steps, *(self.inputs.sizes[part] if isinstance(part, str) else part for part in shape))
+        if num_steps and value.shape != expected:
+            names = f"; {shape[0]}: {listed(self.inputs.names[str(shape[0])])}"
+            self.note(name, f"found shape {value.shape}, expected ({', '.join(map(str, expected))}){names}")
         return value
 
-    def _order(self, axis: str, key: str) -> list[int] | None:
-        """Return where each name of the module's axis stands in the recording."""
+    def _ordered(self, name: str, value: np.ndarray) -> np.ndarray:
+        """Return a field, or its widths, with the entries of its first axis in the module's order."""
+        axis = str(SHAPES[name][0])
+        key = NAMES_OF[axis]
         if key not in self.arrays:
-            return None
+            return value
         names = [str(name) for name in self.arrays[key]]
         for wanted in self.inputs.names[axis]:
             if wanted not in names:
-                problem = Problem(self.name, 0, 0, key, f'"{wanted}" is missing', did_you_mean(wanted, names, "names"))
-                if problem not in self.problems:
-                    self.problems.append(problem)
-                return None
-        return [names.index(wanted) for wanted in self.inputs.names[axis]]
+                self.note(key, f'"{wanted}" is missing', did_you_mean(wanted, names, "names"))
+                return value
+        return value[:, [names.index(wanted) for wanted in self.inputs.names[axis]]] if value.shape[1] == len(names) else value
 
-    def _width(self, key: str, name: str, value: np.ndarray) -> np.ndarray:
-        width, axis = self._numbers(key), str(SHAPES[name][0])
+    def _width(self, name: str, value: np.ndarray) -> np.ndarray:
+        key = f"width:{name}"
+        width = self._numbers(key)
         if width is None:
             return np.zeros(0)
         width = width[None] if width.ndim == value.ndim - 1 else width
-        order = self._order(axis, NAMES_OF[axis])
-        if order is not None and width.ndim == value.ndim and width.shape[1] == len(self.arrays[NAMES_OF[axis]]):
-            width = width[:, order]
+        width = self._ordered(name, width) if width.ndim == value.ndim > 1 else width
         if width.shape not in (value.shape, (1, *value.shape[1:])):
             self.note(key, f"found shape {width.shape}, expected {value.shape[1:]}, or {value.shape} for each step its own")
         elif not (np.isfinite(width) & (width >= 0)).all():
@@ -246,13 +237,12 @@ class _Reader:
         return width
 
     def _target(self, name: str, steps: np.ndarray) -> Target | None:
-        key = f"target:{name}"
+        key, weight_key = f"target:{name}", f"weight:{name}"
         output, value = self.outputs.get(name), self._numbers(key)
         time = self._clock(f"clock:{name}", "clock of the target")
         if output is None or value is None:
             return None  # which is noted
-        channels = self._channels(name, output)
-        factor, unit = self._unit(name, output)
+        channels, (factor, unit) = self._channels(name, output), self._unit(name, output)
         if not len(time):
             return None
         num_rows = output.shape[-2]
@@ -261,27 +251,23 @@ class _Reader:
             return None
         shape = (len(time), num_rows, len(channels))
         if value.shape != shape:
-            axes = f"samples, {output.rows}s, channels"
-            self.note(key, f"found shape {value.shape}, expected {shape}: {axes}")
+            self.note(key, f"found shape {value.shape}, expected {shape}: samples, {output.rows}s, channels")
             return None
         try:
-            weight = np.broadcast_to(self.arrays.get(f"weight:{name}", np.ones(())), shape).astype(np.float64)
+            weight = np.broadcast_to(self.arrays.get(weight_key, np.ones(())), shape).astype(np.float64)
         except ValueError:
-            found = self.arrays[f"weight:{name}"].shape
-            self.note(f"weight:{name}", f"found shape {found}, expected one that fits {shape}")
+            self.note(weight_key, f"found shape {self.arrays[weight_key].shape}, expected one that fits {shape}")
             return None
         if not (np.isfinite(weight) & (weight >= 0)).all():
-            self.note(f"weight:{name}", "expected weights of at least 0")
-        if (bad := np.argwhere(~np.isfinite(value) & (weight > 0))).size:
-            place = ", ".join(map(str, bad[0]))
-            hint = f"leave the sample out, or set weight:{name} to 0 there"
-            self.note(key, f"[{place}] is {value[tuple(bad[0])]}, {len(bad)} such numbers in all", hint)
+            self.note(weight_key, "expected weights of at least 0")
+        hint = f"leave the sample out, or set {weight_key} to 0 there"
+        self.note_first(key, value, ~np.isfinite(value) & (weight > 0), ", {num} such numbers in all", hint)
         width = self._scalar(f"clock_width:{name}") or 0.0
-        if len(time) and len(steps) > 1 and (time[-1] < steps[0] - 5 * width or time[0] > steps[-1] + 5 * width):
+        if len(steps) > 1 and (time[-1] < steps[0] - 5 * width or time[0] > steps[-1] + 5 * width):
             span = f"{time[0]:g} to {time[-1]:g} s, the states are from {steps[0]:g} to {steps[-1]:g} s"
             self.note(f"clock:{name}", f"found times from {span}", f"expected a common time, or a larger clock_width:{name}")
         floor, zero = self._scalar(f"floor:{name}") or 0.0, self._scalar(f"zero:{name}")
-        value = np.where(weight > 0, np.where(np.isfinite(value), value, 0.0), 0.0) * factor
+        value = np.where((weight > 0) & np.isfinite(value), value, 0.0) * factor
         return Target(name, value, weight, channels, time, width, floor * factor, unit, zero)
 
     def _channels(self, name: str, output: Output) -> tuple[int, ...]:
@@ -295,20 +281,19 @@ class _Reader:
     def _unit(self, name: str, output: Output) -> tuple[float, str]:
         """Return the factor from the target's unit to the reading's, and the latter."""
         key, wanted = f"unit:{name}", output.units[0]
-        if key not in self.arrays:
-            self.note(
-                key, "the unit of the target is missing", f'the reading is in {wanted}: expected "{wanted}" or one like it'
-            )
-            return 1.0, wanted
-        written = str(self.arrays[key])
+        written, symbol = str(self.arrays.get(key, "")), wanted.replace("·", "*")
+        known = next((units for units in UNITS.values() if symbol in units), {})
         if written == wanted:
             return 1.0, wanted
-        known = next((units for units in UNITS.values() if wanted.replace("·", "*") in units), {})
-        if written not in known:
-            options = ", ".join(known) or wanted
-            self.note(key, f'"{written}" is no unit of this reading, which is in {wanted}', f"expected one of {options}")
-            return 1.0, wanted
-        return known[written] / known[wanted.replace("·", "*")], wanted
+        if written in known:
+            return known[written] / known[symbol], wanted
+        if not written:
+            hint = f'the reading is in {wanted}: expected "{wanted}" or one like it'
+            self.note(key, "the unit of the target is missing", hint)
+        else:
+            hint = f"expected one of {', '.join(known) or wanted}"
+            self.note(key, f'"{written}" is no unit of this reading, which is in {wanted}', hint)
+        return 1.0, wanted
 
     def _scalar(self, key: str) -> float | None:
         if key not in self.arrays:

@@ -1,37 +1,68 @@
-"""What commands share: kinds of argument, each with its help, and what becomes of documents, robots, overrides and outputs."""
+"""What commands share: types of options, and what becomes of documents, robots, overrides, policies and outputs.
+
+The help of an option without a value names its default, so none of these types prints `(default: None)`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
 from tgdsl.console.progress import Progress
 from tgdsl.errors import TgdslError, did_you_mean
-from tgdsl.files.write import check_writable
+from tgdsl.files.write import atomic_write, check_writable
 
 if TYPE_CHECKING:
-    from tgdsl.module.module import TactileModule
+    from tqdm import tqdm
 
-FILE = tyro.conf.arg(metavar="FILE")
-"""Marks the path of a file."""
-OUT = tyro.conf.arg(aliases=["-o"], metavar="FILE")
-"""Marks the path of the file that a command writes."""
-FOLDER = tyro.conf.arg(metavar="FOLDER")
-"""Marks the path of a folder."""
-OUT_FOLDER = tyro.conf.arg(aliases=["-o"], metavar="FOLDER")
-"""Marks the path of the folder that a command writes."""
-OptionalFile = Annotated[Path | None, FILE]
-Document = Annotated[tyro.conf.Positional[Path], FILE]
+    from tgdsl.module.module import TactileModule
+    from tgdsl.rl.env import TouchEnv
+    from tgdsl.rl.playing.policy import PolicyFile
+    from tgdsl.rl.playing.rollout import Actor
+    from tgdsl.runtime.xhand1.calibration import Calibration
+
+
+def optional(metavar: str, *aliases: str) -> Any:
+    """Return what marks an option that may have no value."""
+    return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
+
+
+Names = Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="")]
+OptionalNumbers = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="")]
+OptionalText = Annotated[str | None, optional("TEXT")]
+OptionalInt = Annotated[int | None, optional("INT")]
+OptionalFloat = Annotated[float | None, optional("FLOAT")]
+OptionalFile = Annotated[Path | None, optional("FILE")]
+OptionalFolder = Annotated[Path | None, optional("FOLDER")]
+OptionalOut = Annotated[Path | None, optional("FILE", "-o")]
+OptionalOutFolder = Annotated[Path | None, optional("FOLDER", "-o")]
+File = Annotated[Path, tyro.conf.arg(metavar="FILE")]
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
+OutFolder = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
+Document = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The YAML document.", metavar="FILE")]
 DocumentOrArtefact = Annotated[Document, tyro.conf.arg(help="The YAML document, or an artefact (.safetensors).")]
 Robot = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(help="A file (MJCF, URDF, USD), or the name of a robot that tgdsl brings.", metavar="ROBOT"),
 ]
+Layout = Annotated[OptionalFile, tyro.conf.arg(help="Layout of a robot; default: the one next to its file.")]
 Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
-Replace = Annotated[bool, tyro.conf.arg(help="Replace the file if it is there.")]
+Device = Annotated[str, tyro.conf.arg(help="Where physics, touch and networks are computed: cpu, or cuda.")]
+Seed = Annotated[int, tyro.conf.arg(help="Seed of everything random.")]
+Compiled = Annotated[bool, tyro.conf.arg(help="Fuse the module with torch.compile first.")]
+Replace = Annotated[bool, tyro.conf.arg(help="Replace the files if they are there.")]
+Groups = Annotated[
+    Names,
+    tyro.conf.arg(
+        help="Groups of observations that the policy takes, in its order; default: as in its card; without a card, as in "
+        "proprio, tactile_sensors and goal that the task has."
+    ),
+]
 Overrides = Annotated[
     tuple[str, ...],
     tyro.conf.arg(
@@ -41,6 +72,12 @@ Overrides = Annotated[
     ),
     tyro.conf.UseAppendAction,
 ]
+
+
+def subcommands(*commands: type, **named: type) -> Any:
+    """Return the union of commands, each by its class's name in lower case, or by a name of its own."""
+    by_name = {re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command for command in commands} | named
+    return Union[tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in by_name.items())]  # type: ignore[return-value]  # noqa: UP007
 
 
 def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
@@ -65,43 +102,25 @@ def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
 
 
 def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
-    """Return `KEY=VALUE` arguments as a mapping; a key that is repeated has its last value and place.
-
-    Raises:
-        TgdslError: If one has no equals sign.
-    """
+    """Return `KEY=VALUE` arguments as a mapping; a key that is repeated has its last value and place."""
     result: dict[str, str] = {}
     for pair in pairs:
-        if "=" not in pair:
+        key, equals, value = pair.partition("=")
+        if not equals:
             raise TgdslError(f'--set {pair}: expected KEY=VALUE, such as "resolution=high"')
-        key, _, value = pair.partition("=")
         result.pop(key, None)
         result[key] = value
     return result
 
 
 def joined_overrides(before: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """Return older overrides and newer ones, in the order in which they are set.
-
-    Args:
-        before: The older ones; those at or below a newer one's key are dropped.
-        new: The newer ones.
-    """
+    """Return older overrides, but for those at or below a newer one's key, then the newer ones."""
     unchanged = {key: value for key, value in before.items() if not any(f"{key}.".startswith(f"{other}.") for other in new)}
     return unchanged | dict(new)
 
 
 def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progress | None = None) -> TactileModule:
-    """Return the module of a document, or of an artefact.
-
-    Args:
-        document: The file.
-        overrides: `KEY=VALUE` arguments.
-        progress: Called with a line of text for each long job.
-
-    Raises:
-        TgdslError: If the document or artefact has mistakes, or an artefact is overridden.
-    """
+    """Return the module of a document, or of an artefact."""
     from tgdsl.module.artifact import load
     from tgdsl.tuning.compile import compile
 
@@ -112,17 +131,68 @@ def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progres
     return compile(document, overrides=parsed_overrides(overrides), progress=progress)
 
 
+def actor_for(
+    env: TouchEnv, saved: PolicyFile | None, actions: str = "zero", seed: int = 0, groups: tuple[str, ...] = ()
+) -> Actor:
+    """Return a policy that acts in a task's environments, or without one the actor of `--actions`; print what has changed."""
+    from tgdsl.rl.playing.policy import policy_for
+    from tgdsl.rl.playing.rollout import actor_of
+
+    actor = actor_of(env, actions, seed) if saved is None else policy_for(env, saved, groups)
+    print_changes("policy", actor.changes)
+    return actor
+
+
+def print_changes(learner: str, changes: Iterable[str]) -> None:
+    """Print what of a task has changed since a policy or a teacher was learned."""
+    for line in changes:
+        print(f"changed since the {learner} was learned: {line}")
+
+
+def saved_policy(file: Path | None, groups: tuple[str, ...] = ()) -> PolicyFile | None:
+    """Return the policy of a file, if one is given."""
+    from tgdsl.rl.playing.policy import read_policy
+
+    if groups and file is None:
+        raise TgdslError("--groups belong to a policy; give one with --policy")
+    return None if file is None else read_policy(file)
+
+
+def calibration_of(file: Path | None) -> Calibration | None:
+    """Return the calibration of a file, if one is given."""
+    from tgdsl.runtime.xhand1.calibration import load_calibration
+
+    return None if file is None else load_calibration(file)
+
+
+def progress_bar(job: str, total: int | None = None, unit: str = "step") -> tqdm:
+    """Return a bar that counts on a terminal, and is wiped at the end."""
+    from tqdm import tqdm
+
+    return tqdm(total=total, desc=job, unit=unit, disable=None, leave=False)
+
+
+def check_least(command: object, **least: float) -> None:
+    """Raise an error if one of a command's numbers is given, and less than the least."""
+    for name, low in least.items():
+        value = getattr(command, name)
+        if value is not None and not value >= low:
+            raise TgdslError(f"--{name} {value}: expected at least {low}")
+
+
 def in_working_folder(source: str | Path, suffix: str) -> Path:
     """Return a command's default output: the input's name with another ending, in the working folder."""
     return Path(Path(source).with_suffix(suffix).name)
 
 
 def refuse_to_replace(out: Path, is_forced: bool) -> None:
-    """Raise an error if a file cannot be written, or is there and may not be replaced.
-
-    Raises:
-        TgdslError: If so.
-    """
+    """Raise an error if a file cannot be written, or is there and may not be replaced."""
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or another name")
     check_writable(out)
+
+
+def write_json(file: Path, value: object) -> None:
+    """Write a value as an indented JSON file."""
+    text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+    atomic_write(file, f"{text}\n".encode())

@@ -10,29 +10,26 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from tgdsl.commands.arguments import OptionalFile, Overrides, module_of, parsed_overrides
+from tgdsl.commands import arguments as args
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
+from tgdsl.files.write import as_file_error, check_writable, with_folder
 
 if TYPE_CHECKING:
     from tgdsl.rl.datasets.dataset import Episode, Header
-
-Input = Annotated[
-    tyro.conf.Positional[Path],
-    tyro.conf.arg(help="A task (.yaml), a recording of tgdsl run, or a log of tgdsl hand record (.npz).", metavar="INPUT"),
-]
 
 
 @dataclass(frozen=True)
 class ExportDataset:
     """Write episodes with touch as a dataset: joints, set-points, the force on each taxel, rewards, success."""
 
-    input: Input
+    input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
+    """A task (.yaml), a recording of tgdsl run, or a log of tgdsl hand record (.npz)."""
     to: Literal["lerobot", "mcap", "zarr"] = "lerobot"
     """lerobot: LeRobot v3.0; mcap: an MCAP file of JSON messages; zarr: a Zarr store."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    out: args.OptionalOutFolder = None
     """Folder to make; default: out/NAME_lerobot and the like."""
-    policy: OptionalFile = None
+    policy: args.OptionalFile = None
     """Of a task: the policy that acts."""
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
     """Of a task without a policy: who acts, as for tgdsl play."""
@@ -43,39 +40,35 @@ class ExportDataset:
     """Of a task: number of episodes."""
     envs: int = 16
     """Environments that are stepped together."""
-    seconds: float | None = None
+    seconds: args.OptionalFloat = None
     """On a hand: longest duration of an episode [s]; default: the task's."""
-    fps: float | None = None
+    fps: args.OptionalFloat = None
     """Frames per second; default: one per control step, of a log 30."""
-    reading: str | None = None
+    reading: args.OptionalText = None
     """The force on taxels to export; default: the first."""
-    success_score: float | None = None
+    success_score: args.OptionalFloat = None
     """Score with which an episode succeeds; default: it succeeds if it lasts as long as one may."""
-    goal: tuple[float, ...] = ()
+    goal: args.OptionalNumbers = ()
     """On a hand: what the policy is asked for."""
-    calibration: OptionalFile = None
+    calibration: args.OptionalFile = None
     """On a hand or of a log: what counts mean."""
-    side: Literal["right", "left"] | None = None
+    side: Annotated[Literal["right", "left"] | None, args.optional("{right,left}")] = None
     """Of a log: which hand it is, for the names of links and joints."""
     lockstep: bool = False
     """On an emulated hand: its scene waits for each step; a log is read as fast as possible."""
     device: str = "cpu"
     """Where environments are computed: cpu, or cuda."""
-    seed: int = 0
-    """Seed of everything random."""
-    set: Overrides = ()
+    seed: args.Seed = 0
+    set: args.Overrides = ()
 
     def run(self) -> None:
-        """Read or play the episodes, and write them."""
-        from tgdsl.files.write import as_file_error, check_writable, with_folder
         from tgdsl.rl.datasets.dataset import write_lerobot, write_mcap, write_zarr
 
         out = self.out or Path("out") / f"{self.input.stem}_{self.to}"
         if out.exists():
             raise TgdslError(f"{out}: is there already; remove it, or name another folder with --out")
         check_writable(out)
-        if self.episodes < 1:
-            raise TgdslError(f"--episodes {self.episodes}: expected at least 1")
+        args.check_least(self, episodes=1)
         header, episodes = self._recorded() if self.input.suffix == ".npz" else self._played()
         with (
             as_file_error(out),
@@ -94,7 +87,6 @@ class ExportDataset:
     def _recorded(self) -> tuple[Header, Iterator[Episode]]:
         from tgdsl.files.arrays import read_arrays
         from tgdsl.rl.datasets.sources import of_log, of_run
-        from tgdsl.runtime.xhand1.calibration import load_calibration
 
         expected = "a recording of tgdsl run, or a log of tgdsl hand record"
         if self.policy is not None:
@@ -102,23 +94,21 @@ class ExportDataset:
         arrays = read_arrays(self.input, expected)
         names, document = list(arrays), str(arrays.get("document", ""))
         if "about" in names:
-            return of_log(self.input, self.fps, load_calibration(self.calibration) if self.calibration else None, self.side)
+            return of_log(self.input, self.fps, args.calibration_of(self.calibration), self.side)
         if not document:
             contents = ", ".join([*names[:6], *(["…"] if len(names) > 6 else [])]) or "no array"
             hint = "to export what a policy does, name its task"
             raise TgdslError(f"{self.input}: found {contents}; expected {expected}; {hint}")
         with StatusLine() as progress:
-            touch = module_of(Path(document), self.set, progress)
+            touch = args.module_of(Path(document), self.set, progress)
         return of_run(self.input, touch, self.fps, self.reading)
 
     def _played(self) -> tuple[Header, Iterator[Episode]]:
         from tgdsl.rl.datasets.sources import of_deployment, of_environments
         from tgdsl.rl.deploying.deploy import Deployment
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.playing.policy import policy_for, read_policy
-        from tgdsl.rl.playing.rollout import actor_of
 
-        overrides, least = parsed_overrides(self.set), self.success_score
+        overrides, least = args.parsed_overrides(self.set), self.success_score
         if self.source != "environments":
             if self.policy is None:
                 raise TgdslError(f"--source {self.source}: name the policy that acts there with --policy")
@@ -127,19 +117,17 @@ class ExportDataset:
                 options |= {"calibration": self.calibration, "progress": progress}
                 deployment = Deployment(self.input, self.policy, self.source, **options)
             return of_deployment(deployment, self.episodes, self._unit(), self.seconds, self.fps, least)
-        saved = None if self.policy is None else read_policy(self.policy)
-        envs = min(self.envs, self.episodes)
+        saved, envs = args.saved_policy(self.policy), min(self.envs, self.episodes)
         with StatusLine() as progress:
             env = TouchEnv(self.input, envs, device=self.device, seed=self.seed, overrides=overrides, progress=progress)
-        actor = actor_of(env, self.actions, self.seed) if saved is None else policy_for(env, saved)
+        actor = args.actor_for(env, saved, self.actions, self.seed)
         return of_environments(env, actor, self.episodes, self.fps, self.reading, least)
 
     def _unit(self) -> str:
         """Return the unit of a hand's forces: what the calibration says, or the log."""
-        from tgdsl.runtime.xhand1.calibration import load_calibration
         from tgdsl.runtime.xhand1.log.log import open_log
 
-        if self.calibration is not None:
-            return load_calibration(self.calibration).units
-        log = open_log(self.source) if self.source.endswith(".npz") else None
-        return log.calibration.units if log is not None and log.calibration is not None else "counts"
+        calibration = args.calibration_of(self.calibration)
+        if calibration is None and self.source.endswith(".npz"):
+            calibration = open_log(self.source).calibration
+        return "counts" if calibration is None else calibration.units

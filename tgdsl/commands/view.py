@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import OptionalFile, Overrides, module_of, parsed_overrides
+from tgdsl.commands import arguments as args
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
     from tgdsl.view.stages import Stage
-
-HANDS = ("xhand1", "emulator")
 
 
 @dataclass(frozen=True)
@@ -29,9 +27,9 @@ class View:
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
     """A document or a task (.yaml), an artefact (.safetensors), a run of `tgdsl run` or a log of `tgdsl hand record` (.npz),
     `xhand1`, `xhand1:PORT` or `emulator`. A hand is only read."""
-    policy: OptionalFile = None
+    policy: args.OptionalFile = None
     """A task's policy; default: zero actions."""
-    calibration: OptionalFile = None
+    calibration: args.OptionalFile = None
     """A hand's calibration file; default: that of the log, else forces are counts."""
     envs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
     """Environments; the page shows one at a time."""
@@ -39,14 +37,12 @@ class View:
     """Port of the page; where it is taken, the next free one."""
     address: str = "127.0.0.1"
     """Address to serve at; 0.0.0.0 lets others in the network see and control the scene."""
-    seed: int = 0
-    """Seed of everything random in a task."""
-    seconds: float | None = None
+    seed: args.Seed = 0
+    seconds: args.OptionalFloat = None
     """When to stop [s]; default: at Ctrl-C."""
-    set: Overrides = ()
+    set: args.Overrides = ()
 
     def run(self) -> None:
-        """Serve the page until Ctrl-C."""
         from tgdsl.view.page import Page
 
         with StatusLine() as progress:
@@ -64,47 +60,41 @@ class View:
 
     def _stage(self, progress: StatusLine | None = None) -> Stage:
         """Return what the source is shown as."""
-        from tgdsl.commands.hand.arguments import calibration_of
         from tgdsl.runtime.xhand1.log.log import is_hand_log, open_log
         from tgdsl.view.hand_stage import HandLogStage, live_hand
         from tgdsl.view.stages import RunStage, SceneStage, read_run
 
-        if str(self.source).partition(":")[0] in HANDS:
-            return live_hand(self.source, calibration_of(self.calibration))
+        if str(self.source).partition(":")[0] in ("xhand1", "emulator"):
+            return live_hand(self.source, args.calibration_of(self.calibration))
         if is_hand_log(self.source):
-            return HandLogStage(open_log(self.source), calibration_of(self.calibration))
+            return HandLogStage(open_log(self.source), args.calibration_of(self.calibration))
         if self.calibration is not None:
             raise TgdslError(f"--calibration {self.calibration}: {self.source} is neither a hand nor the log of one")
         if self.source.suffix == ".npz":
             document = Path(str(read_run(self.source)["document"]))
-            return RunStage(module_of(document, self.set, progress), self.source)
+            return RunStage(args.module_of(document, self.set, progress), self.source)
         if self._is_task():
             return self._task_stage(progress)
         if self.policy is not None:
             raise TgdslError(f"--policy {self.policy}: {self.source} is no task's document")
-        return SceneStage(module_of(self.source, self.set, progress), self.envs)
+        return SceneStage(args.module_of(self.source, self.set, progress), self.envs)
 
     def _is_task(self) -> bool:
-        """Return whether the file is a task's document."""
         from tgdsl.schema.load import read_source
 
-        if self.source.suffix not in (".yaml", ".yml"):
-            return False
-        value = read_source(self.source).value
+        value = read_source(self.source).value if self.source.suffix in (".yaml", ".yml") else None
         return isinstance(value, dict) and "task" in value
 
     def _task_stage(self, progress: StatusLine | None) -> Stage:
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.playing.policy import policy_for, read_policy
-        from tgdsl.rl.playing.rollout import actor_of
         from tgdsl.rl.playing.stage import TaskStage
 
-        saved = None if self.policy is None else read_policy(self.policy)
-        env = TouchEnv(self.source, self.envs, seed=self.seed, overrides=parsed_overrides(self.set), progress=progress)
-        return TaskStage(env, actor_of(env, "zero", self.seed) if saved is None else policy_for(env, saved), self.seed)
+        saved = args.saved_policy(self.policy)
+        env = TouchEnv(self.source, self.envs, seed=self.seed, overrides=args.parsed_overrides(self.set), progress=progress)
+        return TaskStage(env, args.actor_for(env, saved, seed=self.seed), self.seed)
 
     def _watch(self) -> Callable[[], Stage | str | None]:
-        """Return what looks whether the source's file has been saved since, and compiles it then."""
+        """Return a function that compiles the source's file again if it has been saved since."""
         seen = self._saved()
 
         def watch() -> Stage | str | None:

@@ -14,11 +14,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from packaging.requirements import Requirement
 from packaging.version import Version
 
+from tgdsl.console.tables import text_table
 from tgdsl.errors import TgdslError
 from tgdsl.files import cache
 
@@ -98,13 +99,26 @@ class Installation:
         """Whether nothing that was found is a fault."""
         return all(finding.level != "fault" for finding in self.findings)
 
+    def __str__(self) -> str:
+        width = max(map(len, self.system))
+        draws = {name: "draws" if is_drawn else "does not draw" for name, is_drawn in self.opengl.items()}
+        sizes = {name: "none yet" if size is None else f"{size / 2**20:.1f} MiB" for name, size in self.caches.items()}
+        packages = [(p.name, p.installed or "–", p.wanted or "any", p.extra) for p in self.packages]
+        return "\n\n".join(
+            [
+                "\n".join(f"{name.ljust(width)}  {value}" for name, value in self.system.items()),
+                text_table(("package", "installed", "wanted", "extra"), packages),
+                text_table(("device", ""), self.devices.items()),
+                text_table(("compiler", ""), [(name, place or "none") for name, place in self.compilers.items()]),
+                text_table(("MUJOCO_GL", ""), draws.items()),
+                text_table(("cache", ""), sizes.items()),
+                "\n".join(f"{finding.level}: {finding.what}: {finding.then}" for finding in self.findings),
+            ]
+        )
+
 
 def examine() -> Installation:
-    """Look at this installation.
-
-    Raises:
-        TgdslError: If tgdsl itself is not installed, so that nobody knows what it wants.
-    """
+    """Look at this installation; raise `TgdslError` if tgdsl itself is not installed, so that nobody knows what it wants."""
     known, places, drawn_by = packages(), devices(), opengl()
     compiled_by = compilers(known)
     return Installation(
@@ -123,13 +137,9 @@ def system() -> dict[str, str]:
 
 
 def packages(requirements: Sequence[str] | None = None) -> tuple[Package, ...]:
-    """Return the packages that tgdsl uses, those of its own development left out.
+    """Return the packages that tgdsl uses, but not for its own development.
 
-    Args:
-        requirements: As in the metadata of a package; default: tgdsl's.
-
-    Raises:
-        TgdslError: If tgdsl is not installed.
+    `requirements` are as in the metadata of a package; default: tgdsl's.
     """
     if requirements is None:
         try:
@@ -196,17 +206,11 @@ def caches() -> dict[str, int | None]:
     from tgdsl.tensors.torch_internals import inductor_cache
 
     sizes: dict[str, int | None] = {str(cache.folder()): sum(entry.size for entry in cache.entries())}
-    for folder in (inductor_cache(), _warp_cache()):
+    shared = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    warp = Path(os.environ.get("WARP_CACHE_PATH") or Path(shared) / "warp")  # it has a folder for each version
+    for folder in (inductor_cache(), warp):
         sizes[str(folder)] = folder_size(folder) if folder.is_dir() else None
     return sizes
-
-
-def _warp_cache() -> Path:
-    """Return where Warp keeps its kernels: it has a folder for each version."""
-    if path := os.environ.get("WARP_CACHE_PATH"):
-        return Path(path)
-    shared = os.environ.get("XDG_CACHE_HOME")
-    return (Path(shared) if shared else Path(os.path.expanduser("~/.cache"))) / "warp"
 
 
 def folder_size(folder: Path) -> int:
@@ -219,58 +223,49 @@ def findings(
 ) -> tuple[Finding, ...]:
     """Return what a user should know of some packages, compilers, devices and ways to OpenGL, the worst first."""
     has_gpu = any(name.startswith("cuda") for name in places)
-    results = [*_wrong_versions(known), *_known_faults(known), *_not_there(known, has_gpu)]
+    results = [finding for package in known if (finding := _of_package(package, has_gpu))] + _known_faults(known)
     if compiled_by[CPP] is None:
-        results.append(
-            Finding("slower", "no C++ compiler (g++, clang++ or $CXX)", "`module.compile()` on a CPU leaves it eager")
-        )
+        then = "`module.compile()` on a CPU leaves it eager"
+        results.append(Finding("slower", "no C++ compiler (g++, clang++ or $CXX)", then))
     if not has_gpu:
-        results.append(
-            Finding("note", "torch sees no GPU", "everything runs on the CPU; `python -m torch.utils.collect_env` says more")
-        )
+        then = "everything runs on the CPU; `python -m torch.utils.collect_env` says more"
+        results.append(Finding("note", "torch sees no GPU", then))
     setting = os.environ.get("MUJOCO_GL", OPENGL[0])
     if not drawn_by.get(setting, True):
         others = [f"MUJOCO_GL={name}" for name, draws in drawn_by.items() if draws]
         then = f"set {others[0]}" if others else "install libegl1 or libosmesa6; pictures of `tgdsl run` need none"
         results.append(Finding("missing", f"no OpenGL by MUJOCO_GL={setting}: `tgdsl play --video` is refused", then))
-    order: tuple[Level, ...] = ("fault", "slower", "missing", "note")
-    return tuple(sorted(results, key=lambda finding: order.index(finding.level)))
+    return tuple(sorted(results, key=lambda finding: get_args(Level).index(finding.level)))
 
 
-def _wrong_versions(known: Sequence[Package]) -> list[Finding]:
-    results = []
-    for package in known:
-        install = f'pip install "{package.name}{package.wanted}"'
-        if not package.extra and package.installed is None:
-            results.append(Finding("fault", f"{package.name} is not installed, and tgdsl cannot do without it", install))
-        elif not package.fits:
-            results.append(Finding("fault", f"{package.name} is {package.installed}, expected {package.wanted}", install))
-    return results
+def _of_package(package: Package, has_gpu: bool) -> Finding | None:
+    """Return what follows if a package is missing, or has a wrong version."""
+    name, install = package.name, f'pip install "{package.name}{package.wanted}"'
+    if not package.fits:
+        return Finding("fault", f"{name} is {package.installed}, expected {package.wanted}", install)
+    if package.installed is not None:
+        return None
+    if not package.extra:
+        return Finding("fault", f"{name} is not installed, and tgdsl cannot do without it", install)
+    if name not in WITHOUT or (name == "triton" and not has_gpu):
+        return None
+    level, then = WITHOUT[name]
+    wanted = name if package.extra in DEVELOPMENT else f'"tgdsl[{package.extra}]"'
+    return Finding(level, f"{name} is not installed", f"{then} (pip install {wanted})")
 
 
 def _known_faults(known: Sequence[Package]) -> list[Finding]:
     """Return faults of what is installed that tgdsl's own range of versions does not tell of."""
     versions = {package.name: package.installed for package in known}
     results = []
-    mujoco, warp = versions.get("mujoco"), versions.get("mujoco-warp")
+    mujoco, warp, torch = (versions.get(name) for name in ("mujoco", "mujoco-warp", "torch"))
     if mujoco and Version(mujoco) == Version("4.0.0"):
         problem = "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse"
         results.append(Finding("fault", problem, "forces are wrong there: take another version"))
     if mujoco and warp and Version(mujoco).release[:2] != Version(warp).release[:2]:
         problem = f"MuJoCo {mujoco} beside MuJoCo Warp {warp}"
         results.append(Finding("fault", problem, "their models differ between such versions: take the same of both"))
-    torch = versions.get("torch")
     if torch and Version(torch) >= Version("2.11"):
         problem = f"torch {torch} compiles a copy wrongly whose source is changed after it (pytorch#198131)"
         results.append(Finding("note", problem, "tgdsl compiles nothing that does so; look out in a step of your own"))
-    return results
-
-
-def _not_there(known: Sequence[Package], has_gpu: bool) -> list[Finding]:
-    results = []
-    for package in known:
-        if package.installed is None and package.name in WITHOUT and (has_gpu or package.name != "triton"):
-            level, then = WITHOUT[package.name]
-            wanted = package.name if package.extra in DEVELOPMENT else f'"tgdsl[{package.extra}]"'
-            results.append(Finding(level, f"{package.name} is not installed", f"{then} (pip install {wanted})"))
     return results

@@ -29,11 +29,7 @@ svg{max-width:100%;height:auto} .note{color:#7b828c;font-size:13px} nav a{margin
 
 
 def check_report_files(folder: Path, stem: str) -> None:
-    """Check that a report's files can be written, before the work that leads to them.
-
-    Raises:
-        FileError: If one cannot.
-    """
+    """Raise `FileError` if one of a report's files cannot be written, before the work that leads to them."""
     for suffix in SUFFIXES:
         check_writable(folder / f"{stem}{suffix}")
 
@@ -41,18 +37,7 @@ def check_report_files(folder: Path, stem: str) -> None:
 def write_report_files(
     folder: Path, stem: str, rows: Sequence[Mapping[str, Any]], document: Mapping[str, Any], page: str
 ) -> list[Path]:
-    """Write the files of a report, all or none, and return them.
-
-    Args:
-        folder: Their folder.
-        stem: Stem of their names.
-        rows: Rows of the CSV file; lists are left out.
-        document: Content of the JSON file.
-        page: Content of the HTML file.
-
-    Raises:
-        FileError: If one cannot be written.
-    """
+    """Write the files of a report, all or none, and return them: rows as CSV, without lists; a JSON document; an HTML page."""
     flat = [{key: value for key, value in row.items() if not isinstance(value, list | tuple)} for row in rows]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in flat for key in row)), restval="")

@@ -28,8 +28,19 @@ from tgdsl.schema.objects import query_alternatives
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.recording import Recording, record
-from tgdsl.tuning.trial import Level, Outcome, Places, Trial, brief, cheapest, level_of, shown, shown_errors, written_fields
-from tgdsl.tuning.trials import Sensor
+from tgdsl.tuning.trials import (
+    Level,
+    Outcome,
+    Places,
+    Sensor,
+    Trial,
+    brief,
+    cheapest,
+    level_of,
+    shown,
+    shown_errors,
+    written_fields,
+)
 
 
 class Shared(NamedTuple):
@@ -38,41 +49,6 @@ class Shared(NamedTuple):
     places: Places  # index of the way in which distances to each object are computed
     alone: Mapping[str, Places]  # the same as each sensor would have it by itself
     floors: Places  # of objects that sensors without an accuracy feel too, what they have
-
-
-def account(trial: Trial, own: Outcome, shared: Shared) -> tuple[str, ...]:
-    """Return the account of a sensor: the choice, its measured errors, and the reason, line by line."""
-    exact, written = trial.exact, written_fields(trial)
-    lines = [shown_errors(trial, own)]
-    for (name, errors), bound in zip(own.chosen.items(), trial.bounds.values(), strict=True):
-        lines.append(f"{name}: 99 % within {shown(errors.p99, bound)}, largest {shown(errors.largest.value, bound)}")
-    scales = zip(exact.quantities, exact.magnitude.scale.tolist(), exact.units, strict=True)
-    changes = {name: f"{name} {scale:.3g}{'' if unit == '1' else f' {unit}'}" for name, scale, unit in scales}
-    where = f"on a {trial.recording.source}; largest changes: {', '.join(changes.values())}"
-    lines.append(f"against {exact.variant.label} in float64, {where}")
-    lines.append(f"cheapest by count: {own.cost.operations} operations, {own.cost.constants} bytes of constants")
-    failed = sorted((other for other in trial.outcomes.values() if not other.is_held), key=_cost)
-    worst = [f"{other.variant.label} ({brief(max(other.excess, other.verified_excess))} times the bound)" for other in failed]
-    lines += [f"not within it: {', '.join(worst)}"] if worst else []
-    lines += [f"object {target}: {why}" for target, why in _reasons(trial.sensor.name, shared).items()]
-    lines += [f"left as written: {', '.join(written)}"] if written else []
-    return (f"accuracy {trial.accuracy}: {own.variant.label}", *(f"  {line}" for line in lines))
-
-
-def _reasons(sensor: str, shared: Shared) -> dict[str, str]:
-    """Return why objects are finer than a sensor by itself would have them."""
-    result = {}
-    for target, place in shared.alone[sensor].items():
-        tied = [name for name, places in shared.alone.items() if places.get(target) == shared.places[target]]
-        if place < shared.places[target]:
-            result[target] = f"as fine as {listed(tied)} needs"
-        elif shared.floors.get(target) == place:
-            result[target] = "no coarser than written, as sensors without an accuracy feel it too"
-    return result
-
-
-def _cost(outcome: Outcome) -> tuple[int, int]:
-    return outcome.cost.operations or 0, outcome.cost.constants
 
 
 FORMAT = 2  # version of the choosing
@@ -148,22 +124,14 @@ def task_of(
     progress: Progress | None = None,
     sensors: Collection[str] | None = None,
 ) -> Task:
-    """Return the choices to make: see `choose`.
-
-    Raises:
-        SpecError: If so much is wrong with the document that it cannot be looked at.
-    """
+    """Return the choices to make: see `choose`."""
     loaded = load(document, overrides, known_kinds(kinds), sensors=sensors)
     accuracies = {name: spec.accuracy for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None}
     return Task(document, overrides or {}, kinds, sensors, loaded, accuracies, progress or silent)
 
 
 def key_of(task: Task) -> str:
-    """Return a hash of everything that decides a choice: the document's plan, the requested accuracies, and the free choices.
-
-    Raises:
-        SpecError: If the document has mistakes.
-    """
+    """Return a hash of everything that decides a choice: the document's plan, requested accuracies, and free choices."""
     unchosen = Choice(notes=dict.fromkeys(task.wanted, ()))
     plan = compile_document(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen).plan
     blank = dataclasses.replace(plan.origin, document_sha256="")
@@ -207,7 +175,7 @@ def _chosen(task: Task) -> Choice:
         return Found(trial, *cheapest(trial, trial.fields(), trial.levels(floors)))
 
     result = _each(task, list(task.wanted), by_itself)
-    alone = {name: sensor_result.level.places for name, sensor_result in result.items()}
+    alone = {name: found.level.places for name, found in result.items()}
     places: dict[str, int] = {}
     for own in alone.values():
         places |= {target: max(place, places.get(target, place)) for target, place in own.items()}
@@ -216,15 +184,11 @@ def _chosen(task: Task) -> Choice:
         trial, level = result[name].trial, level_of({target: places[target] for target in alone[name]})
         return Found(trial, *cheapest(trial, trial.fields(), [level]))
 
-    moved = [
-        name for name, sensor_places in alone.items() if any(places[target] != place for target, place in sensor_places.items())
-    ]
+    moved = [name for name, own in alone.items() if any(places[target] != place for target, place in own.items())]
     result |= _each(task, moved, with_others)
-    changes = {key: value for result_of in result.values() for key, value in result_of.outcome.variant.changes.items()}
+    changes = {key: value for found in result.values() for key, value in found.outcome.variant.changes.items()}
     shared = Shared(places, alone, floors)
-    return Choice(
-        changes, {name: account(sensor_result.trial, sensor_result.outcome, shared) for name, sensor_result in result.items()}
-    )
+    return Choice(changes, {name: account(found.trial, found.outcome, shared) for name, found in result.items()})
 
 
 def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dict[str, Found]:
@@ -257,13 +221,45 @@ def _states(task: Task) -> Recording:
     plan = compile_document(task.document, {**task.overrides, **changes}, task.kinds, task.progress, list(task.wanted)).plan
     inputs = plan.inputs
     num_envs = max([ENVS, *(2 * num for num in (*inputs.num_variants, *inputs.num_materials))])
+    touch = TactileModule(plan, known_kinds(task.kinds), torch.float32)
     try:
-        return record(
-            TactileModule(plan, known_kinds(task.kinds), torch.float32), num_envs, steps=STEPS, progress=task.progress
-        )
+        return record(touch, num_envs, steps=STEPS, progress=task.progress)
     except TgdslError as error:
-        problem = f"there are no states to measure errors on: {error}"
-        at = [("sensors", name, "accuracy") for name in task.wanted]
-        raise SpecError(
-            [task.loaded.problem(path, problem, "take it out, or give a scene that can be run") for path in at]
-        ) from error
+        problem, hint = f"there are no states to measure errors on: {error}", "take it out, or give a scene that can be run"
+        places = [("sensors", name, "accuracy") for name in task.wanted]
+        raise SpecError([task.loaded.problem(place, problem, hint) for place in places]) from error
+
+
+def account(trial: Trial, own: Outcome, shared: Shared) -> tuple[str, ...]:
+    """Return the account of a sensor: the choice, its measured errors, and the reason, line by line."""
+    exact, written = trial.exact, written_fields(trial)
+    lines = [shown_errors(trial, own)]
+    for (name, errors), bound in zip(own.chosen.items(), trial.bounds.values(), strict=True):
+        lines.append(f"{name}: 99 % within {shown(errors.p99, bound)}, largest {shown(errors.largest.value, bound)}")
+    scales = zip(exact.quantities, exact.magnitude.scale.tolist(), exact.units, strict=True)
+    changes = {name: f"{name} {scale:.3g}{'' if unit == '1' else f' {unit}'}" for name, scale, unit in scales}
+    where = f"on a {trial.recording.source}; largest changes: {', '.join(changes.values())}"
+    lines.append(f"against {exact.variant.label} in float64, {where}")
+    lines.append(f"cheapest by count: {own.cost.operations} operations, {own.cost.constants} bytes of constants")
+    failed = sorted((other for other in trial.outcomes.values() if not other.is_held), key=_cost)
+    worst = [f"{other.variant.label} ({brief(max(other.excess, other.verified_excess))} times the bound)" for other in failed]
+    lines += [f"not within it: {', '.join(worst)}"] if worst else []
+    lines += [f"object {target}: {why}" for target, why in _reasons(trial.sensor.name, shared).items()]
+    lines += [f"left as written: {', '.join(written)}"] if written else []
+    return (f"accuracy {trial.accuracy}: {own.variant.label}", *(f"  {line}" for line in lines))
+
+
+def _reasons(sensor: str, shared: Shared) -> dict[str, str]:
+    """Return why objects are finer than a sensor by itself would have them."""
+    result = {}
+    for target, place in shared.alone[sensor].items():
+        tied = [name for name, places in shared.alone.items() if places.get(target) == shared.places[target]]
+        if place < shared.places[target]:
+            result[target] = f"as fine as {listed(tied)} needs"
+        elif shared.floors.get(target) == place:
+            result[target] = "no coarser than written, as sensors without an accuracy feel it too"
+    return result
+
+
+def _cost(outcome: Outcome) -> tuple[int, int]:
+    return outcome.cost.operations or 0, outcome.cost.constants

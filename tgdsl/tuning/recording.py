@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -56,19 +57,17 @@ class Recording:
         return [narrowed(state, self.names, inputs) for state in self.states]
 
 
+def control_ranges(model: mujoco.MjModel) -> Float[np.ndarray, "actuator 2"]:
+    """Return the lowest and highest control of each actuator; 0 and 0: it has none."""
+    return np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
+
+
 def varied(
     controls: Float[np.ndarray, "step actuator"], ranges: Float[np.ndarray, "actuator 2"], num_envs: int, seed: int
-) -> Any:
-    """Return a script's controls as each environment has them: it goes further or less far, and sways.
+) -> Float[np.ndarray, "step env actuator"]:
+    """Return a script's controls as each environment has them: it goes further or less far, and sways; the first's are its own.
 
-    Args:
-        controls: The script's.
-        ranges: Lowest and highest control of each actuator; 0 and 0: it has none.
-        num_envs: Environments.
-        seed: What differs between environments follows from it.
-
-    Returns:
-        (step, env, actuator); the first environment's are the script's own.
+    `ranges` are those of `control_ranges`.
     """
     rng = np.random.default_rng(seed)
     num_steps, num = controls.shape
@@ -116,9 +115,7 @@ def record(
     seconds = steps / phases * max(num_substeps, substeps) * scene_model(touch.plan.scene).opt.timestep
     sim, controls = script.begin(touch, num_envs, num_substeps, seconds)
     results = []
-    model = sim.model
-    ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
-    for control in varied(controls, ranges, num_envs, seed):
+    for control in varied(controls, control_ranges(sim.model), num_envs, seed):
         progress(f"recording states: {len(results) + 1} of {len(controls)}")
         sim.step(control)
         results.append(_copy(sim.state()))

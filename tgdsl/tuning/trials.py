@@ -1,4 +1,4 @@
-"""A sensor's variants, compiled from its document with one thing changed, and their errors on recorded states.
+"""A sensor's variants, compiled from its document with one thing changed: what each costs, and how far each is off.
 
 Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` numbers per row.
 """
@@ -6,7 +6,7 @@ Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` num
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,10 +16,20 @@ from jaxtyping import Float
 
 from tgdsl.compiler.pipeline import Document, compile_document
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import TgdslError
-from tgdsl.module.accuracy.errors import Magnitude, magnitude_of
+from tgdsl.errors import LowerError, TgdslError, listed
+from tgdsl.fields.accuracy import Accuracy, Bound
+from tgdsl.module.accuracy.errors import Errors, Magnitude, errors_of, halves, magnitude_of
 from tgdsl.module.accuracy.states import common_of, readings_of
-from tgdsl.module.accuracy.variants import Variant, Variants, bare, queried_objects, variants_of
+from tgdsl.module.accuracy.variants import (
+    Variant,
+    Variants,
+    bare,
+    is_free,
+    is_taken,
+    queried_objects,
+    variants_of,
+    written_of,
+)
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedReading
@@ -29,6 +39,8 @@ from tgdsl.sensors.base import AnySensorSpec, Kind
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise.spec import quantity
 from tgdsl.tuning.recording import Recording
+
+Places = Mapping[str, int]  # of objects, which of `query_alternatives` they have
 
 
 class Cost(NamedTuple):
@@ -59,11 +71,7 @@ class Sensor:
 
     @staticmethod
     def of(document: Document, overrides: Mapping[str, Any], name: str, kinds: Sequence[Kind] = ()) -> Sensor:
-        """Return a sensor of a document.
-
-        Raises:
-            SpecError: If the document has mistakes.
-        """
+        """Return a sensor of a document."""
         changed, all_kinds = {**overrides, **bare(name)}, known_kinds(kinds)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -81,11 +89,7 @@ class Sensor:
         return self.own.readings()[self.name]
 
     def plan(self, variant: Variant) -> Plan:
-        """Return the Plan of a variant.
-
-        Raises:
-            TgdslError: If it is unavailable.
-        """
+        """Return the Plan of a variant; raise `TgdslError` if it is unavailable."""
         if not variant.changes:
             return self.own
         key = repr(sorted(variant.changes.items()))
@@ -94,6 +98,15 @@ class Sensor:
             self.module(plan, torch.float32)  # which may need a library that is missing
             self.plans[key] = plan
         return self.plans[key]
+
+    def has(self, variant: Variant, left_out: dict[str, str]) -> bool:
+        """Return whether a variant is available; if not, the reason is in `left_out`, by its label."""
+        if variant.label not in left_out:
+            try:
+                self.plan(variant)
+            except TgdslError as error:
+                left_out[variant.label] = str(error)
+        return variant.label not in left_out
 
     def module(self, plan: Plan, dtype: torch.dtype) -> TactileModule:
         """Return the module of one of its Plans."""
@@ -119,17 +132,7 @@ class Exact(NamedTuple):
 
 
 def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Progress = silent) -> Exact:
-    """Return what errors of a sensor are measured against.
-
-    Args:
-        sensor: The sensor.
-        finest: Its finest variant: see `finest_of`.
-        recording: States of the document's scene.
-        progress: Called with a line of text for each long job.
-
-    Raises:
-        StateError: If the states are of another document.
-    """
+    """Return what errors of a sensor are measured against, given its finest variant (see `finest_of`) and recorded states."""
     progress(f"{sensor.name}: {finest.label}, float64")
     exact = sensor.module(sensor.own, torch.float64)
     fine = sensor.module(sensor.plan(finest), torch.float64)
@@ -142,36 +145,17 @@ def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Pr
 def finest_of(sensor: Sensor, left_out: dict[str, str]) -> Variant:
     """Return the finest variant: the last available one of its fields and of its queries.
 
-    Args:
-        sensor: The sensor.
-        left_out: Filled with the reasons why finer ones are unavailable, by their labels.
+    `left_out` is filled with the reasons why finer ones are unavailable, by their labels.
     """
-    results = [last for axis in (sensor.variants.fields, sensor.variants.queries) if (last := _last(sensor, axis, left_out))]
+    axes = (sensor.variants.fields, sensor.variants.queries)
+    results = [last for axis in axes if (last := next(filter(lambda v: sensor.has(v, left_out), reversed(axis)), None))]
     if not results:
         return Variant(sensor.variants.own.label, is_own=True, is_exact=True)
     return results[0] if len(results) == 1 else results[0].joined(results[1])
 
 
-def _last(sensor: Sensor, axis: Sequence[Variant], left_out: dict[str, str]) -> Variant | None:
-    for variant in reversed(axis):
-        if variant.label in left_out:
-            continue
-        try:
-            sensor.plan(variant)
-        except TgdslError as error:
-            left_out[variant.label] = str(error)
-        else:
-            return variant
-    return None
-
-
 def cost_of(touch: TactileModule, size: int) -> Cost:
-    """Return the counted cost of a module; its state is that of a single call.
-
-    Args:
-        touch: The module.
-        size: Bytes of a number that it returns.
-    """
+    """Return the counted cost of a module that returns numbers of `size` bytes; its state is that of a single call."""
     state = touch.example_state(2)
     with torch.no_grad():
         touch(state)
@@ -183,3 +167,223 @@ def cost_of(touch: TactileModule, size: int) -> Cost:
         state=state_bytes,
         output=size * sum(int(np.prod(output.shape)) for output in touch.outputs),
     )
+
+
+class Level(NamedTuple):
+    """A way to find distances to the meshes that a sensor feels."""
+
+    variant: Variant
+    places: Places
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A variant, measured."""
+
+    variant: Variant  # it
+    cost: Cost  # what it takes, counted
+    chosen: Mapping[str, Errors]  # errors of each quantity in the environments that variants are compared in
+    verified: Mapping[str, Errors]  # the same in the others, which take no part
+    excess: float  # largest upper end of an interval of `chosen` over its bound: at most 1 if the accuracy is held
+    verified_excess: float  # largest error of `verified` over its bound
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the accuracy is held, in the environments that take no part too."""
+        return self.excess <= 1 and self.verified_excess <= 1
+
+
+class Trial:
+    """A sensor's variants on recorded states, each measured once."""
+
+    def __init__(self, sensor: Sensor, accuracy: Accuracy, recording: Recording, progress: Progress):
+        """Raise `LowerError` if the reading does not change on the states, or the document has the finest variant already."""
+        self.sensor, self.accuracy, self.recording, self._progress = sensor, accuracy, recording, progress
+        self.left_out: dict[str, str] = {}  # why variants are unavailable, by their labels
+        self.exact: Exact = exact_of(sensor, finest_of(sensor, self.left_out), recording, progress)
+        self.outcomes: dict[str, Outcome] = {}  # measurements, by the variants' labels
+        self._costs: dict[str, Cost] = {}
+        self.bounds: dict[str, Bound] = {}  # the accuracy of each quantity
+        for name in dict.fromkeys(self.exact.quantities):
+            bound = accuracy.of(name)
+            assert bound is not None  # the compiler has refused it else
+            self.bounds[name] = bound
+        self._check_states()
+
+    def channels(self, quantity: str) -> list[int]:
+        """Return which channels are components of a quantity."""
+        return [i for i, other in enumerate(self.exact.quantities) if other == quantity]
+
+    def fields(self) -> list[Variant]:
+        """Return the choices of the sensor's fields whose errors can be measured and that change nothing that is written."""
+        candidates = [choice for choice in self.sensor.variants.fields if choice.label not in self.left_out]
+        finest = candidates[-1] if candidates else None
+        if finest is not None and not finest.is_exact:
+            candidates = candidates[:-1]
+        results = [choice for choice in candidates if choice.is_free]
+        is_finest = finest is not None and finest.is_own and not finest.is_exact
+        if not any(choice.is_own for choice in results) and not is_finest:
+            results.insert(0, Variant("as written", is_own=True))
+        if not results:
+            self._refuse_finest(self.sensor.variants.own.label)
+        return results
+
+    def levels(self, floors: Places) -> list[Level]:
+        """Return the ways to find distances to meshes, from coarse to fine, that change nothing that is written.
+
+        No way is coarser than an object's in `floors`, which sensors without an accuracy feel too.
+        """
+        alternatives = query_alternatives()
+        candidates = [i for i, choice in enumerate(alternatives) if choice.label not in self.left_out]
+        finest, queried = alternatives[candidates[-1]], self.sensor.queried
+        if not finest.is_exact:
+            candidates = candidates[:-1]
+            if any(is_taken(spec, finest) for spec in queried.values()):
+                self._refuse_finest(finest.label)
+        free = {
+            name: [i for i in candidates if i >= floors.get(name, 0) and is_free(spec, alternatives[i])]
+            for name, spec in queried.items()
+        }
+        free = {name: ways for name, ways in free.items() if ways}
+        result: dict[tuple[int, ...], Level] = {}
+        for i in candidates:
+            places = {name: next((j for j in ways if j >= i), ways[-1]) for name, ways in free.items()}
+            result.setdefault(tuple(places.values()), level_of(places))
+        return list(result.values())
+
+    def outcome(self, variant: Variant) -> Outcome | None:
+        """Return a variant's errors; None if it is unavailable."""
+        if variant.label not in self.outcomes:
+            cost = self.cost(variant)
+            if cost is None:
+                return None
+            self._progress(f"{self.sensor.name}: {variant.label}, errors")
+            chosen, verified = self._errors(variant)
+            self.outcomes[variant.label] = Outcome(
+                variant,
+                cost,
+                chosen,
+                verified,
+                max(errors.rms.high / self.bounds[name].value for name, errors in chosen.items()),
+                max(errors.rms.value / self.bounds[name].value for name, errors in verified.items()),
+            )
+        return self.outcomes[variant.label]
+
+    def cost(self, variant: Variant) -> Cost | None:
+        """Return the counted cost of a variant; None if it is unavailable."""
+        if variant.label not in self._costs:
+            self._progress(f"{self.sensor.name}: {variant.label}")
+            if not self.sensor.has(variant, self.left_out):
+                return None
+            self._costs[variant.label] = cost_of(self.sensor.module(self.sensor.plan(variant), torch.float32), 4)
+        return self._costs[variant.label]
+
+    def _errors(self, variant: Variant) -> Iterator[dict[str, Errors]]:
+        """Yield the errors of each quantity, first in the environments that choose, then in the ones that verify."""
+        touch, exact = self.sensor.module(self.sensor.plan(variant), torch.float32), self.exact
+        readings = readings_of(touch, self.recording.for_module(touch.inputs), self.sensor.name)
+        readings = common_of(exact.module, touch, self.sensor.name).of_other(readings)
+        for envs in halves(self.recording.num_envs):
+            errors = {}
+            for name, bound in self.bounds.items():
+                channels = self.channels(name)
+                pair = (readings[:, envs][..., channels], exact.readings[:, envs][..., channels])
+                errors[name] = errors_of(*pair, exact.magnitude.of(envs, channels), is_relative=not bound.unit)
+            yield errors
+
+    def _check_states(self) -> None:
+        for envs in halves(self.recording.num_envs):
+            for name in self.bounds:
+                if not self.exact.magnitude.of(envs, self.channels(name)).active.any():
+                    problem = f"its {name} never changes on these states ({self.recording.source}), so no error can be measured"
+                    hint = "give the scene keyframes `rest` and `squeeze` between which its links meet what they feel"
+                    raise LowerError(problem, "accuracy", hint)
+
+    def _refuse_finest(self, label: str) -> None:
+        lacking = "".join(f"; {label}: {why}" for label, why in self.left_out.items())
+        problem = f"the document's own {label} is the finest variant: there is nothing to measure its error against"
+        raise LowerError(f"{problem}{lacking}", "accuracy", "write a coarser one, or none")
+
+
+def level_of(places: Places) -> Level:
+    """Return the variant in which objects find distances in given ways."""
+    alternatives = query_alternatives()
+    changes = {f"objects.{name}.{key}": v for name, i in places.items() for key, v in alternatives[i].changes.items()}
+    labels = dict.fromkeys(alternatives[i].label for i in places.values())
+    each = [f"{name} {alternatives[i].label}" for name, i in places.items()]
+    return Level(Variant(next(iter(labels), "") if len(labels) < 2 else "; ".join(each), changes), places)
+
+
+def _joined(fields: Variant, level: Level) -> Variant:
+    if not level.places:
+        return fields
+    return level.variant if not fields.changes else fields.joined(level.variant)
+
+
+def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -> tuple[Outcome, Level]:
+    """Return the cheapest variant that holds an accuracy, and how it finds distances: fewest operations, then fewest bytes.
+
+    Where both can be chosen, variants that miss it even with the finest of the other kind are dropped first. A `LowerError`
+    names the best if none holds it.
+    """
+    fields, levels = list(fields), list(levels)
+    if len(fields) > 1 and len(levels) > 1:
+        fine = levels[-1]
+        fields = [choice for choice in fields if _is_near(trial, _joined(choice, fine))] or fields
+        finest = fields[-1]
+        levels = [choice for choice in levels if _is_near(trial, _joined(finest, choice))] or levels
+    options = [(_joined(choice, level), level) for choice in fields for level in levels]
+    costs = {option[0].label: cost for option in options if (cost := trial.cost(option[0])) is not None}
+    options = [option for option in options if option[0].label in costs]
+    options.sort(key=lambda option: (costs[option[0].label].operations or 0, costs[option[0].label].constants))
+    for variant, level in options:
+        outcome = trial.outcome(variant)
+        if outcome is not None and outcome.is_held:
+            return outcome, level
+    raise _missed(trial)
+
+
+def _is_near(trial: Trial, variant: Variant) -> bool:
+    outcome = trial.outcome(variant)
+    return outcome is not None and outcome.is_held
+
+
+def _missed(trial: Trial) -> LowerError:
+    best = min(trial.outcomes.values(), key=lambda own: max(own.excess, own.verified_excess))
+    problem = f"nothing that is free to choose holds {trial.accuracy}; best: {best.variant.label}, {shown_errors(trial, best)}"
+    written = written_fields(trial)
+    hints = [f"{listed(written)} stay{'s' if len(written) == 1 else ''} as written"] if written else []
+    hints += [f"{label} cannot be had: {why}" for label, why in trial.left_out.items()]
+    return LowerError(problem, "accuracy", "; ".join([*hints, f"errors are against {trial.exact.variant.label}"]))
+
+
+def written_fields(trial: Trial) -> list[str]:
+    """Return the fields that other choices would change if nobody had written them, by dotted path."""
+    sensor = trial.sensor
+    results = [f"sensors.{sensor.name}.{key}" for key in written_of(sensor.spec, sensor.kind.alternatives(sensor.spec))]
+    for name, spec in sensor.queried.items():
+        results += [f"objects.{name}.{key}" for key in written_of(spec, query_alternatives())]
+    return results
+
+
+def shown_errors(trial: Trial, outcome: Outcome) -> str:
+    """Return the errors of each quantity, in their bounds' units."""
+    parts = []
+    for name, bound in trial.bounds.items():
+        rms = outcome.chosen[name].rms
+        apart = shown(outcome.verified[name].rms.value, bound)
+        parts.append(
+            f"RMS error of {name} {shown(rms.value, bound)}, up to {shown(rms.high, bound)} with 95 % confidence; "
+            f"{apart} in environments that took no part"
+        )
+    return "; ".join(parts)
+
+
+def shown(error: float, bound: Bound) -> str:
+    """Return an error in a bound's unit."""
+    return f"{brief(error)} {bound.unit}" if bound.unit else f"{brief(100 * error)} %"
+
+
+def brief(value: float) -> str:
+    """Return two digits of a number, and all before the point."""
+    return f"{value:.0f}" if 100 <= value < 1e6 else f"{value:.2g}"

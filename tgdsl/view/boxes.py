@@ -17,14 +17,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tgdsl.layout.layout import Layout
-from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.view.markers import Markers
+from tgdsl.view.markers import Markers, Pose, in_world, read_now
 from tgdsl.view.scene import Paint, Seen, draw_colour_bar, draw_image, draw_scale_bar, rendered
 from tgdsl.view.style import WARMTH
-from tgdsl.view.taxels import Pose, in_world
 
 Array = np.ndarray
 FLAT = 0.5  # half of the range of the colours where all that is read is the same [the reading's unit]
@@ -39,7 +37,7 @@ class Boxes:
     size: Float[Array, "shown 3"]  # their sides, along the axes of their body [m]
     value: Float[Array, " box"]  # what each reads, hidden ones too
     label: str  # quantity and unit
-    unit: str  # unit, as it is printed
+    unit: str  # as it is printed
     ends: tuple[float, float] | None = None  # lowest and highest of the colours; None: those of the values
 
     @property
@@ -52,32 +50,33 @@ class Boxes:
 
     @property
     def headline(self) -> str:
-        """The range of what is read: `temperature 22.00 … 24.13 °C`."""
-        return f"{self.label.split(' [')[0]} {span(self.value)} {self.unit}"
+        """The range of what is read: `temperature 22.00 … 24.13 °C`, or one number where all are the same."""
+        ends = dict.fromkeys(f"{end:.2f}" for end in (self.value.min(), self.value.max()))
+        return f"{self.label.split(' [')[0]} {' … '.join(ends)} {self.unit}"
 
     def markers(self, model: mujoco.MjModel, pose: Pose) -> Markers:
         """Return the boxes at the surface as markers; those count as read that differ most from the middle value."""
         bodies = [self.layout.links[i].body for i in self.layout.link_id]
         pos, normal = in_world(model, pose, bodies, self.layout.pos, self.layout.normal)
-        own = np.abs(self.value[self.chosen] - np.median(self.value))
-        own = np.where(own >= 0.5 * own.max(), own, 0.0) if own.max() > 1e-6 else np.zeros(len(own))
-        return Markers(pos, normal, np.sqrt(self.layout.area), own, self.label, self.unit)
+        away = np.abs(self.value[self.chosen] - np.median(self.value))
+        away = np.where(away >= 0.5 * away.max(), away, 0.0) if away.max() > 1e-6 else np.zeros(len(away))
+        return Markers(pos, normal, np.sqrt(self.layout.area), away, self.label, self.unit)
 
     def painter(self, model: mujoco.MjModel, pose: Pose) -> Paint:
         """Return what colours a point of a link's surface: the box there, or the nearest one."""
-        bodies = [model.body(link.body).id for link in self.layout.links]
-        trees = {body: (self.layout.link_id == i).nonzero()[0] for i, body in enumerate(bodies)}
+        members = {
+            model.body(link.body).id: np.flatnonzero(self.layout.link_id == i) for i, link in enumerate(self.layout.links)
+        }
         colour = WARMTH(self.norm(self.value[self.chosen]))[:, :3]
 
         def paint(points: Float[Array, "point 3"], body: Int[Array, " point"]) -> Float[Array, "point 3"]:
             result = np.full(points.shape, np.nan)
-            for own, members in trees.items():
-                at = np.flatnonzero(body == own)
-                if len(at) and len(members):
-                    local = Rotation.from_quat(pose.quat[own], scalar_first=True).inv().apply(points[at] - pose.pos[own])
-                    sides = self.size[members[0]]  # the same for all boxes of a link: nearest in sides is the box itself
-                    near = KDTree(self.layout.pos[members] / sides).query(local / sides)[1]
-                    result[at] = colour[members[near]]
+            for link, boxes in members.items():
+                at = np.flatnonzero(body == link)
+                if len(at) and len(boxes):
+                    local = Rotation.from_quat(pose.quat[link], scalar_first=True).inv().apply(points[at] - pose.pos[link])
+                    sides = self.size[boxes[0]]  # the same for all boxes of a link: nearest in sides is the box itself
+                    result[at] = colour[boxes[KDTree(self.layout.pos[boxes] / sides).query(local / sides)[1]]]
             return result
 
         return paint
@@ -92,19 +91,14 @@ def is_boxed(touch: TactileModule, output: Output) -> bool:
 def boxes_of(
     touch: TactileModule, output: Output, values: Tensor, env: int, temperatures: tuple[float, float] | None = None
 ) -> Boxes:
-    """Return the boxes of a reading in one environment, and what they read; of stacked calls the last one.
+    """Return the boxes of a reading (see `is_boxed`) in one environment, and what they read; of stacked calls the last one.
 
-    Args:
-        touch: The module.
-        output: Which reading: one of boxes, see `is_boxed`.
-        values: The reading of all environments.
-        env: Which environment.
-        temperatures: Lowest and highest of the colours of temperatures [°C]; default: those that are read.
+    `temperatures`: lowest and highest of the colours of temperatures [°C]; default: those that are read.
     """
     table, links = touch.rows[output.name], touch.plan.sensor_of(output.name).links
-    named = table["link"] if "link" in (table.dtype.names or ()) else None
-    own = [link.name for link in links] if named is not None else [link.body for link in links]
-    link_id = np.array([own.index(name) for name in (table["body"] if named is None else named)], dtype=np.int64)
+    key = "link" if "link" in (table.dtype.names or ()) else "body"
+    names = [link.name if key == "link" else link.body for link in links]
+    link_id = np.array([names.index(name) for name in table[key]], dtype=np.int64)
     pos, size = table["pos"], table["size"]
     exposed = _exposed(link_id, pos, size)
     chosen = np.flatnonzero((exposed > 0).any(axis=(1, 2)))
@@ -114,9 +108,8 @@ def boxes_of(
     unit = "°C" if output.units[0] == "degC" else output.units[0]
     tangent = np.roll(normal, 1, axis=1)
     layout = Layout(links, {}, link_id, pos, normal, tangent, np.sqrt(area), area, np.full((len(area), 2), -1))
-    read = last_step(values)[env].detach().cpu().double().numpy()[:, 0]
     ends = temperatures if unit == "°C" else None
-    return Boxes(layout, chosen, size[chosen], read, f"{output.channels[0]} [{unit}]", unit, ends)
+    return Boxes(layout, chosen, size[chosen], read_now(values, env)[:, 0], f"{output.channels[0]} [{unit}]", unit, ends)
 
 
 def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Float[Array, "box 3"]) -> Float[Array, "box 2 3"]:
@@ -125,8 +118,7 @@ def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Floa
     area = size.prod(axis=1, keepdims=True) / size
     for link in np.unique(link_id):
         own = link_id == link
-        low, high = pos[own] - 0.5 * size[own], pos[own] + 0.5 * size[own]
-        slack = 0.1 * size[own]
+        low, high, slack = pos[own] - 0.5 * size[own], pos[own] + 0.5 * size[own], 0.1 * size[own]
         result[own, 0] = area[own] * (low < low.min(axis=0) + slack)
         result[own, 1] = area[own] * (high > high.max(axis=0) - slack)
     return result
@@ -134,14 +126,7 @@ def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Floa
 
 def draw_boxes(axes: Axes, sim: Simulation, seen: Seen, boxes: Boxes, env: int) -> None:
     """Draw the robot in the colours of the boxes of its links, with a bar that says them; objects are faint."""
-    norm = boxes.norm
     scene = rendered(seen, boxes.painter(sim.model, Pose(*sim.body_poses(env))))
     draw_image(axes, scene.image, scene.viewport)
-    draw_scale_bar(axes, scene.viewport.scale, scene.viewport.width, -44.0)
-    draw_colour_bar(axes.inset_axes((0.46, -0.06, 0.5, 0.022)), norm, WARMTH, boxes.label)
-
-
-def span(values: Array) -> str:
-    """Return the lowest and the highest of some values: `22.00 … 24.13`, or one where they are the same."""
-    ends = dict.fromkeys(f"{end:.2f}" for end in (values.min(), values.max()))
-    return " … ".join(ends)
+    draw_scale_bar(axes, scene.viewport, -44.0)
+    draw_colour_bar(axes.inset_axes((0.46, -0.06, 0.5, 0.022)), boxes.norm, WARMTH, boxes.label)

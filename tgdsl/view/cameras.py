@@ -5,7 +5,7 @@ Shapes: `taxel` taxels of one sensor or layout.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.layout.layout import Layout
-from tgdsl.view.markers import Markers
+from tgdsl.view.markers import Markers, Pose, is_visible, taxels_of
 from tgdsl.view.raster import Camera, Mesh, rasterise, unit, viewport_for
-from tgdsl.view.taxels import Pose, is_visible, taxels_of
 
 Array = np.ndarray
+# where the camera is, from the taxels' mean normal: degrees round the hand to the picture's right, and degrees up
 VIEWS = {
     "front": (6.0, 16.0),
     "back": (186.0, 16.0),
@@ -28,11 +28,10 @@ VIEWS = {
     "bottom": (0.0, -90.0),
     "iso": (36.0, 32.0),
 }
-"""Where the camera is, from the taxels' mean normal: degrees round the hand to the picture's right, and degrees up."""
+# length of the mean unit normal below which taxels have no common side, but look at each other, as a gripper's pads do
 OPPOSED = 0.2
-"""Length of the mean unit normal below which taxels have no common side, but look at each other, as a gripper's pads do."""
 _PAST_NEAR_PAD = np.radians(35.0)  # how far a camera turns from beside opposed pads towards the face of one
-_AROUND, _RISES = range(0, 360, 45), (-30, 16, 50)
+_CANDIDATES = (*VIEWS, *(f"{around},{rise}" for rise in (-30, 16, 50) for around in range(0, 360, 45)))
 _LOOK = 200  # columns and rows of the pictures by which views are compared
 
 
@@ -41,14 +40,7 @@ class ViewError(TgdslError):
 
 
 def angles_of(view: str) -> tuple[float, float]:
-    """Return where a view is from: azimuth and elevation [degrees].
-
-    Args:
-        view: One of `VIEWS`, or the two numbers themselves, such as "30,20".
-
-    Raises:
-        ViewError: If it is none.
-    """
+    """Return azimuth and elevation [degrees] of a view: one of `VIEWS`, or the two numbers themselves, such as "30,20"."""
     if view in VIEWS:
         return VIEWS[view]
     azimuth, comma, elevation = view.partition(",")
@@ -64,11 +56,7 @@ def angles_of(view: str) -> tuple[float, float]:
 
 
 def pose_of(model: mujoco.MjModel, keyframe: str | None) -> Pose:
-    """Return where a keyframe puts the bodies; without one, where the model's own initial state does.
-
-    Raises:
-        ViewError: If the model has no such keyframe.
-    """
+    """Return where a keyframe puts the bodies; without one, where the model's own initial state does."""
     state = mujoco.MjData(model)
     if keyframe is not None:
         names = [model.key(i).name for i in range(model.nkey)]
@@ -82,14 +70,16 @@ def pose_of(model: mujoco.MjModel, keyframe: str | None) -> Pose:
 def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose: Pose, root: int) -> Camera:
     """Return the camera of a view: it is fixed to the hand's first body, so that a hand that closes is seen from the same side.
 
+    Up is an axis of the root's frame: the one along which the taxels lie farthest from its origin, of those not pointing at
+    the camera. Where taxels are opposed, up is against gravity, and the camera stands beside the gap that they close, turned so
+    far that one side's faces show.
+
     Args:
         view: One of `VIEWS`, or azimuth and elevation in degrees.
         model: The robot.
         layouts: The taxels, which count in the model's initial state, each by the surface that it stands for.
         pose: Where the bodies are.
-        root: The hand's first body: up is an axis of its frame, the one along which the taxels lie farthest from its origin of
-            those that do not point at the camera. Where taxels are opposed, up is against gravity, and the camera stands beside
-            the gap that they close, turned so far that one side's faces show.
+        root: The hand's first body.
     """
     initial = pose_of(model, None)
     taxels = [taxels_of(model, initial, layout) for layout in layouts]
@@ -104,34 +94,24 @@ def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose:
     up = across[np.argmax(across @ (centre - initial.pos[root] + [0, 0, 1e-6]))]  # the world's z, where nothing else decides
     toward = unit(normal - (normal @ up) * up, axes[np.argmin(np.abs(axes @ up))])
     if np.linalg.norm(mean) < OPPOSED:
-        up, toward = _beside_gap(model, normals, weight)
+        up = unit(-model.opt.gravity, np.array([0.0, 0.0, 1.0]))
+        level = normals - np.outer(normals @ up, up)
+        along = np.linalg.eigh((level * weight[:, None]).T @ level)[1][:, -1]
+        along = along * np.sign(along[np.abs(along).argmax()])
+        toward = np.cos(_PAST_NEAR_PAD) * np.cross(along, up) + np.sin(_PAST_NEAR_PAD) * along
     around, rise = np.radians(angles_of(view))
     level = np.cos(around) * toward + np.sin(around) * np.cross(up, toward)
     toward = np.cos(rise) * level + np.sin(rise) * up
     right = np.cross(up, level)
-    frame = np.stack([right, np.cross(toward, right), toward])
     turn = Rotation.from_quat(pose.quat[root], scalar_first=True).as_matrix() @ axes[:3]
-    right, above, toward = frame @ turn.T
+    right, above, toward = np.stack([right, np.cross(toward, right), toward]) @ turn.T
     return Camera(right, above, toward, pose.pos[root])
 
 
-def _beside_gap(
-    model: mujoco.MjModel, normals: Float[Array, "taxel 3"], weight: Float[Array, " taxel"]
-) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
-    """Return up and toward the camera in the world, for taxels that look at each other."""
-    up = unit(-model.opt.gravity, np.array([0.0, 0.0, 1.0]))
-    level = normals - np.outer(normals @ up, up)
-    along = np.linalg.eigh((level * weight[:, None]).T @ level)[1][:, -1]
-    along = along * np.sign(along[np.abs(along).argmax()])
-    return up, np.cos(_PAST_NEAR_PAD) * np.cross(along, up) + np.sin(_PAST_NEAR_PAD) * along
-
-
 def facing_camera(markers: Markers, origin: Float[Array, " 3"]) -> Camera:
-    """Return a camera that the most strongly read taxels face, a little from the side.
+    """Return a camera that the most strongly read taxels face, a little from the side; where none reads, all count alike.
 
-    Args:
-        markers: The taxels; where none reads anything, all count alike.
-        origin: Where the hand begins [m]: the image's up is the world's, or else leads away from here.
+    The image's up is the world's, or else leads away from where the hand begins: `origin` [m].
     """
     weight = markers.value if markers.is_read.any() else np.ones(len(markers.value))
     toward = unit(weight @ markers.normal, np.array([0.0, 0.0, 1.0]))
@@ -149,9 +129,8 @@ def facing_camera(markers: Markers, origin: Float[Array, " 3"]) -> Camera:
 def best_camera(markers: Markers, hand: Mesh, model: mujoco.MjModel, layout: Layout, pose: Pose, root: int) -> Camera:
     """Return the camera that those taxels face which read most (see `facing_camera`), or the one that shows most taxels.
 
-    Where those are opposed, that camera is `front`.
-
-    Taxels count that are touched, or all where none is. The first camera is kept if it shows half as many as any other or more.
+    Taxels count that are touched, or all where none is. The first camera is kept if it shows half as many as any other or more;
+    it is `front` where the taxels are opposed.
 
     Args:
         markers: The taxels.
@@ -168,20 +147,15 @@ def best_camera(markers: Markers, hand: Mesh, model: mujoco.MjModel, layout: Lay
     own, _ = _shown(markers, wanted, hand, first)
     if 2 * own >= wanted.sum():
         return first
-    others = [(camera, _shown(markers, wanted, hand, camera)) for camera in _candidates(model, layout, pose, root)]
-    best, (most, _) = max(others, key=lambda entry: entry[1])
-    return first if 2 * own >= most else best
-
-
-def _candidates(model: mujoco.MjModel, layout: Layout, pose: Pose, root: int) -> Iterator[Camera]:
-    for view in (*VIEWS, *(f"{around},{rise}" for rise in _RISES for around in _AROUND)):
-        yield camera_of(view, model, [layout], pose, root)
+    others = [camera_of(view, model, [layout], pose, root) for view in _CANDIDATES]
+    counts = [_shown(markers, wanted, hand, camera) for camera in others]
+    most = max(counts)
+    return first if 2 * own >= most[0] else others[counts.index(most)]
 
 
 def _shown(markers: Markers, wanted: Array, hand: Mesh, camera: Camera) -> tuple[int, int]:
     """Return how many of the taxels that are wanted a camera shows, and how many in all."""
-    facing = hand.normals.mean(axis=1) @ camera.toward > 0
-    corners = hand.corners[facing]
+    corners = hand.corners[hand.normals.mean(axis=1) @ camera.toward > 0]
     flat = np.concatenate([camera.project(corners).reshape(-1, 3), camera.project(markers.pos)])[:, :2]
     margin = 1e-3  # [m] so that a single point has a size too
     viewport = viewport_for(camera, np.stack([flat.min(axis=0) - margin, flat.max(axis=0) + margin]), _LOOK, _LOOK)

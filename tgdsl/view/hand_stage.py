@@ -29,7 +29,7 @@ from tgdsl.runtime.xhand1.wire.protocol import FINGERS, HandState
 from tgdsl.scene.scene import scene_model
 from tgdsl.tuning.compile import compile
 from tgdsl.view.hand_table import StreamCounter
-from tgdsl.view.stages import Stage, kinematic_poses
+from tgdsl.view.stages import Poses, RecordedStage, Stage, kinematic_poses
 
 Array = np.ndarray
 LIVE_STEP = 0.02  # time between readings of a live hand that are shown [s]
@@ -44,17 +44,15 @@ _DOCUMENT = {
 
 
 class HandStage(Stage):
-    """A hand at one instant, drawn as the right hand: which bytes say left or right is unverified.
+    """A hand at one instant, drawn as the right hand: which bytes say left or right is unverified."""
 
-    Attributes:
-        calibration: What the hand's counts mean.
-    """
-
-    def __init__(self, calibration: Calibration):
-        self.touch, self.calibration, self.num_envs = compile(_DOCUMENT), calibration, 1
+    def __init__(self, calibration: Calibration | None):
+        """Show a hand by what its counts mean; default: they stay counts."""
+        self.touch, self.num_envs = compile(_DOCUMENT), 1
+        self.calibration = calibration or Calibration.none()
         self.model = scene_model(self.touch.plan.scene)
         (output,) = self.touch.outputs
-        self._output = dataclasses.replace(output, units=(calibration.units,) * 3)
+        self._output = dataclasses.replace(output, units=(self.calibration.units,) * 3)
         self._fingers = [i for body in output.bodies if (i := finger_of(body)) is not None]
         self._qpos_id = JointControls.of_model(self.model).qpos_id
         self._data = mujoco.MjData(self.model)
@@ -64,33 +62,23 @@ class HandStage(Stage):
         """The forces on the fingertips, in the calibration's unit."""
         return (self._output,)
 
-    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return where MuJoCo's kinematics put the bodies at the hand's joint angles."""
+    def body_poses(self, env: int) -> Poses:
         return kinematic_poses(self.model, self._data)
 
     def _take(self, position: Float[Array, " joint"], counts: Num[Array, "finger 3"]) -> None:
+        """Take joint angles [rad] and the fingertips' counts along the sensors' axes."""
         self._data.qpos[self._qpos_id] = position
         force = self.calibration.apply(counts)[self._fingers]
         self.readings = {"tips": torch.from_numpy(force).float().unsqueeze(0)}
 
 
 class LiveHandStage(HandStage):
-    """A hand that is connected, or an emulated one.
-
-    Attributes:
-        opened: What is closed with the stage.
-    """
+    """A hand that is connected, or an emulated one; `opened` is closed with the stage."""
 
     control_step = LIVE_STEP
 
     def __init__(self, hand: XHand1, calibration: Calibration | None = None):
-        """Show a hand.
-
-        Args:
-            hand: The hand.
-            calibration: What its counts mean; default: they stay counts.
-        """
-        super().__init__(calibration or Calibration.none())
+        super().__init__(calibration)
         self._hand, self.opened = hand, ExitStack()
         self._counter = StreamCounter()
         reading = hand.read()
@@ -100,11 +88,7 @@ class LiveHandStage(HandStage):
         self._take(reading.state.position, reading.state.total_force)
 
     def advance(self) -> None:
-        """Take the hand's next reading; where none comes, the last stays and the page says why.
-
-        Raises:
-            HandClosedError: If the hand was closed.
-        """
+        """Take the hand's next reading; where none comes, the last stays and the page says why."""
         try:
             reading = self._hand.read()
         except HandClosedError:
@@ -122,30 +106,22 @@ class LiveHandStage(HandStage):
 
     def notes(self, env: int) -> Mapping[str, float | str]:
         """Return why no reading comes, how many failed, how many joints report errors, and the fingertips' temperatures."""
-        fault = self._stats.fault
+        fault, state = self._stats.fault, self._state
         trouble = {} if fault is None else {"NO NEW READING": f"{fault.kind}: {fault.message}"}
-        temperatures = {
-            f"{name} [°C]": float(value) for name, value in zip(FINGERS, self._state.total_temperature, strict=True)
-        }
-        errors = float(self._state.joint_error.any(axis=-1).sum())
+        temperatures = {f"{name} [°C]": float(value) for name, value in zip(FINGERS, state.total_temperature, strict=True)}
+        errors = float(state.joint_error.any(axis=-1).sum())
         return {**trouble, "failures": float(self._stats.num_faults), "joints with errors": errors, **temperatures}
 
     def close(self) -> None:
-        """Close what was opened for the stage."""
         self.opened.close()
 
 
-class HandLogStage(HandStage):
+class HandLogStage(HandStage, RecordedStage):
     """A log of `tgdsl hand record`, reading by reading."""
 
     def __init__(self, log: HandLog, calibration: Calibration | None = None):
-        """Show a log.
-
-        Args:
-            log: The log.
-            calibration: What its counts mean; default: what the log says, and counts if it says nothing.
-        """
-        super().__init__(calibration or log.calibration or Calibration.none())
+        """Show a log; default calibration: the log's."""
+        super().__init__(calibration or log.calibration)
         self._log, self.num_steps = log, log.num_readings
         self._position, self._counts = log.column("position"), log.column("total_force")
         self._faults = {int(i) - 1: fault for i, fault in zip(log.fault_reading, log.faults, strict=True)}
@@ -153,36 +129,18 @@ class HandLogStage(HandStage):
         self.seek(0)
 
     def seek(self, step: int) -> None:
-        """Go to a reading."""
-        self._index = int(np.clip(step, 0, self._log.num_readings - 1))
-        self.time = float(self._log.received_at[self._index] - self._log.received_at[0])
-        self._take(self._position[self._index], self._counts[self._index])
-
-    @property
-    def step_index(self) -> int:
-        """Which reading this is."""
-        return self._index
-
-    def advance(self) -> None:
-        """Go to the next reading."""
-        self.seek(self._index + 1)
-
-    def restart(self) -> None:
-        """Go to the first reading."""
-        self.seek(0)
+        self.step_index = i = int(np.clip(step, 0, self._log.num_readings - 1))
+        self.time = float(self._log.received_at[i] - self._log.received_at[0])
+        self._take(self._position[i], self._counts[i])
 
     def notes(self, env: int) -> Mapping[str, float | str]:
         """Return the failure that came before the next reading, if one did."""
-        fault = self._faults.get(self._index)
+        fault = self._faults.get(self.step_index)
         return {} if fault is None else {"then no reading": f"{fault.kind}: {fault.message}"}
 
 
 def live_hand(source: Path, calibration: Calibration | None) -> LiveHandStage:
-    """Return the stage of `emulator`, `xhand1` or `xhand1:PORT`.
-
-    Raises:
-        HandError: If no hand answers, or several do.
-    """
+    """Return the stage of `emulator`, `xhand1` or `xhand1:PORT`; raise `HandError` if no hand answers, or several do."""
     name, _, port = str(source).partition(":")
     with ExitStack() as opened:
         device = opened.enter_context(Emulator()).device if name == "emulator" else port or None

@@ -33,7 +33,6 @@ class StreamCounter:
     """Counts readings and failures as they come."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._times: deque[float] = deque()
         self._num_faults = 0
         self._fault: Fault | None = None
@@ -56,12 +55,7 @@ class HandView:
     """Draws a hand over itself on a terminal as readings and failures come; elsewhere only its last state is printed."""
 
     def __init__(self, calibration: Calibration | None, title: str):
-        """Start with nothing.
-
-        Args:
-            calibration: What the hand's counts mean; None: they stay counts.
-            title: What to write above.
-        """
+        """Start without a reading; without a calibration, counts stay counts."""
         self._calibration = calibration or Calibration.none()
         self._title = title
         self._table, self._counter = LiveTable(), StreamCounter()
@@ -69,12 +63,7 @@ class HandView:
         self._reading: Reading | None = None
 
     def show(self, event: Reading | Fault, now: float | None = None) -> None:
-        """Take a reading or a failure, and draw if it is time to.
-
-        Args:
-            event: What came.
-            now: The time on its clock [s]; default: that of this moment.
-        """
+        """Take a reading or a failure, and draw if it is time to; `now` is the time on its clock [s], default: this moment."""
         stats = self._counter.add(event)
         if not isinstance(event, Fault):
             self._reading = event
@@ -95,40 +84,24 @@ def bar(part: float, width: int = BAR) -> str:
 
 
 def hand_lines(reading: Reading, calibration: Calibration, stats: StreamStats, age_s: float) -> list[str]:
-    """Return a hand's state as lines of text.
+    """Return a hand's newest reading, some seconds old, as lines of text.
 
     Bars are full at what 255 counts along the sensor's z mean.
-
-    Args:
-        reading: The newest reading.
-        calibration: What its counts mean.
-        stats: How the readings come.
-        age_s: How old the reading is [s].
     """
-    status = f"reading {reading.sequence}   age {1e3 * age_s:.0f} ms   {stats.rate:.0f}/s   {stats.num_faults} failures"
-    trouble = f"NO NEW READING: {stats.fault.kind}: {stats.fault.message}" if stats.fault is not None else ""
-    return [status, trouble, *_tip_lines(reading, calibration), "", *_joint_lines(reading)]
-
-
-def _tip_lines(reading: Reading, calibration: Calibration) -> list[str]:
-    state = reading.state
-    force = calibration.apply(state.total_force)
-    full = float(FORCE_MAX[2]) * calibration.scale[:, 2]
-    lines = [f"{'fingertip':<18}{'x':>9}{'y':>9}{'z':>9}{'|force|':>10} {calibration.units:<7}{'°C':>4}"]
+    state, fault = reading.state, stats.fault
+    force, full = calibration.apply(state.total_force), float(FORCE_MAX[2]) * calibration.scale[:, 2]
+    lines = [f"reading {reading.sequence}   age {1e3 * age_s:.0f} ms   {stats.rate:.0f}/s   {stats.num_faults} failures"]
+    lines.append(f"NO NEW READING: {fault.kind}: {fault.message}" if fault is not None else "")
+    lines.append(f"{'fingertip':<18}{'x':>9}{'y':>9}{'z':>9}{'|force|':>10} {calibration.units:<7}{'°C':>4}")
     for i, name in enumerate(FINGERS):
         size = float(np.linalg.norm(force[i]))
-        flags = [] if not state.is_total_saturated[i].any() else ["SATURATED"]
+        flags = ["SATURATED"] if state.is_total_saturated[i].any() else []
         num_taxels = int(state.is_taxel_saturated[i].any(axis=-1).sum())
         flags += [f"{num_taxels} taxels saturated"] if num_taxels else []
         numbers = "".join(f"{value:>9.2f}" for value in force[i])
         end = f"{bar(size / full[i]):<{BAR}} {', '.join(flags)}"
         lines.append(f"{name:<18}{numbers}{size:>10.2f} {'':<7}{state.total_temperature[i]:>4}  {end}".rstrip())
-    return lines
-
-
-def _joint_lines(reading: Reading) -> list[str]:
-    state = reading.state
-    lines = [f"{'joint':<18}{'rad':>9}{'mA':>9}{'°C':>9}  errors of its three boards"]
+    lines += ["", f"{'joint':<18}{'rad':>9}{'mA':>9}{'°C':>9}  errors of its three boards"]
     for i, name in enumerate(JOINTS):
         errors = "–" if not state.joint_error[i].any() else " ".join(f"{code:#06x}" for code in state.joint_error[i])
         numbers = f"{state.position[i]:>9.3f}{state.current[i]:>9}{state.joint_temperature[i] & 0xFF:>9}"

@@ -1,27 +1,58 @@
-"""Readings as markers at their taxels: where these are in the world, and how much they read.
+"""Taxels and readings as markers: where they are in the world, how much they read, and which of them a camera shows.
 
 Shapes: `taxel` taxels of one sensor or layout, `body` bodies of the model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from tgdsl.layout.layout import Layout
 from tgdsl.module.memory import Memory, last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.simulators.simulation import Simulation
-from tgdsl.view.taxels import Pose, Posed, Taxels, in_world
+from tgdsl.view.raster import Camera, Fragments
 
 Array = np.ndarray
+# magnitude up to which a reading is rounding: it is not drawn, not counted, and printed as 0 [the unit itself]
 THRESHOLDS = {"N": 1e-3, "N·m": 1e-6, "m": 1e-6, "Pa": 1.0}
-"""Magnitude up to which a reading is rounding: it is not drawn, not counted, and printed as 0 [the unit itself]."""
+_PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "µ"))
+
+
+class Pose(NamedTuple):
+    """Bodies in the world at one instant: origins [m], and orientations as quaternions w, x, y, z."""
+
+    pos: Float[Array, "body 3"]
+    quat: Float[Array, "body 4"]
+
+
+class Posed(Protocol):
+    """A model whose bodies are somewhere: a simulator's, or a recorded run's."""
+
+    model: mujoco.MjModel
+
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return origins [m] and quaternions w, x, y, z of all bodies in one environment, in the world."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Taxels:
+    """Taxels in one frame."""
+
+    pos: Float[Array, "taxel 3"]  # [m]
+    normal: Float[Array, "taxel 3"]  # outward unit normal
+    size: Float[Array, " taxel"]  # width of the patch that the taxel stands for [m]; 0 marks an inactive filler
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +61,9 @@ class Markers(Taxels):
 
     value: Float[Array, " taxel"]  # magnitude of the reading, in `unit`; 0 where it does not exceed `threshold`
     quantity: str  # what is read, such as `|force|`
-    unit: str  # its unit, with the prefix that suits the values; empty for plain numbers
+    unit: str  # with the prefix that suits the values; empty for plain numbers
     vector: Float[Array, "taxel 3"] | None = None  # the reading itself in the world, in SI units, if it is a vector
-    scale: float = 1.0  # what a number in SI units is multiplied with to be in `unit`
+    scale: float = 1.0  # converts SI units to `unit`
     would_read: Bool[Array, " taxel"] | None = None  # which of them would read anything without noise; None: those that do
     threshold: float = 0.0  # see `THRESHOLDS` [SI]; 0: whatever is read counts
 
@@ -47,26 +78,22 @@ class Markers(Taxels):
         return self.is_read if self.would_read is None else self.would_read
 
     @property
-    def label(self) -> str:
-        """Quantity and unit."""
-        return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
-
-    @property
     def threshold_label(self) -> str:
         """The threshold with the prefix that suits it, such as `1 mN`; empty where all that is read counts."""
         base = self.unit if self.scale == 1.0 else self.unit[1:]
-        factor, prefix = next(((f, p) for f, p in ((1.0, ""), (1e3, "m"), (1e6, "µ")) if f * self.threshold >= 0.1), (1.0, ""))
+        factor, prefix = next(((f, p) for f, p in _PREFIXES if f * self.threshold >= 0.1), _PREFIXES[0])
         return f"{factor * self.threshold:g} {prefix}{base}" if self.threshold else ""
 
     @property
     def colour_label(self) -> str:
         """Label of the colours: quantity, unit, and what is grey."""
-        return f"{self.label}   (grey: {f'up to {self.threshold_label}' if self.threshold else 'zero'})"
+        unit = f" [{self.unit}]" if self.unit else ""
+        return f"{self.quantity}{unit}   (grey: {f'up to {self.threshold_label}' if self.threshold else 'zero'})"
 
     def summary(self, chosen: Int[Array, " chosen"] | slice = slice(None)) -> str:
         """Return the sum of some taxels, unless they are lengths, and the largest magnitude.
 
-        Vectors of a link are summed as vectors, `|Σ|`, as the table of `tgdsl run` does; magnitudes alone as they are, `Σ`.
+        Vectors of a link are summed as vectors, `|Σ|`, as the table of `tgdsl run` does; magnitudes as they are, `Σ`.
         """
         value, unit = self.value[chosen], f" {self.unit}" if self.unit else ""
         if not value.any():
@@ -99,10 +126,39 @@ def _number(number: float) -> str:
     return f"{number:.{3 if number >= 0.1 else 2}g}"
 
 
-def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tensor, env: int) -> Markers:
-    """Return where the taxels of a reading are in one environment, and what they read.
+def taxels_of(model: mujoco.MjModel, pose: Pose, layout: Layout) -> Taxels:
+    """Return a layout's taxels in the world."""
+    bodies = [layout.links[i].body for i in layout.link_id]
+    return Taxels(*in_world(model, pose, bodies, layout.pos, layout.normal), np.sqrt(layout.area) * (layout.radius > 0))
 
-    A reading of bodies has one marker for each, amid its taxels.
+
+def in_world(
+    model: mujoco.MjModel, pose: Pose, bodies: Iterable[str], pos: Float[Array, "taxel 3"], normal: Float[Array, "taxel 3"]
+) -> tuple[Float[Array, "taxel 3"], Float[Array, "taxel 3"]]:
+    """Return positions and normals in the world of taxels in the frames of their bodies, which go by name."""
+    body = np.array([model.body(name).id for name in bodies], dtype=np.int64)
+    rotation = Rotation.from_quat(pose.quat[body], scalar_first=True)
+    return pose.pos[body] + rotation.apply(np.array(pos)), rotation.apply(np.array(normal))  # SciPy wants writable arrays
+
+
+def rows_of(touch: TactileModule, output: Output) -> tuple[list[str], Taxels]:
+    """Return the bodies of a reading's rows, by name, and the rows in their frames; a body's row is amid its taxels."""
+    table = touch.taxels[output.sensor]
+    taxels = Taxels(np.array(table["pos"]), np.array(table["normal"]), np.sqrt(table["area"]) * (table["radius"] > 0))
+    if output.rows != "body":
+        return list(table["body"]), taxels
+    member = [table["body"] == name for name in output.bodies]
+    parts = (taxels.pos, taxels.normal, 3 * taxels.size)
+    return list(output.bodies), Taxels(*(np.array([part[own].mean(axis=0) for own in member]) for part in parts))
+
+
+def read_now(values: Tensor, env: int) -> Float[Array, "row channel"]:
+    """Return what one environment reads; of stacked calls the last one."""
+    return last_step(values)[env].detach().cpu().double().numpy()
+
+
+def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tensor, env: int) -> Markers:
+    """Return where the rows of a reading are in one environment, and what they read.
 
     Args:
         touch: The module.
@@ -111,27 +167,22 @@ def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tenso
         values: The reading of all environments; of stacked calls the last one is shown.
         env: Which environment.
     """
-    table = touch.taxels[output.sensor]
+    bodies, rows = rows_of(touch, output)
     pose = Pose(*scene.body_poses(env))
-    pos, normal = in_world(scene.model, pose, table["body"], table["pos"], table["normal"])
-    size = np.sqrt(table["area"]) * (table["radius"] > 0)
-    bodies = np.array(table["body"])
-    if output.rows == "body":
-        member = np.array([bodies == body for body in output.bodies])
-        pos, normal, size = (np.array([part[own].mean(axis=0) for own in member]) for part in (pos, normal, 3 * size))
-        bodies = np.array(output.bodies)
+    pos, normal = in_world(scene.model, pose, bodies, rows.pos, rows.normal)
     same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
-    read = last_step(values)[env].detach().cpu().double().numpy()
+    read = read_now(values, env)
     value = magnitude(read, output.units)
     is_vector = len(same) == 3 and output.channels[0].endswith("_x")
     stem = output.channels[0].removesuffix("_x")
     unit, scale = "" if output.units[0] == "1" else output.units[0], 1.0
     if unit and 0 < value.max() < 0.1:
-        scale, unit = (1e3, f"m{unit}") if value.max() >= 1e-4 else (1e6, f"µ{unit}")
+        scale, prefix = _PREFIXES[1 if value.max() >= 1e-4 else 2]
+        unit = f"{prefix}{unit}"
     return Markers(
         pos=pos,
         normal=normal,
-        size=size,
+        size=rows.size,
         value=scale * value,
         scale=scale,
         vector=in_world(scene.model, pose, bodies, np.zeros_like(pos), read[:, same])[1] if is_vector else None,
@@ -152,18 +203,13 @@ def touched(
 ) -> Bool[Array, " taxel"] | None:
     """Return which taxels of a reading with noise would read something without it; None if the reading has no noise.
 
-    Args:
-        touch: The module; what it remembers is neither read nor changed.
-        sim: The scene, at the instant of the reading.
-        output: Which reading.
-        readings: All readings: where the clean one is among them, it is that one which counts.
-        env: Which environment.
+    The clean reading counts where it is among `readings`; the module's memory is neither read nor changed.
     """
     sensor = touch.plan.sensor_of(output.name)
     if sensor.noise is None or output.name != sensor.name:
         return None
     if (clean := readings.get(f"{sensor.name}/clean")) is not None:
-        return magnitude(last_step(clean)[env].detach().cpu().numpy(), output.units) > 0
+        return magnitude(read_now(clean, env), output.units) > 0
     state = sim.state()
     memory = Memory(touch.plan.sensors, touch.plan.readings()).tensors(sim.num_envs, state.dt, touch.dtype, touch.device)
     tensors = {name: torch.as_tensor(getattr(state, name), device=touch.device) for name in touch.inputs.fields}
@@ -171,3 +217,19 @@ def touched(
         signal = touch.core(tensors, memory)[0][f"{sensor.name}/signal"]
     units = dict(zip(output.channels, output.units, strict=True))  # the signal of a contact bit is a depth
     return magnitude(signal[env].cpu().numpy().T, [units.get(channel, "m") for channel in sensor.signal]) > 0
+
+
+def is_visible(taxels: Taxels, at: Float[Array, "taxel 3"], fragments: Fragments, camera: Camera) -> Bool[Array, " taxel"]:
+    """Return which taxels face the camera with nothing of the robot between.
+
+    Args:
+        taxels: The taxels in the world.
+        at: Where they are, as (column [pixel], row [pixel], nearness [m]).
+        fragments: The robot.
+        camera: The camera.
+    """
+    height, width = fragments.nearness.shape
+    column = np.clip(np.rint(at[:, 0]), 0, width - 1).astype(int)
+    row = np.clip(np.rint(at[:, 1]), 0, height - 1).astype(int)
+    slack = np.maximum(0.2 * taxels.size, 5e-4)  # [m] for taxels a little under the surface
+    return (taxels.normal @ camera.toward > 0) & (at[:, 2] + slack >= fragments.nearness[row, column])

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.layout.layout import Link
 from tgdsl.scene.scene import is_absent
+from tgdsl.view.markers import Pose
 from tgdsl.view.raster import Mesh
-from tgdsl.view.taxels import Pose
 
 Array = np.ndarray
 GeomType = mujoco.mjtGeom
@@ -41,14 +41,7 @@ def robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], s
 
 
 def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int], links: Iterable[Link] = ()) -> Mesh:
-    """Return the triangles of some bodies: of their geoms that collide, or else of all; planes not.
-
-    Args:
-        model: The model.
-        pose: Where its bodies are.
-        bodies: Which of them.
-        links: What carries taxels: bodies that have theirs on a geom or mesh that does not collide show those that do not.
-    """
+    """Return the triangles of some bodies in the world: see `body_triangles`."""
     parts = [Mesh(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
     links = list(links)
     for body in sorted(bodies):
@@ -61,7 +54,10 @@ def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int], links: Iterable
 def body_triangles(
     model: mujoco.MjModel, body: int, links: Iterable[Link] = ()
 ) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
-    """Return corners and normals of a body's triangles in its own frame: see `mesh_of`."""
+    """Return corners and normals of a body's triangles in its own frame: of its geoms that collide, or else of all; no planes.
+
+    If one of `links` has its taxels on a geom or mesh that does not collide, those that do not collide are shown instead.
+    """
     names = {link.name for link in links}
     geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
     colliding = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
@@ -93,7 +89,6 @@ def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3
         return np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
     shape = _PRIMITIVES[kind](model.geom_size[geom])
     shape.apply_translation(-shape.bounds.mean(axis=0))  # trimesh puts capsules elsewhere in some versions
-    flat = kind in (GeomType.mjGEOM_BOX, GeomType.mjGEOM_CYLINDER)
-    return np.array(shape.triangles), shape.face_normals[:, None].repeat(3, axis=1) if flat else shape.vertex_normals[
-        shape.faces
-    ]
+    is_flat = kind in (GeomType.mjGEOM_BOX, GeomType.mjGEOM_CYLINDER)
+    normals = shape.face_normals[:, None].repeat(3, axis=1) if is_flat else shape.vertex_normals[shape.faces]
+    return np.array(shape.triangles), normals

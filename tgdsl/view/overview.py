@@ -5,26 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.boxes import Boxes, boxes_of, draw_boxes, is_boxed
 from tgdsl.view.cameras import ViewError
-from tgdsl.view.markers import Markers, markers_of, touched
+from tgdsl.view.markers import Markers, Pose, markers_of, touched
 from tgdsl.view.picture import chosen_output
 from tgdsl.view.scene import RenderedScene, draw_colour_bar, draw_markers, rendered, seen
-from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING
+from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING, new_figure, save_figure
 from tgdsl.view.table import outputs_on_taxels
-from tgdsl.view.taxels import Pose
 
 PANEL = (3.9, 3.7)  # width and height of a panel [inch]
 ALONE = 1.6  # how much larger a panel is that stands alone
@@ -37,43 +35,9 @@ def drawn_outputs(touch: TactileModule) -> list[Output]:
     return [output for output in touch.outputs if output in on_taxels or is_boxed(touch, output)]
 
 
-def overview(
-    touch: TactileModule,
-    sim: Simulation,
-    readings: Mapping[str, Tensor],
-    path: Path,
-    *,
-    env: int = 0,
-    title: str = "",
-    view: str | None = None,
-    temperatures: tuple[float, float] | None = None,
-) -> Path:
-    """Draw every reading of one environment, and write the picture.
-
-    Each panel has a scale of its own. An arrow is a vector as it is, in the plane of the picture; the longest is as long in
-    every panel. Readings of bodies have one large marker per body; those of boxes, such as temperatures of cells, colour these.
-
-    Args:
-        touch: The module.
-        sim: The scene, at the instant of the readings.
-        readings: What the module read, by name.
-        path: PNG file to write; its folder is created if necessary.
-        env: Which environment.
-        title: What to write above it all.
-        view: From where, as in `view.picture`.
-        temperatures: Lowest and highest of the colours of temperatures [°C]; default: those that are read, in each panel.
-
-    Returns:
-        The path.
-
-    Raises:
-        ViewError: If there is no such environment or view, or nothing to draw.
-        FileError: If the file cannot be written.
-    """
-    figure = drawing(touch, sim, readings, env=env, title=title, view=view, temperatures=temperatures)
-    with atomic_open(with_folder(path)) as file:
-        figure.savefig(file, format="png")
-    return path
+def overview(touch: TactileModule, sim: Simulation, readings: Mapping[str, Tensor], path: Path, **options: Any) -> Path:
+    """Write `drawing` as a PNG file; return the path."""
+    return save_figure(drawing(touch, sim, readings, **options), path)
 
 
 def drawing(
@@ -86,38 +50,50 @@ def drawing(
     view: str | None = None,
     temperatures: tuple[float, float] | None = None,
 ) -> Figure:
-    """Return what `overview` writes; its axes are the panels, one for each reading of taxels or bodies."""
+    """Draw every reading of taxels, bodies or boxes of one environment, a panel for each, whose axes are the figure's.
+
+    Each panel has a scale of its own. An arrow is a vector as it is, in the plane of the picture; the longest is as long in
+    every panel. Readings of bodies have one large marker per body; those of boxes, such as temperatures of cells, colour these.
+
+    Args:
+        touch: The module.
+        sim: The scene, at the instant of the readings.
+        readings: What the module read, by name.
+        env: Which environment.
+        title: What to write above it all.
+        view: From where, as in `view.picture`.
+        temperatures: Lowest and highest of the colours of temperatures [°C]; default: those that are read, in each panel.
+
+    Raises:
+        ViewError: If there is nothing to draw, or no such environment or view.
+    """
     outputs = [output for output in drawn_outputs(touch) if output.name in readings]
     if not outputs:
         raise ViewError("there is nothing to draw: the readings given hold none of this module's sensors")
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
-    boxes = {o.name: boxes_of(touch, o, readings[o.name], env, temperatures) for o in outputs if is_boxed(touch, o)}
-    markers = {o.name: markers_of(touch, sim, o, readings[o.name], env) for o in outputs if o.name not in boxes}
+    panels = {
+        o.name: boxes_of(touch, o, readings[o.name], env, temperatures)
+        if is_boxed(touch, o)
+        else markers_of(touch, sim, o, readings[o.name], env)
+        for o in outputs
+    }
     columns = min(len(outputs), 4)
     rows = -(-len(outputs) // columns)
     panel = [(ALONE if len(outputs) == 1 else 1.0) * side for side in PANEL]
     width, height = (SUPERSAMPLING * round(0.94 * size * DPI) for size in (panel[0], 0.82 * panel[1]))
-    lead = _lead(touch, sim, readings, markers, boxes, env)
-    view_of = seen(touch, sim, lead, env, width, height, view, [own.layout for own in boxes.values()])
-    scene = rendered(view_of) if markers else None
-    figure = Figure(figsize=(columns * panel[0], rows * panel[1] + 0.5), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(
-        rows,
-        columns,
-        left=0.01,
-        right=0.99,
-        bottom=0.5 / figure.get_figheight(),
-        top=1 - 1.0 / figure.get_figheight(),
-        wspace=0.06,
-        hspace=0.3,
-    )
+    lead = _lead(touch, sim, readings, panels, env)
+    layouts = [own.layout for own in panels.values() if isinstance(own, Boxes)]
+    in_view = seen(touch, sim, lead, env, width, height, view, layouts)
+    scene = rendered(in_view) if len(layouts) < len(panels) else None
+    figure = new_figure(columns * panel[0], rows * panel[1] + 0.5)
+    bottom, top = 0.5 / figure.get_figheight(), 1 - 1.0 / figure.get_figheight()
+    grid = figure.add_gridspec(rows, columns, left=0.01, right=0.99, bottom=bottom, top=top, wspace=0.06, hspace=0.3)
     for i, output in enumerate(outputs):
         axes = figure.add_subplot(grid[i])
-        own = markers.get(output.name) or boxes[output.name]
+        own = panels[output.name]
         if isinstance(own, Boxes):
-            draw_boxes(axes, sim, view_of, own, env)
+            draw_boxes(axes, sim, in_view, own, env)
         elif scene is not None:
             norm = Normalize(0.0, float(own.value.max()) or 1.0)
             draw_markers(axes, scene, own, norm)
@@ -131,19 +107,16 @@ def drawing(
 
 
 def _lead(
-    touch: TactileModule,
-    sim: Simulation,
-    readings: Mapping[str, Tensor],
-    markers: Mapping[str, Markers],
-    boxes: Mapping[str, Boxes],
-    env: int,
+    touch: TactileModule, sim: Simulation, readings: Mapping[str, Tensor], panels: Mapping[str, Markers | Boxes], env: int
 ) -> Markers:
     """Return what the camera is to face: taxels of the reading that a picture is of, or else bodies, or else boxes."""
-    outputs = {output.name: output for output in touch.outputs if output.name in markers}
+    markers = {name: panel for name, panel in panels.items() if isinstance(panel, Markers)}
+    outputs = [output for output in touch.outputs if output.name in markers]
     if not outputs:
-        return next(iter(boxes.values())).markers(sim.model, Pose(*sim.body_poses(env)))
-    has_taxels = any(output.rows == "taxel" for output in outputs.values())
-    output = chosen_output(touch, readings) if has_taxels else next(iter(outputs.values()))
+        first = next(panel for panel in panels.values() if isinstance(panel, Boxes))
+        return first.markers(sim.model, Pose(*sim.body_poses(env)))
+    has_taxels = any(output.rows == "taxel" for output in outputs)
+    output = chosen_output(touch, readings) if has_taxels else outputs[0]
     return replace(markers[output.name], would_read=touched(touch, sim, output, readings, env))
 
 

@@ -7,7 +7,7 @@
 
 The page is served by viser, an optional package: `pip install tgdsl[view]`.
 
-Shapes: `taxel` taxels of the chosen reading.
+Shapes: `taxel` rows of the chosen reading.
 """
 
 from __future__ import annotations
@@ -30,17 +30,15 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tgdsl.errors import TgdslError
-from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.boxes import boxes_of, is_boxed
 from tgdsl.view.cameras import facing_camera
-from tgdsl.view.markers import Markers, markers_of
+from tgdsl.view.markers import Markers, Pose, Taxels, markers_of, read_now, rows_of
 from tgdsl.view.meshes import body_triangles, robot_bodies
 from tgdsl.view.stages import SimStage, Stage
 from tgdsl.view.style import HEAT, WARMTH
-from tgdsl.view.taxels import Pose
 
 Array = np.ndarray
 LOCAL = "127.0.0.1"
@@ -71,8 +69,12 @@ class Page:
 
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
         _drawn(stage)
+        try:
+            import viser
+        except ImportError as error:
+            raise TgdslError("the live page needs viser: pip install 'tgdsl[view]'") from error
         with redirect_stdout(StringIO()):  # viser prints its address
-            self.server = _viser().ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
+            self.server = viser.ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
         if host != LOCAL:
             warnings.warn(f"the page is served at {host}: whoever reaches this machine can see and control it", stacklevel=2)
         self._clicks: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -120,11 +122,9 @@ class Page:
             self.draw()
 
     def run(self, watch: Callable[[], Stage | str | None] = lambda: None, seconds: float = math.inf) -> None:
-        """Step the stage in real time and draw it, until interrupted.
+        """Step the stage in real time and draw it, for some seconds or until interrupted.
 
-        Args:
-            watch: Asked before each frame for another stage to show, or for text of what is wrong with it; None: nothing new.
-            seconds: When to stop.
+        `watch` is asked before each frame for another stage to show, or for text of what is wrong with it; None: nothing new.
         """
         begin = before = time.monotonic()
         due = 0.0
@@ -205,10 +205,10 @@ class Page:
             corners, normals = body_triangles(model, body, links)
             if not len(corners):
                 continue
-            colour = _CARRIER if body in carriers else _ROBOT if body in robot or body == 0 else _OBJECT
-            vertices, faces = _joined(corners, normals)
-            mesh = scene.add_mesh_simple(f"/body{body}/mesh", vertices, faces, color=colour)
-            self._meshes["robot" if body in robot or body == 0 else "objects"].append(mesh)
+            is_robot = body in robot or body == 0
+            colour = _CARRIER if body in carriers else _ROBOT if is_robot else _OBJECT
+            mesh = scene.add_mesh_simple(f"/body{body}/mesh", *_joined(corners, normals), color=colour)
+            self._meshes["robot" if is_robot else "objects"].append(mesh)
 
     def _add_discs(self) -> None:
         """Add a disc for each row of the chosen reading, in the frame of its body."""
@@ -216,56 +216,55 @@ class Page:
             handle.remove()
         self._discs = {}
         self._is_boxed = is_boxed(self.stage.touch, self._output)
-        table = self._table()
+        self._table_now = table = self._table()
         angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
         corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])
         faces = np.array([[0, 1 + i, 1 + (i + 1) % 16] for i in range(16)])
-        for body in np.unique(table.body):
-            rows = np.flatnonzero(table.body == body)
-            turns = [Rotation.align_vectors(normal[None], [[0, 0, 1]])[0] for normal in table.normal[rows]]
-            handle = self.server.scene.add_batched_meshes_simple(
+        self._rows_of = {int(body): np.flatnonzero(table.body == body) for body in np.unique(table.body)}
+        for body, rows in self._rows_of.items():
+            normal = table.rows.normal[rows]
+            turns = [Rotation.align_vectors(n[None], [[0, 0, 1]])[0].as_quat(scalar_first=True) for n in normal]
+            self._discs[body] = self.server.scene.add_batched_meshes_simple(
                 f"/body{body}/taxels",
                 corners,
                 faces,
-                np.array([turn.as_quat(scalar_first=True) for turn in turns]),
-                table.pos[rows] + _LIFT * table.normal[rows],
-                batched_scales=np.clip(0.45 * table.size[rows], *_DISC_RADIUS),
+                np.array(turns),
+                table.rows.pos[rows] + _LIFT * normal,
+                batched_scales=np.clip(0.45 * table.rows.size[rows], *_DISC_RADIUS),
                 batched_colors=np.tile(np.array(_REST, dtype=np.uint8), (len(rows), 1)),
                 side="double",
                 lod="off",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            handle.on_click(lambda event, rows=rows: self._clicks.put(lambda: self._pick(int(rows[event.instance_index]))))
-            self._discs[int(body)] = handle
-        self._table_now, self._rows_of = table, {int(b): np.flatnonzero(table.body == b) for b in np.unique(table.body)}
+            self._discs[body].on_click(
+                lambda event, rows=rows: self._clicks.put(lambda: self._pick(int(rows[event.instance_index])))
+            )
 
-    def _table(self) -> _Rows:
+    def _table(self) -> _Table:
         """Return where the chosen reading's rows are in the frames of their bodies."""
-        model, touch, output = self.stage.model, self.stage.touch, self._output
-        if is_boxed(touch, output):
+        touch, output = self.stage.touch, self._output
+        if self._is_boxed:
             layout = boxes_of(touch, output, self.stage.readings[output.name], 0).layout
             names = [layout.links[i].body for i in layout.link_id]
-            pos, normal = layout.pos, layout.normal / np.linalg.norm(layout.normal, axis=1, keepdims=True)
-            size, labels = np.sqrt(layout.area), [f"{name}, cell {i}" for i, name in enumerate(names)]
+            rows, labels = (
+                Taxels(layout.pos, layout.normal, np.sqrt(layout.area)),
+                [f"{n}, cell {i}" for i, n in enumerate(names)],
+            )
         else:
-            table = touch.taxels[output.sensor]
-            pos, normal, size = table["pos"], table["normal"], np.sqrt(table["area"]) * (table["radius"] > 0)
-            names, labels = list(table["body"]), [f"{link}, taxel {i}" for i, link in enumerate(table["link"])]
-            if output.rows == "body":
-                member = np.array([table["body"] == name for name in output.bodies])
-                pos, normal, size = (np.array([part[rows].mean(axis=0) for rows in member]) for part in (pos, normal, 3 * size))
-                normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-                names = labels = list(output.bodies)
-        return _Rows(np.array([model.body(name).id for name in names]), np.array(pos), np.array(normal), np.array(size), labels)
+            names, rows = rows_of(touch, output)
+            links = touch.taxels[output.sensor]["link"]
+            labels = names if output.rows == "body" else [f"{link}, taxel {i}" for i, link in enumerate(links)]
+        if self._is_boxed or output.rows == "body":
+            rows = Taxels(rows.pos, rows.normal / np.linalg.norm(rows.normal, axis=1, keepdims=True), rows.size)
+        return _Table(np.array([self.stage.model.body(name).id for name in names]), rows, labels)
 
     def _place_camera(self) -> None:
         """Look at what carries taxels, from where most of these face."""
-        pose = Pose(*self.stage.body_poses(0))
-        table = self._table_now
+        pose, table = Pose(*self.stage.body_poses(0)), self._table_now
         turn = Rotation.from_quat(pose.quat[table.body], scalar_first=True)
-        pos, normal = pose.pos[table.body] + turn.apply(table.pos), turn.apply(table.normal)
-        camera = facing_camera(Markers(pos, normal, table.size, np.zeros(len(pos)), "", ""), pose.pos[min(self._near)])
+        pos, normal = pose.pos[table.body] + turn.apply(table.rows.pos), turn.apply(table.rows.normal)
+        camera = facing_camera(Markers(pos, normal, table.rows.size, np.zeros(len(pos)), "", ""), pose.pos[min(self._near)])
         centre = 0.5 * (pos.min(axis=0) + pos.max(axis=0))
         reach = max(0.03, float(np.linalg.norm(pos - centre, axis=1).max()))
         initial = self.server.initial_camera
@@ -285,34 +284,32 @@ class Page:
     def _draw_touch(self, env: int) -> None:
         """Colour the discs, and draw arrows, the legend and the plot."""
         output, channel = self._output, self._channel.value
-        readings = self.stage.readings[output.name]
-        vector, markers = None, None
+        readings, markers = self.stage.readings[output.name], None
         if self._is_boxed:
             boxes = boxes_of(self.stage.touch, output, readings, env)
             value, unit, colours = boxes.value[boxes.chosen], boxes.unit, WARMTH
             norm, label = boxes.norm, boxes.label
         elif channel == MAGNITUDE:
             markers = markers_of(self.stage.touch, self.stage, output, readings, env)
-            value, unit, colours, vector = markers.value / markers.scale, _unit(output.units[0]), _HEAT, markers.vector
+            value, unit, colours = markers.value / markers.scale, _unit(output.units[0]), _HEAT
             norm, label = Normalize(1e-12, self._widened(output, channel, value), clip=False), f"{markers.quantity} [{unit}]"
         else:
             i = output.channels.index(channel)
-            value = last_step(readings)[env, ..., i].detach().cpu().double().numpy().reshape(-1)
-            unit, colours, most = _unit(output.units[i]), _SIGNED, self._widened(output, channel, value)
+            value, unit, colours = read_now(readings, env)[:, i], _unit(output.units[i]), _SIGNED
+            most = self._widened(output, channel, value)
             norm, label = Normalize(-most, most, clip=True), f"{channel} [{unit}]"
-        colour = _rgb(colours, norm, value)
+        colour: UInt8[Array, "taxel 3"] = (255 * np.asarray(colours(norm(value)))[:, :3]).astype(np.uint8)
         for body, rows in self._rows_of.items():
             self._discs[body].batched_colors = colour[rows]
-        self._draw_arrows(markers, vector)
+        self._draw_arrows(markers)
         self._legend.content = _legend(colours, norm, label)
-        picked = self._picked
-        shown = value.mean() if self._is_boxed else value.sum()
-        self._history.append((self.stage.time, float(shown if picked is None else value[picked])))
-        while self._history and not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
+        picked, total = self._picked, "mean" if self._is_boxed else "sum"
+        shown = float(getattr(value, total)() if picked is None else value[picked])
+        self._history.append((self.stage.time, shown))
+        while not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
             self._history.popleft()
-        name = ("mean" if self._is_boxed else "sum") if picked is None else self._table_now.labels[picked]
-        reads = f"{self._history[-1][1]:.4g} {unit}" if self._history else ""
-        self._reads.content = f"**{name}**: {label.split(' [')[0]} {reads}"
+        name = total if picked is None else self._table_now.labels[picked]
+        self._reads.content = f"**{name}**: {label.split(' [')[0]} {shown:.4g} {unit}"
         if len(self._history) > 1:
             times, values = np.array(self._history).T
             self._plot.data = (times, values)
@@ -324,28 +321,24 @@ class Page:
         self._range[key] = max(self._range.get(key, 1e-9), most)
         return self._range[key]
 
-    def _draw_arrows(self, markers: Markers | None, vector: Float[Array, "taxel 3"] | None) -> None:
+    def _draw_arrows(self, markers: Markers | None) -> None:
         """Draw vectors from the taxels where the reading is a vector and arrows are asked for."""
-        points = np.zeros((0, 2, 3), dtype=np.float32)
-        if markers is not None and vector is not None and self._arrows.value and markers.is_read.any():
-            longest = self._range[self._output.name, MAGNITUDE]
-            begin = markers.pos[markers.is_read] + _LIFT * markers.normal[markers.is_read]
-            points = np.stack([begin, begin + _ARROW / longest * vector[markers.is_read]], axis=1).astype(np.float32)
         if self._arrow_handle is not None:
             self._arrow_handle.remove()
             self._arrow_handle = None
-        if len(points):
-            self._arrow_handle = self.server.scene.add_line_segments(
-                "/arrows", points, (30, 30, 30), thickness=2.0, thickness_units="screen"
-            )
+        if markers is None or markers.vector is None or not (self._arrows.value and markers.is_read.any()):
+            return
+        longest = self._range[self._output.name, MAGNITUDE]
+        begin = markers.pos[markers.is_read] + _LIFT * markers.normal[markers.is_read]
+        points = np.stack([begin, begin + _ARROW / longest * markers.vector[markers.is_read]], axis=1).astype(np.float32)
+        style = {"thickness": 2.0, "thickness_units": "screen"}
+        self._arrow_handle = self.server.scene.add_line_segments("/arrows", points, (30, 30, 30), **style)
 
     def _draw_text(self) -> None:
         """Write the time, and what the stage notes."""
         notes = self.stage.notes(self._env_index)
-        rows = "".join(
-            f"\n| {name} | {f'{value:.4g}' if isinstance(value, float) else value} |" for name, value in notes.items()
-        )
-        self._notes.content = f"| | |\n|---|---|{rows}" if rows else ""
+        rows = [f"\n| {name} | {f'{value:.4g}' if isinstance(value, float) else value} |" for name, value in notes.items()]
+        self._notes.content = f"| | |\n|---|---|{''.join(rows)}" if rows else ""
         self._status.content = f"t = {self.stage.time:.2f} s · {len(self._table_now.body)} taxels"
         if self._instant is not None and self.stage.step_index != int(self._instant.value):
             self._instant.value = self._seen_instant = self.stage.step_index
@@ -385,7 +378,8 @@ class Page:
         self._sliders: list[Any] = []
         if stage.control is not None and len(stage.control):
             with gui.add_folder("actuators"):
-                self._keyframe = gui.add_dropdown("keyframe", self._keyframes())
+                keys = (stage.model.key(i).name for i in range(stage.model.nkey))
+                self._keyframe = gui.add_dropdown("keyframe", ("", *filter(None, keys)))
                 self._seen_keyframe = self._keyframe.value
                 for i, (low, high) in enumerate(stage.model.actuator_ctrlrange):
                     low, high = (float(low), float(high)) if stage.model.actuator_ctrllimited[i] else (-1.0, 1.0)
@@ -396,10 +390,6 @@ class Page:
     def _channels(self) -> tuple[str, ...]:
         output = self._output
         return (output.channels[0],) if is_boxed(self.stage.touch, output) else (MAGNITUDE, *output.channels)
-
-    def _keyframes(self) -> tuple[str, ...]:
-        model = self.stage.model
-        return ("", *(model.key(i).name for i in range(model.nkey) if model.key(i).name))
 
     def _react(self) -> None:
         """Do what was clicked and set since the last frame."""
@@ -419,22 +409,15 @@ class Page:
         if self._instant is not None and int(self._instant.value) != self._seen_instant:
             self._seen_instant = int(self._instant.value)
             self.stage.seek(self._seen_instant)
-        for name, meshes in self._meshes.items():
-            for mesh in meshes:
-                mesh.visible = self._shown[name].value
-        for disc in self._discs.values():
-            disc.visible = self._shown["taxels"].value
-        if self._sliders:
-            self._read_actuators()
-
-    def _read_actuators(self) -> None:
-        """Take the actuators' values from their sliders, or these from a keyframe that was chosen."""
-        assert self.stage.control is not None
-        if self._keyframe.value != self._seen_keyframe:
-            self._seen_keyframe = self._keyframe.value
-            if self._keyframe.value:
-                self._set_sliders(self.stage.model.key(self._keyframe.value).ctrl)
-        self.stage.control[:] = [slider.value for slider in self._sliders]
+        for name, handles in {**self._meshes, "taxels": self._discs.values()}.items():
+            for handle in handles:
+                handle.visible = self._shown[name].value
+        if self._sliders and self.stage.control is not None:
+            if self._keyframe.value != self._seen_keyframe:
+                self._seen_keyframe = self._keyframe.value
+                if self._keyframe.value:
+                    self._set_sliders(self.stage.model.key(self._keyframe.value).ctrl)
+            self.stage.control[:] = [slider.value for slider in self._sliders]
 
     def _set_sliders(self, control: Float[Array, " actuator"]) -> None:
         for slider, value in zip(self._sliders, control, strict=True):
@@ -445,6 +428,7 @@ class Page:
         self.stage.advance()
 
     def _save(self, client: Any) -> None:
+        """Send the saved frames to the browser that asked for them."""
         if self._frames_seen:
             client.send_file_download("seen.npz", self.saved_frames(), save_immediately=True)
 
@@ -455,17 +439,16 @@ class Page:
             self._set_sliders(self.stage.control)
 
     def _pick(self, row: int) -> None:
+        """Show one taxel's name and reading; a second click on it shows all again."""
         self._picked = None if self._picked == row else row
         self._history.clear()
 
 
-class _Rows(NamedTuple):
+class _Table(NamedTuple):
     """Rows of a reading in the frames of their bodies."""
 
     body: Int[Array, " taxel"]
-    pos: Float[Array, "taxel 3"]
-    normal: Float[Array, "taxel 3"]
-    size: Float[Array, " taxel"]
+    rows: Taxels
     labels: list[str]
 
 
@@ -481,8 +464,7 @@ def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int 
     Raises:
         TgdslError: If viser is not installed, or the module has nothing to draw.
     """
-    stage = SimStage(touch, sim)
-    page = Page(stage, host, port)
+    page = Page(SimStage(touch, sim), host, port)
     print(f"tgdsl view: {page.url}")
     return page
 
@@ -495,22 +477,11 @@ def _drawn(stage: Stage) -> dict[str, Output]:
     return outputs
 
 
-def _viser() -> Any:
-    try:
-        import viser
-    except ImportError as error:
-        raise TgdslError("the live page needs viser: pip install 'tgdsl[view]'") from error
-    return viser
-
-
 def _joined(corners: Float[Array, "face 3 3"], normals: Float[Array, "face 3 3"]) -> tuple[Array, Array]:
+    """Return vertices and faces; corners are one vertex where place and normal agree, so that edges stay sharp."""
     both = np.concatenate([corners.reshape(-1, 3) * 1e6, normals.reshape(-1, 3) * 1e3], axis=1).round().astype(np.int64)
     _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
     return corners.reshape(-1, 3)[first].astype(np.float32), inverse.reshape(-1, 3).astype(np.uint32)
-
-
-def _rgb(colours: Colormap, norm: Normalize, value: Float[Array, " taxel"]) -> UInt8[Array, "taxel 3"]:
-    return (255 * np.asarray(colours(norm(value)))[:, :3]).astype(np.uint8)
 
 
 def _unit(unit: str) -> str:

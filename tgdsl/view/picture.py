@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from tgdsl.errors import did_you_mean
-from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import Markers, markers_of, touched
 from tgdsl.view.raster import Viewport, unit
-from tgdsl.view.scene import draw_colour_bar, draw_markers, render_scene
-from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING
+from tgdsl.view.scene import draw_colour_bar, draw_markers, rendered, seen
+from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING, new_figure, save_figure
 
 Array = np.ndarray
 SIZE = (16.0, 9.0)  # width and height of the picture [inch]
@@ -34,41 +33,9 @@ _NAME_SPACING = 0.028  # least distance of the names of links, as a part of the 
 _TITLE = {1: 11, 2: 11, 3: 9, 4: 7.8}  # size of the maps' titles, by how many stand side by side
 
 
-def picture(
-    touch: TactileModule,
-    sim: Simulation,
-    readings: Mapping[str, Tensor],
-    path: Path,
-    *,
-    env: int = 0,
-    reading: str | None = None,
-    title: str = "",
-    view: str | None = None,
-) -> Path:
-    """Draw one reading of one environment: the robot with its taxels, and a heat map per link.
-
-    Args:
-        touch: The module.
-        sim: The scene, at the instant of the readings.
-        readings: What the module read, by name.
-        path: PNG file to write; its folder is created if necessary.
-        env: Which environment.
-        reading: Which reading of taxels; default: a kinematic taxel's, if there is any, or else the first.
-        title: What to write above it all; default: the reading's name.
-        view: From where: one of `cameras.VIEWS`, or azimuth and elevation in degrees, "30,20"; default: see
-            `cameras.best_camera`.
-
-    Returns:
-        The path.
-
-    Raises:
-        ViewError: If there is no such reading, environment or view.
-        FileError: If the file cannot be written.
-    """
-    figure = drawing(touch, sim, readings, env=env, reading=reading, title=title, view=view)
-    with atomic_open(with_folder(path)) as file:
-        figure.savefig(file, format="png")
-    return path
+def picture(touch: TactileModule, sim: Simulation, readings: Mapping[str, Tensor], path: Path, **options: Any) -> Path:
+    """Write `drawing` as a PNG file; return the path."""
+    return save_figure(drawing(touch, sim, readings, **options), path)
 
 
 def drawing(
@@ -81,7 +48,20 @@ def drawing(
     title: str = "",
     view: str | None = None,
 ) -> Figure:
-    """Return what `picture` writes: the 3-D view, then a map for each link, whose label is its name, and the colour bar."""
+    """Draw one reading of one environment: the robot with its taxels, then a map for each link, whose axes have its name.
+
+    Args:
+        touch: The module.
+        sim: The scene, at the instant of the readings.
+        readings: What the module read, by name.
+        env: Which environment.
+        reading: Which reading of taxels; default: a kinematic taxel's, if there is any, or else the first.
+        title: What to write above it all; default: the reading's name.
+        view: One of `cameras.VIEWS`, or azimuth and elevation in degrees, "30,20"; default: see `cameras.best_camera`.
+
+    Raises:
+        ViewError: If there is no such reading, environment or view.
+    """
     output = chosen_output(touch, readings, reading)
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
@@ -89,8 +69,7 @@ def drawing(
     markers = replace(markers, would_read=touched(touch, sim, output, readings, env))
     table = touch.taxels[output.sensor]
     norm = Normalize(0.0, float(markers.value.max()) or 1.0)
-    figure = Figure(figsize=SIZE, dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*SIZE)
     width, height = (SUPERSAMPLING * round(part * size * DPI) for part, size in zip(VIEW[2:], SIZE, strict=True))
     links = list(dict.fromkeys(table["link"].tolist()))
     links.sort(key=lambda link: -markers.value[table["link"] == link].sum())
@@ -99,7 +78,7 @@ def drawing(
         rest = f"and {len(links) - MAX_MAPS} more links, touched less or not at all"
         figure.text(0.985, 0.912, rest, size=10.5, color=FAINT, ha="right", va="center")
     maps = {link: np.flatnonzero(table["link"] == link) for link in links[:MAX_MAPS]}
-    axes, scene = figure.add_axes(VIEW), render_scene(touch, sim, markers, env, width, height, view)
+    axes, scene = figure.add_axes(VIEW), rendered(seen(touch, sim, markers, env, width, height, view))
     draw_markers(axes, scene, markers, norm)
     _draw_names(axes, scene.viewport, {names[link]: markers.pos[chosen].mean(axis=0) for link, chosen in maps.items()})
     _draw_maps(figure, sim.model, markers, table, maps, names, norm)
@@ -115,11 +94,7 @@ def drawing(
 
 
 def chosen_output(touch: TactileModule, readings: Mapping[str, Tensor], name: str | None = None) -> Output:
-    """Return the reading of taxels that a picture is of: the one named, or a kinematic taxel's, or else the first.
-
-    Raises:
-        ViewError: If there is none.
-    """
+    """Return the reading of taxels that a picture is of: the one named, or a kinematic taxel's, or else the first."""
     known = {output.name: output for output in touch.outputs if output.name in readings and output.rows == "taxel"}
     if not known:
         raise ViewError("there is nothing to draw: the readings given hold none of this module's taxels")
@@ -128,9 +103,6 @@ def chosen_output(touch: TactileModule, readings: Mapping[str, Tensor], name: st
     if name not in known:
         raise ViewError(f'there is no reading "{name}"; {did_you_mean(name, known, "readings")}')
     return known[name]
-
-
-# The maps -------------------------------------------------------------------------------------------------------------
 
 
 def _draw_names(axes: Axes, viewport: Viewport, places: Mapping[str, Float[Array, " 3"]]) -> None:
@@ -185,12 +157,7 @@ def _draw_maps(
 def distal(model: mujoco.MjModel, body: str, pos: Float[Array, "taxel 3"]) -> tuple[Float[Array, " 3"], bool]:
     """Return the direction in a body's frame in which the robot goes on from its joint, and whether it ends there.
 
-    It leads to the bodies that move against this one, or else to its taxels.
-
-    Args:
-        model: The robot.
-        body: The body, by name.
-        pos: Its taxels in its frame [m].
+    It leads to the bodies that move against this one, or else to its taxels, at `pos` in its frame [m].
     """
     own = model.body(body).id
     state = mujoco.MjData(model)
@@ -208,11 +175,7 @@ def distal(model: mujoco.MjModel, body: str, pos: Float[Array, "taxel 3"]) -> tu
 def turned(table: Array, along: Float[Array, " 3"]) -> tuple[Float[Array, " 3"], int]:
     """Return the direction to the right of a link's map, and by how many quarter turns, counter-clockwise, its grid is turned.
 
-    Unturned, columns run to the right and rows down, seen from outside.
-
-    Args:
-        table: The link's taxels.
-        along: What shall be up, as nearly as it can be, in the frame of the body.
+    Unturned, columns run to the right and rows down, seen from outside; `along` shall be up, as nearly as it can be.
     """
     normal = unit(table["normal"].mean(axis=0), table["normal"][0])
     across = table["tangent"].mean(axis=0)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 Array = np.ndarray
-_FRAGMENTS = 100_000  # fragments drawn at a time, to bound memory
+_FRAGMENTS = 100_000  # drawn at a time, to bound memory
 
 
 class Camera(NamedTuple):
@@ -30,11 +30,11 @@ class Camera(NamedTuple):
 class Viewport(NamedTuple):
     """The pixels that a part of a camera's image fills."""
 
-    camera: Camera  # the camera
+    camera: Camera
     corner: Float[Array, " 2"]  # the lower left pixel on the camera's image [m]
     scale: float  # pixels per metre
-    width: int  # number of columns
-    height: int  # number of rows
+    width: int
+    height: int
 
     def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """Return column [pixel], row [pixel] and nearness to the camera [m]."""
@@ -66,13 +66,7 @@ def viewport_for(camera: Camera, box: Float[Array, "2 2"], width: int, height: i
 
 
 def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fragments:
-    """Return what each pixel shows: the nearest triangle, by z-buffer.
-
-    Args:
-        corners: Corners as (column [pixel], row [pixel], nearness [m]).
-        width: Number of columns.
-        height: Number of rows.
-    """
+    """Return what each pixel shows of triangles whose corners are (column [pixel], row [pixel], nearness [m])."""
     face, row, left, right = _scanlines(corners, width, height)
     count = right - left + 1
     fragments = Fragments(np.full(height * width, -np.inf), np.full(height * width, -1), np.zeros((height * width, 3)))
@@ -122,9 +116,9 @@ def _scanlines(corners: Array, width: int, height: int) -> tuple[Array, Array, A
     return face[is_run], row[is_run], first[is_run], last[is_run]
 
 
-def shade(image: Array, fragments: Fragments, mesh: Mesh, colour: Array, camera: Camera, opacity: float, scale: float) -> Array:
+def shade(image: Array, fragments: Fragments, mesh: Mesh, colour: Array, viewport: Viewport, opacity: float = 1.0) -> Array:
     """Return the image with a mesh drawn over it: lit from the upper right, edges in depth drawn dark."""
-    drawn = fragments.face >= 0
+    drawn, camera = fragments.face >= 0, viewport.camera
     face, weights = fragments.face[drawn], fragments.weights[drawn]
     normal = np.einsum("pi,pij->pj", weights, mesh.normals[face])
     normal *= np.where(normal @ camera.toward < 0, -1, 1)[:, None]
@@ -132,7 +126,7 @@ def shade(image: Array, fragments: Fragments, mesh: Mesh, colour: Array, camera:
     image[drawn] += opacity * (np.minimum(colour[face] * lit[:, None], 1) - image[drawn])
     near = np.where(drawn, fragments.nearness, -1.0)
     jump = np.maximum(*(np.abs(np.diff(near, axis=axis, append=near.take([-1], axis))) for axis in (0, 1)))
-    image[jump > np.maximum(6 / scale, 0.002)] *= 0.62
+    image[jump > np.maximum(6 / viewport.scale, 0.002)] *= 0.62
     return image
 
 

@@ -1,36 +1,38 @@
 """Pictures of a hand and its taxels: one panel per resolution, taxels as discs that lie on the surface, coloured by link group.
 
 A disc is drawn in its taxel's tangent plane and carries a tick along the normal, so that a normal that is not the surface's
-shows. Shapes: `point` points of the picture, `h` and `w` rows and columns of pixels.
+shows.
+
+Shapes: `taxel` taxels of one layout, `corner` corners of a disc, `h` and `w` rows and columns of pixels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
 
 from tgdsl.errors import FileError
-from tgdsl.files.write import atomic_open, check_writable, with_folder
+from tgdsl.files.write import check_writable
 from tgdsl.layout.layout import Layout, Unfelt, unfelt_ids
 from tgdsl.view.cameras import ViewError, angles_of, camera_of, pose_of
-from tgdsl.view.discs import discs, group_of, legend, radii
+from tgdsl.view.markers import Taxels, is_visible, taxels_of
 from tgdsl.view.meshes import mesh_of, robot_bodies
 from tgdsl.view.raster import Fragments, Mesh, Viewport, downsample, light_direction, rasterise, shade, viewport_for
 from tgdsl.view.scene import draw_image, draw_scale_bar
-from tgdsl.view.style import FAINT, INK
-from tgdsl.view.taxels import Taxels, is_visible, taxels_of
+from tgdsl.view.style import FAINT, INK, new_figure, save_figure
 
 Array = np.ndarray
 COLOURS = ("#0f7fb8", "#e8871e", "#c2315b", "#3a9d5d", "#7a55b0", "#8c6d46", "#d4b106", "#4f5d75")
@@ -42,48 +44,17 @@ _SUPERSAMPLING = 3  # pixels rendered per pixel of the file, along each axis
 _SURFACE = np.array([0.91, 0.92, 0.94])
 _CROSS = "#d40000"
 _DIAGONALS = np.array([[3, 15], [9, 21]])  # corners of a disc of 24 that lie opposite each other
-_AMBIENT_OCCLUSION = (
-    (0.004, 12.0),
-    (0.012, 6.0),
-)  # width [m] of hollows that are shaded, and how much darker per metre of depth
+_AMBIENT_OCCLUSION = ((0.004, 12.0), (0.012, 6.0))  # width [m] of hollows, and how much darker per metre of depth
+_RADIUS = (0.0006, 0.0022)  # least and largest radius of a disc [m]
 
 
-def render(
-    model: mujoco.MjModel,
-    layouts: Mapping[str, Layout],
-    out: Path,
-    *,
-    keyframe: str | None = None,
-    view: str = "front",
-    size: tuple[int, int] | None = None,
-    unfelt: Mapping[str, Sequence[Unfelt]] | None = None,
-) -> Path:
-    """Draw the taxels of one layout or more on the robot that has them, and write the picture.
-
-    Args:
-        model: The robot, or a scene with it.
-        layouts: What to draw, by the title of its panel.
-        out: PNG file to write; its folder is made if need be.
-        keyframe: Name of the model's keyframe that gives the pose; default: the model's own initial state.
-        view: One of `cameras.VIEWS`, or azimuth and elevation in degrees. In `front` the taxels' mean normal points at the
-            camera, or nearly so.
-        size: Columns and rows of the file; default: `HEIGHT` rows and as many columns as the hand needs.
-        unfelt: Taxels of each panel that cannot feel: they are crossed out.
-
-    Returns:
-        The path.
-
-    Raises:
-        ViewError: If there is no such keyframe or view, if there is nothing to draw, or if the file cannot be written.
-    """
+def render(model: mujoco.MjModel, layouts: Mapping[str, Layout], out: Path, **options: Any) -> Path:
+    """Write `drawing` as a PNG file; return the path. A file that cannot be written is a `ViewError`."""
     try:
         check_writable(out)
-        figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size, unfelt=unfelt)
-        with atomic_open(with_folder(out)) as file:
-            figure.savefig(file, format="png", pil_kwargs={"optimize": True})
+        return save_figure(drawing(model, layouts, **options), out, pil_kwargs={"optimize": True})
     except FileError as error:
         raise ViewError(f"cannot write {error}") from error
-    return out
 
 
 def drawing(
@@ -95,8 +66,25 @@ def drawing(
     size: tuple[int, int] | None = None,
     unfelt: Mapping[str, Sequence[Unfelt]] | None = None,
 ) -> Figure:
-    """Return the picture that `render` writes."""
-    _check(layouts, view, size)
+    """Draw the taxels of one layout or more on the robot that has them.
+
+    Args:
+        model: The robot, or a scene with it.
+        layouts: What to draw, by the title of its panel.
+        keyframe: Name of the model's keyframe that gives the pose; default: the model's own initial state.
+        view: One of `cameras.VIEWS`, or azimuth and elevation in degrees. In `front` the taxels' mean normal points at the
+            camera, or nearly so.
+        size: Columns and rows of the file; default: `HEIGHT` rows and as many columns as the hand needs.
+        unfelt: Taxels of each panel that cannot feel: they are crossed out.
+
+    Raises:
+        ViewError: If there is no such keyframe or view, or there is nothing to draw.
+    """
+    angles_of(view)
+    if not any((layout.radius > 0).any() for layout in layouts.values()):
+        raise ViewError("there is nothing to draw: no layout has a taxel")
+    if size is not None and min(size) < MIN_SIZE:
+        raise ViewError(f"a picture of {size[0]} × {size[1]} pixels is too small, expected at least {MIN_SIZE} of each")
     pose = pose_of(model, keyframe)
     taxels = [taxels_of(model, pose, layout) for layout in layouts.values()]
     links = [link for layout in layouts.values() for link in layout.links]
@@ -110,8 +98,7 @@ def drawing(
     viewport = viewport_for(camera, box, _SUPERSAMPLING * columns, _SUPERSAMPLING * rows)
     fragments = rasterise(viewport.project(hand.corners), viewport.width, viewport.height)
     image = _image(hand, fragments, viewport)
-    figure = Figure(figsize=(width / height * _INCHES, _INCHES), dpi=height / _INCHES, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(width / height * _INCHES, _INCHES, dpi=height / _INCHES)
     for i, (name, layout) in enumerate(layouts.items()):
         left = _GAP * height + i * (columns + _GAP * height)
         axes = figure.add_axes((left / width, _FOOT, columns / width, rows / height), label=name)
@@ -119,19 +106,8 @@ def drawing(
         crossed = unfelt_ids((unfelt or {}).get(name, ()))
         _draw_taxels(axes, layout, taxels[i], viewport, fragments, crossed)
         _draw_captions(axes, name, layout, len(crossed))
-    draw_scale_bar(figure.axes[0], viewport.scale, viewport.width, 1.03 * viewport.height)
+    draw_scale_bar(figure.axes[0], viewport, 1.03 * viewport.height)
     return figure
-
-
-def _check(layouts: Mapping[str, Layout], view: str, size: tuple[int, int] | None) -> None:
-    angles_of(view)
-    if not any((layout.radius > 0).any() for layout in layouts.values()):
-        raise ViewError("there is nothing to draw: no layout has a taxel")
-    if size is not None and min(size) < MIN_SIZE:
-        raise ViewError(f"a picture of {size[0]} × {size[1]} pixels is too small, expected at least {MIN_SIZE} of each")
-
-
-# The hand -------------------------------------------------------------------------------------------------------------
 
 
 def _box(points: Float[Array, "point 2"]) -> Float[Array, "2 2"]:
@@ -150,7 +126,7 @@ def _image(hand: Mesh, fragments: Fragments, viewport: Viewport) -> Float[Array,
     """Return the hand alone: lit, with hollows darkened by how far they lie behind what is around them."""
     image = np.ones((viewport.height, viewport.width, 3))
     colour = np.broadcast_to(_SURFACE, (len(hand.body), 3))
-    image = downsample(shade(image, fragments, hand, colour, viewport.camera, 1.0, viewport.scale), _SUPERSAMPLING)
+    image = downsample(shade(image, fragments, hand, colour, viewport), _SUPERSAMPLING)
     near = fragments.nearness[_SUPERSAMPLING // 2 :: _SUPERSAMPLING, _SUPERSAMPLING // 2 :: _SUPERSAMPLING]
     is_hand = np.isfinite(near)
     near = np.where(is_hand, near, near[is_hand].min())
@@ -158,9 +134,6 @@ def _image(hand: Mesh, fragments: Fragments, viewport: Viewport) -> Float[Array,
         behind = gaussian_filter(near, width * viewport.scale / _SUPERSAMPLING) - near
         image *= np.where(is_hand, 1 - np.clip(amount * behind, 0, 0.35), 1)[..., None]
     return image
-
-
-# The panels -----------------------------------------------------------------------------------------------------------
 
 
 def _draw_taxels(
@@ -206,3 +179,46 @@ def _draw_captions(axes: Axes, name: str, layout: Layout, num_crossed: int) -> N
     style = {"frameon": False, "handletextpad": 0.1, "columnspacing": 1.1, "fontsize": 10, "labelcolor": INK}
     columns = len(handles) if len(handles) <= 3 else -(-len(handles) // 2)
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.005), ncols=columns, **style)
+
+
+def radii(layout: Layout, pos: Float[Array, "taxel 3"]) -> Float[Array, " taxel"]:
+    """Return the radius of each disc [m]: the same on a link, and small enough to leave room between neighbours."""
+    radius = np.full(len(pos), _RADIUS[1])
+    for link in range(len(layout.links)):
+        own = np.flatnonzero(layout.link_id == link)
+        if len(own) > 1:
+            apart = KDTree(pos[own]).query(pos[own], k=2)[0][:, 1]
+            radius[own] = np.clip(0.44 * np.median(apart), *_RADIUS)
+    return radius
+
+
+def discs(taxels: Taxels, radius: Float[Array, " taxel"]) -> Float[Array, "taxel corner 3"]:
+    """Return discs about the taxels, in their tangent planes."""
+    least = np.eye(3)[np.abs(taxels.normal).argmin(axis=1)]
+    first = np.cross(taxels.normal, least)
+    first *= (radius / np.linalg.norm(first, axis=1))[:, None]
+    second = np.cross(taxels.normal, first)
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)[:, None]
+    return taxels.pos[:, None] + np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None]
+
+
+def group_of(layout: Layout) -> list[str]:
+    """Return the group that each link is coloured by: the one of fewest links that it is in; empty if it is in none."""
+    groups = sorted(layout.groups.items(), key=lambda group: (len(group[1]), group[0]))
+    return [next((group for group, members in groups if link.name in members), "") for link in layout.links]
+
+
+def legend(layout: Layout) -> dict[str, int]:
+    """Return the label of each group that colours any link, in the links' order, and how many taxels have its colour.
+
+    A group some of whose links have the colour of a smaller one is called `other`.
+    """
+    chosen = group_of(layout)
+    active = np.bincount(layout.link_id[layout.radius > 0], minlength=len(layout.links))
+    counts: dict[str, int] = {}
+    for group in dict.fromkeys(chosen):
+        is_whole = chosen.count(group) == len(layout.groups.get(group, ()))
+        nobody = "no group" if layout.groups else "taxels"
+        label = nobody if not group else group if is_whole else f"other {group}"
+        counts[label] = int(sum(active[i] for i, own in enumerate(chosen) if own == group))
+    return counts

@@ -19,17 +19,15 @@ from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.cameras import best_camera, camera_of
-from tgdsl.view.markers import Markers
+from tgdsl.view.markers import Markers, Pose, is_visible
 from tgdsl.view.meshes import mesh_of, robot_bodies
 from tgdsl.view.raster import Fragments, Mesh, Viewport, downsample, rasterise, shade, viewport_for
 from tgdsl.view.style import DPI, HEAT, INK, SUPERSAMPLING
-from tgdsl.view.taxels import Pose, is_visible
 
 Array = np.ndarray
 _SENSING, _OTHER, _OBJECT = np.array([0.83, 0.84, 0.86]), np.array([0.60, 0.62, 0.66]), np.array([0.33, 0.55, 0.83])
-
-
 _DEPTH = 0.5  # how much of the shading painted surfaces keep
+# returns the colours of points of the robot's surface [m] on some bodies, NaN where these stay grey
 Paint = Callable[[Array, Array], Array]
 
 
@@ -48,13 +46,6 @@ class Seen(NamedTuple):
     carriers: frozenset[int]
     objects: Mesh
     viewport: Viewport
-
-
-def render_scene(
-    touch: TactileModule, sim: Simulation, markers: Markers, env: int, width: int, height: int, view: str | None = None
-) -> RenderedScene:
-    """Draw robot and felt objects, seen from where some taxels are in view: see `seen`."""
-    return rendered(seen(touch, sim, markers, env, width, height, view))
 
 
 def seen(
@@ -80,42 +71,38 @@ def seen(
         layouts: What else carries sensors; the first gives views their names where the module has no taxels.
     """
     model, pose = sim.model, Pose(*sim.body_poses(env))
-    links = [link for own in (touch.plan.layout, *layouts) for link in own.links]
+    layouts = (touch.plan.layout, *layouts)
+    links = [link for layout in layouts for link in layout.links]
     carriers = {model.body(link.body).id for link in links}
     framed, robot = robot_bodies(model, carriers)
     felt = {model.body(target.body).id for target in touch.plan.objects} - carriers
     hand, objects = (mesh_of(sim.env_model(env), pose, bodies, links) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
-    own = next((own for own in (touch.plan.layout, *layouts) if (own.radius > 0).any()), touch.plan.layout)
+    named = next((layout for layout in layouts if (layout.radius > 0).any()), layouts[0])
     root = min(framed)
-    camera = best_camera(markers, hand, model, own, pose, root) if view is None else camera_of(view, model, [own], pose, root)
+    camera = (
+        best_camera(markers, hand, model, named, pose, root) if view is None else camera_of(view, model, [named], pose, root)
+    )
     box = _bounds(camera.project(hand.corners[frame] if frame.any() else markers.pos[:, None]), camera.project(objects.corners))
     return Seen(hand, frozenset(carriers), objects, viewport_for(camera, box, width, height))
 
 
 def rendered(seen: Seen, paint: Paint | None = None) -> RenderedScene:
-    """Draw what is in view.
-
-    Args:
-        seen: What that is.
-        paint: Returns the colours of points of the robot's surface [m] on some bodies, NaN where these stay grey; objects are
-            then fainter.
-    """
+    """Draw what is in view; objects are fainter over a robot that is painted."""
     hand, carriers, objects, viewport = seen
-    width, height, camera = viewport.width, viewport.height, viewport.camera
-    fragments = rasterise(viewport.project(hand.corners), width, height)
+    fragments = rasterise(viewport.project(hand.corners), viewport.width, viewport.height)
     colour = np.where(np.isin(hand.body, list(carriers))[:, None], _SENSING, _OTHER)
-    image = shade(np.ones((height, width, 3)), fragments, hand, colour, camera, 1.0, viewport.scale)
+    image = shade(np.ones((viewport.height, viewport.width, 3)), fragments, hand, colour, viewport)
     if paint is not None:
         drawn = fragments.face >= 0
         face, weights = fragments.face[drawn], fragments.weights[drawn]
-        own = paint(np.einsum("pi,pij->pj", weights, hand.corners[face]), hand.body[face])
+        painted = paint(np.einsum("pi,pij->pj", weights, hand.corners[face]), hand.body[face])
         light = 1 - _DEPTH * (1 - np.minimum(image[drawn] / colour[face], 1))
-        image[drawn] = np.where(np.isnan(own), image[drawn], own * light)
-    over = rasterise(viewport.project(objects.corners), width, height)
+        image[drawn] = np.where(np.isnan(painted), image[drawn], painted * light)
+    over = rasterise(viewport.project(objects.corners), viewport.width, viewport.height)
     over.face[over.nearness < fragments.nearness] = -1
-    blue, opacity = np.broadcast_to(_OBJECT, (len(objects.body), 3)), 0.4 if paint is None else 0.25
-    image = shade(image, over, objects, blue, camera, opacity, viewport.scale)
+    blue = np.broadcast_to(_OBJECT, (len(objects.body), 3))
+    image = shade(image, over, objects, blue, viewport, opacity=0.4 if paint is None else 0.25)
     return RenderedScene(downsample(image, SUPERSAMPLING), fragments, viewport)
 
 
@@ -134,7 +121,7 @@ def draw_markers(axes: Axes, scene: RenderedScene, markers: Markers, norm: Norma
     order = np.argsort(markers.value[shown], kind="stable")
     place, value, size = at[shown, :2][order], markers.value[shown][order], area[shown][order]
     axes.scatter(*place.T, s=size, c=value, cmap=HEAT, norm=norm, edgecolors=INK, linewidths=0.5, zorder=5)
-    draw_scale_bar(axes, viewport.scale, viewport.width, -44.0)
+    draw_scale_bar(axes, viewport, -44.0)
 
 
 def draw_image(axes: Axes, image: Float[Array, "h w 3"], viewport: Viewport) -> None:
@@ -145,11 +132,11 @@ def draw_image(axes: Axes, image: Float[Array, "h w 3"], viewport: Viewport) -> 
     axes.autoscale(False)
 
 
-def draw_scale_bar(axes: Axes, scale: float, width: int, row: float) -> None:
-    """Draw a round number of millimetres at the left of a row [pixel], for a view of `scale` pixels per metre."""
+def draw_scale_bar(axes: Axes, viewport: Viewport, row: float) -> None:
+    """Draw a round number of millimetres at the left of a row [pixel]."""
     steps = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000])
-    length = steps[np.abs(steps * scale / 1000 / width - 0.12).argmin()]
-    end = 8 + length * scale / 1000
+    length = steps[np.abs(steps * viewport.scale / 1000 / viewport.width - 0.12).argmin()]
+    end = 8 + length * viewport.scale / 1000
     axes.plot([8, end], [row, row], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False)
     axes.text(end + 16, row - 1, f"{length} mm", fontsize=9.5, color=INK, va="center")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.sensors.upstream import SAMPLES
+from tgdsl.view.style import new_figure, save_figure
 
 PEAK = 0.7  # largest sample of a file that is normalised, of full scale
 RANGE = 80.0  # levels that a spectrogram tells apart [dB]
@@ -41,14 +42,8 @@ def sounding(plan: Plan) -> tuple[PlannedSensor, ...]:
 
 
 def write_wav(sound: Sound, path: Path) -> float:
-    """Write a sound as 16-bit WAV, its largest sample at `PEAK` of full scale, and return by what samples were multiplied.
-
-    Of silence the file is silent, and the factor is 1.
-
-    Raises:
-        TgdslError: If soundfile is not installed.
-    """
-    soundfile = _soundfile()
+    """Write a sound as 16-bit WAV, its largest sample at `PEAK` of full scale; return the gain, which is 1 of silence."""
+    soundfile = check_soundfile()
     largest = float(np.abs(sound.samples).max(initial=0.0))
     gain = PEAK / largest if largest > 0 else 1.0
     with atomic_open(with_folder(path)) as file:
@@ -56,7 +51,8 @@ def write_wav(sound: Sound, path: Path) -> float:
     return gain
 
 
-def _soundfile() -> Any:
+def check_soundfile() -> Any:
+    """Return soundfile; raise an error if it is not installed."""
     try:
         import soundfile
     except ImportError as error:
@@ -64,32 +60,16 @@ def _soundfile() -> Any:
     return soundfile
 
 
-def check_soundfile() -> None:
-    """Raise an error if soundfile is not installed.
-
-    Raises:
-        TgdslError: If so.
-    """
-    _soundfile()
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrogram:
+class Spectrogram(NamedTuple):
     """How strong each frequency is at each time."""
 
     time: Float[np.ndarray, " time"]  # middles of the windows [s]
     frequency: Float[np.ndarray, " frequency"]  # [Hz]
-    # power over the loudest one's of the sound, (frequency, time) [dB]; −inf where there is none
-    level: Float[np.ndarray, "frequency time"]
+    level: Float[np.ndarray, "frequency time"]  # power over the loudest one's of the sound [dB]; −inf where there is none
 
 
 def spectrogram(sound: Sound, window: float = 0.02) -> Spectrogram:
-    """Return the spectrogram of a sound, by Hann windows that overlap by three quarters.
-
-    Args:
-        sound: The sound.
-        window: Length of a window [s], at most that of the sound.
-    """
+    """Return the spectrogram of a sound, by Hann windows [s], at most the sound's length, that overlap by three quarters."""
     num = int(np.clip(round(window * sound.rate), 1, max(len(sound.samples), 1)))
     hop = max(num // 4, 1)
     frequency, time, power = signal.spectrogram(sound.samples, sound.rate, "hann", num, num - hop, detrend=False)  # type: ignore[arg-type]
@@ -100,26 +80,13 @@ def spectrogram(sound: Sound, window: float = 0.02) -> Spectrogram:
 
 
 def draw(sounds: Sequence[Sound], path: Path, title: str = "", marks: Mapping[str, Sequence[float]] | None = None) -> Path:
-    """Draw the spectrograms of some sounds, one above the other.
-
-    Args:
-        sounds: The sounds.
-        path: The picture.
-        title: Its title.
-        marks: Frequencies that are marked beside each, by its name [Hz].
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 0.6 + 1.9 * len(sounds)), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    """Draw the spectrograms of some sounds, one above the other; `marks` are frequencies beside each, by its name [Hz]."""
+    figure = new_figure(8.0, 0.6 + 1.9 * len(sounds), dpi=150, layout="constrained")
     axes = figure.subplots(len(sounds), 1, sharex=True, squeeze=False)[:, 0]
     for axis, sound in zip(axes, sounds, strict=True):
-        found = spectrogram(sound)
-        level = np.maximum(found.level, -RANGE)
-        image = axis.pcolormesh(
-            found.time, found.frequency / 1e3, level, vmin=-RANGE, vmax=0.0, cmap="magma", shading="nearest"
-        )
+        time, frequencies, level = spectrogram(sound)
+        style = {"vmin": -RANGE, "vmax": 0.0, "cmap": "magma", "shading": "nearest"}
+        image = axis.pcolormesh(time, frequencies / 1e3, np.maximum(level, -RANGE), **style)
         for frequency in (marks or {}).get(sound.name, ()):
             axis.plot([0.0], [frequency / 1e3], ">", color="tab:green", clip_on=False, markersize=4)
         axis.set_xlim(0.0, len(sound.samples) / sound.rate)
@@ -127,6 +94,4 @@ def draw(sounds: Sequence[Sound], path: Path, title: str = "", marks: Mapping[st
     axes[-1].set_xlabel("time [s]")
     figure.suptitle(title)
     figure.colorbar(image, ax=list(axes), label="power, of the loudest [dB]")
-    with atomic_open(with_folder(path)) as file:
-        figure.savefig(file, format="png")
-    return path
+    return save_figure(figure, path)

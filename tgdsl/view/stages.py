@@ -27,6 +27,7 @@ from tgdsl.scene.scene import scene_model
 from tgdsl.view.overview import drawn_outputs
 
 Array = np.ndarray
+Poses = tuple[Float[Array, "body 3"], Float[Array, "body 4"]]
 
 
 class Stage(ABC):
@@ -34,13 +35,14 @@ class Stage(ABC):
 
     touch: TactileModule  # the module whose taxels are shown
     model: mujoco.MjModel  # the compiled scene
-    num_envs: int  # number of environments
+    num_envs: int
     control_step: float  # duration of one step [s]
     time: float  # the instant [s]
     readings: Mapping[str, Tensor]  # what the taxels read then
     # values that a user may set, one per actuator; None where something else acts
     control: Float[Array, " actuator"] | None = None
     num_steps: int | None = None  # number of instants of a recorded run; None: the scene goes on without end
+    step_index = 0  # which instant of a recorded run this is
 
     @abstractmethod
     def advance(self) -> None:
@@ -51,17 +53,12 @@ class Stage(ABC):
         """Begin again."""
 
     @abstractmethod
-    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+    def body_poses(self, env: int) -> Poses:
         """Return origins [m] and quaternions w, x, y, z of all bodies in one environment, in the world."""
 
     def seek(self, step: int) -> None:
-        """Go to an instant of a recorded run."""
+        """Go to an instant of a recorded run, or to its first or last one."""
         raise NotImplementedError(f"{type(self).__name__} is not recorded")
-
-    @property
-    def step_index(self) -> int:
-        """Which instant of a recorded run this is."""
-        return 0
 
     @property
     def outputs(self) -> Sequence[Output]:
@@ -76,8 +73,18 @@ class Stage(ABC):
         """Release the simulator; of a recorded run, nothing."""
 
 
+class RecordedStage(Stage):
+    """A stage with `num_steps` instants; `seek` sets `step_index`."""
+
+    def advance(self) -> None:
+        self.seek(self.step_index + 1)
+
+    def restart(self) -> None:
+        self.seek(0)
+
+
 class SimStage(Stage):
-    """A simulation that its user steps; `update` says what the module has read."""
+    """A simulation that its user steps and resets; `update` says what the module has read."""
 
     def __init__(self, touch: TactileModule, sim: Simulation):
         self.touch, self.sim, self.model = touch, sim, sim.model
@@ -91,109 +98,78 @@ class SimStage(Stage):
         self.time += self.control_step
 
     def advance(self) -> None:
-        """Leave the steps to the user's loop."""
+        pass
 
     def restart(self) -> None:
-        """Leave resets to the user's loop."""
+        pass
 
-    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return where the bodies are."""
+    def body_poses(self, env: int) -> Poses:
         return self.sim.body_poses(env)
 
 
 class SceneStage(SimStage):
-    """A document's scene in MuJoCo, whose actuators follow `control`."""
+    """A document's scene in MuJoCo, whose actuators follow `control`: at first the keyframe's that has the initial pose."""
 
     def __init__(self, touch: TactileModule, num_envs: int = 1):
         super().__init__(touch, simulate(touch, num_envs, substeps=substeps_of(touch, 5), on_fault="reset"))
-        self.control = self._start_control()
-        self.readings = touch(self.sim.state())
+        self._begin()
 
     def advance(self) -> None:
-        """Step the scene."""
         self.sim.step(self.control)
         self.update(self.touch(self.sim.state()))
 
     def restart(self) -> None:
-        """Begin from the model's initial state."""
         self.sim.reset()
         self.touch.reset()
-        self.control, self.time = self._start_control(), 0.0
-        self.readings = self.touch(self.sim.state())
+        self._begin()
 
     def close(self) -> None:
-        """Release the simulator."""
         self.sim.close()
 
-    def _start_control(self) -> Float[Array, " actuator"]:
-        """Return the controls of the first keyframe that holds the initial pose; else zero."""
-        for key in range(self.model.nkey):
-            if np.array_equal(self.model.key_qpos[key], self.model.qpos0):
-                return self.model.key_ctrl[key].copy()
-        return np.zeros(self.model.nu)
+    def _begin(self) -> None:
+        keys = (i for i in range(self.model.nkey) if np.array_equal(self.model.key_qpos[i], self.model.qpos0))
+        key = next(keys, None)
+        self.control = np.zeros(self.model.nu) if key is None else self.model.key_ctrl[key].copy()
+        self.time, self.readings = 0.0, self.touch(self.sim.state())
 
 
-class RunStage(Stage):
+class RunStage(RecordedStage):
     """A run that `tgdsl run` recorded, instant by instant."""
 
     def __init__(self, touch: TactileModule, path: Path):
-        """Read a run.
-
-        Raises:
-            SimulationError: If the file holds no positions, or is of another scene or other sensors.
-        """
+        """Read a run; raise `SimulationError` if the file holds no positions, or is of another scene or other sensors."""
         self.touch, self.model = touch, scene_model(touch.plan.scene)
         arrays = read_run(path)
         self._qpos, self._times = arrays["qpos"], arrays["time"]
-        self._readings = {output.name: arrays.get(output.name) for output in touch.outputs}
-        missing = [name for name, values in self._readings.items() if values is None]
+        names = [output.name for output in touch.outputs]
+        missing = [name for name in names if name not in arrays]
         if missing or self._qpos.shape[-1] != self.model.nq:
             has = f'has no reading "{missing[0]}"' if missing else f"has {self._qpos.shape[-1]} numbers in `qpos`"
             raise SimulationError(f"{path}: the run {has}, and the scene has {self.model.nq}: was the document changed since?")
+        self._readings = {name: arrays[name] for name in names}
         self.num_steps, self.num_envs = self._qpos.shape[:2]
         self.control_step = float(self._times[0])
         self._data = mujoco.MjData(self.model)
         self.seek(0)
 
     def seek(self, step: int) -> None:
-        """Go to an instant."""
-        self._index = int(np.clip(step, 0, len(self._times) - 1))
-        self.time = float(self._times[self._index])
-        self.readings = {
-            name: torch.from_numpy(values[self._index]) for name, values in self._readings.items() if values is not None
-        }
+        self.step_index = i = int(np.clip(step, 0, len(self._times) - 1))
+        self.time = float(self._times[i])
+        self.readings = {name: torch.from_numpy(values[i]) for name, values in self._readings.items()}
 
-    @property
-    def step_index(self) -> int:
-        """Which instant this is."""
-        return self._index
-
-    def advance(self) -> None:
-        """Go to the next instant."""
-        self.seek(self._index + 1)
-
-    def restart(self) -> None:
-        """Go to the first instant."""
-        self.seek(0)
-
-    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return where MuJoCo's kinematics put the bodies."""
-        self._data.qpos[:] = self._qpos[self._index, env]
+    def body_poses(self, env: int) -> Poses:
+        self._data.qpos[:] = self._qpos[self.step_index, env]
         return kinematic_poses(self.model, self._data)
 
 
-def kinematic_poses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+def kinematic_poses(model: mujoco.MjModel, data: mujoco.MjData) -> Poses:
     """Return origins [m] and quaternions w, x, y, z of all bodies in the world at `data.qpos`."""
     mujoco.mj_kinematics(model, data)
     return data.xpos.copy(), data.xquat.copy()
 
 
 def read_run(path: Path) -> dict[str, Any]:
-    """Return the arrays of a run that `tgdsl run` recorded.
-
-    Raises:
-        SimulationError: If it is none.
-    """
+    """Return the arrays of a run that `tgdsl run` recorded; raise `SimulationError` if it is none."""
     arrays = read_arrays(path, "a run, as `tgdsl run` writes it", SimulationError)
     if missing := [name for name in ("time", "qpos", "document") if name not in arrays]:
         raise SimulationError(f"{path}: expected a run, as `tgdsl run` writes it; it has no `{missing[0]}`")

@@ -1,13 +1,36 @@
-"""What all pictures share: resolution and colours."""
+"""What all pictures share: resolution, colours, and how a figure begins and is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from tgdsl.files.write import atomic_open, with_folder
 
 DPI = 100
 SUPERSAMPLING = 2  # pixels that are rendered per pixel of the file, along each axis
 INK, FAINT, REST = "#2b2f36", "#7b828c", "#d3d6da"
 _HEAT = LinearSegmentedColormap.from_list("touch", matplotlib.colormaps["YlOrRd"](np.linspace(0.2, 0.93, 256)))
 HEAT = _HEAT.with_extremes(under=REST, bad=(0, 0, 0, 0))  # from little to much; zero, and less, is grey
+# from cold to warm, of even steps in lightness
 WARMTH = LinearSegmentedColormap.from_list("warmth", matplotlib.colormaps["inferno"](np.linspace(0.2, 0.97, 256)))
-"""From cold to warm, of even steps in lightness."""
+
+
+def new_figure(width: float, height: float, dpi: float = DPI, **options: Any) -> Figure:
+    """Return a white figure of some inches that needs no display."""
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white", **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path, **options: Any) -> Path:
+    """Write a figure as a PNG file, its folder made if need be; return the path."""
+    with atomic_open(with_folder(path)) as file:
+        figure.savefig(file, format="png", **options)
+    return path

@@ -8,10 +8,9 @@ import numpy as np
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable
-from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.view.markers import THRESHOLDS
+from tgdsl.view.markers import THRESHOLDS, read_now
 
 
 def outputs_on_taxels(touch: TactileModule) -> list[Output]:
@@ -23,15 +22,15 @@ def outputs_on_taxels(touch: TactileModule) -> list[Output]:
 def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) -> list[str]:
     """Return the readings of one environment, link by link.
 
-    Each reading has one column: force as the magnitude of the link's summed force, depth as its largest, contact as the number
-    of taxels in contact; any other vector, and any other channel, as the largest magnitude. Readings of bodies show the
-    link's body. Readings with rows of their own, such as one per inertial sensor, follow with a line for each row; those of
-    joints and actuators are left out.
+    Each reading has one column: force as the magnitude of the link's summed force, contact as the number of taxels in contact,
+    any other channel or vector as the largest magnitude. Readings of bodies show the link's body. Readings with rows of their
+    own, such as one per inertial sensor, follow with a line for each row; those of joints and actuators are left out.
     """
     taxels = touch.taxels
     outputs = outputs_on_taxels(touch)
     links = list(dict.fromkeys(link for sensor in taxels.values() for link in sensor["link"]))
-    header = ["link"] + [f"{output.name} [{_summary_unit(output)}]" for output in outputs]
+    units = ["taxels" if output.channels == ("contact",) else output.units[0] for output in outputs]
+    header = ["link"] + [f"{output.name} [{unit}]" for output, unit in zip(outputs, units, strict=True)]
     rows = [[link] + [_cell(taxels[output.sensor], output, readings, link, env) for output in outputs] for link in links]
     lines = _aligned(header, rows) if outputs else []
     for output in (own for own in touch.outputs if own not in outputs and own.rows not in ("joint", "actuator")):
@@ -40,48 +39,43 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
 
 
 def _own_rows(table: TaxelTable, output: Output, readings: Mapping[str, Tensor], env: int) -> list[str]:
-    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample."""
+    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample.
+
+    Rows that share that column, such as the cells of a link, are one line: how many they are, the lowest and the highest.
+    """
     first, *_ = table.dtype.names or ("row",)
-    values = last_step(readings[output.name])[env].detach().cpu().double().numpy()
+    values = read_now(readings[output.name], env)
     channels = [f"{name} [{unit}]" for name, unit in zip(output.channels, output.units, strict=True)]
     names = list(dict.fromkeys(table[first].tolist()))
-    if len(names) < len(table):
-        rows = [_span_row(str(name), values[table[first] == name], output.units) for name in names]
-        return [output.name, *_aligned([first, f"{output.rows}s", *channels], rows)]
-    rows = [
-        [str(row[first]), *(_number(n, unit) for n, unit in zip(own, output.units, strict=True))]
-        for row, own in zip(table, values, strict=True)
-    ]
-    return [output.name, *_aligned([output.rows, *channels], rows)]
+    if len(names) == len(table):
+        rows = [[str(name), *_numbers(own, output.units)] for name, own in zip(names, values, strict=True)]
+        return [output.name, *_aligned([output.rows, *channels], rows)]
+    rows = []
+    for name in names:
+        own = values[table[first] == name]
+        ends = zip(_numbers(own.min(axis=0), output.units), _numbers(own.max(axis=0), output.units), strict=True)
+        rows.append([str(name), str(len(own)), *map(" … ".join, ends)])
+    return [output.name, *_aligned([first, f"{output.rows}s", *channels], rows)]
 
 
-def _span_row(name: str, values: np.ndarray, units: Sequence[str]) -> list[str]:
-    ends = zip(values.min(axis=0), values.max(axis=0), units, strict=True)
-    return [name, str(len(values)), *(f"{_number(low, unit)} … {_number(high, unit)}" for low, high, unit in ends)]
-
-
-def _number(number: float, unit: str) -> str:
-    return f"{number:.2f}" if unit == "degC" else f"{number:.3g}"
+def _numbers(values: np.ndarray, units: Sequence[str]) -> list[str]:
+    return [f"{value:.2f}" if unit == "degC" else f"{value:.3g}" for value, unit in zip(values, units, strict=True)]
 
 
 def _aligned(header: list[str], rows: list[list[str]]) -> list[str]:
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    lines = [
-        "  ".join(text.ljust(w) if i == 0 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True)))
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    header, *rows = [
+        [text.rjust(width) if i else text.ljust(width) for i, (text, width) in enumerate(zip(row, widths, strict=True))]
         for row in [header, *rows]
     ]
-    return [lines[0], "  ".join("─" * width for width in widths), *lines[1:]]
-
-
-def _summary_unit(output: Output) -> str:
-    return "taxels" if output.channels == ("contact",) else output.units[0]
+    return ["  ".join(row) for row in (header, ["─" * width for width in widths], *rows)]
 
 
 def _cell(taxels: TaxelTable, output: Output, readings: Mapping[str, Tensor], link: str, env: int) -> str:
     own = taxels["link"] == link
     if not own.any():
         return "–"
-    values = last_step(readings[output.name])[env].detach().cpu().double().numpy()
+    values = read_now(readings[output.name], env)
     values = values[[output.bodies.index(taxels["body"][own][0])]] if output.rows == "body" else values[own]
     if output.channels == ("contact",):
         return f"{int(values.sum())}/{len(values)}"

@@ -12,65 +12,42 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.view.markers import magnitude
+from tgdsl.view.markers import Pose, in_world, magnitude, read_now
 from tgdsl.view.picture import MAX_MAPS, short_names
-from tgdsl.view.style import DPI, HEAT, INK, REST
-from tgdsl.view.taxels import Pose, in_world
+from tgdsl.view.style import DPI, HEAT, INK, REST, new_figure
 
 Array = np.ndarray
-RADIUS = (0.16, 0.36)
-"""Radius of the sphere of a taxel that reads nothing, and of one that reads something, as a part of its patch's width."""
+RADIUS = (0.16, 0.36)  # of the sphere of a taxel that reads nothing, or something, as a part of its patch's width
 _ROW, _LABELS, _WIDTH = 18, 120, 300  # height of a bar's row, width of the names, and of all [pixel]
 _LETTERS = 18  # of a name, from its end
 
 
 class TouchTrace:
-    """Readings of the taxels of one environment over a run.
-
-    Attributes:
-        values: Magnitude of each taxel's reading at the start of each control step [the reading's unit].
-    """
+    """Readings of the taxels of one environment over a run."""
 
     def __init__(self, touch: TactileModule, output: Output, num_steps: int):
-        """Begin; what is not added stays 0.
-
-        Args:
-            touch: The module.
-            output: Which reading: one of taxels.
-            num_steps: Number of control steps.
-        """
         self._table, self._output = touch.taxels[output.sensor], output
+        # magnitude of each taxel's reading at the start of each control step [the reading's unit]; 0 until it is added
         self.values: Float[Array, "step taxel"] = np.zeros((num_steps, len(self._table)))
 
     def add(self, step: int, readings: Mapping[str, Tensor], env: int = 0) -> None:
         """Keep what an environment reads at the start of a control step; steps beyond the last are left out."""
         if step < len(self.values):
-            read = last_step(readings[self._output.name])[env].detach().cpu().double().numpy()
-            self.values[step] = magnitude(read, self._output.units)
+            self.values[step] = magnitude(read_now(readings[self._output.name], env), self._output.units)
 
     def draw(self, scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData, step: int) -> None:
         """Add the taxels to a scene: colours run to the largest reading of the run; what reads nothing is small and grey."""
         table, value = self._table, self.values[step]
         pos, _ = in_world(model, Pose(data.xpos, data.xquat), table["body"], table["pos"], table["normal"])
-        colour = np.array(HEAT(np.where(value > 0, value / (self.values.max() or 1.0), -1.0)))
+        colour = np.array(HEAT(np.where(value > 0, value / (self.values.max() or 1.0), -1.0))).astype(np.float32)
         size = np.sqrt(table["area"]) * np.where(value > 0, RADIUS[1], RADIUS[0])
-        active = np.flatnonzero(table["radius"] > 0)[: scene.maxgeom - scene.ngeom]
-        for i in active:
-            sphere = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(
-                sphere,
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                np.full(3, size[i]),
-                pos[i],
-                np.eye(3).ravel(),
-                colour[i].astype(np.float32),
-            )
+        sphere, turn = mujoco.mjtGeom.mjGEOM_SPHERE, np.eye(3).ravel()
+        for i in np.flatnonzero(table["radius"] > 0)[: scene.maxgeom - scene.ngeom]:
+            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, np.full(3, size[i]), pos[i], turn, colour[i])
             scene.ngeom += 1
 
     def bars(self) -> LinkBars:
@@ -88,24 +65,19 @@ class TouchTrace:
 
 
 class LinkBars:
-    """Bars at the lower left of a frame.
-
-    Attributes:
-        parts: How full each bar is at each step, from 0 to 1.
-    """
+    """Bars at the lower left of a frame; `parts` is how full each is at each step, from 0 to 1."""
 
     def __init__(self, names: tuple[str, ...], parts: Float[Array, "step link"], title: str):
-        """Draw what stays: names and a title."""
         self.parts = parts
         height = _ROW * (len(names) + 1)
-        figure = Figure(figsize=(_WIDTH / DPI, height / DPI), dpi=DPI, facecolor="white")
-        canvas = FigureCanvasAgg(figure)
+        figure = new_figure(_WIDTH / DPI, height / DPI)
         figure.text(6 / _WIDTH, 1 - 9 / height, title, size=7.5, color=INK, va="center")
         for i, name in enumerate(names):
             name = name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}"
-            figure.text(
-                (_LABELS - 6) / _WIDTH, 1 - (_ROW * (i + 1) + 9) / height, name, size=7.5, color=INK, ha="right", va="center"
-            )
+            y = 1 - (_ROW * (i + 1) + 9) / height
+            figure.text((_LABELS - 6) / _WIDTH, y, name, size=7.5, color=INK, ha="right", va="center")
+        canvas = figure.canvas
+        assert isinstance(canvas, FigureCanvasAgg)
         canvas.draw()
         self._labels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
@@ -118,7 +90,6 @@ class LinkBars:
             panel[rows, _LABELS : _LABELS + room] = np.round(255 * np.array(to_rgb(REST)))
             panel[rows, _LABELS : _LABELS + round(room * part)] = np.round(255 * np.array(HEAT(part)[:3]))
         drawn = frame.copy()
-        height, width = panel.shape[:2]
-        under = drawn[-height:, :width]
+        under = drawn[-panel.shape[0] :, : panel.shape[1]]
         under[:] = np.round(0.15 * under + 0.85 * panel)
         return drawn

@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from tgdsl.commands.report.sheets import tests_of_clone
+from tgdsl.commands.report import tests_of_clone
 from tgdsl_docs.tables import inline, table
 
 HEADER = ("comparison", "quantity", "largest exact", "error", "of what is allowed", "error of the paper's", "source")

@@ -16,8 +16,7 @@ from oracles.geometry import mesh_scene
 from ruamel.yaml import YAML
 
 import tgdsl
-from tgdsl.commands.export import Export
-from tgdsl.commands.verify import Verify
+from tgdsl.commands.documents import Export, Verify
 from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.module.export.program import read_signature
 from tgdsl.module.export.verify import verify

@@ -13,10 +13,9 @@ from benched_pads import bench_document
 import tgdsl
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.accuracy.states import narrowed, readings_of
-from tgdsl.report.bench.bench import Bench, bench
+from tgdsl.report.bench.bench import Bench, Options, bench
 from tgdsl.report.bench.page import write_bench
 from tgdsl.report.bench.results import rows_of
-from tgdsl.report.bench.sensors import Options
 from tgdsl.tuning.recording import load_recording, record, save_recording, varied
 
 FEW = Options(num_envs=(3, 5), repeats=2)

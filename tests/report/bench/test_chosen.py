@@ -5,9 +5,8 @@ import json
 import pytest
 from chosen_pads import chosen_document
 
-from tgdsl.report.bench.bench import Bench, bench
+from tgdsl.report.bench.bench import Bench, Options, bench
 from tgdsl.report.bench.page import write_bench
-from tgdsl.report.bench.sensors import Options
 from tgdsl.tuning import choose as choosing
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tgdsl.module.accuracy.errors import Interval
-from tgdsl.report.bench.timing import dominates, front_of, median_of
+from tgdsl.report.bench.results import dominates, front_of, median_of
 
 
 def point(time, error, half=0.1):

@@ -8,8 +8,8 @@ from warp_cases import SCENE, module, warp
 import tgdsl
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.scene.scene import geom_name, is_absent
+from tgdsl.view.markers import Pose
 from tgdsl.view.meshes import mesh_of
-from tgdsl.view.taxels import Pose
 
 VARIANTS = [
     {"type": "box", "size": [0.02, 0.02, 0.02]},

@@ -87,9 +87,8 @@ def fit_finger(
     _expect_response(centred_counts)
     solve = _signs if axes == "signs" else _rotation
     rotation, scale = solve(centred_counts, centred_force)
-    found_tare = middle[0] - (rotation.T @ middle[1]) / scale
-    said = (scale * (counts - found_tare)) @ rotation.T
-    return FingerFit(scale, rotation, found_tare, force, said - force)
+    zero = middle[0] - (rotation.T @ middle[1]) / scale
+    return FingerFit(scale, rotation, zero, force, (scale * (counts - zero)) @ rotation.T - force)
 
 
 def time_offset(
@@ -99,16 +98,9 @@ def time_offset(
     known_force: Float[np.ndarray, "step component"],
     max_offset_s: float,
 ) -> float:
-    """Return what to add to the known forces' times so that they fit the counts best [s].
+    """Return what to add to the known forces' times [s] so that they [N] fit the counts best, up to `max_offset_s` either way.
 
     First by cross-correlation of how far counts and forces are from their medians, then by the residual of a linear fit.
-
-    Args:
-        time: When the counts were read [s].
-        counts: What one or more fingertips read.
-        known_time: When the known forces were [s].
-        known_force: The forces on them [N].
-        max_offset_s: Largest offset to look for, either way [s].
 
     Raises:
         FitError: If there is nothing to compare: no force, no response, or no time in common.
@@ -166,10 +158,8 @@ def _expect_loads(force: Forces, has_tare: bool) -> None:
     missing = [name for name, size in zip("xyz", along, strict=True) if size <= limit]
     problem = f"no load along {' or '.join(missing)} of the link"
     if not missing:
-        weak = directions[int(np.argmin(strength))]
-        problem = (
-            f"no load in the direction ({', '.join(f'{value:.2f}' for value in weak)}) of the link: all loads lie in a plane"
-        )
+        weak = ", ".join(f"{value:.2f}" for value in directions[int(np.argmin(strength))])
+        problem = f"no load in the direction ({weak}) of the link: all loads lie in a plane"
     than = "" if has_tare else ", and no load as one of them, or keep the tare"
     raise FitError(f"{problem}; expected loads along x, y and z{than}")
 

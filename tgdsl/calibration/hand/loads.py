@@ -75,25 +75,13 @@ class TipRecord:
 
     @classmethod
     def of(cls, log: HandLog, ignored_taxels: Sequence[int] = ()) -> TipRecord:
-        """Read that of a log.
-
-        Args:
-            log: The log.
-            ignored_taxels: Numbers of taxels that do not count as saturated on any finger, as they always are.
-
-        Raises:
-            FitError: If there is no such taxel.
-        """
+        """Read a log; the numbers of `ignored_taxels` do not count as saturated on any finger, as they always are."""
         if not all(0 <= taxel < NUM_TAXELS for taxel in ignored_taxels):
             raise FitError(f"taxels {', '.join(map(str, ignored_taxels))}: expected numbers from 0 to {NUM_TAXELS - 1}")
-        num, fingers = log.num_readings, len(FINGERS)
-        counts = np.zeros((num, fingers, 3))
-        is_saturated = np.zeros((num, fingers), dtype=np.bool_)
-        is_taxel_saturated = np.zeros((num, fingers, NUM_TAXELS), dtype=np.bool_)
-        for i, reading in enumerate(log.readings()):
-            counts[i] = reading.state.total_force
-            is_saturated[i] = reading.state.is_total_saturated.any(axis=-1)
-            is_taxel_saturated[i] = reading.state.is_taxel_saturated.any(axis=-1)
+        states = [reading.state for reading in log.readings()]
+        counts = np.array([state.total_force for state in states], dtype=np.float64).reshape(-1, len(FINGERS), 3)
+        is_saturated = np.array([state.is_total_saturated.any(axis=-1) for state in states])
+        is_taxel_saturated = np.array([state.is_taxel_saturated.any(axis=-1) for state in states])
         is_taxel_saturated[:, :, list(ignored_taxels)] = False
         return cls(log.requested_at - log.received_at[0], counts, is_saturated, is_taxel_saturated)
 
@@ -109,11 +97,7 @@ class Samples:
 
 
 def load_loads(path: Path) -> tuple[Load, ...]:
-    """Read a file of loads.
-
-    Raises:
-        SpecError: All its mistakes, each at its place.
-    """
+    """Read a file of loads; all its mistakes are one `SpecError`."""
     spec, _ = read_spec(path, LoadsSpec, ("tgdsl", "loads"))
     return spec.loads
 
@@ -141,13 +125,9 @@ def samples_under_loads(record: TipRecord, finger: str, loads: tuple[Load, ...])
 def samples_under_forces(
     record: TipRecord, finger: str, time: Float[np.ndarray, " step"], force: Float[np.ndarray, "step 3"]
 ) -> Samples:
-    """Return a fingertip's samples while a force over time is known.
+    """Return a fingertip's samples while a force along its link's axes [N] is known, linear between instants [s].
 
-    Args:
-        record: The log's fingertips.
-        finger: Which one.
-        time: Instants at which the force is known, after the log's first reading [s].
-        force: The force on the fingertip, along its link's axes [N]; linear in between.
+    Instants count from the log's first reading.
 
     Raises:
         FitError: If they have no time in common, or all samples are at the end of the range.

@@ -8,27 +8,20 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from tgdsl.calibration.hand.fit import FingerFit, FitError
 from tgdsl.calibration.hand.loads import Samples
-from tgdsl.files.write import atomic_open
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.wire.protocol import FINGERS
-from tgdsl.view.style import DPI, FAINT, INK
+from tgdsl.view.style import FAINT, INK, new_figure, save_figure
 
 AXIS_COLOURS = ("#c8553d", "#588157", "#3d5a80")
 _PANEL = (3.6, 5.4)
 
 
 def calibrated(base: Calibration, fits: Mapping[str, FingerFit], others: str | None = None) -> Calibration:
-    """Return a calibration in N.
-
-    Args:
-        base: What stays of fingers that were not fitted.
-        fits: Fits by finger.
-        others: A finger whose scale and rotation the unfitted ones get, with their own tare.
+    """Return a calibration in N: fits by finger, and `base` for the others, or the scale and rotation of the finger `others`.
 
     A threshold of contact in counts means nothing in N, and is left out.
 
@@ -62,10 +55,9 @@ def report(fits: Mapping[str, FingerFit], samples: Mapping[str, Samples]) -> lis
             size = f"RMS {fit.rms[i]:.4f} N, at most {fit.max_error[i]:.4f} N, R² {fit.r_squared[i]:.5f}"
             lines.append(f"  {axis}: loads {fit.force[:, i].min():.2f} to {fit.force[:, i].max():.2f} N; {size}")
         if finger_samples.num_left_out:
-            taxels = (
-                f"; taxels {', '.join(map(str, finger_samples.saturated_taxels))}" if finger_samples.saturated_taxels else ""
-            )
-            lines.append(f"  left out at the end of the range: {finger_samples.num_left_out} readings{taxels}")
+            taxels = ", ".join(map(str, finger_samples.saturated_taxels))
+            left_out = f"{finger_samples.num_left_out} readings{f'; taxels {taxels}' if taxels else ''}"
+            lines.append(f"  left out at the end of the range: {left_out}")
     return lines
 
 
@@ -77,23 +69,13 @@ def fit_text(fit: FingerFit) -> str:
 
 
 def picture(fits: Mapping[str, FingerFit], path: Path, title: str) -> Path:
-    """Draw fitted over known forces, and their difference, a column per finger; return the path.
-
-    Args:
-        fits: Fits by finger.
-        path: PNG file to write.
-        title: What to write above it all.
-    """
-    figure = drawing(fits, title)
-    with atomic_open(path) as file:
-        figure.savefig(file, format="png")
-    return path
+    """Write `drawing` as a PNG file; return the path."""
+    return save_figure(drawing(fits, title), path)
 
 
 def drawing(fits: Mapping[str, FingerFit], title: str) -> Figure:
-    """Return what `picture` writes: two axes per finger, fitted over known forces, and their difference."""
-    figure = Figure(figsize=(0.4 + _PANEL[0] * len(fits), _PANEL[1]), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    """Draw fitted over known forces, and their difference, a column per finger."""
+    figure = new_figure(0.4 + _PANEL[0] * len(fits), _PANEL[1], layout="constrained")
     figure.suptitle(title, fontsize=13, weight="bold", color=INK, x=0.01, ha="left")
     panels = figure.subplots(2, len(fits), squeeze=False, sharex="col", height_ratios=[2, 1])
     for column, (name, fit) in enumerate(fits.items()):

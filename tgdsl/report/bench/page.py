@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from tgdsl.console.tables import text_table
 from tgdsl.module.accuracy.errors import Interval
 from tgdsl.report.bench.results import Measured, Report, Subject, rows_of
 from tgdsl.report.files import page_of, svg_of, table_of, write_report_files
@@ -44,6 +45,20 @@ def page(report: Report) -> str:
     links = [(subject.name, subject.name) for subject in report.subjects]
     sections = [_section(subject, i) for i, subject in enumerate(report.subjects)]
     return page_of(f"{report.document}: speed against error", about, links, sections)
+
+
+def bench_text(report: Report) -> str:
+    """Return the printed text of a bench."""
+    parts = [f"{report.document}: {report.states}\n{report.machine}"]
+    for subject in report.subjects:
+        header, *rows = cells_of(subject)
+        marks = [("now" if p.is_own else "") + (" ●" if p.is_on_front else "") for p in subject.points]
+        table = text_table((*header, ""), [(*row, mark.strip()) for row, mark in zip(rows, marks, strict=True)])
+        lines = [f"{subject.name} ({subject.kind}), against {subject.reference}", subject.check, *subject.chosen, table]
+        lines += [f"not to be had: {label}: {why}" for label, why in subject.left_out]
+        parts.append("\n".join(filter(None, lines)))
+    parts.append("now: what the compiler takes; ●: on the front of time and RMS error, overlapping intervals being equal")
+    return "\n\n".join(parts)
 
 
 def _section(subject: Subject, index: int) -> str:

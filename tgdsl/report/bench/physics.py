@@ -11,19 +11,17 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SimulationError
 from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
-from tgdsl.report.bench.results import Measured, Subject, with_front
-from tgdsl.report.bench.timing import median_of
+from tgdsl.report.bench.results import Measured, Subject, median_of, with_front
 from tgdsl.runtime.rollout import Script
 from tgdsl.scene.scene import scene_model
 from tgdsl.sensors.known import known_kinds
-from tgdsl.tuning.recording import varied
+from tgdsl.tuning.recording import control_ranges, varied
 from tgdsl.tuning.trials import Cost
 
 FINE = 4  # how many times smaller the time step of the fine run is
@@ -40,12 +38,7 @@ class Setting(NamedTuple):
 
 
 def settings(model: mujoco.MjModel, substeps: int) -> list[Setting]:
-    """Return options that trade speed for error; all control steps are equally long.
-
-    Args:
-        model: The scene.
-        substeps: Physics steps of a control step, as the user has them.
-    """
+    """Return options that trade speed for error; all control steps are as long as `substeps` steps of the model."""
     step, cones = model.opt.timestep, ("pyramidal", "elliptic")
     tried = [Setting(f"as written: {cones[model.opt.cone]} cone, time step {1e3 * step:g} ms", {}, substeps, True)]
     tried.append(Setting(f"{cones[1 - model.opt.cone]} cone", {"cone": cones[1 - model.opt.cone]}, substeps))
@@ -63,16 +56,8 @@ def measure_physics(
     """Return the physics of a scene under several options.
 
     Errors are of joint angles and positions along the run, relative to how far they move, against a run with a time step
-    `FINE` times smaller, as the document's cone has it. Step by step all runs take turns, on the CPU.
-
-    Args:
-        plan: A Plan of the scene.
-        script: How it is run.
-        num_envs: Environments.
-        steps: Control steps, about.
-        substeps: Physics steps of each.
-        seed: Of what differs between environments.
-        progress: Called with a line of text for each long job.
+    `FINE` times smaller, as the document's cone has it. Step by step all runs take turns, on the CPU, with `substeps` physics
+    steps as the document is written.
 
     Raises:
         SimulationError: If the scene cannot be simulated.
@@ -88,7 +73,7 @@ def measure_physics(
         script.begin(TactileModule(unread, known_kinds()), num_envs, setting.substeps, seconds, setting.options)
         for setting in tried
     ]
-    controls = _controls(runs[0].controls, runs[0].sim.model, num_envs, seed)
+    controls = varied(runs[0].controls, control_ranges(runs[0].sim.model), num_envs, seed)
     visited: list[list[np.ndarray]] = [[] for _ in tried]
     times: list[list[float]] = [[] for _ in tried]
     faults: dict[int, str] = {}
@@ -110,11 +95,6 @@ def measure_physics(
     if len(tried) - 1 in faults or 0 in faults:
         raise SimulationError(faults.get(len(tried) - 1) or faults[0])
     return _subject(tried, faults, visited, times, model, num_envs, seed)
-
-
-def _controls(controls: np.ndarray, model: mujoco.MjModel, num_envs: int, seed: int) -> Float[np.ndarray, "step env actuator"]:
-    ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
-    return varied(controls, ranges, num_envs, seed)
 
 
 def _subject(

@@ -16,7 +16,7 @@ from tgdsl.runtime.xhand1.log import log as log_file
 from tgdsl.runtime.xhand1.log.log import open_log
 from tgdsl.runtime.xhand1.wire.protocol import Command
 
-REPOSITORY = Path(__file__).parents[3]
+REPOSITORY = Path(__file__).parents[2]
 
 
 def test_record_and_replay(emulator, plugged, here, tmp_path):

@@ -13,13 +13,13 @@ from small_runs import SMALL
 from small_tasks import small_task
 from written_teachers import teacher
 
-from tgdsl.commands.learning.sweep_document import Trial, load_sweep
-from tgdsl.commands.learning.sweep_trial import left, run_trial
+from tgdsl.commands.sweep import left, run_trial
+from tgdsl.commands.sweep_document import Trial, load_sweep
 from tgdsl.errors import SpecError
 from tgdsl.rl.load import load_task
 from tgdsl.rl.train.folder import FORMAT, RunFolder, read_checkpoint
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "tasks" / "sweep.yaml"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "tasks" / "sweep.yaml"
 FIXED = {"--device": "cpu", "--envs": 4, "--iterations": 3, "--episodes": 4, **SMALL}
 KILLED = """
 import os, signal

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from tgdsl.commands.arguments import FOLDER, OUT_FOLDER, Overrides, Task, joined_overrides, parsed_overrides
+from tgdsl.commands import arguments as args
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -29,32 +28,27 @@ INITIAL_STD = "train.networks.initial_std:"
 class Train:
     """Learn a policy by PPO, as the document's `train` says; write checkpoints, the policy, and how good it is."""
 
-    task: Task
-    envs: int | None = None
+    task: args.Task
+    envs: args.OptionalInt = None
     """Environments per process; default: 8192, or as in the run that is resumed."""
     device: str = "cuda"
     """Where physics, touch and networks are computed: cuda, or cpu. With torchrun each process takes a GPU."""
-    iterations: int | None = None
+    iterations: args.OptionalInt = None
     """Iterations of the whole run, those made before included; default: train.iterations of the document."""
-    minutes: float | None = None
+    minutes: args.OptionalFloat = None
     """Time to learn from now on [min], start-up not counted; default: no limit."""
-    seed: int | None = None
+    seed: args.OptionalInt = None
     """Random seed; default: 0, or as in the run that is resumed."""
-    resume: Annotated[Path | None, FOLDER] = None
+    resume: args.OptionalFolder = None
     """Folder of a run that goes on from its last checkpoint, with its overrides; with another --out a run of its own begins
     from there, with those that are given now alone."""
-    out: Annotated[Path | None, OUT_FOLDER] = None
+    out: args.OptionalOutFolder = None
     """Folder of the run; default: out/NAME of the document, or that of the run that is resumed."""
     episodes: int = 1000
     """Episodes of the evaluation at the end; 0: none."""
-    set: Overrides = ()
+    set: args.Overrides = ()
 
     def run(self) -> None:
-        """Learn.
-
-        Raises:
-            TgdslError: If rsl_rl is not installed, or what else is wrong.
-        """
         from tgdsl.rl.load import load_task
 
         try:
@@ -70,9 +64,9 @@ class Train:
         source = RunFolder(self.resume) if self.resume else None
         last_start = source.last_start() if source else {}
         is_same = source is not None and folder.path.resolve() == source.path.resolve()
-        overrides = joined_overrides(last_start.get("overrides", {}) if is_same else {}, parsed_overrides(self.set))
+        overrides = args.joined_overrides(last_start.get("overrides", {}) if is_same else {}, args.parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
-        self._check()
+        args.check_least(self, envs=1, iterations=1, minutes=0.0, episodes=0)
         with folder.lock() if ranks.is_first else nullcontext():
             if ranks.is_first:
                 folder.check(is_resumed=is_same)
@@ -82,17 +76,6 @@ class Train:
                 self._learn(loaded, folder, ranks, device, overrides, last_start, state)
             finally:
                 ranks.leave()
-
-    def _check(self) -> None:
-        """See that numbers make sense.
-
-        Raises:
-            TgdslError: If one does not.
-        """
-        for name, least in (("envs", 1), ("iterations", 1), ("minutes", 0.0), ("episodes", 0)):
-            value = getattr(self, name)
-            if value is not None and not value >= least:
-                raise TgdslError(f"--{name} {value}: expected at least {least}")
 
     def _learn(
         self,
@@ -137,7 +120,6 @@ class Train:
 
     def _finish(self, learner: Learner, folder: RunFolder, origin: dict[str, Any], run: Run) -> None:
         """Write the policy, evaluate it unless the run was stopped, and say so."""
-        from tgdsl.files.write import atomic_write
         from tgdsl.rl.playing.evaluation import evaluate
         from tgdsl.rl.playing.policy import policy_for, read_policy
         from tgdsl.rl.train.run import end_if_stopped
@@ -155,5 +137,5 @@ class Train:
                 actor = policy_for(learner.env, read_policy(folder.policy))
                 evaluation = evaluate(learner.env, actor, self.episodes, progress=progress)
             learner.write_policy(card | {"score": evaluation.plain()}, folder.policy)
-            atomic_write(folder.evaluation, (json.dumps(evaluation.plain(), indent=2, allow_nan=False) + "\n").encode())
+            args.write_json(folder.evaluation, evaluation.plain())
             print(evaluation)

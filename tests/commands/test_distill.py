@@ -9,9 +9,9 @@ import torch
 from felt_tasks import felt_task
 from written_teachers import teacher
 
-from tgdsl.commands.learning.distill import _warn_unlike
-from tgdsl.commands.learning.sweep_document import Trial
-from tgdsl.commands.learning.sweep_trial import run_trial
+from tgdsl.commands.distill import _warn_unlike
+from tgdsl.commands.sweep import run_trial
+from tgdsl.commands.sweep_document import Trial
 from tgdsl.rl.load import load_task
 from tgdsl.rl.students.results import Row
 from tgdsl.rl.train.folder import read_checkpoint
@@ -114,10 +114,10 @@ def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeyp
         "--set",
         "placement=ends",
     )
-    monkeypatch.setattr("tgdsl.commands.learning.distill.ENVS", 6)
+    monkeypatch.setattr("tgdsl.commands.distill.ENVS", 6)
     assert here(base, "distill", "task.yaml", *few)[0] == 0
     assert json.loads((base / "run" / "distill.json").read_text())["envs"] == 6
-    monkeypatch.setattr("tgdsl.commands.learning.distill.ENVS", 8)
+    monkeypatch.setattr("tgdsl.commands.distill.ENVS", 8)
     on = ("--resume", "run", "--device", "cpu", "--iterations", "2", "--episodes", "0")
     for key in ("resolution=high", "placement=all", "noise=noisy"):
         code, out, error = here(base, "distill", "task.yaml", *on, "--set", key)
@@ -227,7 +227,7 @@ def test_what_is_refused_leaves_a_run_as_it_was(base, here):
 def test_resolutions_are_simulations_one_after_the_other(base, here, monkeypatch):
     """One that the layout lacks is named before the first begins, and one that cannot go on before the first goes on."""
     compared = []
-    monkeypatch.setattr("tgdsl.commands.learning.distill._warn_unlike", compared.extend)
+    monkeypatch.setattr("tgdsl.commands.distill._warn_unlike", compared.extend)
     arguments = (*TEACHER, "--types", "depth", "--placements", "ends", "--seeds", "2", "--envs", "4", "--iterations", "1")
     code, _, error = here(base, "distill", "task.yaml", *arguments, "--resolutions", "low,med", *SMALL)
     assert code == 2 and '"med"' in error and not (base / "out").exists()

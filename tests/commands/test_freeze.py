@@ -13,7 +13,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.placement.freeze import frozen_files
 from tgdsl.schema.load import load_layout
 
-REPOSITORY = Path(__file__).parents[3]
+REPOSITORY = Path(__file__).parents[2]
 WITHOUT_TAXELS = ("xhand1_calibration", "materials_audio")
 EXAMPLES = [path for path in sorted((REPOSITORY / "examples").glob("*.yaml")) if path.stem not in WITHOUT_TAXELS]
 ARRAYS = ("link_id", "pos", "normal", "tangent", "radius", "area", "cell")

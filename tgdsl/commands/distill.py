@@ -12,22 +12,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
-from tgdsl.commands.arguments import FOLDER, OUT_FOLDER, Overrides, Task, joined_overrides, parsed_overrides
+from tgdsl.commands import arguments as args
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
+from tgdsl.files.write import check_writable
 
 if TYPE_CHECKING:
     from tgdsl.rl.load import LoadedTask
-    from tgdsl.rl.spec import TaskSpec
     from tgdsl.rl.students.results import Row
     from tgdsl.rl.train.run import Run
 
-Names = tyro.conf.arg(metavar="A,B,…")
+Names = Annotated[str | None, args.optional("A,B,…")]
 ENVS = 13824
+# keys of a task's document that an option of the command replaces
 OPTIONS = {"touch": "types", "placement": "placements", "noise": "noise", "resolution": "resolutions"}
-"""Keys of a task's document that an option of the command replaces."""
 
 
 @dataclass(frozen=True)
@@ -37,43 +35,38 @@ class Distill:
     There is one per type, placement, noise and seed, all in one simulation per resolution.
     """
 
-    task: Task
-    teacher: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    task: args.Task
+    teacher: args.OptionalFile = None
     """The teacher: a policy with its card, as tgdsl train writes it."""
-    types: Annotated[str | None, Names] = None
+    types: Names = None
     """What students feel: types as `touch` has them, none among them, or all; default: all."""
-    placements: Annotated[str | None, Names] = None
+    placements: Names = None
     """Link groups that feel; default: the document's `placement`."""
-    noise: Annotated[str | None, Names] = None
+    noise: Names = None
     """Profiles of noise; default: the document's `noise`."""
-    resolutions: Annotated[str | None, Names] = None
+    resolutions: Names = None
     """How densely they feel: a simulation each, one after the other; default: the document's `resolution`."""
-    seeds: int | None = None
+    seeds: args.OptionalInt = None
     """Students of each kind; default: 3."""
-    envs: int | None = None
+    envs: args.OptionalInt = None
     """Environments of a simulation; default: about 13824, so that they divide among the students."""
     device: str = "cuda"
     """Where physics, touch and networks are computed: cuda, or cpu."""
-    iterations: int | None = None
+    iterations: args.OptionalInt = None
     """Iterations of each simulation, those made before included; default: distill.iterations of the document."""
-    minutes: float | None = None
+    minutes: args.OptionalFloat = None
     """Time to learn from now on in each simulation [min], start-up not counted; default: no limit."""
-    seed: int | None = None
+    seed: args.OptionalInt = None
     """Seed of the environments; default: 0."""
-    resume: Annotated[Path | None, FOLDER] = None
+    resume: args.OptionalFolder = None
     """Folder of a run that goes on from its last checkpoints, with the same students and overrides."""
-    out: Annotated[Path | None, OUT_FOLDER] = None
+    out: args.OptionalOutFolder = None
     """Folder of the run, with one per resolution in it; default: out/NAME_students."""
     episodes: int = 1000
     """Episodes of each student's evaluation at the end; 0: none."""
-    set: Overrides = ()
+    set: args.Overrides = ()
 
     def run(self) -> None:
-        """Teach.
-
-        Raises:
-            TgdslError: If something is wrong; nothing has run then.
-        """
         from tgdsl.rl.load import load_task
         from tgdsl.rl.train.folder import RunFolder
 
@@ -81,32 +74,30 @@ class Distill:
             raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
         folder = self.resume or self.out or Path("out") / f"{self.task.stem}_students"
         last_start = _read(folder) if self.resume else {}
-        given = parsed_overrides(self.set)
-        overrides = joined_overrides(last_start.get("overrides", {}), given)
+        given = args.parsed_overrides(self.set)
+        overrides = args.joined_overrides(last_start.get("overrides", {}), given)
         loaded = load_task(self.task, overrides)
         self._check(given, last_start.get("overrides", {}))
-        settings = self._asked(loaded, last_start, folder)
-        prepared = [_Part(self, name, settings, overrides, folder / name) for name in settings["resolutions"]]
-        settings["envs"] = prepared[0].envs
+        settings = self._settings(loaded, last_start, folder)
+        parts = [_Part(self, name, settings, overrides, folder / name) for name in settings["resolutions"]]
+        settings["envs"] = parts[0].envs
         with RunFolder(folder).lock():
-            self._teach(loaded, folder, prepared)
+            self._teach(loaded, folder, parts)
 
-    def _teach(self, loaded: LoadedTask, folder: Path, prepared: list[_Part]) -> None:
+    def _teach(self, loaded: LoadedTask, folder: Path, parts: list[_Part]) -> None:
         """Teach the students of each resolution, and write the table of all."""
         from tgdsl.rl.students.results import shown, write_table
 
         if self.resume is None:
-            _check_new(folder, [part.resolution for part in prepared])
-        for part in prepared:
+            _check_new(folder, [part.resolution for part in parts])
+        for part in parts:
             part.check(is_resumed=self.resume is not None)
-        for line in prepared[0].teacher.changes:
-            print(f"changed since the teacher was learned: {line}")
+        args.print_changes("teacher", parts[0].teacher.changes)
         rows: list[Row] = []
-        unit = ""
-        table = folder / "table.csv"
-        for part in prepared:
-            part_result, unit = part.taught(folder / "distill.json" if part is prepared[0] else None)
-            rows += part_result
+        unit, table = "", folder / "table.csv"
+        for part in parts:
+            part_rows, unit = part.teach(folder / "distill.json" if part is parts[0] else None)
+            rows += part_rows
         _warn_unlike(rows)
         if rows:
             write_table(rows, table)
@@ -120,33 +111,14 @@ class Distill:
                 raise TgdslError(f"--set {key}={overrides[key]}: --{option} says it of students")
             if key in overrides and self.resume is not None and overrides[key] != before.get(key):
                 raise TgdslError(f"--set {key}={overrides[key]}: what students feel stays as it is in a run that goes on")
-        for name, least in (("envs", 1), ("iterations", 1), ("minutes", 0.0), ("episodes", 0), ("seeds", 1)):
-            value = getattr(self, name)
-            if value is not None and not value >= least:
-                raise TgdslError(f"--{name} {value}: expected at least {least}")
+        args.check_least(self, envs=1, iterations=1, minutes=0.0, episodes=0, seeds=1)
 
-    def _asked(self, loaded: LoadedTask, before: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """Return who is taught, by whom and where, as plain values.
-
-        Args:
-            loaded: The task's document.
-            before: What a run that goes on began with.
-            folder: Its folder.
-
-        Raises:
-            TgdslError: If a run that goes on shall teach others, there is no teacher, or no resolution, or one is named twice.
-        """
+    def _settings(self, loaded: LoadedTask, before: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """Return who is taught, by whom and where, as plain values; `before`: the same of a run that goes on in a folder."""
         spec = loaded.spec
-        options: dict[str, Any] = {
-            "teacher": self._teacher(before, folder),
-            "types": _names(self.types),
-            "placements": _names(self.placements),
-            "noise": _names(self.noise),
-            "seeds": self.seeds,
-            "resolutions": _names(self.resolutions),
-            "envs": self.envs,
-            "seed": self.seed,
-        }
+        options: dict[str, Any] = {"teacher": self._teacher(before, folder)}
+        options |= {name: _names(getattr(self, name)) for name in OPTIONS.values()}
+        options |= {name: getattr(self, name) for name in ("seeds", "envs", "seed")}
         for name, value in options.items():
             if before and name != "teacher" and value is not None and value != before[name]:
                 raise TgdslError(f"--{name} {_text(value)}: this run began with {_text(before[name])}; begin another one")
@@ -166,11 +138,7 @@ class Distill:
         return settings
 
     def _teacher(self, before: dict[str, Any], folder: Path) -> str | None:
-        """Return the teacher's name; of a run that goes on the one that it began with, wherever that is now: told by its bytes.
-
-        Raises:
-            TgdslError: If another one is named.
-        """
+        """Return the teacher's file; a run that goes on keeps its teacher, which has the same bytes wherever it is now."""
         from tgdsl.rl.train.folder import RunFolder
 
         if self.teacher is None or not before:
@@ -178,8 +146,8 @@ class Distill:
         if self.teacher.resolve() == Path(before["teacher"]).resolve():
             return before["teacher"]
         parts = [RunFolder(folder / name) for name in before["resolutions"]]
-        teacher_hashes = {part.last_start().get("teacher_sha256") for part in parts if part.run.is_file()}
-        if self.teacher.is_file() and teacher_hashes == {hashlib.sha256(self.teacher.read_bytes()).hexdigest()}:
+        hashes = {part.last_start().get("teacher_sha256") for part in parts if part.run.is_file()}
+        if self.teacher.is_file() and hashes == {hashlib.sha256(self.teacher.read_bytes()).hexdigest()}:
             return str(self.teacher)
         raise TgdslError(f"--teacher {self.teacher}: this run began with {before['teacher']}; begin another one")
 
@@ -187,37 +155,28 @@ class Distill:
 class _Part:
     """The students of one resolution: one simulation."""
 
-    def __init__(self, command: Distill, resolution: str, asked: dict[str, Any], overrides: dict[str, Any], folder: Path):
-        """See that all fits together.
-
-        Raises:
-            TgdslError: If something does not.
-        """
+    def __init__(self, command: Distill, resolution: str, settings: dict[str, Any], overrides: dict[str, Any], folder: Path):
         from tgdsl.rl.load import load_task
-        from tgdsl.rl.sensed import check_felt, num_variants
+        from tgdsl.rl.sensed import check_felt, num_variants, types_of
         from tgdsl.rl.students.keys import Teacher, check_blocks, feels, student_keys, students_task
         from tgdsl.rl.train.folder import RunFolder
 
-        self._command, self.resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
-        override = {} if resolution == "default" else {"resolution": resolution}
-        self._given, self._overrides = overrides, overrides | override
+        self._command, self.resolution, self._settings, self._folder = command, resolution, settings, RunFolder(folder)
+        self._given, self._overrides = overrides, dict(overrides)
+        if resolution != "default":
+            self._overrides["resolution"] = resolution
         self._loaded = students_task(load_task(command.task, self._overrides))
-        types = _known(self._loaded, asked["types"])
-        self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
-        self.teacher = Teacher(Path(asked["teacher"]), self._loaded)
+        types = [name for type_ in settings["types"] for name in (types_of(self._loaded) if type_ == "all" else [type_])]
+        self._keys = student_keys(types, settings["placements"], settings["noise"], settings["seeds"])
+        self.teacher = Teacher(Path(settings["teacher"]), self._loaded)
         self._felt = feels(self._keys, self.teacher.felt)
         check_felt(self._loaded, self._felt)
         unit = len(self._keys) * num_variants(self._loaded)
-        self.envs = asked["envs"] or max(1, ENVS // unit) * unit
+        self.envs = settings["envs"] or max(1, ENVS // unit) * unit
         check_blocks(self.envs, len(self._keys), num_variants(self._loaded))
 
     def check(self, is_resumed: bool) -> None:
-        """Read the checkpoint; see that the run can begin or go on in its folder, and that a teacher feels with its taxels.
-
-        Raises:
-            TgdslError: If not.
-        """
-        from tgdsl.files.write import check_writable
+        """Read the checkpoint; raise an error if the run cannot begin or go on, or the teacher feels with other taxels."""
         from tgdsl.rl.sensed import compile_sensed
         from tgdsl.rl.train.folder import read_checkpoint
 
@@ -227,14 +186,13 @@ class _Part:
         self._state = read_checkpoint(self._folder.checkpoint) if self._goes_on else None
         check_writable(self._folder.checkpoint)
         self.teacher.check_taxels()
-        if len(self._asked["resolutions"]) > 1:  # else it is compiled next
+        if len(self._settings["resolutions"]) > 1:  # else it is compiled next
             compile_sensed(self._loaded, "cpu", feels=self._felt)
 
-    def taught(self, file: Path | None) -> tuple[list[Row], str]:
+    def teach(self, file: Path | None) -> tuple[list[Row], str]:
         """Teach, write and evaluate; return the table's rows, and the unit of the score.
 
-        Args:
-            file: Where what the run goes on with is written, once nothing is refused any more; None: it has been.
+        The settings are written to `file`, if one is given, once nothing is refused any more.
         """
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.playing.policy import changes_around
@@ -242,25 +200,25 @@ class _Part:
         from tgdsl.rl.train.folder import run_origin
         from tgdsl.rl.train.run import Run, restore
 
-        command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
-        state = self._state
+        command, folder, loaded, state = self._command, self._folder, self._loaded, self._state
+        teacher_file, seed = self._settings["teacher"], self._settings["seed"]
         with StatusLine() as progress:
             env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
         try:
             distiller = Distiller(env, loaded, self.teacher.bound(env), self._keys, seed)
-            for line in changes_around(self.teacher.card, loaded, env.sim.model) if file is not None else ():
-                print(f"changed since the teacher was learned: {line}")
+            if file is not None:
+                args.print_changes("teacher", changes_around(self.teacher.card, loaded, env.sim.model))
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
-            origin = run_origin(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
+            origin = run_origin(loaded, env, seed, self._overrides, 1) | {"teacher": teacher_file}
             origin["teacher_sha256"] = hashlib.sha256(self.teacher.saved.content).hexdigest()
-            taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
-            for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():
-                print(f"changed since the run began: {line}")
+            if self._goes_on:
+                self._print_changes(origin)
             if file is not None:
-                relative_path = os.path.relpath(Path(self._asked["teacher"]).resolve(), file.parent.resolve())
-                _write(file, self._asked | {"overrides": self._given, "teacher_from_here": relative_path})
-            folder.begin(origin | taught, loaded, env)
+                relative_path = os.path.relpath(Path(teacher_file).resolve(), file.parent.resolve())
+                args.write_json(file, self._settings | {"overrides": self._given, "teacher_from_here": relative_path})
+            students = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
+            folder.begin(origin | students, loaded, env)
             run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
             print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self.envs} environments: {folder.path}")
             run.learn_with_bar(command.iterations, command.minutes, loaded.spec.distill.iterations)
@@ -268,13 +226,16 @@ class _Part:
         finally:
             env.close()
 
-    def _changes(self, origin: dict[str, Any], model: type[TaskSpec]) -> list[str]:
-        """Return the changes since the run was last started, a line each."""
+    def _print_changes(self, origin: dict[str, Any]) -> None:
+        """Print what has changed since the run was last started."""
         from tgdsl.rl.train.folder import changes
 
         last_start = self._folder.last_start()
-        other = last_start.get("teacher_sha256", origin["teacher_sha256"]) != origin["teacher_sha256"]
-        return [*changes(last_start, origin, model), *(["the teacher's file"] if other else [])]
+        lines = list(changes(last_start, origin, type(self._loaded.spec)))
+        if last_start.get("teacher_sha256", origin["teacher_sha256"]) != origin["teacher_sha256"]:
+            lines.append("the teacher's file")
+        for line in lines:
+            print(f"changed since the run began: {line}")
 
     def _finish(self, distiller: Any, origin: dict[str, Any], run: Run) -> list[Row]:
         """Evaluate the students unless the run was stopped, write them, and return the table's rows."""
@@ -282,57 +243,38 @@ class _Part:
         from tgdsl.rl.students.results import rows_of, write_students
         from tgdsl.rl.train.run import end_if_stopped
 
-        command, keys, is_evaluated = self._command, distiller.keys, self._command.episodes > 0 and run.stopped_by is None
-        result, text = [], shlex.join(["tgdsl", *sys.argv[1:]])
+        command, keys, folder, result = self._command, distiller.keys, self._folder, []
         with StatusLine() as progress:
-            if is_evaluated:
-                acting = distiller.acting()
-                result = evaluate_each(distiller.env, acting, len(keys), command.episodes, progress=progress)
-            students = self._folder.path / "students"
+            if command.episodes > 0 and run.stopped_by is None:
+                result = evaluate_each(distiller.env, distiller.acting(), len(keys), command.episodes, progress=progress)
+            text, students = shlex.join(["tgdsl", *sys.argv[1:]]), folder.path / "students"
             write_students(distiller, self._loaded, origin, run.seconds, text, result, students, progress)
-        resume = ("--device", command.device, "--resume", str(self._folder.path.parent))
+        resume = ("--device", command.device, "--resume", str(folder.path.parent))
         end_if_stopped(run, shlex.join(["tgdsl", "distill", str(command.task), *resume]))
         if not result:
-            self._folder.evaluation.unlink(missing_ok=True)  # of what they were before
+            folder.evaluation.unlink(missing_ok=True)  # of what they were before
             return []
         plain = {key.name: evaluation.plain() for key, evaluation in zip(keys, result, strict=True)}
-        _write(self._folder.evaluation, plain)
+        args.write_json(folder.evaluation, plain)
         return rows_of(keys, result, self.resolution, distiller.samples // len(keys), round(run.seconds / 60.0, 2))
 
 
 def _warn_unlike(rows: list[Row]) -> None:
-    """Say of resolutions that had unlike numbers of control steps: their scores do not compare."""
+    """Warn if students of some resolutions had more control steps than others: their scores do not compare."""
     steps = {row.resolution: row.samples for row in rows}
     if steps and max(steps.values()) > 1.1 * min(steps.values()):
-        step_counts = ", ".join(f"{name} {number:,}" for name, number in steps.items())
-        warnings.warn(
-            f"students had unlike numbers of control steps, {step_counts}: `--iterations` makes them alike", stacklevel=3
-        )
+        counts = ", ".join(f"{name} {number:,}" for name, number in steps.items())
+        warnings.warn(f"students had unlike numbers of control steps, {counts}: `--iterations` makes them alike", stacklevel=3)
 
 
 def _check_new(folder: Path, resolutions: list[str]) -> None:
-    """See that a folder holds no run yet.
-
-    Raises:
-        TgdslError: If it does.
-    """
-    results_file = folder / "distill.json"
-    other_files = [
-        folder / "table.csv",
-        *(folder / name / file for name in resolutions for file in ("run.json", "checkpoint.pt")),
-    ]
-    if results_file.exists():
+    """Raise an error if a folder holds a run already."""
+    if (folder / "distill.json").exists():
         raise TgdslError(f"{folder}: this folder holds a run; go on with --resume {folder}, or give another --out")
-    for file in other_files:
+    others = [folder / name / file for name in resolutions for file in ("run.json", "checkpoint.pt")]
+    for file in (folder / "table.csv", *others):
         if file.exists():
             raise TgdslError(f"{folder}: this folder holds {file.relative_to(folder)} of a run; give another --out")
-
-
-def _known(loaded: LoadedTask, types: list[str]) -> list[str]:
-    """Return the types, `all` as all that the sensors' document has sensors for."""
-    from tgdsl.rl.sensed import types_of
-
-    return [name for type_ in types for name in (types_of(loaded) if type_ == "all" else [type_])]
 
 
 def _names(text: str | None) -> list[str] | None:
@@ -343,15 +285,8 @@ def _text(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _write(file: Path, plain: dict[str, Any]) -> None:
-    from tgdsl.files.write import atomic_write, with_folder
-
-    with_folder(file)
-    atomic_write(file, (json.dumps(plain, indent=2, ensure_ascii=False) + "\n").encode())
-
-
 def _read(folder: Path) -> dict[str, Any]:
-    """Return what a run was asked for, its teacher as it is named in the working folder."""
+    """Return the settings of a run, its teacher as it is named in the working folder."""
     file = folder / "distill.json"
     try:
         result = json.loads(file.read_text(encoding="utf-8"))

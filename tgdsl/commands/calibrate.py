@@ -1,15 +1,16 @@
-"""`tgdsl calibrate hand`: what a real hand's counts mean, from a log under known forces."""
+"""`tgdsl calibrate`: parameters of sensors, or what a real hand's counts mean, from recordings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from tgdsl.commands.arguments import FILE, OUT, OptionalFile, module_of, refuse_to_replace
+from tgdsl.commands import arguments as args
 from tgdsl.errors import TgdslError
+from tgdsl.files.write import atomic_write, with_folder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from tgdsl.calibration.hand.loads import Load, Samples, TipRecord
 
 Finger = Literal["thumb", "index", "middle", "ring", "pinky"]
+OptionalFinger = Annotated[Finger | None, args.optional("FINGER")]
 Intervals = Annotated[
     tuple[tuple[float, float, float, float, float], ...],
     tyro.conf.UseAppendAction,
@@ -25,22 +27,78 @@ Intervals = Annotated[
 
 
 @dataclass(frozen=True)
+class CalibrateSensor:
+    """Fit parameters of sensors to recordings; docs/reality.md describes the recordings."""
+
+    document: tyro.conf.Positional[args.File]
+    """The document; its values are where the search starts."""
+    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RECORDING")]
+    """The recordings: .npz files, or YAML documents of CSV files."""
+    fit: Annotated[tuple[str, ...], args.optional("SENSOR.FIELD")] = ()
+    """Parameters, or with a range to search: `skin.thickness="1 mm:9 mm"`; none: the document predicts the recordings."""
+    compare: args.OptionalFile = None
+    """YAML file with `compare:`, models that are fitted in turn; prints one table."""
+    reading: Literal["none", "offset", "scale", "affine"] = "none"
+    """Map of its own that each recording's reading may have: an offset, also a scale, or an affine map of the rows' places."""
+    gain: bool = False
+    """Each recording may have a gain of its own."""
+    robust: bool = False
+    """Rows far off, such as lost markers, count less."""
+    hold_out: Literal["none", "taxel", "blocks", "time", "recording"] = "none"
+    """What is left out in turn to measure the error on it."""
+    folds: int = 6
+    """Number of parts for that."""
+    starts: int = 8
+    """Starts of the search."""
+    intervals: Literal["profile", "bootstrap", "none"] = "profile"
+    """How 95 % intervals are computed; `none`: from the derivatives."""
+    seed: int = 0
+    """Seed of starts, folds and the bootstrap."""
+    set: args.Overrides = ()
+    out: args.OptionalOut = None
+    """The document to write with the fitted values, beside the document."""
+    plot: args.OptionalFile = None
+    """The picture to write: targets, fits and residuals."""
+    force: args.Replace = False
+
+    def run(self) -> None:
+        from tgdsl.calibration.fit import calibrate, compare
+
+        names = ("reading", "gain", "robust", "hold_out", "folds", "starts", "intervals", "seed")
+        options: dict[str, Any] = {name: getattr(self, name) for name in names} | {"overrides": args.parsed_overrides(self.set)}
+        if self.compare is not None:
+            if self.fit or self.out is not None or self.plot is not None:
+                raise TgdslError("--compare prints a table of its own models, expected no --fit, --out or --plot")
+            print(compare(self.document, list(self.recordings), self.compare, **options))
+            return
+        for file in (self.out, self.plot):
+            if file is not None:
+                args.refuse_to_replace(file, self.force)
+        fit = calibrate(self.document, list(self.recordings), self.fit, **options)
+        print(fit)
+        if self.out is not None:
+            print(f"document: {fit.document(self.out)}")
+        if self.plot is not None:
+            print(f"picture:  {fit.plot(self.plot)}")
+
+
+@dataclass(frozen=True)
 class CalibrateHand:
     """Fit scale, rotation and tare of fingertips to a log under known loads, or to a simulation of the same motion."""
 
     log: Annotated[Path, tyro.conf.arg(metavar="LOG.npz")]
     """A log of `tgdsl hand record`."""
-    loads: OptionalFile = None
+    loads: args.OptionalFile = None
     """Known loads: a YAML file of intervals and forces."""
-    finger: Finger | None = None
+    finger: OptionalFinger = None
     """The finger that --load is about."""
     load: Intervals = ()
     """A known load instead: from when to when after the log's first reading [s], and the force on the fingertip along its
     link's axes [N]; to be repeated for each, one of them 0 0 0."""
-    simulation: OptionalFile = None
+    simulation: args.OptionalFile = None
     """Forces over time instead: readings.npz of `tgdsl run` (then with --document and --reading), or any .npz with `time` and
     `tip_force` (step, finger, 3) [N]."""
-    document: OptionalFile = None
+    document: args.OptionalFile = None
     """The document, or artefact, that was run."""
     reading: str = "touch"
     """Its reading whose forces (or depths) count."""
@@ -52,33 +110,30 @@ class CalibrateHand:
     """Whether the sensor's axes may be turned in any way, or are parallel to the link's but for their signs."""
     keep_tare: bool = False
     """Keep the calibration's tare instead of fitting it; then no load of 0 0 0 is needed."""
-    ignore_taxels: tuple[int, ...] = ()
+    ignore_taxels: Annotated[tuple[int, ...], tyro.conf.arg(help_behavior_hint="")] = ()
     """Numbers of taxels that do not count as saturated, because they always are."""
-    calibration: OptionalFile = None
+    calibration: args.OptionalFile = None
     """The calibration to start from; default: the log's."""
-    others: Finger | None = None
+    others: OptionalFinger = None
     """Give fingers that no load was on the scale and rotation of this one."""
-    out: Annotated[Path, OUT] = Path("hand.calibration.yaml")
+    out: args.Out = Path("hand.calibration.yaml")
     """The calibration file to write."""
-    plot: Annotated[Path, FILE] = Path("hand.calibration.png")
+    plot: args.File = Path("hand.calibration.png")
     """The picture to write: fitted over known forces."""
-    force: bool = False
-    """Replace the files if they are there."""
+    force: args.Replace = False
 
     def run(self) -> None:
-        """Fit, report, and write the files."""
         from tgdsl.calibration.hand.fit import FitError, fit_finger
         from tgdsl.calibration.hand.loads import TipRecord
         from tgdsl.calibration.hand.report import calibrated, fit_text, picture, report
-        from tgdsl.files.write import atomic_write, with_folder
-        from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
+        from tgdsl.runtime.xhand1.calibration import Calibration
         from tgdsl.runtime.xhand1.log.log import open_log
         from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 
         for file in (self.out, self.plot):
-            refuse_to_replace(file, self.force)
+            args.refuse_to_replace(file, self.force)
         log = open_log(self.log)
-        base = load_calibration(self.calibration) if self.calibration else log.calibration or Calibration.none()
+        base = args.calibration_of(self.calibration) or log.calibration or Calibration.none()
         samples = self._samples(TipRecord.of(log, self.ignore_taxels))
         fits = {}
         for name, finger_samples in samples.items():
@@ -94,20 +149,18 @@ class CalibrateHand:
         notes += [f"# {name}: not loaded; {origin}\n" for name in FINGERS if name not in fits]
         atomic_write(with_folder(self.out), ("".join(notes) + result.text()).encode())
         print(f"calibration: {self.out}")
-        print(f"picture:     {picture(fits, with_folder(self.plot), f'{self.log.name}: fingertip forces')}")
+        print(f"picture:     {picture(fits, self.plot, f'{self.log.name}: fingertip forces')}")
 
     def _samples(self, record: TipRecord) -> dict[str, Samples]:
         """Return the samples to fit to, by finger."""
         from tgdsl.calibration.hand.loads import load_loads, samples_under_loads
 
-        sources = [self.loads is not None, bool(self.load), self.simulation is not None]
-        if sum(sources) != 1:
+        if sum([self.loads is not None, bool(self.load), self.simulation is not None]) != 1:
             raise TgdslError("expected the known forces as one of --loads FILE, --finger with --load, or --simulation FILE")
         if self.simulation is not None:
             return self._simulated_samples(record, self.simulation)
         loads = load_loads(self.loads) if self.loads is not None else self._loads()
-        fingers = dict.fromkeys(load.finger for load in loads)
-        return {finger: samples_under_loads(record, finger, loads) for finger in fingers}
+        return {finger: samples_under_loads(record, finger, loads) for finger in dict.fromkeys(load.finger for load in loads)}
 
     def _loads(self) -> tuple[Load, ...]:
         from pydantic import ValidationError
@@ -129,10 +182,14 @@ class CalibrateHand:
         import numpy as np
 
         from tgdsl.calibration.hand.fit import time_offset
-        from tgdsl.calibration.hand.loads import samples_under_forces
+        from tgdsl.calibration.hand.loads import known_tip_forces, samples_under_forces, simulated_tip_forces
         from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 
-        time, forces = self._known_forces(path)
+        forces: dict[str, np.ndarray]
+        if self.document is None:
+            time, forces = known_tip_forces(path)
+        else:
+            time, forces = simulated_tip_forces(path, args.module_of(self.document), self.reading, depth_scale=self.depth_scale)
         loaded = [name for name in forces if np.ptp(forces[name], axis=0).any()]
         if not loaded:
             raise TgdslError(f"{path}: no fingertip is ever loaded")
@@ -144,9 +201,13 @@ class CalibrateHand:
         print(f"the log's clock is {offset:.4f} s ahead of the simulation's; fingertips with loads: {', '.join(loaded)}")
         return {name: samples_under_forces(record, name, time + offset, forces[name]) for name in loaded}
 
-    def _known_forces(self, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        from tgdsl.calibration.hand.loads import known_tip_forces, simulated_tip_forces
 
-        if self.document is None:
-            return known_tip_forces(path)
-        return simulated_tip_forces(path, module_of(self.document), self.reading, depth_scale=self.depth_scale)
+@dataclass(frozen=True)
+class Calibrate:
+    """Fit to recordings: sensor fits parameters of a document's sensors, hand the counts of a real hand's fingertips."""
+
+    action: Annotated[args.subcommands(sensor=CalibrateSensor, hand=CalibrateHand), tyro.conf.arg(name="")]  # type: ignore[valid-type]
+    """What to calibrate."""
+
+    def run(self) -> None:
+        self.action.run()

@@ -44,3 +44,9 @@ def plugged(monkeypatch):
         monkeypatch.setattr(ports, "list_ports", lambda: found)
 
     return plug
+
+
+@pytest.fixture(autouse=True)
+def checked_often(monkeypatch):
+    """Look after each episode's length whether all have ended: those of the small task last 8 control steps."""
+    monkeypatch.setattr("tgdsl.rl.playing.evaluation.CHECK_INTERVAL", 8)

@@ -1,1 +1,0 @@
-"""`tgdsl calibrate`: parameters of sensors from recordings, and of a real hand from logs."""

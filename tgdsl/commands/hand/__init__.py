@@ -1,1 +1,0 @@
-"""`tgdsl hand`, one file per command."""

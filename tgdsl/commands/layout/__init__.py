@@ -1,1 +1,0 @@
-"""`tgdsl layout`: where taxels sit, proposed or written down, one command per file."""

@@ -1,1 +1,0 @@
-"""Commands of learning: `tgdsl train` and `tgdsl evaluate`."""
