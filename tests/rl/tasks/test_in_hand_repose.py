@@ -380,7 +380,7 @@ def test_the_documents_have_the_papers_numbers(document):
     assert list(InHandRepose.Rewards().model_dump().values()) == weights
     assert spec.rewards == (
         InHandRepose.Rewards(joint_limit=-4) if document is DOCUMENTS[0] else InHandRepose.Rewards()
-    )  # docs/tasks.md says why
+    )  # docs/records/learned.md says why
 
 
 @pytest.mark.slow
