@@ -270,6 +270,8 @@ def test_mistakes_are_named_before_anything_runs(base, fails):
     assert "types bool, bool: one is named twice" in fails(*TEACHER, "--types", "bool,bool")
     assert "--resolutions low,low: one is named twice" in fails(*TEACHER, "--resolutions", "low,low")
     assert "--resolutions: expected one at least" in fails(*TEACHER, "--resolutions", ",")
+    alike = fails(*TEACHER, "--types", "depth", "--placements", "fing*,fing_", "--seeds", "1")
+    assert "two students would have the name depth-fing_-clean-s0" in alike
     assert "--teacher FILE is missing" in fails("--device", "cpu")
     assert "groups names a group twice" in fails(*TEACHER, "--set", "distill.groups=[proprio, proprio]")
     felt = ("--types", "none,depth", "--placements", "all", "--set", "distill.groups=[tactile_sensors/depth/all/clean]")

@@ -13,7 +13,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from tgdsl.errors import BakeError, LowerError
@@ -151,6 +150,8 @@ class ReferenceMoments:
 
 def _reference(table: MomentTable[np.ndarray], variant: int, point: np.ndarray, radius: float) -> np.ndarray:
     """Return S0 [m³] and S1 [m⁴] at a point in the object's frame [m]: by SciPy, a sum over all points, or in closed form."""
+    from scipy.ndimage import map_coordinates  # a compiled module needs no SciPy
+
     total, surface = np.zeros(4), table.surface
     if isinstance(surface, FieldTable):
         i = variant * len(table.radii) + table.radii.index(radius)

@@ -78,7 +78,12 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
         for placement in placements
         for noise in noises
     ]
-    return [StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)]
+    keys = {}
+    for key in (StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)):
+        if (other := keys.setdefault(key.name, key)) is not key:
+            both = " and ".join(" ".join(part for part in each.kind if part) for each in (other, key))
+            raise StudentError(f"two students would have the name {key.name}: those of {both}")
+    return list(keys.values())
 
 
 def feels(dealt: Sequence[StudentKey], also: Felt | None = None) -> list[Felt]:
