@@ -68,7 +68,7 @@ def parse(value: object, dimension: str | Dimension) -> float:
         ValueError: If the value is no finite number, or its unit is not one of the dimension.
     """
     factors = units_of(dimension)
-    example = next((unit for unit in reversed(factors) if unit not in ZEROS), "")
+    example = next((unit for unit in reversed(list(factors)) if unit not in ZEROS), "")
     expected = f'a number in {next(iter(factors))} or a string such as "4 {example}"' if factors else "a number"
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{value!r} is not a quantity, expected {expected}")

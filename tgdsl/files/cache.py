@@ -128,7 +128,7 @@ def cached_record(key: str, make: Callable[[], T], kind: type[T]) -> T:
         values: dict[str, Any] = {}
         for name, hint in get_type_hints(kind).items():
             value = found[name]
-            if dataclasses.is_dataclass(hint):
+            if isinstance(hint, type) and dataclasses.is_dataclass(hint):
                 numbers = zip(dataclasses.fields(hint), value.tolist(), strict=True)
                 values[name] = hint(*(None if n != n else int(n) if field.type == "int" else n for field, n in numbers))
             elif value.ndim == 0 or get_origin(hint) is tuple:

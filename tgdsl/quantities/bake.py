@@ -186,16 +186,17 @@ def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, na
 
     A primitive needs neither. `name` is what warnings call the object or link: "object cube".
     """
-    if felt.surface is None:
+    surface = felt.surface
+    if surface is None:
         return GeomDistance(felt, felt.shape, {}, {})
     _warn_of_hull(felt, margin, name)
     if options.query == "raycast":
-        mesh = np.asarray(felt.surface.vertices, np.float64), np.asarray(felt.surface.faces, np.int64)
-        made = cache.cached_record(cache.digest(OUTER_FORMAT, mesh), lambda: outer(felt.surface), Outer)
+        mesh = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
+        made = cache.cached_record(cache.digest(OUTER_FORMAT, mesh), lambda: outer(surface), Outer)
         arrays = {"vertices": made.vertices, "faces": made.faces, "max_distance": np.asarray(2.0 * margin)}
         found = GeomDistance(felt, "raycast", arrays, {})
     else:
-        made = bake(felt.surface, margin, options.tolerance, options.max_bytes)
+        made = bake(surface, margin, options.tolerance, options.max_bytes)
         arrays = {"values": made.values, "origin": made.origin, "cell": np.asarray(made.cell)}
         accuracy = {key: float(value) for key, value in dataclasses.asdict(made.errors).items()}
         limits = {"tolerance": options.tolerance, "cell": made.cell}

@@ -131,7 +131,7 @@ def _surface(table: MomentTable[Tensor], variant: Tensor | None, radius_id: Tens
     if which is not None:
         lattice = (surface.first[which], *(split(part[which]) for part in (surface.num, surface.origin)), surface.cell[which])
     if isinstance(surface, FieldTable):
-        return MomentField(surface.values, *lattice, surface.is_smooth)
+        return MomentField(surface.values, *lattice, is_smooth=surface.is_smooth)
     weight = surface.weight[0 if which is None else which]
     return PointCloud(vec(surface.points.unbind()), weight, surface.lists, *lattice)
 

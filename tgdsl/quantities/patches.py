@@ -428,7 +428,7 @@ def _objects(use: PatchesUse[Tensor], scene: Scene) -> HeatOfObjects:
     grids = use.grids.to(scene.dtype)
     corner, size = (planes.vec(grids[:, i, axis] for axis in range(3)) for i in range(2))
     made_of: Any = (*material_id.unbind(-1), *shaped.unbind(-1))
-    return HeatOfObjects(start, use.has_start.to(scene.dtype)[None], *made_of, size, corner)
+    return HeatOfObjects(start, use.has_start.to(scene.dtype)[None], *made_of, size=size, corner=corner)
 
 
 def _chosen(values: Tensor, which: Tensor | None, places: tuple[int, ...], counts: tuple[int, ...]) -> Tensor:
@@ -522,7 +522,8 @@ def _reference_object(use: PatchesUse[np.ndarray], i: int, scene: ReferenceScene
     material = int(scene.fields["object_material"][use.heated[i]]) if use.num_materials[i] > 1 else 0
     variant = int(scene.fields["variant"][use.variants[i]]) if use.variants[i] >= 0 else 0
     corner, size = use.grids[i]
-    return ReferenceObject(start, *use.materials[i, material].tolist(), *use.shapes[i, variant].tolist(), corner, size)
+    made_of: Any = (*use.materials[i, material].tolist(), *use.shapes[i, variant].tolist())
+    return ReferenceObject(start, *made_of, corner=corner, size=size)
 
 
 class _Patches(Quantity):
