@@ -168,6 +168,13 @@ def scene_of(
 def _gathered(sensing: Sensing, own: Tree, scene: Scene) -> dict[str, Gathered]:
     """Return what each sensor asked for."""
     values = [(quantity, quantity.gather(own["quantities"][quantity.name], scene)) for quantity in sensing.quantities]
+    for quantity, found in values:
+        if not isinstance(found, (tuple, list)):
+            problem = f"expected a tuple with a value for each use, found {type(found).__name__}"
+            raise TgdslError(f'`gather` of the quantity "{quantity.name}": {problem}')
+        for sensor in (sensor for sensor in sensing.plan.sensors if sensor.uses.get(quantity.name, -1) >= len(found)):
+            problem = f'{len(found)} values, and sensor "{sensor.name}" has use {sensor.uses[quantity.name]} (from 0)'
+            raise TgdslError(f'`gather` of the quantity "{quantity.name}" returns {problem}; expected one for each use')
     return {
         sensor.name: Gathered({q.request: of[sensor.uses[q.name]] for q, of in values if q.name in sensor.uses})
         for sensor in sensing.plan.sensors

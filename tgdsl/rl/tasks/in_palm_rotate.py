@@ -132,7 +132,10 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.parts = {
             "goal": groups.goal(spec.goal, setup.object, self._goal_quat),
             "priv_obj_state": [groups.object_state(setup)],
-            "priv_obj_props": [groups.object_props(setup), groups.distances(setup)],
+            "priv_obj_props": [
+                groups.object_props(setup),
+                *([groups.distances(setup)] if "surface_distance" in setup.rows else []),
+            ],
         }
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
