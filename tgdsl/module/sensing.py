@@ -305,10 +305,13 @@ def _check_answer(sensor: PlannedSensor, kind: Kind, answer: Any, state: Tensors
         if outputs[name].shape[-1] != num_rows:
             shape = tuple(outputs[name].shape)
             raise TgdslError(f"{where} {name} of shape {shape}, expected {num_rows} rows as its reading has, (env, {num_rows})")
-    for name in new:
+    for name, value in new.items():
         if name not in state:
             state_names = listed(list(state)) or "none"
             raise TgdslError(f'{where} the state "{name}", which `Lowered.state` does not have: {state_names}')
+        if value.shape != state[name].shape:
+            shapes = f"{tuple(value.shape)}, expected {tuple(state[name].shape)}"
+            raise TgdslError(f'{where} the state "{name}" of shape {shapes} as the old one')
 
 
 def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env *sample channel row"]:
