@@ -307,7 +307,7 @@ def compare(
     overrides: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Comparison:
-    """Fit several kernels or kinds to the same recordings.
+    """Fit several kernels or kinds to the same recordings. A file of models is::
 
         tgdsl: 1
         compare:
