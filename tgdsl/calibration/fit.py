@@ -307,7 +307,9 @@ def compare(
     overrides: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Comparison:
-    """Fit several kernels or kinds to the same recordings. A file of models is::
+    """Fit several kernels or kinds to the same recordings.
+
+    A file of models::
 
         tgdsl: 1
         compare:

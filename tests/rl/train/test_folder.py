@@ -4,6 +4,8 @@ import contextlib
 import subprocess
 import sys
 
+import pytest
+
 from tgdsl.errors import TgdslError
 from tgdsl.rl.train.folder import RunFolder
 
@@ -28,6 +30,28 @@ def test_a_curve_goes_on_whatever_byte_was_its_last(tmp_path):
         assert folder.curve.read_bytes() == (header + first if whole else b""), size
         folder.add_row(row_of(2))
         assert folder.curve.read_bytes() == (content if whole else header + second), size
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "found"),
+    [
+        ("iteration,samp1,\n1,2,3\nx,2,3\n", 3, "'x,2,3'"),
+        ("\0\0\n\0\n", 2, "'\\x00'"),
+        ("iteration,samples,seconds\n1,2,3\n\0,,\n", 3, "'\\x00,,'"),
+        ("iteration,samples,seconds\n1,2\n2,3,4\n", 2, "'1,2'"),
+        ("iteration,samples,seconds\n1,2,3,4,5\n", 2, "'1,2,3,4,5'"),
+    ],
+    ids=["torn", "zeros", "zeros later", "too few", "too many"],
+)
+def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, line, found):
+    folder = RunFolder(tmp_path)
+    folder.checkpoint.write_bytes(b"")
+    folder.curve.write_text(text)
+    with pytest.raises(TgdslError) as raised:
+        folder.check(is_resumed=True)
+    assert str(raised.value).startswith(f"{folder.curve}:{line}: found {found}")
+    assert str(raised.value).endswith("; move this file away, and the run goes on with a new one")
+    assert folder.curve.read_text() == text
 
 
 def is_held(folder):

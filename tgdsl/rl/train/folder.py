@@ -62,6 +62,8 @@ class RunFolder:
             raise TgdslError(f"{self.path}: this folder holds a run; go on with --resume {self.path}, or give another --out")
         if is_resumed and not self.checkpoint.is_file():
             raise TgdslError(f"{self.path}: there is no checkpoint.pt to go on with")
+        if is_resumed:
+            self.rows()
         check_writable(self.checkpoint)
 
     @contextlib.contextmanager
@@ -101,9 +103,19 @@ class RunFolder:
         return starts[-1]
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the complete rows of the curve; a killed run may leave half a line."""
-        text = self.curve.read_text(encoding="utf-8") if self.curve.is_file() else ""
-        return list(csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1])))
+        """Return the complete rows of the curve; a killed run may leave half a line, a machine that loses power zeros."""
+        text = self.curve.read_text(encoding="utf-8", errors="replace") if self.curve.is_file() else ""
+        complete = text[: text.rfind("\n") + 1]
+        lines = csv.DictReader(io.StringIO(complete))
+        rows = list[dict[str, str]]()
+        for row in lines:
+            if None in row or None in row.values() or not row.get("iteration", "").isdecimal():
+                found = complete.splitlines()[lines.line_num - 1]
+                expected = f"a value for each of {', '.join(lines.fieldnames or ())}"
+                hint = "move this file away, and the run goes on with a new one"
+                raise TgdslError(f"{self.curve}:{lines.line_num}: found {found!r}, expected {expected}; {hint}")
+            rows.append(row)
+        return rows
 
     def keep_rows(self, iterations: int) -> None:
         """Keep the curve's complete rows up to an iteration; later iterations run again."""
