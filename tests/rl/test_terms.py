@@ -115,6 +115,13 @@ def test_a_saved_environment_goes_on_with_its_terms(folder):
     )
 
 
+def test_observations_are_one_graph(folder):
+    """Steps on a GPU are compiled: each break of the graph would launch kernels of its own."""
+    env = tiny_env(folder, more="terms: {object: {term: object_state}}\ngoal: [orientation, difference, angle]\n")
+    found = torch.compile(env._observe, fullgraph=True, backend="eager")(env.now)
+    torch.testing.assert_close(found, env._observe(env.now), rtol=0, atol=0)
+
+
 def test_terms_bring_the_sensors_that_they_look_at(folder):
     env = tiny_env(folder, task="own.py:Idle", more="terms: {near: {weight: 1}}\n")
     assert env.now.distance.shape[1] > 0

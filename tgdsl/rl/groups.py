@@ -62,23 +62,31 @@ def priv_proprio(now: Now) -> Float[Tensor, "env feature"]:
     return torch.cat([proprio(now), now.link_force.flatten(1)], dim=1)
 
 
-def goal(parts: Sequence[GoalPart], body: str, wanted: Callable[[], Quat]) -> list[Part]:
+def goal(parts: Sequence[GoalPart], body: str, wanted: Callable[[], Quat]) -> Part:
     """Return parts of a goal, the orientation `wanted` of an object: see `PlacedTaskSpec.goal`."""
-    known = {
-        "orientation": Part(lambda now: six_numbers(wanted()), _orientation("goal", body)),
-        "difference": Part(
-            lambda now: six_numbers(product(wanted(), inverse(now.object.quat))), _orientation("goal_from_object", body)
-        ),
-        "angle": Part(lambda now: between(wanted(), now.object.quat)[:, None], [Features("angle_to_goal", 1, "rad", "", body)]),
+    features = {
+        "orientation": _orientation("goal", body),
+        "difference": _orientation("goal_from_object", body),
+        "angle": [Features("angle_to_goal", 1, "rad", "", body)],
     }
-    return [known[part] for part in parts]
+
+    def observe(now: Now) -> Float[Tensor, "env feature"]:
+        goal_quat, quat = wanted(), now.object.quat
+        values = {
+            "orientation": lambda: six_numbers(goal_quat),
+            "difference": lambda: six_numbers(product(goal_quat, inverse(quat))),
+            "angle": lambda: between(goal_quat, quat)[:, None],
+        }
+        return torch.cat([values[part]() for part in parts], dim=1)
+
+    return Part(observe, [each for part in parts for each in features[part]])
 
 
 def object_state(setup: Setup) -> Part:
     """Return the object's position [m], six numbers of its orientation, velocity [m/s] and angular velocity [rad/s]."""
     body, vectors = setup.object, (("position", "m"), ("velocity", "m/s"), ("angular_velocity", "rad/s"))
     position, *velocities = (vector(name, unit, body) for name, unit in vectors)
-    return Part(_object_motion, [position, *_orientation("orientation", body), *velocities])
+    return Part(object_motion, [position, *_orientation("orientation", body), *velocities])
 
 
 def object_props(setup: Setup) -> Part:
@@ -118,7 +126,8 @@ def runs_of(links: Sequence[str], rows: Sequence[int]) -> list[tuple[str, range]
     return runs
 
 
-def _object_motion(now: Now) -> Float[Tensor, "env feature"]:
+def object_motion(now: Now) -> Float[Tensor, "env feature"]:
+    """Return position [m], six numbers of the orientation, velocity [m/s] and angular velocity [rad/s] of the object."""
     body = now.object
     return torch.cat([body.pos, six_numbers(body.quat), body.linvel, body.angvel], dim=1)
 

@@ -341,7 +341,7 @@ class ObjectState(ObservationTerm):
     """Position [m], six numbers of the orientation, velocity [m/s] and angular velocity [rad/s] of the object."""
 
     def observe(self, now: Now, setup: Setup) -> Float[Tensor, "env feature"]:
-        return groups.object_state(setup).observe(now)
+        return groups.object_motion(now)
 
     def describe(self, setup: Setup) -> Sequence[Features]:
         return groups.object_state(setup).features

@@ -156,7 +156,7 @@ class InHandRepose(Task[InHandReposeSpec]):
         self.held, self.waited = self.keep("held", dtype=torch.int64), self.keep("waited", dtype=torch.int64)
         self.is_reached, self.is_late = self.keep("is_reached", dtype=torch.bool), self.keep("is_late", dtype=torch.bool)
         self.parts = {
-            "goal": groups.goal(spec.goal, setup.object, lambda: self.goal),
+            "goal": [groups.goal(spec.goal, setup.object, lambda: self.goal)],
             "priv_obj_state": [groups.object_state(setup)],
             "priv_obj_props": [groups.object_props(setup), groups.distances(setup)],
         }

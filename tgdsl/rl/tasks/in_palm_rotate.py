@@ -130,7 +130,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.pay, self.share = self.keep("pay"), self.keep("share")  # c of this step, and s of the goal that is under way
         self.forth, self.paid = self.keep("forth"), self.keep("paid")  # Σ max(0, Δψ) and Σ c max(0, Δψ) since the goal before
         self.parts = {
-            "goal": groups.goal(spec.goal, setup.object, self._goal_quat),
+            "goal": [groups.goal(spec.goal, setup.object, self._goal_quat)],
             "priv_obj_state": [groups.object_state(setup)],
             "priv_obj_props": [
                 groups.object_props(setup),
