@@ -81,3 +81,11 @@ def test_two_processes_do_not_run_in_one_folder(tmp_path):
         other.kill()
         other.wait()
         assert not is_held(folder) and list(folder.path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["[]", '{"runs": 3}', "{", "\0"])
+def test_a_file_that_tells_no_starts_is_refused(tmp_path, text):
+    folder = RunFolder(tmp_path)
+    folder.run.write_text(text)
+    with pytest.raises(TgdslError, match=r"run\.json: (expected a file that tgdsl wrote|cannot read this file)"):
+        folder.last_start()

@@ -144,6 +144,8 @@ class RunFolder:
             return json.loads(self.run.read_text(encoding="utf-8"))["starts"] if self.run.is_file() else []
         except (OSError, ValueError) as error:
             raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
+        except (KeyError, TypeError) as error:
+            raise TgdslError(f"{self.run}: expected a file that tgdsl wrote, with `starts`; give another --out") from error
 
 
 class CheckpointError(TgdslError):
