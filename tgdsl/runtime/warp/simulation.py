@@ -215,12 +215,6 @@ class WarpSimulation(Simulation):
         if message:
             raise SimulationError(message)
 
-    def recapture(self) -> None:
-        """Capture the CUDA graphs again: when an array of `warp_model` or `warp_data` was replaced."""
-        calls = (self._step, self._substep, self._step_and_read, self._restarting, self._evaluation, self._posing)
-        for call in calls:
-            call.forget()
-
     def _forget_other_tensors(self) -> None:
         """Forget a graph that was captured with other tensors of the module than it has now."""
         held = (self.drive, self._touch.calls.compiled, self._touch.incoming.held_dt, *self._touch.buffers())
