@@ -286,3 +286,19 @@ def test_run_holds_a_scene_without_keyframes(here, tmp_path):
     assert code == 0 and f"{why}: its initial state is held for 0.1 s\n" in out
     with np.load(tmp_path / "held" / "readings.npz") as kept:
         assert kept["touch"].shape[0] == 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "format_"),
+    [((), "pt2"), (("-o", "hand.onnx"), "onnx"), (("--to", "aoti"), "aoti"), (("-o", "hand.aoti.pt2"), "aoti")],
+)
+def test_an_export_has_the_format_of_its_ending(base, here, monkeypatch, arguments, format_):
+    class Exported(Exception):
+        pass
+
+    def export(self, path, to, **_):
+        raise Exported(to)
+
+    monkeypatch.setattr(tgdsl.TactileModule, "export", export)
+    with pytest.raises(Exported, match=f"^{format_}$"):
+        here(base, "export", "pad.yaml", *arguments)

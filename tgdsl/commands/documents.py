@@ -259,8 +259,9 @@ class Export:
     """Write a document's or an artefact's sensors and observations as a program that runs without tgdsl."""
 
     document: args.DocumentOrArtefact
-    to: Literal["pt2", "aoti", "onnx"] = "pt2"
-    """pt2: torch.export, for Python with torch; aoti: AOTInductor, for C++ and Python with torch; onnx: ONNX Runtime."""
+    to: Annotated[Literal["pt2", "aoti", "onnx"] | None, args.optional("pt2|aoti|onnx")] = None
+    """pt2: torch.export, for Python with torch; aoti: AOTInductor, for C++ and Python with torch; onnx: ONNX Runtime; default:
+    by the ending of --out, or pt2."""
     out: args.OptionalOut = None
     """The file; default: the document's name with the ending .pt2, .aoti.pt2 or .onnx, in the working folder."""
     dt: args.OptionalFloat = None
@@ -272,13 +273,13 @@ class Export:
     def run(self) -> None:
         from tgdsl.module.export.program import ENDINGS, format_of
 
-        out = check_writable(self.out or args.in_working_folder(self.document, ENDINGS[self.to]))
-        format_of(out, self.to)
+        out = check_writable(self.out or args.in_working_folder(self.document, ENDINGS[self.to or "pt2"]))
+        to = format_of(out, self.to)
         with StatusLine() as progress:
             touch = args.module_of(self.document, self.set, progress)
-            progress(f"exporting to {self.to}")
+            progress(f"exporting to {to}")
             source = {"source": str(self.document.absolute()), "overrides": self.set}
-            signature = touch.export(with_folder(out), self.to, dt=self.dt, state_dtype=self.state_dtype, **source)
+            signature = touch.export(with_folder(out), to, dt=self.dt, state_dtype=self.state_dtype, **source)
         for way, ports in (("in", signature.inputs), ("out", signature.outputs)):
             for i, port in enumerate(ports):
                 print(f"{way:<4}{i:>3}  {port.name:<34}{port.dtype:<9}(env{''.join(f', {n}' for n in port.shape)})")
