@@ -1,5 +1,7 @@
 """What pages say of the code is what the code says: tables of kinds and extras, the rooms, the example's kinds."""
 
+import importlib
+import inspect
 import re
 import tomllib
 from pathlib import Path
@@ -37,3 +39,19 @@ def test_every_kind_has_its_example():
 @pytest.mark.parametrize("room", sorted(p.name for p in (REPOSITORY / "tgdsl").iterdir() if (p / "__init__.py").is_file()))
 def test_the_architecture_names_every_room(room):
     assert re.search(rf"\b{room}\b", text_of("docs/architecture.md"))
+
+
+def test_comments_on_fields_of_documented_classes_are_shown(monkeypatch):
+    """Sphinx shows comments that begin with `#:`, and leaves others out."""
+    monkeypatch.syspath_prepend(REPOSITORY / "docs/_ext")
+    from tgdsl_docs.api import api_pages
+
+    paths = re.findall(r"autoclass:: ([\w.]+)\.(\w+)$", "\n".join(api_pages().values()), re.M)
+    assert ("tgdsl.sensors.base", "Lowered") in paths
+    for module, name in paths:
+        documented = getattr(importlib.import_module(module), name)
+        if inspect.isclass(documented):
+            hidden = re.findall(
+                r"^    (?!_)\w+: .*  # (?!type:|noqa)|^    # .*\n    (?!_)\w+: ", inspect.getsource(documented), re.M
+            )
+            assert not hidden, f"{module}.{name}"

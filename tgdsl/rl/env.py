@@ -53,14 +53,14 @@ Observations = dict[str, Float[Tensor, "env feature"]]
 class StepInfo(NamedTuple):
     """Further results of a step. Values of an episode are those of the one that has just ended, where one has."""
 
-    ended: Bool[Tensor, " env"]  # episodes that have ended, terminated or truncated
-    final_obs: Observations  # observations before the reset: they differ from `Step.obs` where an episode has ended
-    terms: dict[str, Float[Tensor, " env"]]  # terms of the reward of this step by name, weights and Δt included
-    score: Float[Tensor, " env"]  # score of the episode, in `task.score_unit`
-    episode_return: Float[Tensor, " env"]  # sum of its rewards
-    episode_steps: Int[Tensor, " env"]  # its control steps
-    episode_terms: dict[str, Float[Tensor, " env"]]  # sums of its terms by name
-    # environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0
+    ended: Bool[Tensor, " env"]  #: episodes that have ended, terminated or truncated
+    final_obs: Observations  #: observations before the reset: they differ from `Step.obs` where an episode has ended
+    terms: dict[str, Float[Tensor, " env"]]  #: terms of the reward of this step by name, weights and Δt included
+    score: Float[Tensor, " env"]  #: score of the episode, in `task.score_unit`
+    episode_return: Float[Tensor, " env"]  #: sum of its rewards
+    episode_steps: Int[Tensor, " env"]  #: its control steps
+    episode_terms: dict[str, Float[Tensor, " env"]]  #: sums of its terms by name
+    #: environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0
     faults: Bool[Tensor, " env"]
 
     def __repr__(self) -> str:
@@ -74,11 +74,11 @@ class StepInfo(NamedTuple):
 class Step(NamedTuple):
     """Result of a control step."""
 
-    obs: Observations  # observations by group; of episodes that have ended, the first of the next one
-    reward: Float[Tensor, " env"]  # sum of the terms
-    terminated: Bool[Tensor, " env"]  # episodes that have ended for good
-    truncated: Bool[Tensor, " env"]  # episodes that have merely lasted long enough
-    info: StepInfo  # further results
+    obs: Observations  #: observations by group; of episodes that have ended, the first of the next one
+    reward: Float[Tensor, " env"]  #: sum of the terms
+    terminated: Bool[Tensor, " env"]  #: episodes that have ended for good
+    truncated: Bool[Tensor, " env"]  #: episodes that have merely lasted long enough
+    info: StepInfo  #: further results
 
     def __repr__(self) -> str:
         return "Step\n" + listing((name, shapes(value)) for name, value in self._asdict().items())

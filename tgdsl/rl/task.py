@@ -223,26 +223,26 @@ def reward_term(weight: float, unit: str, name: str | None = None) -> Callable[[
 class Task(ABC, Generic[S]):
     """A task of all environments."""
 
-    Spec: ClassVar[type[TaskSpec]]  # model of its document
-    # kinds of sensors of the sensors' document that it looks at, besides what the policy feels: `now.link_force` is that of
-    # `link_contact`, `now.distance` that of `surface_distance`
+    Spec: ClassVar[type[TaskSpec]]  #: model of its document
+    #: kinds of sensors of the sensors' document that it looks at, besides what the policy feels: `now.link_force` is that of
+    #: `link_contact`, `now.distance` that of `surface_distance`
     senses: ClassVar[tuple[str, ...]] = ()
-    # whether it looks at the normal force of the `link_contact` sensor, besides the force
+    #: whether it looks at the normal force of the `link_contact` sensor, besides the force
     wants_normal_force: ClassVar[bool] = False
-    score_unit: ClassVar[str]  # unit of its score
-    is_less_better: ClassVar[bool] = False  # whether its score is an error
-    # groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task
+    score_unit: ClassVar[str]  #: unit of its score
+    is_less_better: ClassVar[bool] = False  #: whether its score is an error
+    #: groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task
     hand_groups: ClassVar[tuple[str, ...]] = ()
-    # keys of its document that are read once, when it is made: no curriculum can change them
+    #: keys of its document that are read once, when it is made: no curriculum can change them
     constants: ClassVar[tuple[str, ...]] = ()
-    # units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for
+    #: units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for
     goal_units: ClassVar[tuple[str, ...]] = ()
-    terms: ClassVar[Mapping[str, TaskReward]] = {}  # terms of its reward by name
-    Rewards: ClassVar[type[SpecModel]] = SpecModel  # model of their weights
-    spec: S  # its document
-    setup: Setup  # its setup
-    memory: dict[str, Tensor]  # its own state, (env, …) each, kept by `state_dict`
-    parts: dict[str, list[Part]]  # its groups of observations, which `__init__` may set
+    terms: ClassVar[Mapping[str, TaskReward]] = {}  #: terms of its reward by name
+    Rewards: ClassVar[type[SpecModel]] = SpecModel  #: model of their weights
+    spec: S  #: its document
+    setup: Setup  #: its setup
+    memory: dict[str, Tensor]  #: its own state, (env, …) each, kept by `state_dict`
+    parts: dict[str, list[Part]]  #: its groups of observations, which `__init__` may set
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Collect the terms of the reward; add `rewards`, their weights, and their parameters to the document's model."""

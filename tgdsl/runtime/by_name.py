@@ -102,9 +102,9 @@ def _body_index(bodies: tuple[str, ...], names: tuple[str, ...], device: torch.d
 class Geoms(NamedTuple):
     """The geoms (shapes, colliders) of an environment, by name."""
 
-    bodies: tuple[str, ...]  # name of the body of each geom
-    names: tuple[str, ...] = ()  # name of each geom; needed only for modules with objects that share a body
-    # name of each body's parent; needed only for modules whose objects or links have child bodies without joints
+    bodies: tuple[str, ...]  #: name of the body of each geom
+    names: tuple[str, ...] = ()  #: name of each geom; needed only for modules with objects that share a body
+    #: name of each body's parent; needed only for modules whose objects or links have child bodies without joints
     parents: tuple[tuple[str, str], ...] = ()
 
     def of_part(self, part: ContactPart) -> Int[np.ndarray, " geom"]:

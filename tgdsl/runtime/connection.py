@@ -162,12 +162,12 @@ class SimulationConnection(Connection):
 class SourceKind:
     """A kind of source that `tgdsl.connect` can open."""
 
-    name: str  # its name, by which it is also recognised: alone, or with an address, "name:ADDRESS"
-    expected: str  # how users name a source of this kind, as errors list it: '"name" or "name:ADDRESS"'
-    # opens a source: `open(touch, source, *, option, …)`, given the module and the source as the user named it. The options
-    # that it knows are its keyword-only parameters: options of `connect`, and more.
+    name: str  #: its name, by which it is also recognised: alone, or with an address, "name:ADDRESS"
+    expected: str  #: how users name a source of this kind, as errors list it: '"name" or "name:ADDRESS"'
+    #: opens a source: `open(touch, source, *, option, …)`, given the module and the source as the user named it. The options
+    #: that it knows are its keyword-only parameters: options of `connect`, and more.
     open: Callable[..., Connection]
-    # whether a source that a user named is of this kind; default: if its name is the kind's
+    #: whether a source that a user named is of this kind; default: if its name is the kind's
     recognise: Callable[[str], bool] | None = None
 
     @property
@@ -183,8 +183,8 @@ class SourceKind:
 class SimulatorKind(SourceKind):
     """A kind of source that `tgdsl.simulate` can make too."""
 
-    devices: tuple[str, ...]  # types of torch devices that it is the default simulator of: "cpu", "cuda"
-    simulate: Callable[..., Any]  # makes a simulation: `simulate(touch, num_envs, *, device, option, …)`
+    devices: tuple[str, ...]  #: types of torch devices that it is the default simulator of: "cpu", "cuda"
+    simulate: Callable[..., Any]  #: makes a simulation: `simulate(touch, num_envs, *, device, option, …)`
 
 
 def keyword_options(call: Callable[..., Any]) -> tuple[str, ...]:

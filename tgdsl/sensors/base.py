@@ -137,21 +137,21 @@ def components(name: str, planes: Vec) -> dict[str, Tensor]:
 class Memory:
     """A tensor (env, *shape) that is carried from one call to the next."""
 
-    rest: float = 0.0  # its value after a reset
-    # its shape; None: (row,) of the reading; a type of request: the rows of that quantity's value
+    rest: float = 0.0  #: its value after a reset
+    #: its shape; None: (row,) of the reading; a type of request: the rows of that quantity's value
     shape: tuple[int, ...] | type[Request] | None = None
-    overwritten: bool = False  # whether a kernel may overwrite it in place; `forward` then returns no new value
+    overwritten: bool = False  #: whether a kernel may overwrite it in place; `forward` then returns no new value
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
     """The rows of a reading."""
 
-    name: str  # noun for a row: "taxel", "body", "voxel", "sample", …
-    size: int  # number of rows
-    # columns of a table for users: texts, or arrays (row, …)
+    name: str  #: noun for a row: "taxel", "body", "voxel", "sample", …
+    size: int  #: number of rows
+    #: columns of a table for users: texts, or arrays (row, …)
     table: Mapping[str, Sequence[str] | np.ndarray] = field(default_factory=dict)
-    # the layout's link of each row, for noise that differs between links; None: rows are on no link
+    #: the layout's link of each row, for noise that differs between links; None: rows are on no link
     link_id: Int[np.ndarray, " row"] | None = None
 
 
@@ -182,25 +182,25 @@ def _named(constants: Any, path: str = "") -> dict[str, Any]:
 class Lowered:
     """A sensor, ready to be planned."""
 
-    channels: tuple[Channel, ...]  # channels of the sensor's reading, in order
-    # arrays that `forward` gets as tensors: a mapping, or a dataclass, which becomes a mapping by path
+    channels: tuple[Channel, ...]  #: channels of the sensor's reading, in order
+    #: arrays that `forward` gets as tensors: a mapping, or a dataclass, which becomes a mapping by path
     constants: Any = field(default_factory=dict)
-    state: Mapping[str, Memory] = field(default_factory=dict)  # tensors carried from one call to the next
-    requests: tuple[Request, ...] = ()  # requests to the scene, at most one of each type
-    rows: Axis | None = None  # rows of the reading; None: taxels, or bodies if the kind is not on taxels
-    # further readings `<sensor>/<name>` with these channels and a row per body
+    state: Mapping[str, Memory] = field(default_factory=dict)  #: tensors carried from one call to the next
+    requests: tuple[Request, ...] = ()  #: requests to the scene, at most one of each type
+    rows: Axis | None = None  #: rows of the reading; None: taxels, or bodies if the kind is not on taxels
+    #: further readings `<sensor>/<name>` with these channels and a row per body
     reports: Mapping[str, tuple[Channel, ...]] = field(default_factory=dict)
-    report_rows: Mapping[str, Axis] = field(default_factory=dict)  # rows of a report, where they are not bodies
-    notes: tuple[str, ...] = ()  # lines about its parameters for `explain`
-    signal: tuple[Channel, ...] | None = None  # channels that `forward` returns and noise disturbs, if the kind has `decide`
-    # number of physics steps per call. `forward` is called at each, and the reading is a block of this many samples, times
-    # `samples`. 0: `forward` is called once per call, with the state of the last physics step.
+    report_rows: Mapping[str, Axis] = field(default_factory=dict)  #: rows of a report, where they are not bodies
+    notes: tuple[str, ...] = ()  #: lines about its parameters for `explain`
+    signal: tuple[Channel, ...] | None = None  #: channels that `forward` returns and noise disturbs, if the kind has `decide`
+    #: number of physics steps per call. `forward` is called at each, and the reading is a block of this many samples, times
+    #: `samples`. 0: `forward` is called once per call, with the state of the last physics step.
     substeps: int = 0
-    samples: int = 0  # samples that `forward` returns at once, as "signal" (env, sample, channel, row); 0: a single reading
-    timestep: float = 0.0  # time between calls of `forward` that the constants are for [s]; another one is warned of. 0: any.
-    provides: frozenset[str] = frozenset()  # planes that `forward` returns for other sensors, among `Kind.provides`
-    sound: int = 0  # samples of sound per call of `forward`, see `sensors.upstream`; 0: none
-    upstream: Upstream | None = None  # request to other sensors: `forward` gets `gathered[Upstream]`, see `sensors.upstream`
+    samples: int = 0  #: samples that `forward` returns at once, as "signal" (env, sample, channel, row); 0: a single reading
+    timestep: float = 0.0  #: time between calls of `forward` that the constants are for [s]; another one is warned of. 0: any.
+    provides: frozenset[str] = frozenset()  #: planes that `forward` returns for other sensors, among `Kind.provides`
+    sound: int = 0  #: samples of sound per call of `forward`, see `sensors.upstream`; 0: none
+    upstream: Upstream | None = None  #: request to other sensors: `forward` gets `gathered[Upstream]`, see `sensors.upstream`
 
     def __post_init__(self) -> None:
         """Name the constants."""
@@ -224,12 +224,12 @@ class Fitting(NamedTuple):
 class Context(NamedTuple):
     """When `forward` is called. A kind without `is_timed` gets `UNTIMED`, whose fields are None."""
 
-    dt: Tensor  # time since the last call or substep [s], a scalar
-    step: Tensor  # number of this call of each environment, (env, 1)
-    substep: int  # index of the substep within the call
-    time: Tensor  # time since each environment's reset [s], (env, 1); 0 at the first call after it
-    is_first: Tensor  # whether this is the first call after each environment's reset, (env, 1)
-    stream: Stream | None = None  # random words of this call or substep, for a kind with `is_random`: see `noise.random`
+    dt: Tensor  #: time since the last call or substep [s], a scalar
+    step: Tensor  #: number of this call of each environment, (env, 1)
+    substep: int  #: index of the substep within the call
+    time: Tensor  #: time since each environment's reset [s], (env, 1); 0 at the first call after it
+    is_first: Tensor  #: whether this is the first call after each environment's reset, (env, 1)
+    stream: Stream | None = None  #: random words of this call or substep, for a kind with `is_random`: see `noise.random`
 
 
 UNTIMED = Context(*[None] * 5)  # type: ignore[arg-type]

@@ -32,6 +32,8 @@ WRITING = {
 }
 """What authors of kinds, quantities and sources use."""
 HEADS = "=-"
+COLON = "\ue000"
+"""Stands for a colon while Napoleon reads an attribute's docstring: it takes what is before the first colon for a type."""
 
 
 def api_pages() -> dict[str, str]:
@@ -76,10 +78,16 @@ def _part(name: str) -> str:
     return _page(name, "".join(_class(f"{module}.{each}") for each in names), "-")
 
 
+def hide_colons(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Hide colons of attributes' and properties' docstrings from Napoleon; types are in annotations."""
+    if what in ("attribute", "property"):
+        lines[:] = [line.replace(":", COLON) for line in lines]
+
+
 def escape_docstring(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Keep bars and stars of equations in docstrings from being read as markup."""
+    """Keep bars and stars of equations in docstrings from being read as markup; show colons that were hidden."""
     for i, line in enumerate(lines):
-        parts = re.split(r"(`[^`]*`)(?=\w)?", line)
+        parts = re.split(r"(`[^`]*`)(?=\w)?", line.replace(COLON, ":"))
         escaped = (part if j % 2 else re.sub(r"(?<!\\)([|*])", r"\\\1", part) for j, part in enumerate(parts))
         lines[i] = re.sub(r"(`[^`]+`)(?=[A-Za-z])", r"\1\\ ", "".join(escaped))
 

@@ -12,7 +12,7 @@ from typing import Any
 from sphinx.application import Sphinx
 
 from tgdsl_docs.accuracy import Accuracy
-from tgdsl_docs.api import api_pages, escape_docstring, is_external
+from tgdsl_docs.api import api_pages, escape_docstring, hide_colons, is_external
 from tgdsl_docs.commands import command_pages
 from tgdsl_docs.grammar import grammar_pages
 from tgdsl_docs.kinds import kind_pages
@@ -57,5 +57,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", generate)
     app.connect("source-read", read)
     app.connect("missing-reference", missing)
+    app.connect("autodoc-process-docstring", hide_colons, priority=100)  # before Napoleon, whose priority is 500
     app.connect("autodoc-process-docstring", escape_docstring)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -152,8 +152,8 @@ class Simulation(ABC):
             actuator model that MuJoCo lacks. It is captured with the step on a GPU, so it must not wait for it there.
     """
 
-    OPTIONS: ClassVar[tuple[str, ...]]  # the options of `SimOptions` that this engine knows
-    DEVICE: ClassVar[str] = "cpu"  # the default device
+    OPTIONS: ClassVar[tuple[str, ...]]  #: the options of `SimOptions` that this engine knows
+    DEVICE: ClassVar[str] = "cpu"  #: the default device
 
     model: mujoco.MjModel
     substeps: int
