@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tyro
 from first_order_hands import first_order_hand
 from hand_logs import random_readings
 from resting_hands import TARE
 
+from tgdsl.commands.calibrate import CalibrateHand
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator, TipForces
@@ -50,6 +52,13 @@ def pressed(tmp_path_factory):
 
 
 @pytest.mark.slow
+def test_the_help_names_the_fingers(capsys):
+    with pytest.raises(SystemExit):
+        tyro.cli(CalibrateHand, args=["--help"])
+    shown = capsys.readouterr().out
+    assert all(f"{option} {{thumb,index,middle,ring,pinky}}" in shown for option in ("--finger", "--others"))
+
+
 def test_calibrate_with_loads(pressed, here, tmp_path):
     folder, loads = pressed
     log = str(folder / "press.npz")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tgdsl.calibration.hand.loads import Load, Samples, TipRecord
 
 Finger = Literal["thumb", "index", "middle", "ring", "pinky"]
-OptionalFinger = Annotated[Finger | None, args.optional("FINGER")]
+OptionalFinger = Annotated[Finger | None, args.optional("{thumb,index,middle,ring,pinky}")]
 Intervals = Annotated[
     tuple[tuple[float, float, float, float, float], ...],
     tyro.conf.UseAppendAction,
