@@ -99,7 +99,7 @@ class TactileModule(HookedModule):
 
     @property
     def taxels_id(self) -> str:
-        """A hash of all taxels, to the last bit; `identity.check_taxels` compares those of modules, artefacts and rollouts."""
+        """A hash of all taxels, to the last bit; `tgdsl.check_taxels` compares those of modules, artefacts and rollouts."""
         return self.plan.taxels_id
 
     @property

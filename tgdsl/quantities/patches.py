@@ -144,7 +144,7 @@ class ContactPatch(NamedTuple):
     objects: HeatOfObjects  # materials of the objects
     topology: Topology  # which patch joins what
     sides: Mapping[str, Tensor]  # `topology`'s tables
-    cells: Mapping[str, Tensor]  # what a step needs of the boxes of objects with cells, see `cells.tables`
+    cells: Mapping[str, Tensor]  # what a step needs of the boxes of objects with cells, see `tables`
     boxes: Float[Tensor, "body 2 3"]  # lowest and highest corner of each body's box, (body, 2, 3) in its frame [m]
 
 
@@ -196,7 +196,7 @@ class PatchesUse(Generic[Array]):
     has_own_start: tuple[bool, ...]  # whether the state says at which temperature it begins
     num_materials: tuple[int, ...]  # how many materials it may have
     sides: Mapping[str, Array]  # the tables of `topology`
-    # what a step needs of the boxes of objects with cells, see `cells.tables`; empty if there are none
+    # what a step needs of the boxes of objects with cells, see `tables`; empty if there are none
     cells: Mapping[str, Array]
 
 

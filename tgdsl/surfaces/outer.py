@@ -1,7 +1,7 @@
 """The surface that separates a mesh's inside from its outside: what distances to the mesh are measured to.
 
 Files have parts that are inside out, parts within or across others, faces that two parts share, and holes. The parts are wound
-outwards (`parts.outward`), so that a point is inside where they wind around it (Jacobson, Kavan and Sorkine-Hornung, *Robust
+outwards (`outward`), so that a point is inside where they wind around it (Jacobson, Kavan and Sorkine-Hornung, *Robust
 inside-outside segmentation using generalized winding numbers*, SIGGRAPH 2013; fast: Barill et al., SIGGRAPH 2018). Faces that
 cross or touch are cut there, and the pieces that have the inside on one side stay. Each loop of open edges gets a lid, a fan
 around the mean of its corners, which is such a face too. Sheets, which have the inside on no side, stay. Of faces that cover

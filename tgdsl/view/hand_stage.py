@@ -1,6 +1,6 @@
 """An XHand1 on the live page: its joints, and the forces that it reports on its fingertips. No command is sent.
 
-Shapes: `joint` and `finger` as in `payloads`.
+Shapes: `joint` and `finger` as in `protocol`.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ Known are either constant loads over intervals of the log, as a YAML file says, 
       - {finger: index, start: 0, end: 2 s, force: [0, 0, 0]}
       - {finger: index, start: 3.5 s, end: 6 s, force: [0, 0, -2 N]}    # on the fingertip, along its link's axes
 
-Shapes: `reading` of the log, `finger`, `taxel` as in `payloads`.
+Shapes: `reading` of the log, `finger`, `taxel` as in `protocol`.
 """
 
 from __future__ import annotations

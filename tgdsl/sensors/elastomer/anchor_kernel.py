@@ -52,10 +52,11 @@ def advance_anchors(
     conclude that all arguments may change.
 
     Args:
-        pose: As for `depth_kernel.launch`, as the next six.
-        gate: Negative where a pair's gate is closed.
+        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: nine planes
+            (env, pair) that lie in memory alike, and three.
+        gate: Negative where a pair's gate is closed, (env, pair).
         pair: Index of each link's pair.
-        points: Places in the object's frame [m].
+        points: Places in the object's frame [m], (3, case, point).
         frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes [m], (link, 16).
         counts: Index of each grid's first node, and the number of its nodes along each axis, (link, 4).
         values: `Grid.values`.

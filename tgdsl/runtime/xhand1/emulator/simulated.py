@@ -4,7 +4,7 @@ Joints go where the set-points say, with the gains and forces of the robot file:
 it is driven at all. A drive that becomes passive holds where it is, as geared ones do. Taxels feel nothing, for where a real
 hand's are is not known.
 
-Shapes: `joint` and `finger` as in `payloads`.
+Shapes: `joint` and `finger` as in `protocol`.
 """
 
 from __future__ import annotations
