@@ -91,11 +91,12 @@ class ExportDataset:
         expected = "a recording of tgdsl run, or a log of tgdsl hand record"
         if self.policy is not None:
             raise TgdslError(f"--policy {self.policy}: a recording has its actions; a policy acts on a task: see --source")
-        arrays = read_arrays(self.input, expected)
-        names, document = list(arrays), str(arrays.get("document", ""))
-        if "about" in names:
+        arrays = read_arrays(self.input, expected, only=("about", "document"))  # a log's readings may be gigabytes
+        if "about" in arrays:
             return of_log(self.input, self.fps, args.calibration_of(self.calibration), self.side)
+        document = str(arrays.get("document", ""))
         if not document:
+            names = list(read_arrays(self.input, expected))
             contents = ", ".join([*names[:6], *(["…"] if len(names) > 6 else [])]) or "no array"
             hint = "to export what a policy does, name its task"
             raise TgdslError(f"{self.input}: found {contents}; expected {expected}; {hint}")
