@@ -92,7 +92,14 @@ def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> 
 
 
 def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
-    """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there."""
+    """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there.
+
+    `package://` and `model://` are looked up in the folders above the file: by the name in a `package.xml`, or by their own.
+    A moving link without mass or geometry gets `LEAST_MASS`; an inertia that no rigid body can have becomes that of a ball.
+
+    Raises:
+        RobotError: If the file is not XML, or a mesh cannot be found.
+    """
     robot = _root(path)
     _number_names(robot)
     files: dict[str, Path] = {}

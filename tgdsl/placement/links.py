@@ -21,7 +21,10 @@ _JOINTS = ("free", "ball", "slide", "hinge")  # in the order of mjtJoint
 
 
 def links_table(robot: Model, layout: Path | None = None) -> list[str]:
-    """Return the lines of the table: one body after another in depth-first order, children indented."""
+    """Return the lines of the table: one body after another in depth-first order, children indented.
+
+    Areas are sums over the geoms that can be touched: where these overlap, both count.
+    """
     model = robot.compiled
     groups = _groups(robot, load_layout(layout)) if layout else {}
     blocks: list[list[tuple[str, ...]]] = [[(name,) for name in _HEADER]]

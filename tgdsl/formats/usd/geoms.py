@@ -318,6 +318,7 @@ def _properties(stage: Stage, geom: Gprim) -> tuple[float, Vector, Tensor]:
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise stage.error(geom.prim, f"MuJoCo has no {geom.mass_model} inertia for it: {reason}") from error
+    # A shell without a thickness has its density in kg/m², as in MuJoCo.
     thick = stage.number(geom.prim, "newton:shellThickness", -math.inf) * stage.metres_per_unit
     thick = thick if geom.mass_model == "shell" and thick > 0 else 1.0
     return volume * thick, centre, tensor * thick

@@ -119,6 +119,7 @@ def _is_inside(
 
 def _uniform(*keys: int | Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return numbers in [0, 1) that are a hash of integers: a counter through the mixing function of SplitMix64."""
+    # Steele, Lea and Flood, "Fast Splittable Pseudorandom Number Generators", OOPSLA 2014.
     value = np.zeros(1, dtype=np.uint64)
     for key in keys:
         word = np.array([key % 2**64], dtype=np.uint64) if isinstance(key, int) else key.astype(np.uint64)
