@@ -322,7 +322,7 @@ def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[i
 
 def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
     """Return the segments at which hands begin, the deepest first."""
-    parting = [s for s in segments if len(_chains(tree, s, tree.below(s))) > 1]
+    parting = [s for s in segments if len(_chains(tree, tree.below(s))) > 1]
     parting = parting or [s for s in segments if len(tree.children(s)) > 1][:1]  # a rod that moves all fingers binds them
     results: list[int] = []
     for s in sorted(parting, key=lambda s: len(tree.path(s)), reverse=True):
@@ -360,7 +360,7 @@ def anchor(tree: KinematicTree, segment: int) -> Float[np.ndarray, " 3"]:
 def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None) -> Hand:
     beyond = tree.below(base) if segments is None else list(segments)
     mounts = _mounts(tree, base) if base else []
-    chains = _chains(tree, base, beyond)
+    chains = _chains(tree, beyond)
     if len(tree.children(base)) > 1 or not base:
         above = [tree.within(base, int(tree.model.body_parentid[child])) for child in tree.children(base) if base]
         common = [body for body in mounts if all(body in path for path in above)]
@@ -395,7 +395,7 @@ def _last(tree: KinematicTree, segment: int) -> list[int]:
     return [body for body in bodies if body not in above]
 
 
-def _chains(tree: KinematicTree, base: int, beyond: Sequence[int]) -> list[list[int]]:
+def _chains(tree: KinematicTree, beyond: Sequence[int]) -> list[list[int]]:
     """Return the segments of each chain that has surface."""
     place = {s: i for i, s in enumerate(beyond)}
     pairs = [(place[s], place[tree.parent[s]]) for s in beyond if tree.parent[s] in place]

@@ -301,7 +301,7 @@ def _touch(
         film = 0.0 if spec.contact_conductance is None else 1.0 / (spec.contact_conductance * area)
         own = _conductances(links[b], area, patch.pos, patch.normal)
         if o in where.lumped:
-            series = film + _inside(objects[o], found.objects[o], area)
+            series = film + _inside(found.objects[o], area)
             sides.append((b, where.lumped.index(o), own / (1.0 + own.sum() * series)))
             continue
         node, other = len(bodies) + where.interfaces.index((b, o)), gridded[o]
@@ -428,7 +428,7 @@ def _area(
     return max(patch.area, np.pi * (0.75 * patch.force * compliance / curvature) ** (2 / 3))
 
 
-def _inside(block: Block, own: ReferenceObject, area: float) -> float:
+def _inside(own: ReferenceObject, area: float) -> float:
     width, radius = own.volume ** (1 / 3), np.sqrt(area / np.pi)
     spot = 4 * radius * max(0.0, 1 - np.sqrt(area) / width) / (1 + 0.5 * radius / width)
     return 1 / (own.conductivity * (2 * area / width + spot))
