@@ -19,7 +19,7 @@ demo: $(READY)
 	@echo "stepping its scene: the hand squeezes a cube"
 	@$(BIN)/tgdsl run out/xhand1_palm.safetensors --out out
 
-# Ten minutes in which a finger learns to find a ridge by touch: see docs/learn.md. `make learn MINUTES=1` takes one; LEARN="--blind".
+# Ten minutes in which a finger learns to find a ridge by touch: see docs/start/learn.md. `make learn MINUTES=1` takes one; LEARN="--blind".
 MINUTES ?= 10
 learn: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python examples/learn.py --minutes $(MINUTES) $(LEARN)

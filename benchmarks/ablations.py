@@ -1,4 +1,4 @@
-"""What is kept of students that feel different things, and the page that compares them: docs/ablations.md.
+"""What is kept of students that feel different things, and the page that compares them: docs/background/ablations.md.
 
     python benchmarks/ablations.py collect out/ablation in_palm_rotate_types --teacher out/teacher.json --rest out/rest.json
     python benchmarks/ablations.py reading                    # how well the force of grip_force can be read from each type
@@ -6,8 +6,8 @@
 
 `collect` copies a run's tables and thinned curves to docs/measured/ablations, in place of what was kept under the name; a run
 that went on with --resume is collected again. Runs that differ in their overrides alone, as in students' networks, are kept as
-SERIES__WHAT and have one table and plot. `page` writes between the markers of docs/ablations.md, and a plot of each to
-docs/images/ablation_NAME.png.
+SERIES__WHAT and have one table and plot. `page` writes between the markers of docs/background/ablations.md, and
+a plot of each to docs/images/ablation_NAME.png.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tables of docs/ablations.md, between its markers, from what is kept; what stands around them is left as it is."""
+"""Tables of docs/background/ablations.md, between its markers, from what is kept; what stands around them is left as it is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tgdsl.files.write import atomic_write_all, with_folder
 from tgdsl.rl.students.keys import NONE
 from tgdsl.rl.students.results import Row
 
-PAGE = ROOT / "docs" / "ablations.md"
+PAGE = ROOT / "docs" / "background" / "ablations.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 PAPER = {"in_palm_rotate": (6000, 24), "in_hand_repose": (6000, 24), "screwdriver": (2000, 12)}
 """Iterations of a student and control steps of each environment per iteration: Chung et al., *Tactile Genesis*, appendix,
@@ -128,7 +128,7 @@ def section(ablation: Ablation, reading: Sequence[dict[str, str]] = ()) -> str:
         lines.append(_line([*_row(ablation, each, found), *([force.get(each.taught.row.type, "–")] if force else [])]))
     lines += _yardsticks(ablation, ["", ""], len(header))
     parts = [f"### {ablation.name}", _conditions([ablation]), "\n".join(lines), _verdicts(found, is_less_better)]
-    parts.append(f"![Score over control steps of each student: {ablation.name}](images/ablation_{ablation.name}.png)")
+    parts.append(f"![Score over control steps of each student: {ablation.name}](../images/ablation_{ablation.name}.png)")
     return "\n\n".join(parts)
 
 
@@ -152,7 +152,7 @@ def series_section(runs: Sequence[Ablation]) -> str:
         line = [", ".join([name_of_run, *changed]), *cells, f"{own.taught.row.minutes:.1f}", moved, flat]
         lines.append(_line([*line, _verdict(own, names, untold)]))
     lines += _yardsticks(runs[0], ["", "", ""], len(header))
-    plotted = f"![Score over control steps of each student: {name}](images/ablation_{name}.png)"
+    plotted = f"![Score over control steps of each student: {name}](../images/ablation_{name}.png)"
     return "\n\n".join([f"### {name}", _conditions(runs), "\n".join(lines), plotted])
 
 
@@ -196,7 +196,7 @@ def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
         KeptError: If something that is kept cannot be read, or the page has no markers.
         FileError: If something cannot be written.
     """
-    images = page.parent / "images"
+    images = page.parents[1] / "images"
     contents = {
         images / f"ablation_{series_of(own[0].name)}.png": png_of(series_plot(own) if what_of(own[0].name) else plot(own[0]))
         for own in grouped(kept_ablations(folder))

@@ -3,7 +3,7 @@
     python benchmarks/gpu.py artefacts out/gpu                              # where documents can be compiled
     python benchmarks/gpu.py run out/gpu --out out/gpu.json --jobs 8        # on the machine with the GPU
     python benchmarks/gpu.py guard out/gpu --jobs 8                         # the rows with a limit, against kept ratios
-    python benchmarks/gpu.py table out/gpu.json                             # for docs/performance.md
+    python benchmarks/gpu.py table out/gpu.json                             # for docs/background/performance.md
     python benchmarks/gpu.py plot out/gpu.json --out docs/images
     python benchmarks/gpu.py bytes out/gpu                                  # memory of every case, without a GPU
 

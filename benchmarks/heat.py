@@ -2,7 +2,7 @@
 
     python benchmarks/heat.py artefacts out/heat                            # where documents can be compiled
     python benchmarks/heat.py run out/heat --out out/heat.json --jobs 8     # on the machine with the GPU
-    python benchmarks/heat.py table out/heat.json                           # for docs/performance.md
+    python benchmarks/heat.py table out/heat.json                           # for docs/background/performance.md
     python benchmarks/heat.py conduction --out out/heat_conduction.json     # on a CPU, one thread
 
 `run` needs torch and what `tgdsl.load` needs, no more; `--device cpu --eager --envs 4 --repeats 1 --steps 80` tries it out.

@@ -72,8 +72,9 @@ SETTINGS = (
     Setting("paper", 1.0, 0.5),
     Setting("paper", 10.0, 0.5),
 )
-"""Those in which a fingertip that is pressed on the ball latches within 20 s, by docs/heat.md or with walls so thin; and one
-beside them, of steel, in which it does not. Good conductors diverge by the paper's formula."""
+"""In these a pressed fingertip latches within 20 s by docs/background/heat.md, or walls are as thin; one of steel never does.
+
+Good conductors diverge by the paper's formula."""
 
 
 def heat_of(setting: Setting, heat: Mapping[str, Any], density: float) -> dict[str, Any]:

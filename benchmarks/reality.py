@@ -1,4 +1,4 @@
-"""Sensors fitted to recordings of real ones, and to a finite-element model: the tables and plots of docs/reality.md.
+"""Sensors fitted to recordings of real ones, and to a finite-element model: the tables and plots of docs/background/reality.md.
 
     python benchmarks/reality.py gelsight DATA_FOLDER [--out docs/images]
     python benchmarks/reality.py eflesh DATA_FOLDER

@@ -1,4 +1,4 @@
-"""Pictures of docs/sound.md: what a microphone's interpolation and Doppler shift are off by, and the materials by ear.
+"""Pictures of docs/background/sound.md: errors of a microphone's interpolation and Doppler shift, and the materials by ear.
 
 python benchmarks/sound_pictures.py [--out docs/images]
 """

@@ -11,7 +11,7 @@ author = "The tgdsl authors"
 version = release = installed_version("tgdsl")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "tgdsl_docs.extension"]
-exclude_patterns = ["_ext", "records/changes-0.1.md"]
+exclude_patterns = ["_ext"]
 default_role = "code"
 nitpicky = True
 

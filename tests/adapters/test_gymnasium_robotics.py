@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-PAGE = Path(__file__).parents[2] / "docs" / "adapters.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "adapters.md"
 
 
 def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):

@@ -101,11 +101,11 @@ def test_a_teacher_that_is_no_better_than_rest(kept, tmp_path):
 
 
 def test_page_and_plots_are_written_together_into_folders_that_are_made(kept, tmp_path):
-    page = tmp_path / "docs" / "page.md"
-    page.parent.mkdir()
+    page = tmp_path / "docs" / "background" / "page.md"
+    page.parent.mkdir(parents=True)
     page.write_text(f"before\n{BEGIN}\n{END}\nafter\n")
     files = write_page(kept(), page)
-    assert files == [page, page.parent / "images" / "ablation_made_up.png"] and all(file.is_file() for file in files)
+    assert files == [page, page.parents[1] / "images" / "ablation_made_up.png"] and all(file.is_file() for file in files)
     assert "### made_up" in page.read_text()
 
 
@@ -191,9 +191,10 @@ def test_placements_resolutions_and_noises(kept):
 @pytest.mark.slow
 def test_the_page_has_the_samples_of_the_paper_and_is_the_same_again(kept, tmp_path):
     assert paper_samples("in_palm_rotate") == 1_179_648_000 and paper_samples("screwdriver") == 196_608_000
-    folder, page = kept(), tmp_path / "docs" / "ablations.md"
+    folder, page = kept(), tmp_path / "docs" / "background" / "ablations.md"
     kept("another", LEVEL)
-    (page.parent / "images").mkdir(parents=True)
+    page.parent.mkdir(parents=True)
+    (page.parents[1] / "images").mkdir()
     page.write_text(f"# Title\n\nProse before.\n\n{BEGIN}\n\nwhat was there\n\n{END}\n\nProse after.\n")
     files = write_page(folder, page)
     first = [file.read_bytes() for file in files]
@@ -209,8 +210,8 @@ def test_the_page_that_is_committed_is_that_of_what_is_kept():
     text = PAGE.read_text(encoding="utf-8")
     assert text == written(text, tables()), "run: python benchmarks/ablations.py page"
     found = kept_ablations()
-    pictures = {PAGE.parent / "images" / f"ablation_{series_of(own.name)}.png" for own in found}
-    assert sorted((PAGE.parent / "images").glob("ablation_*.png")) == sorted(pictures)
+    pictures = {PAGE.parents[1] / "images" / f"ablation_{series_of(own.name)}.png" for own in found}
+    assert sorted((PAGE.parents[1] / "images").glob("ablation_*.png")) == sorted(pictures)
     sizes = [sum(file.stat().st_size for file in (KEPT / own.name).rglob("*.*")) for own in found]
     assert all(size <= LIMIT for size in sizes)
 
@@ -222,7 +223,7 @@ def test_of_nothing_the_page_says_so(tmp_path):
 def test_no_local_paths_are_kept(kept):
     own = {"grasps.file": "/somewhere/else/grasps.npz", "x": f"{PAGE}"}
     text = (kept(overrides=own) / "made_up" / "distill.json").read_text()
-    assert json.loads(text)["overrides"] == {"grasps.file": "grasps.npz", "x": "docs/ablations.md"}
+    assert json.loads(text)["overrides"] == {"grasps.file": "grasps.npz", "x": "docs/background/ablations.md"}
     assert str(PAGE.parents[1]) not in text
 
 

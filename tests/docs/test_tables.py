@@ -19,8 +19,8 @@ def text_of(name: str) -> str:
 
 
 def test_the_comparison_has_every_kind_with_its_file():
-    table = text_of("docs/which-kind.md").split("\n\n")[1]
-    files = dict(re.findall(r"^\|[^|]*\| \[`(\w+)`\]\(\.\./(tgdsl/[^)]+)\) \|", table, re.M))
+    table = text_of("docs/start/which-kind.md").split("\n\n")[1]
+    files = dict(re.findall(r"^\|[^|]*\| \[`(\w+)`\]\(\.\./\.\./(tgdsl/[^)]+)\) \|", table, re.M))
     assert files.keys() == {kind.name for kind in KINDS} and len(table.splitlines()) == len(KINDS) + 2
     for kind in KINDS:
         assert files[kind.name] in {part.__module__.replace(".", "/") + ".py" for part in (kind.forward, kind.spec)}
@@ -28,7 +28,7 @@ def test_the_comparison_has_every_kind_with_its_file():
 
 def test_the_page_of_installing_has_every_extra():
     extras = tomllib.loads(text_of("pyproject.toml"))["project"]["optional-dependencies"]
-    assert set(FIRST_CELL.findall(text_of("docs/install.md"))) == extras.keys()
+    assert set(FIRST_CELL.findall(text_of("docs/start/install.md"))) == extras.keys()
 
 
 def test_every_kind_has_its_example():
@@ -38,7 +38,7 @@ def test_every_kind_has_its_example():
 
 @pytest.mark.parametrize("room", sorted(p.name for p in (REPOSITORY / "tgdsl").iterdir() if (p / "__init__.py").is_file()))
 def test_the_architecture_names_every_room(room):
-    assert re.search(rf"\b{room}\b", text_of("docs/architecture.md"))
+    assert re.search(rf"\b{room}\b", text_of("docs/reference/architecture.md"))
 
 
 def test_comments_on_fields_of_documented_classes_are_shown(monkeypatch):

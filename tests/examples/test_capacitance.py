@@ -1,4 +1,4 @@
-"""The worked example of docs/add/kind.md against closed forms of the parallel-plate capacitor."""
+"""The worked example of docs/how-to/kind.md against closed forms of the parallel-plate capacitor."""
 
 import sys
 from pathlib import Path

@@ -224,7 +224,7 @@ class TactileModule(HookedModule):
         source: str = "",
         overrides: Sequence[str] = (),
     ) -> Signature:
-        """Write `step` and `observe` as a file that runs without tgdsl: see docs/export.md. The module stays as it is.
+        """Write `step` and `observe` as a file that runs without tgdsl: see docs/how-to/export.md. The module stays as it is.
 
         The file has the module's constants, dtype, device and seed, and takes any number of environments.
 

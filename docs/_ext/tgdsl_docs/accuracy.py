@@ -34,7 +34,7 @@ class Accuracy:
         found = self.of(kind)
         if not found:
             return "Compared with no closed form.\n"
-        about = "Computed when these pages were built; [accuracy](../../accuracy.md) says how."
+        about = "Computed when these pages were built; [accuracy](../../background/accuracy.md) says how."
         return f"![Exact values, tgdsl and the paper's formula](accuracy_{kind}.svg)\n\n{_table(found)}\n{about}\n"
 
     def plot(self, kind: str) -> str:
@@ -54,7 +54,7 @@ class Accuracy:
 
     def page(self) -> str:
         """Return the page of all comparisons and of the findings that they answer."""
-        parts = ["# All comparisons\n\n[Accuracy](../accuracy.md) says what they are.\n"]
+        parts = ["# All comparisons\n\n[Accuracy](../background/accuracy.md) says what they are.\n"]
         for field, comparisons in self.fields.items():
             parts.append(f"## {field[0].upper()}{field[1:]}\n\n{_table(comparisons)}")
         entries = [report.entry_of(own) for comparisons in self.fields.values() for own in comparisons]

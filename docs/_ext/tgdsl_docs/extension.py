@@ -18,7 +18,6 @@ from tgdsl_docs.grammar import grammar_pages
 from tgdsl_docs.kinds import kind_pages
 from tgdsl_docs.links import overview, resolve_links
 from tgdsl_docs.observations import observation_pages
-from tgdsl_docs.sections import add_others
 
 FOLDER = "generated"
 """Folder of the generated pages, within the source folder."""
@@ -40,10 +39,8 @@ def generate(app: Sphinx) -> None:
 
 
 def read(app: Sphinx, docname: str, content: list[str]) -> None:
-    """Complete the index, and turn links that leave the documentation into downloads."""
-    if docname == "index":
-        content[0] = add_others(content[0], Path(app.srcdir))
-    if docname not in {"index"} and not str(app.env.doc2path(docname)).endswith(".rst"):
+    """Turn links that leave the documentation into downloads."""
+    if not str(app.env.doc2path(docname)).endswith(".rst"):
         content[0] = resolve_links(content[0], Path(app.srcdir) / f"{docname}.md", Path(app.srcdir))
 
 

@@ -38,7 +38,7 @@ def grammar_pages() -> dict[str, str]:
         "layout": _page(
             "Layouts", "Where taxels sit. A file, or the document's `robot.layout` in line.", [("Layout", layout)], {}
         ),
-        "task": _page("Tasks", "What is to be learned: see [tasks](../../tasks.md).", _tasks(), {}),
+        "task": _page("Tasks", "What is to be learned: see [tasks](../../how-to/tasks.md).", _tasks(), {}),
     }
     return {"grammar/index.md": INDEX} | {f"grammar/{name}.md": text for name, text in pages.items()}
 

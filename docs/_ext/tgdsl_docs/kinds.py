@@ -20,7 +20,7 @@ from tgdsl_docs.tables import fields_table, inline, split_unit, table
 EXAMPLE = "examples/every_sensor.yaml"
 """The document whose sensors are the pages' examples; it has every kind."""
 MEASURED = "docs/measured/gpu_h200.json"
-"""Timings of the module alone: see docs/performance.md."""
+"""Timings of the module alone: see docs/background/performance.md."""
 ENVS, TAXELS = 16384, 100
 """Size of the rows that the cost is taken from; of kinds per body, one body."""
 
@@ -70,7 +70,7 @@ def _index(outputs: list[Any], measured: Mapping[str, Any]) -> str:
     header = ("kind", "what it measures", "channels of the example", f"ms, {ENVS:,} × {TAXELS}", "float32 error")
     names = "\n".join(kind.name for kind in KINDS)
     return (
-        "# Sensor kinds\n\n[Which kind to use](../../which-kind.md) compares them. Channels are those of "
+        "# Sensor kinds\n\n[Which kind to use](../../start/which-kind.md) compares them. Channels are those of "
         f"[every_sensor.yaml](../../../{EXAMPLE}).\n\n{table(header, rows)}\n{_about_cost(measured)}\n\n"
         f"```{{toctree}}\n:hidden:\n\n{names}\n```\n"
     )
@@ -80,8 +80,8 @@ def _about_cost(measured: Mapping[str, Any]) -> str:
     return (
         f"Time: one call of the module in graph replay on one {measured['device']}, {ENVS:,} environments of {TAXELS} taxels "
         "(`link_contact`: of one body), one object, no noise. Error: 99.9 % quantile of float32 against float64, relative to "
-        "the channel's largest magnitude. [Performance](../../performance.md) has the method and all rows; a kind without "
-        "numbers has no row there."
+        "the channel's largest magnitude. [Performance](../../background/performance.md) has the method and all rows; a kind "
+        "without numbers has no row there."
     )
 
 
@@ -125,9 +125,10 @@ def _body(text: str, kind: Kind) -> str:
 
 def _mentions(kind: Kind, source: Path) -> str:
     """Return links to the pages that treat the kind: those that name its folder or file, or it twice or more."""
-    pages = [page for page in sorted(source.glob("*.md")) if page.name not in {"index.md", "performance.md", "architecture.md"}]
-    found = [page.stem for page in pages if page.read_text(encoding="utf-8").count(f"`{kind.name}`") >= 2]
-    return f"More: {', '.join(f'[{name}](../../{name}.md)' for name in found)}.\n" if found else ""
+    pages = sorted(page for folder in ("how-to", "background") for page in (source / folder).glob("*.md"))
+    found = [page for page in pages if page.read_text(encoding="utf-8").count(f"`{kind.name}`") >= 2]
+    links = ", ".join(f"[{page.stem}](../../{page.parent.name}/{page.name})" for page in found)
+    return f"More: {links}.\n" if found else ""
 
 
 def _fields(kind: Kind) -> tuple[list[str], list[str]]:
@@ -162,7 +163,7 @@ def _noise(kind: Kind) -> str:
         meaning, unit = split_unit(Knobs.model_fields[name].description or "")
         idle = " Has no effect on this kind." if name in kind.idle_knobs else ""
         rows.append((f"`{name}`", unit, inline(meaning) + idle))
-    about = "[Noise and time](../../noise.md) has equations and order."
+    about = "[Noise and time](../../background/noise.md) has equations and order."
     return f"{table(('knob', 'unit', 'meaning'), rows)}\n{about}\n" if rows else "None.\n"
 
 
@@ -183,6 +184,6 @@ def _cost(kind: Kind, measured: Mapping[str, Any]) -> str:
         (row["case"], f"{row['graph']:.4f}", f"{row['error']:.0e}", f"{row['per_taxel']:.1f}") for row in _rows(kind, measured)
     ]
     if not rows:
-        return "Not among the rows of [performance](../../performance.md).\n"
+        return "Not among the rows of [performance](../../background/performance.md).\n"
     header = ("row", "graph, ms", "float32 error", "bytes per taxel and environment")
     return f"{table(header, rows)}\n{_about_cost(measured)}\n"

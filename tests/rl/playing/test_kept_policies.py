@@ -15,7 +15,7 @@ from tgdsl.rl.start import moved_joints
 REPOSITORY = Path(__file__).parents[3]
 POLICIES = sorted((REPOSITORY / "policies").glob("*.pt"))
 CAPPED = "physics.iterations: null, now 10"
-"""Policies of the palm were learned before their tasks had a cap that hardly ever acts: docs/hands.md."""
+"""Policies of the palm were learned before their tasks had a cap that hardly ever acts: docs/background/hands.md."""
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 SAYS = {
     *("groups", "joints", "iterations", "samples", "minutes", "command", "score", "task", "overrides", "seed", "device"),

@@ -8,7 +8,7 @@ from oracles.setups.boxes import heat_module
 import tgdsl
 
 ROOT = Path(__file__).parents[3]
-BLOCKS = [part.split("```")[0] for part in (ROOT / "docs" / "heat.md").read_text().split("```yaml\n")[1:]]
+BLOCKS = [part.split("```")[0] for part in (ROOT / "docs" / "background" / "heat.md").read_text().split("```yaml\n")[1:]]
 
 
 @pytest.mark.parametrize("text", BLOCKS)
