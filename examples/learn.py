@@ -37,7 +37,7 @@ from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 
-TASK = Path(__file__).parent / "tasks" / "find_ridge.yaml"
+TASK = Path(__file__).parent / "tasks/find_ridge.yaml"
 SEES = {"touch": ("command", "tactile_sensors"), "blind": ("command",), "joints": ("command", "proprio")}
 """Groups of observations of each condition's policy."""
 PRIVILEGED = ("proprio", "priv_ridge")

@@ -1,4 +1,4 @@
-"""The wheel in an empty environment outside the clone: a document that names one of its robots compiles and runs."""
+"""The wheel, built from the sdist, in an empty environment outside the clone: its robots and examples compile and run."""
 
 import os
 import shutil
@@ -40,14 +40,17 @@ def skip_offline(ran: subprocess.CompletedProcess) -> None:
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of this clone."""
+    """The wheel of this clone's sdist."""
     folder = tmp_path_factory.mktemp("wheel")
-    built = subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, REPOSITORY],
-        capture_output=True,
-        text=True,
-    )
-    skip_offline(built)
+    pip, python = [sys.executable, "-m", "pip"], {**os.environ, "PYTHONPATH": str(folder / "hatchling")}
+    for command in (
+        [*pip, "install", "--quiet", "--target", folder / "hatchling", "hatchling"],
+        [sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", folder],
+    ):
+        skip_offline(subprocess.run(command, cwd=REPOSITORY, env=python, capture_output=True, text=True))
+    (sdist,) = folder.glob("*.tar.gz")
+    built = [*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, sdist]
+    skip_offline(subprocess.run(built, capture_output=True, text=True))
     return next(folder.glob("*.whl"))
 
 
@@ -68,7 +71,14 @@ def test_a_robot_of_the_wheel_compiles_and_runs(wheel, version, tmp_path):
 
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    for arguments in (["compile", "hand.yaml", "-o", "hand.safetensors"], ["run", "hand.safetensors", "--seconds", "0.05"]):
+    for arguments in (
+        ["compile", "hand.yaml", "-o", "hand.safetensors"],
+        ["run", "hand.safetensors", "--seconds", "0.05"],
+        ["examples", "list"],
+        ["examples", "copy", "xhand1_palm", "tasks/find_ridge"],
+        ["compile", "examples/xhand1_palm.yaml"],
+        ["play", "examples/tasks/find_ridge.yaml", "--policy", "policies/find_ridge.pt", "--seconds", "0.1", "--no-video"],
+    ):
         ran = subprocess.run([commands / "tgdsl", *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True)
         assert ran.returncode == 0, ran.stderr
     assert (tmp_path / "out" / "readings.npz").is_file() and (tmp_path / "out" / "picture.png").is_file()

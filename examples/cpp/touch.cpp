@@ -1,4 +1,4 @@
-// Touch without Python: runs a package that `tgdsl export hand.yaml --to aoti` wrote.
+// Touch without Python: runs a package that `tgdsl export hand.yaml --to aoti` wrote. CMakeLists.txt builds it.
 //
 //   touch hand.aoti.pt2 FOLDER NUM_ENVS NUM_CALLS
 //

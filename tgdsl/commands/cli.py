@@ -13,6 +13,7 @@ from tgdsl.commands.arguments import subcommands
 from tgdsl.commands.calibrate import Calibrate
 from tgdsl.commands.distill import Distill
 from tgdsl.commands.documents import Cache, Compile, Explain, Export, Listen, Run, Schema, Verify
+from tgdsl.commands.examples import Examples
 from tgdsl.commands.export_dataset import ExportDataset
 from tgdsl.commands.hand import Hand
 from tgdsl.commands.play import Deploy, Evaluate, Grasps, Play
@@ -25,7 +26,24 @@ from tgdsl.errors import SpecError, TgdslError
 
 # Every command by its name. A command imports what it needs when it runs, so that `tgdsl --help` imports no torch.
 Command = subcommands(
-    *(Compile, Explain, Schema, Run, Listen, Play, Train, Distill, Sweep, Evaluate, Deploy, View, Render, Links, Layout),
+    *(
+        Examples,
+        Compile,
+        Explain,
+        Schema,
+        Run,
+        Listen,
+        Play,
+        Train,
+        Distill,
+        Sweep,
+        Evaluate,
+        Deploy,
+        View,
+        Render,
+        Links,
+        Layout,
+    ),
     *(Import, ExportUsd, Export, ExportDataset, Verify, Cache, Bench, Doctor, Grasps, Hand, Calibrate),
 )
 

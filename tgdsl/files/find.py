@@ -1,4 +1,4 @@
-"""Where files are: those that a document names, and the robots that come with tgdsl."""
+"""Where files are: those that a document names, and the robots and examples that come with tgdsl."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ def is_file(path: Path) -> bool:
     return os.path.isfile(path)
 
 
+def shared_folder() -> Path:
+    """Return the folder that has `robots`, `examples` and `policies`: in the installed package, or the top of a checkout."""
+    installed = _PACKAGE / "_shared"
+    return installed if installed.is_dir() else _PACKAGE.parent
+
+
 def robots_folder() -> Path:
-    """Return the folder of the robots that come with tgdsl: in the installed package, or at the top of a checkout."""
-    installed = _PACKAGE / "_robots"
-    return installed if installed.is_dir() else _PACKAGE.parent / "robots"
+    """Return the folder of the robots that come with tgdsl."""
+    return shared_folder() / "robots"
 
 
 def robot_names() -> dict[str, Path]:
