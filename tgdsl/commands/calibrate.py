@@ -28,7 +28,7 @@ Intervals = Annotated[
 
 @dataclass(frozen=True)
 class CalibrateSensor:
-    """Fit parameters of sensors to recordings; docs/background/reality.md describes the recordings."""
+    """Fit parameters of sensors to recordings; docs/how-to/calibrate.md describes the recordings."""
 
     document: tyro.conf.Positional[args.File]
     """The document; its values are where the search starts."""
