@@ -1,7 +1,10 @@
-"""Draw instants of what a policy does, side by side, in one image.
+"""Draw what a policy does: instants side by side in one image, or a GIF in real time with the taxels on a translucent hand.
 
     MUJOCO_GL=osmesa python benchmarks/gait_strip.py examples/tasks/screwdriver.yaml policies/screwdriver.pt --every 0.05 \
         --distance 0.45 --azimuth=200 --elevation=-25 --out docs/images/screwdriver.png
+    MUJOCO_GL=egl python benchmarks/gait_strip.py examples/tasks/in_palm_rotate_cube_held.yaml \
+        policies/in_palm_rotate_cube_held.pt --set touch=force_taxel --first 2.075 --every 0.05 --frames 45 --distance 0.175 \
+        --azimuth=60 --elevation=-50 --out docs/images/turn.gif
 
 One environment with the task's first variant, in MuJoCo, without exploration.
 """
@@ -9,6 +12,7 @@ One environment with the task's first variant, in MuJoCo, without exploration.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import mujoco
@@ -18,19 +22,25 @@ from PIL import Image
 from tgdsl.commands.arguments import parsed_overrides
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.policy import policy_for, read_policy
+from tgdsl.view.trace import TouchTrace
 
 COLUMNS, ROWS, WIDTH, HEIGHT = 6, 2, 240, 200
 """Images beside and below one another, and pixels of each."""
+FRAME = (480, 300)
+"""Pixels of a GIF's frame."""
+HAND, OBJECT, HIDDEN = (0.55, 0.58, 0.64, 0.36), (0.3, 0.5, 0.8, 1.0), (0.0, 0.0, 0.0, 0.0)
 
 
-def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.ndarray]]:
-    """Return the model, the object's body, and `qpos` at the instants that are drawn."""
+def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.ndarray], TouchTrace]:
+    """Return the model, the object's body, and `qpos` and the first sensor's readings at the instants that are drawn."""
     env = TouchEnv(options.task, 1, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
-    policy, obs, found = policy_for(env, read_policy(options.policy)), env.reset(), []
+    policy, obs, instants = policy_for(env, read_policy(options.policy)), env.reset(), []
     first, every = (round(time / env.control_step) for time in (options.first, options.every))
-    for step in range(first + every * COLUMNS * ROWS):
+    trace = TouchTrace(env.touch, next(output for output in env.touch.outputs if output.rows == "taxel"), options.frames)
+    for step in range(first + every * options.frames):
         if step >= first and (step - first) % every == 0:
-            found.append(env.sim.qpos[0].double().numpy().copy())
+            trace.add(len(instants), env.now.readings)
+            instants.append(env.sim.qpos[0].double().numpy().copy())
         made = env.step(policy(obs))
         obs = made.obs
         if made.info.ended.any():
@@ -38,24 +48,58 @@ def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.nda
     model = env.sim.model
     body = int(model.body(env.task.setup.object).id)
     env.close()
-    return model, body, found
+    return model, body, instants, trace
 
 
-def strip(model: mujoco.MjModel, body: int, instants: list[np.ndarray], options: argparse.Namespace) -> Image.Image:
-    """Return the image: the camera looks at where the object is at the first instant."""
-    data, image = mujoco.MjData(model), Image.new("RGB", (COLUMNS * WIDTH, ROWS * HEIGHT))
+def images(
+    model: mujoco.MjModel, body: int, instants: list[np.ndarray], options: argparse.Namespace, trace: TouchTrace | None
+) -> Iterator[Image.Image]:
+    """Yield an image of each instant; the camera looks at where the object is at the first one."""
+    width, height = (WIDTH, HEIGHT) if trace is None else (2 * FRAME[0], 2 * FRAME[1])
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
     data.qpos[:] = instants[0]
     mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance = data.xpos[body], options.distance
     camera.azimuth, camera.elevation = options.azimuth, options.elevation
-    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+    with mujoco.Renderer(model, height, width) as renderer:
         for i, pose in enumerate(instants):
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
-            image.paste(Image.fromarray(renderer.render()), (i % COLUMNS * WIDTH, i // COLUMNS * HEIGHT))
-    return image
+            if trace is not None:
+                scene, first = renderer.scene, renderer.scene.ngeom
+                trace.draw(scene, model, data, i)
+                for geom in scene.geoms[first : scene.ngeom]:
+                    geom.emission = 0.9 if np.ptp(geom.rgba[:3]) > 0.2 else 0.0  # grey ones read nothing
+            yield Image.fromarray(renderer.render())
+
+
+def strip(frames: Iterable[Image.Image]) -> Image.Image:
+    """Return the images in rows."""
+    image = Image.new("RGB", (COLUMNS * WIDTH, ROWS * HEIGHT))
+    for i, frame in enumerate(frames):
+        image.paste(frame, (i % COLUMNS * WIDTH, i // COLUMNS * HEIGHT))
+    return image.quantize(128)
+
+
+def darken(model: mujoco.MjModel, body: int) -> None:
+    """Make the hand translucent and hide the floor and the sky, so that taxels stand out."""
+    is_object, is_plane = model.geom_bodyid == body, model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    model.geom_rgba[:] = np.where(is_object[:, None], OBJECT, np.where(is_plane[:, None], HIDDEN, HAND))
+    model.geom_matid[:] = -1
+    model.tex_data[:] = 30
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.25, 0.35
+    model.light_diffuse[:] = 0.35
+    model.light_ambient[:], model.light_castshadow[:] = 0.0, False
+
+
+def palette(frames: list[Image.Image]) -> Image.Image:
+    """Return an image with 160 colours for all frames, half of them for the warm colours of taxels, which cover few pixels."""
+    pixels = np.concatenate([np.asarray(frame).reshape(-1, 3) for frame in frames[:: max(1, len(frames) // 6)]])
+    warm = pixels[pixels[:, 0] > pixels[:, 2].astype(int) + 25]
+    both = np.concatenate([pixels, np.resize(warm, pixels.shape)]) if len(warm) else pixels
+    return Image.fromarray(both.reshape(-1, FRAME[0], 3)).quantize(160, method=Image.Quantize.MEDIANCUT)
 
 
 def main() -> None:
@@ -65,6 +109,7 @@ def main() -> None:
     parser.add_argument("policy", type=Path)
     parser.add_argument("--first", type=float, default=2.0, help="first instant [s]")
     parser.add_argument("--every", type=float, default=0.075, help="from one to the next [s]")
+    parser.add_argument("--frames", type=int, default=COLUMNS * ROWS, help="instants")
     parser.add_argument("--distance", type=float, default=0.3, help="of the camera from the object [m]")
     parser.add_argument("--azimuth", type=float, default=150.0, help="of where it looks [deg]")
     parser.add_argument("--elevation", type=float, default=-40.0, help="the same [deg]")
@@ -72,7 +117,16 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="of the task's document")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    strip(*poses(options), options).quantize(128).save(options.out, optimize=True)
+    model, body, instants, trace = poses(options)
+    if options.out.suffix == ".gif":
+        darken(model, body)
+        trace.values = trace.values.clip(max=np.quantile(trace.values[trace.values > 0.0], 0.95))
+        frames = [frame.resize(FRAME, Image.Resampling.LANCZOS) for frame in images(model, body, instants, options, trace)]
+        colours, none = palette(frames), Image.Dither.NONE
+        first, *rest = (frame.quantize(palette=colours, dither=none) for frame in frames)
+        first.save(options.out, save_all=True, append_images=rest, duration=round(1e3 * options.every), loop=0, optimize=True)
+    else:
+        strip(images(model, body, instants, options, None)).save(options.out, optimize=True)
     print(options.out)
 
 
