@@ -195,7 +195,7 @@ def test_names_that_mjlabs_scene_lacks_fail_when_the_environment_is_made(tmp_pat
 
 
 def test_the_lines_of_the_page_put_touch_into_an_environment(tmp_path, monkeypatch):
-    page = (Path(__file__).parents[2] / "docs" / "how-to" / "adapters.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "mjlab.md").read_text(encoding="utf-8")
     lines = re.search(r"^```python\n(from mjlab.*?)^```$", page, flags=re.M | re.S)[1].replace("4096", "2")
     tips = {"kind": "contact_depth", "links": ["pad"], "feels": ["cube"]}
     monkeypatch.chdir(tmp_path)

@@ -151,7 +151,7 @@ def test_a_model_without_worlds_is_one(tmp_path):
 
 
 def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
-    page = (Path(__file__).parents[2] / "docs" / "how-to" / "adapters.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "newton.md").read_text(encoding="utf-8")
     lines = re.search(r"^```python\n(import newton.*?)^```$", page, flags=re.M | re.S)[1]
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hand.yaml").write_text(json.dumps(document(tmp_path, load=LOAD)), encoding="utf-8")
