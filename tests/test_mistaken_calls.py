@@ -1,5 +1,6 @@
 """Calls with something else than what is expected: each is told what it is, and what to do."""
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from small_tasks import small_task
 
 import tgdsl
-from tgdsl.errors import ObservationError, SimulationError, SpecError, TgdslError
+from tgdsl.errors import ArtifactError, ObservationError, SimulationError, SpecError, StateError, TgdslError
 from tgdsl.rl.env import TouchEnv
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -55,12 +56,34 @@ def test_modules_readings_and_files(touch, tmp_path):
     with pytest.raises(TgdslError, match=r"x\.pt: an artefact is a safetensors file, expected a name such as x\.safetensors"):
         tgdsl.save(touch, tmp_path / "x.pt")
     assert not list(tmp_path.iterdir())
+    with pytest.raises(ArtifactError, match=r"this is a folder, expected an artefact such as .*hand\.safetensors"):
+        tgdsl.load(tmp_path)
+
+
+def test_environments_counts_and_memory(touch):
+    state = touch.example_state(2)
+    with pytest.raises(StateError, match="memory: found NoneType, expected `initial_memory`, or what the step before returned"):
+        touch.step(state, None)
+    with pytest.raises(SimulationError, match=r"^num_envs is '2', expected a whole number of at least 1$"):
+        tgdsl.simulate(touch, "2")  # type: ignore[arg-type]
+    with closing(tgdsl.simulate(touch, 2, device=torch.device("cpu"))) as sim:
+        for env_ids in ("all", slice(0, 1), object()):
+            for call in (sim.reset, sim.set_state, sim.forward, sim.read):
+                with pytest.raises(SimulationError, match=r"env_ids: found .*, expected indices from 0 to 1, or a mask of 2"):
+                    call(env_ids)
+        with pytest.raises(SimulationError, match="control is no array of numbers: "):
+            sim.step("open")  # type: ignore[arg-type]
 
 
 def test_steps_of_environments(tmp_path):
     env = TouchEnv(small_task(tmp_path), 2)
     with pytest.raises(SimulationError, match=r"action is of torch\.int64, expected numbers from -1 to 1"):
         env.step(torch.zeros(2, env.num_actions, dtype=torch.int64))
+    for wrong in (None, "up", {"swing": 0.1}, np.array(["up"])):
+        with pytest.raises(SimulationError, match=r"action is of .*, expected a tensor \(2, 2\) of numbers from -1 to 1"):
+            env.step(wrong)
+    with pytest.raises(SimulationError, match="the seed is 'a', expected a whole number"):
+        env.reset(seed="a")
     action = np.linspace(-1, 1, 2 * env.num_actions, dtype=np.float32).reshape(2, -1)
     made = env.step(action)
     env.reset(seed=0)

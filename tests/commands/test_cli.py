@@ -244,7 +244,7 @@ def test_bad_runs(base, tmp_path, fails):
     cases = {
         ("--keyframes", "rest", "sqeeze"): 'tgdsl: the scene has no keyframe "sqeeze"; did you mean "squeeze"?\n',
         ("--keyframes",): "tgdsl: 0 keyframes held for 1 s: expected at least one, and more than 0 s\n",
-        ("--num-envs", "0"): "tgdsl: num_envs is 0 and substeps 5, expected at least 1 of each\n",
+        ("--num-envs", "0"): "tgdsl: num_envs is 0, expected a whole number of at least 1\n",
         ("--controls", "none.npz"): "tgdsl: none.npz: expected an .npz file with an array `ctrl`: ",
         ("--controls", str(tmp_path / "two.npz")): "tgdsl: control has shape (2,), expected (1, 1) or (1,)\n",
     }

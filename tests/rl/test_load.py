@@ -138,6 +138,8 @@ def test_values_are_set_by_dotted_path(tmp_path):
     assert (spec.rewards.spin, spec.randomise.friction, spec.episode) == (3.0, (0.5, 2.0), 2.0)
     (found,) = problems(lambda: load_task(task, {"rewards.spinn": 3}))
     assert found.file == "--set rewards.spinn=3"
+    (found,) = problems(lambda: load_task(task, {"terms.a.weight": 1}))
+    assert (found.file, found.path) == ("--set terms.a.weight=1", "terms.a.term")
 
 
 def test_a_task_of_ones_own_stands_beside_its_document(tmp_path):
@@ -186,21 +188,39 @@ def test_what_the_file_of_a_task_of_ones_own_raises_is_told_with_its_line(tmp_pa
     assert (found.what, found.hint) == ('code/own.py has no class "Own"', 'did you mean "Owl"?')
 
 
+def test_what_a_task_of_ones_own_lacks_is_named_at_once(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "from tgdsl.rl.task import Task\nfrom tgdsl.rl.spec import TaskSpec\nclass Own(Task[TaskSpec]):\n    pass\n"
+    )
+    (found,) = problems(lambda: load_task(write_task(tmp_path, task="own.py:Own")))
+    assert found.what == '"own.py:Own" lacks advance, is_over, reset, score, Spec, score_unit'
+
+
 @pytest.mark.parametrize(
     ("method", "says"),
     [
         ("def reward(self, now, is_over):\n        return {}", "Own: `reward` has no terms, expected one at least"),
         (
             "def reward(self, now, is_over):\n        return {'a': is_over[:, None] * 1.0}",
-            r'Own: the term "a" of `reward` is of shape \(2, 1\), expected a tensor \(2,\)',
+            r'Own: the term "a" of `reward` is of shape \(2, 1\) and torch\.float\d+, expected a tensor \(2,\)',
         ),
         (
             "def reward(self, now, is_over):\n        return {'a': 1.0}",
             r'the term "a" of `reward` is a float, expected a tensor',
         ),
         (
+            "def is_over(self, now):\n        return now.friction",
+            r"`is_over` is .*float64, expected a tensor \(2,\) of torch\.bool",
+        ),
+        ("def score(self):\n        return None", r"Own: `score` is a NoneType, expected a tensor \(2,\)"),
+        ("def reset(self, chosen, episode):\n        return {}", "Own: `reset` is a dict, expected a Start"),
+        (
+            "def observe(self, now):\n        self.parts = {}\n        return super().observe(now)",
+            "Own: it has no `observe`, and sets no `self.parts`",
+        ),
+        (
             "def observe(self, now):\n        return {'goal': now.friction}",
-            r'Own: the group "goal" of `observe` is of shape \(2,\), expected a tensor \(2, …\)',
+            r'Own: the group "goal" of `observe` is of shape \(2,\) and torch\.float64, expected a tensor \(2, …\)',
         ),
         (
             "def observe(self, now):\n        return {'proprio': now.joint_pos}",

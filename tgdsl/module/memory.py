@@ -299,6 +299,9 @@ class Memory(HookedModule):
 
     def check(self, memory: Mapping[str, Tensor], num_envs: int, dt: float | None) -> None:
         """Refuse memory of another module."""
+        if not isinstance(memory, Mapping):
+            problem = f"memory: found {type(memory).__name__}"
+            raise StateError(f"{problem}, expected `initial_memory`, or what the step before returned")
         clock = ("clock/age", "clock/step") if self.clock.is_wanted else ()
         if missing := [name for name in (*self._planned, *clock) if name not in memory]:
             raise StateError(f'memory: found no "{missing[0]}"; expected `initial_memory`, or what the step before returned')

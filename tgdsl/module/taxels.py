@@ -50,6 +50,8 @@ def load_plan(path: str | PathLike[str], quantities: Sequence[Quantity] = QUANTI
         ArtifactError: If the file is not an artefact, is damaged, is of another version, or names files in places where those
             of an artefact cannot be.
     """
+    if Path(path).is_dir():
+        raise ArtifactError(f"{path}: this is a folder, expected an artefact such as {Path(path) / 'hand.safetensors'}")
     try:
         with safe_open(str(path), framework="numpy") as file:
             metadata = file.metadata() or {}

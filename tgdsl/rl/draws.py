@@ -11,6 +11,7 @@ Shapes: `env` environments, `num` numbers of one environment.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -172,6 +173,6 @@ def whole(share: Float[Tensor, "env num"], low: int, high: int) -> Int[Tensor, "
 
 
 def _checked(seed: int) -> int:
-    if not -(2**63) <= seed < 2**63:
-        raise SimulationError(f"the seed is {seed}, expected a whole number of 64 bits: from −2⁶³ to 2⁶³ − 1")
+    if not (isinstance(seed, Integral) and -(2**63) <= seed < 2**63):
+        raise SimulationError(f"the seed is {seed!r}, expected a whole number of 64 bits: from −2⁶³ to 2⁶³ − 1")
     return seed

@@ -34,7 +34,7 @@ from tgdsl.rl.grasps.sampling import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.sensed import Felt, Sensed, SubstepTouch, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints
-from tgdsl.rl.task import Now, checked
+from tgdsl.rl.task import Now, Start, checked
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
 from tgdsl.tensors.env_ids import may_be_nonempty
 from tgdsl.tensors.fused import FusedCall
@@ -112,7 +112,7 @@ class TouchEnv:
         task: str | PathLike[str] | Mapping[str, Any] | LoadedTask,
         num_envs: int,
         *,
-        device: str = "cpu",
+        device: str | torch.device = "cpu",
         seed: int = 0,
         overrides: Mapping[str, Any] | None = None,
         simulator: str | None = None,
@@ -145,6 +145,7 @@ class TouchEnv:
             SpecError: All mistakes of the document, at their places.
             SimulationError: If the scene cannot be simulated as the document says.
         """
+        device = str(device)
         loaded = self.loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
         self.spec, sensed = loaded.spec, sensed or compile_sensed(loaded, device, progress, feels=feels)
         self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
@@ -244,7 +245,11 @@ class TouchEnv:
         Raises:
             SimulationError: If an action does not fit or is of integers, or a pool of MuJoCo Warp was too small.
         """
-        action = torch.as_tensor(action)
+        try:
+            action = torch.as_tensor(action)
+        except (TypeError, ValueError, RuntimeError) as error:
+            expected = f"a tensor {tuple(self._action.shape)} of numbers from -1 to 1"
+            raise SimulationError(f"action is of {type(action).__name__}, expected {expected}") from error
         if not action.is_floating_point():
             raise SimulationError(f"action is of {action.dtype}, expected numbers from -1 to 1")
         if tuple(action.shape) != tuple(self._action.shape):
@@ -342,6 +347,8 @@ class TouchEnv:
         self.resets += chosen
         self._events.reset(chosen, self.resets, is_placed=False)
         start = self.task.reset(chosen, self.resets)
+        if not isinstance(start, Start):
+            raise SimulationError(f"{type(self.task).__name__}: `reset` is a {type(start).__name__}, expected a Start")
         self.sim.reset(chosen, contacts=start.contacts, **start.values)
         self._restarted(chosen, "ctrl" in start.values)
         self._events.reset(chosen, self.resets, is_placed=True)
@@ -402,11 +409,14 @@ class TouchEnv:
 
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
         """Return ends, rewards and observations of a control step before any reset, and add rewards up."""
-        terminated = self.task.is_over(now) | faults
+        task, num = type(self.task).__name__, self.num_envs
+        terminated = checked(f"{task}: `is_over`", self.task.is_over(now), num, dtype=torch.bool) | faults
         rates = self._rates(now, terminated)
         for name, term in self.curricula.terms.items():
             if isinstance(term, TerminationTerm):
-                terminated = terminated | checked(f'the term "{name}"', term.is_over(now, self.task.setup), self.num_envs)
+                terminated = terminated | checked(
+                    f'the term "{name}"', term.is_over(now, self.task.setup), num, dtype=torch.bool
+                )
         earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self.control_step).float()
         reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
         self._sums += earned
@@ -416,7 +426,8 @@ class TouchEnv:
         obs = self._observe(now)
         if may_be_nonempty(faults):
             obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in obs.items()}
-        sums, score = dict(zip(rates, self._sums.clone(), strict=True)), self.task.score().float().clone()
+        sums = dict(zip(rates, self._sums.clone(), strict=True))
+        score = checked(f"{task}: `score`", self.task.score(), num).float().clone()
         ended = terminated | truncated
         info = StepInfo(ended, obs, terms, score, self._return.clone(), self.steps.clone(), sums, faults.clone())
         return Step(obs, reward, terminated, truncated, info)

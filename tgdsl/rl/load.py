@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 
-from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
+from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, listed, raised_at
 from tgdsl.fields.models import SpecModel
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
@@ -160,6 +160,10 @@ def _class_of(
         return cast(type[C], event_term(result))
     if not (isinstance(result, type) and issubclass(result, base)):
         raise SpecError([source.problem(place, f'"{name}" is no subclass of {base.__module__}.{base.__name__}')])
+    lacks = sorted(getattr(result, "__abstractmethods__", ()))
+    lacks += [key for key in ("Spec", "score_unit") if base is Task and not hasattr(result, key)]
+    if lacks:
+        raise SpecError([source.problem(place, f'"{name}" lacks {listed(lacks)}')])
     return result
 
 

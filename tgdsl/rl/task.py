@@ -46,16 +46,17 @@ from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 S = TypeVar("S", bound=TaskSpec)
 
 
-def checked(what: str, value: object, num_envs: int, ndim: int = 1) -> Tensor:
-    """Return what a task or a term returns: a tensor (env,) or (env, feature).
+def checked(what: str, value: object, num_envs: int, ndim: int = 1, dtype: torch.dtype | None = None) -> Tensor:
+    """Return what a task or a term returns: a tensor (env,) or (env, feature), of a dtype if one is given.
 
     Raises:
         SimulationError: If it is something else.
     """
-    if isinstance(value, Tensor) and value.ndim == ndim and len(value) == num_envs:
+    if isinstance(value, Tensor) and value.ndim == ndim and len(value) == num_envs and dtype in (None, value.dtype):
         return value
-    given = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
-    raise SimulationError(f"{what} is {given}, expected a tensor ({num_envs},{' …' if ndim > 1 else ''})")
+    given = f"of shape {tuple(value.shape)} and {value.dtype}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+    kind = f" of {dtype}" if dtype else ""
+    raise SimulationError(f"{what} is {given}, expected a tensor ({num_envs},{' …' if ndim > 1 else ''}){kind}")
 
 
 def free_qpos(model: mujoco.MjModel, name: str) -> slice | None:
@@ -323,7 +324,14 @@ class Task(ABC, Generic[S]):
         return {name: getattr(weights, name) * rate(now) for name, rate in self._rates.items()}
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`: by default those of `parts`."""
+        """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`: by default those of `parts`.
+
+        Raises:
+            SimulationError: If the task has neither `observe` nor `parts`.
+        """
+        if not self.parts:
+            problem = f"{type(self).__name__}: it has no `observe`, and sets no `self.parts`"
+            raise SimulationError(f"{problem}; a task without groups of its own returns {{}} from `observe`")
         return {group: torch.cat([part.observe(now) for part in parts], dim=1) for group, parts in self.parts.items()}
 
     def describe(self) -> Mapping[str, Sequence[Features]]:

@@ -15,6 +15,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, Unpack, overload
 
+import torch
+
 from tgdsl.errors import HandError, SimulationError, TgdslError, did_you_mean, listed
 from tgdsl.files.plugins import known
 from tgdsl.module.module import TactileModule
@@ -112,10 +114,10 @@ def simulate(
 ) -> BatchSimulation: ...
 @overload
 def simulate(
-    touch: TactileModule, num_envs: int, *, device: str, **options: Unpack[SimOptions]
+    touch: TactileModule, num_envs: int, *, device: str | torch.device, **options: Unpack[SimOptions]
 ) -> BatchSimulation | WarpSimulation: ...
 def simulate(
-    touch: TactileModule, num_envs: int, *, device: str = "cpu", **options: Unpack[SimOptions]
+    touch: TactileModule, num_envs: int, *, device: str | torch.device = "cpu", **options: Unpack[SimOptions]
 ) -> BatchSimulation | WarpSimulation:
     """Simulate the scene that a module was compiled for.
 
@@ -139,6 +141,7 @@ def simulate(
     if misspelt := [name for name in options if name not in SimOptions.__annotations__]:
         hint = did_you_mean(misspelt[0], SimOptions.__annotations__, "options")
         raise SimulationError(f'simulate has no option "{misspelt[0]}"; {hint}')
+    device = str(device)
     kind = simulator_for(device)
     kind_options = keyword_options(kind.simulate)
     if unknown := [name for name, value in options.items() if name not in kind_options and value]:

@@ -80,8 +80,11 @@ class Source:
         if parsed.problems:
             return
         parent = self.value
-        for part in path[:-1]:
-            parent = parent.setdefault(part, {}) if isinstance(parent, dict) else None
+        for i, part in enumerate(path[:-1]):
+            if isinstance(parent, dict) and part not in parent:
+                parent[part] = {}
+                self.values[path[: i + 1]] = Mark(parsed.file, 0, 0)
+            parent = parent[part] if isinstance(parent, dict) else None
         if not isinstance(parent, dict):
             self.problems.append(Problem(parsed.file, 0, 0, dotted, "does not lead to a key of a mapping"))
             return

@@ -24,11 +24,7 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
     """
     if env_ids is None:
         return np.arange(num_envs)
-    expected = f"expected indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
-    try:
-        found = np.asarray(torch.as_tensor(env_ids).cpu())
-    except (TypeError, ValueError, RuntimeError) as wrong:
-        raise error(f"env_ids: found {env_ids!r}, {expected}") from wrong
+    found = np.asarray(_ids_tensor(env_ids, num_envs, error).cpu())
     if found.dtype == bool and found.shape == (num_envs,):
         return np.flatnonzero(found)
     # Numbers of 8 bits are a mask that is not boolean rather than indices.
@@ -38,14 +34,29 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
     if found.size and not is_index:
         is_mask = found.dtype == bool
         seen = f"a mask of {' x '.join(map(str, found.shape))}" if is_mask else listed([str(value) for value in found.ravel()])
-        raise error(f"env_ids: found {seen}, {expected}")
+        raise error(f"env_ids: found {seen}, {_expected_ids(num_envs)}")
     return found.reshape(-1).astype(np.int64)
 
 
 def is_env_mask(env_ids: EnvIds, num_envs: int) -> bool:
-    """Return whether environments are named by a mask; a tensor's numbers are not looked at."""
-    result = env_ids if isinstance(env_ids, Tensor) else torch.as_tensor(env_ids)
+    """Return whether environments are named by a mask; a tensor's numbers are not looked at.
+
+    Raises:
+        SimulationError: If they are neither numbers nor a mask.
+    """
+    result = _ids_tensor(env_ids, num_envs, SimulationError)
     return result.dtype == torch.bool and result.shape == (num_envs,)
+
+
+def _ids_tensor(env_ids: EnvIds, num_envs: int, error: type[TgdslError]) -> Tensor:
+    try:
+        return torch.as_tensor(env_ids)
+    except (TypeError, ValueError, RuntimeError) as wrong:
+        raise error(f"env_ids: found {env_ids!r}, {_expected_ids(num_envs)}") from wrong
+
+
+def _expected_ids(num_envs: int) -> str:
+    return f"expected indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
 
 
 def env_mask(

@@ -109,11 +109,19 @@ def test_files_of_others_and_of_other_taxels_are_refused(noisy, tmp_path):
     with zipfile.ZipFile(tmp_path / "empty.pt2", "w"):
         pass
     for name in ("text.pt2", "empty.pt2"):
-        with pytest.raises(ArtifactError, match="expected a file that `tgdsl export` wrote"):
+        with pytest.raises(ArtifactError, match="expected a whole file that `tgdsl export` wrote"):
             read_signature(tmp_path / name)
     with pytest.raises(ArtifactError, match="cannot be read: No such file"):
         read_signature(tmp_path / "none.pt2")
     noisy.export(tmp_path / "hand.pt2", dt=0.01)
+    whole = (tmp_path / "hand.pt2").read_bytes()
+    (tmp_path / "text.pt2").write_bytes(whole[:-100])
+    with pytest.raises(ArtifactError, match="expected a whole file that `tgdsl export` wrote"):
+        read_signature(tmp_path / "text.pt2")
+    middle = len(whole) // 2
+    (tmp_path / "text.pt2").write_bytes(whole[:middle] + bytes(b ^ 1 for b in whole[middle : middle + 9]) + whole[middle + 9 :])
+    with pytest.raises(ArtifactError, match=r"expected a whole file .* is damaged"):
+        read_signature(tmp_path / "text.pt2")
     with pytest.raises(ArtifactError, match="its taxels are other ones than the module's"):
         verify(tmp_path / "hand.pt2", tgdsl.compile(document(tmp_path, {"a": {"links": "tip"}})))
 

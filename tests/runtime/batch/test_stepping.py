@@ -174,10 +174,11 @@ def test_a_model_of_your_own_needs_the_bodies(tmp_path):
     assert str(caught.value) == 'the scene has no body "cube"; did you mean "cub"?'
 
 
-@pytest.mark.parametrize("keys", [{"num_envs": 0}, {"num_envs": 1, "substeps": 0}])
+@pytest.mark.parametrize("keys", [{"num_envs": 0}, {"num_envs": "2"}, {"num_envs": 1, "substeps": 0}])
 def test_nothing_to_step(tmp_path, keys):
     touch, _ = arm(tmp_path)
-    with pytest.raises(SimulationError, match=r"expected at least 1 of each"):
+    name, value = list(keys.items())[-1]
+    with pytest.raises(SimulationError, match=f"^{name} is {value!r}, expected a whole number of at least 1$"):
         simulate(touch, **keys)
 
 

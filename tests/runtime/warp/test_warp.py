@@ -286,7 +286,7 @@ def test_controls(tmp_path):
     ("keys", "message"),
     [
         ({"keyframe": "hme"}, r'^the scene has no keyframe "hme"; did you mean "home"\?$'),
-        ({"substeps": 0}, r"^num_envs is 2 and substeps 0, expected at least 1 of each$"),
+        ({"substeps": 0}, r"^substeps is 0, expected a whole number of at least 1$"),
         ({"per_env": ["geom_type"]}, r"^MuJoCo Warp: Model field 'geom_type' is not a batched array field\.$"),
         ({"device": "gpu"}, r'^there is no device "gpu" to run physics on; did you mean "cuda"\?$'),
         ({"device": "meta"}, r'^physics on "meta" is not supported, expected "cuda" or "cpu"$'),

@@ -85,13 +85,16 @@ def read_signature(path: Path) -> Signature:
             text = next(entry.value for entry in properties if entry.key == Path(ENTRY).stem)
         else:
             with zipfile.ZipFile(path) as archive:
+                if damaged := archive.testzip():
+                    raise zipfile.BadZipFile(f"{damaged} is damaged")
                 name = next(name for name in archive.namelist() if name.endswith(f"/extra/{ENTRY}"))
                 text = archive.read(name).decode()
         values: dict[str, Any] = json.loads(text)
     except OSError as error:
         raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from error
     except Exception as error:  # what parsers of protobuf and zip raise has no common base
-        raise ArtifactError(f"{path}: expected a file that `tgdsl export` wrote (.pt2, .onnx)") from error
+        why = f": {error}" if str(error) else ""
+        raise ArtifactError(f"{path}: expected a whole file that `tgdsl export` wrote (.pt2, .onnx){why}") from error
     if values.get("format") != FORMAT:
         raise ArtifactError(f"{path}: found format {values.get('format')}, expected {FORMAT}; export it again")
     for side in ("inputs", "outputs"):

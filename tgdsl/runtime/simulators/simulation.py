@@ -11,6 +11,7 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from numbers import Integral
 from typing import Any, ClassVar, TypedDict, TypeVar, Unpack
 
 import mujoco
@@ -575,9 +576,10 @@ def _reader_of(touch: TactileModule) -> Simulation | None:
 
 def _refuse_unfit(touch: TactileModule, num_envs: int, options: SimOptions) -> None:
     """Raise an error for what no simulation can do."""
-    substeps, has_model = options.get("substeps", 1), options.get("model") is not None
-    if num_envs < 1 or substeps < 1:
-        raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
+    for name, count in (("num_envs", num_envs), ("substeps", options.get("substeps", 1))):
+        if not isinstance(count, Integral) or isinstance(count, bool) or count < 1:
+            raise SimulationError(f"{name} is {count!r}, expected a whole number of at least 1")
+    has_model = options.get("model") is not None
     if has_model and touch.inputs.objects:
         problem = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
         raise SimulationError(f"{problem}; leave `model` out")

@@ -99,10 +99,7 @@ class StateTable:
         """Return a value as a tensor without gradients, where it is, of a shape that fits."""
         if name not in self._arrays:
             raise SimulationError(f'the state has no array "{name}"; {did_you_mean(name, self._arrays, "arrays")}')
-        try:
-            result = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
-        except (TypeError, ValueError) as error:
-            raise SimulationError(f"{name} is no array of numbers: {error}") from error
+        result = _as_tensor(name, value)
         shape = tuple(self._arrays[name].shape[1:])
         num_rows = self._num_envs if ids is None else len(ids)
         if tuple(result.shape) not in ((num_rows, *shape), shape):
@@ -136,9 +133,16 @@ class StateTable:
             raise SimulationError(f"{problem} in environments {listed(list(map(str, envs)))}")
 
 
+def _as_tensor(name: str, value: Any) -> Tensor:
+    try:
+        return value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise SimulationError(f"{name} is no array of numbers: {error}") from error
+
+
 def control_tensor(control: Tensor | np.ndarray, num_envs: int, num_actuators: int) -> Float[Tensor, "*env actuator"]:
     """Return controls, (actuator,) or (env, actuator), as a tensor without gradients; an array becomes float64."""
-    values = control.detach() if isinstance(control, Tensor) else torch.from_numpy(np.array(control, dtype=np.float64))
+    values = _as_tensor("control", control)
     if tuple(values.shape) not in ((num_actuators,), (num_envs, num_actuators)):
         expected = f"({num_envs}, {num_actuators}) or ({num_actuators},)"
         raise SimulationError(f"control has shape {tuple(values.shape)}, expected {expected}")

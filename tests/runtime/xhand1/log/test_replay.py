@@ -359,8 +359,10 @@ def test_another_calibration_than_the_log_s(tmp_path):
 
 @pytest.mark.parametrize("options", [{"speed": 0.0}, {"speed": math.nan}, {"control_step": 0.0}, {"control_step": math.inf}])
 def test_speeds_and_steps_that_cannot_be(tmp_path, options):
+    ((name, value),) = options.items()
+    message = f"^{name} is {value:g}( s)?, expected more than 0"
     path = write_log(tmp_path / "a.npz", random_readings(np.array([1.0])))
-    with pytest.raises(TgdslError, match="expected more than 0 of each"):
+    with pytest.raises(TgdslError, match=message):
         ReplaySource(path, **options)
 
 

@@ -58,8 +58,10 @@ class ReplaySource(HandSource):
             clock: Seconds that only go forward.
             sleep: Waits for some seconds.
         """
-        if not speed > 0 or not (control_step is None or 0 < control_step < math.inf):
-            raise TgdslError(f"a speed of {speed:g} and a control step of {control_step} s, expected more than 0 of each")
+        if not speed > 0:
+            raise TgdslError(f"speed is {speed:g}, expected more than 0")
+        if not (control_step is None or 0 < control_step < math.inf):
+            raise TgdslError(f"control_step is {control_step:g} s, expected more than 0, and a finite time")
         self.log = open_log(path)
         super().__init__(calibration or self.log.calibration, velocity_time_constant)
         self._speed, self._control_step = speed, control_step
