@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from tgdsl.runtime.read import read_warp as read_warp
     from tgdsl.runtime.warp import WarpSimulation as WarpSimulation
     from tgdsl.tuning.compile import compile as compile
-    from tgdsl.view.page import show as show
+    from tgdsl.view.mirror import show as show
 
 _PLACES = {
     "ArtifactError": "errors",
@@ -74,7 +74,7 @@ _PLACES = {
     "read_mujoco": "runtime.read",
     "read_warp": "runtime.read",
     "save": "module.artifact",
-    "show": "view.page",
+    "show": "view.mirror",
     "simulate": "runtime.connect",
 }
 

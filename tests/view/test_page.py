@@ -29,7 +29,7 @@ from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.protocol import JOINTS, STATE_SIZE, decode_state
 from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
 from tgdsl.view.page import Page
-from tgdsl.view.stages import RunStage, SceneStage, SimStage, Stage
+from tgdsl.view.stages import RunStage, SceneStage, Stage
 
 ROOT = Path(__file__).parents[2]
 SCENE = """
@@ -137,23 +137,6 @@ def test_pause_stops_and_step_once_makes_one_step(document):
         assert page.stage.time == 0
         page._step_once()
         assert page.stage.time == pytest.approx(page.stage.control_step)
-
-
-def test_a_loop_of_ones_own_is_drawn_at_most_thirty_times_a_second(document):
-    touch = tgdsl.compile(document)
-    sim = tgdsl.simulate(touch, num_envs=2)
-    page = tgdsl.show(touch, sim, port=8310)
-    drawn = []
-    draw = page.draw
-    page.draw = lambda: (drawn.append(time.monotonic()), draw())
-    begin = time.monotonic()
-    while time.monotonic() - begin < 0.5:
-        sim.step()
-        page.update(touch(sim.state()))
-    page.close()
-    assert 2 <= len(drawn) <= 16
-    assert isinstance(page.stage, SimStage)
-    assert page.stage.time > 0
 
 
 def recorded(document: Path, folder: Path) -> Path:

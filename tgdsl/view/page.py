@@ -1,10 +1,5 @@
 """A live page in the browser: robot and objects, taxels coloured by what they read, and the controls of a scene.
 
-    page = tgdsl.show(touch, sim)            # a loop of one's own
-    for control in controls:
-        sim.step(control)
-        page.update(touch(sim.state()))
-
 The page is served by viser, an optional package: `pip install tgdsl[view]`.
 
 Shapes: `taxel` rows of the chosen reading.
@@ -16,33 +11,33 @@ import math
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import redirect_stdout
+from importlib.util import find_spec
 from io import BytesIO, StringIO
 from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
+import torch
 from jaxtyping import Float, Int, UInt8
 from matplotlib.colors import Colormap, Normalize, to_hex
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from tgdsl.errors import TgdslError
-from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.boxes import boxes_of, is_boxed
 from tgdsl.view.cameras import facing_camera
 from tgdsl.view.markers import Markers, Pose, Taxels, markers_of, read_now, rows_of
 from tgdsl.view.meshes import body_triangles, robot_bodies
-from tgdsl.view.stages import SimStage, Stage
+from tgdsl.view.stages import Stage
 from tgdsl.view.style import HEAT, WARMTH
 
 Array = np.ndarray
 LOCAL = "127.0.0.1"
 PORT = 8080
+NETWORK_WARNING = "the page is served at {}: whoever reaches this machine can see and control it"
 FRAME = 1 / 30  # least time between two frames [s]
 PLOT_SECONDS = 10.0  # how much of the past the plot shows [s]
 SAVED_FRAMES = 1800  # number of frames that the page can save: the last minute at 30 per second
@@ -68,17 +63,15 @@ class Page:
     """
 
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
-        _drawn(stage)
-        try:
-            import viser
-        except ImportError as error:
-            raise TgdslError("the live page needs viser: pip install 'tgdsl[view]'") from error
+        drawn(stage)
+        check_viser()
+        import viser
+
         with redirect_stdout(StringIO()):  # viser prints its address
             self.server = viser.ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
         if host != LOCAL:
-            warnings.warn(f"the page is served at {host}: whoever reaches this machine can see and control it", stacklevel=2)
+            warnings.warn(NETWORK_WARNING.format(host), stacklevel=2)
         self._clicks: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._last_draw = -math.inf
         self.show(stage)
 
     @property
@@ -93,7 +86,7 @@ class Page:
         Raises:
             TgdslError: If the stage has nothing to draw; the one before stays.
         """
-        self._outputs = _drawn(stage)
+        self._outputs = drawn(stage)
         is_first = not hasattr(self, "stage")
         chosen = None if is_first else self._reading.value
         self.stage = stage
@@ -112,14 +105,6 @@ class Page:
         self.draw()
         if is_first:
             self._place_camera()
-
-    def update(self, readings: Mapping[str, Tensor]) -> None:
-        """Take the readings of a loop of one's own, and draw them if the last frame is long enough ago."""
-        assert isinstance(self.stage, SimStage)
-        self.stage.update(readings)
-        if time.monotonic() - self._last_draw >= FRAME:
-            self._react()
-            self.draw()
 
     def run(self, watch: Callable[[], Stage | str | None] = lambda: None, seconds: float = math.inf) -> None:
         """Step the stage in real time and draw it, for some seconds or until interrupted.
@@ -158,7 +143,6 @@ class Page:
 
     def draw(self) -> None:
         """Draw the stage as it is now."""
-        self._last_draw = time.monotonic()
         env = self._env_index
         pos, quat = self.stage.body_poses(env)
         with self.server.atomic():
@@ -245,7 +229,7 @@ class Page:
         """Return where the chosen reading's rows are in the frames of their bodies."""
         touch, output = self.stage.touch, self._output
         if self._is_boxed:
-            layout = boxes_of(touch, output, self.stage.readings[output.name], 0).layout
+            layout = boxes_of(touch, output, torch.zeros(1, *output.shape), 0).layout
             names = [layout.links[i].body for i in layout.link_id]
             rows, labels = (
                 Taxels(layout.pos, layout.normal, np.sqrt(layout.area)),
@@ -452,24 +436,13 @@ class _Table(NamedTuple):
     labels: list[str]
 
 
-def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int = PORT) -> Page:
-    """Show a simulation that a loop of one's own steps, in the browser; call the page's `update` with each step's readings.
-
-    Args:
-        touch: The module.
-        sim: The simulation.
-        host: Address to serve at: see `Page`.
-        port: Port to serve at.
-
-    Raises:
-        TgdslError: If viser is not installed, or the module has nothing to draw.
-    """
-    page = Page(SimStage(touch, sim), host, port)
-    print(f"tgdsl view: {page.url}")
-    return page
+def check_viser() -> None:
+    """Raise `TgdslError` if viser is not installed."""
+    if find_spec("viser") is None:
+        raise TgdslError("the live page needs viser: pip install 'tgdsl[view]'")
 
 
-def _drawn(stage: Stage) -> dict[str, Output]:
+def drawn(stage: Stage) -> dict[str, Output]:
     """Return the readings that a page can show, by name."""
     outputs = {output.name: output for output in stage.outputs}
     if not outputs:

@@ -1,0 +1,167 @@
+"""The page in a process of its own: what it is sent, when, and what happens to the loop if it ends."""
+
+import os
+import pickle
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import viser
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+import tgdsl
+from tgdsl.errors import TgdslError
+from tgdsl.view import mirror
+from tgdsl.view.mirror import MirrorStage
+from tgdsl.view.stages import SimStage
+
+SCENE = """
+<mujoco model="press"><option timestep="0.002"/><worldbody>
+<body name="pad" pos="0 0 0.05"><geom name="pad" type="box" size=".03 .03 .005" density="800"/></body>
+<body name="ball" pos=".01 0 .0749"><joint name="lift" type="slide" axis="0 0 1" damping="2"/>
+<geom name="ball" type="sphere" size=".02" mass="0.2"/></body>
+</worldbody><actuator><motor name="lift" joint="lift"/></actuator></mujoco>
+"""
+DOCUMENT = """
+tgdsl: 1
+robot:
+  model: press.xml
+  layout:
+    resolutions: {low: {pad: {method: grid, rows: 4, columns: 4, direction: [0, 0, -1], radius: 6 mm}}}
+    groups: {all: [pad]}
+resolution: low
+objects: {ball: {body: ball}}
+sensors:
+  touch: {kind: kinematic_taxel, links: all, feels: [ball]}
+"""
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1, 0, 0, 0),
+    "position": (0, 0, 1),
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 10.0,
+    "image_height": 480,
+    "image_width": 640,
+    "look_at": (0, 0, 0),
+    "up_direction": (0, 1, 0),
+}
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("mirror")
+    (folder / "press.xml").write_text(SCENE)
+    (folder / "press.yaml").write_text(DOCUMENT)
+    return folder / "press.yaml"
+
+
+def answer(stage: SimStage, requests, frames) -> None:
+    """Answer requests for frames, as a loop does, until there are no more."""
+    try:
+        while True:
+            frame = mirror._frame(stage, pickle.load(requests))
+            pickle.dump(pickle.loads(pickle.dumps(frame)), frames)
+            frames.flush()
+    except EOFError:
+        pass
+
+
+def close(copy: MirrorStage, sent, *others) -> None:
+    """Close pipes, that of the frames first: then the mirror reads no more."""
+    sent.close()
+    while not copy.is_over:
+        time.sleep(0.01)
+    for end in others:
+        end.close()
+
+
+def test_a_mirror_has_the_poses_and_readings_of_the_environment_that_is_asked_for(document):
+    touch = tgdsl.compile(document)
+    sim = tgdsl.simulate(touch, num_envs=3)
+    lift = np.array([[0.0], [0.01], [-0.002]])
+    sim.reset(qpos=lift)
+    stage = SimStage(touch, sim)
+    stage.update(touch(sim.state()))
+    (requests, asked), (frames, sent) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
+    opening = mirror._Opening(mirror._tables(touch), stage.outputs, stage.model, 3, mirror._frame(stage, 0), "127.0.0.1", 0)
+    copy = MirrorStage(pickle.loads(pickle.dumps(opening)), frames, asked)
+    thread = threading.Thread(target=answer, args=(stage, requests, sent))
+    thread.start()
+    for env in (1, 0, 2):
+        pos, quat = copy.body_poses(env)
+        np.testing.assert_allclose(pos[2], [0.01, 0.0, 0.0749 + lift[env, 0]], atol=1e-12)
+        np.testing.assert_array_equal(quat, sim.body_poses(env)[1])
+        np.testing.assert_array_equal(copy.readings["touch"][env], stage.readings["touch"][env])
+    assert float(copy.readings["touch"].norm()) > 0
+    assert copy.time == stage.time
+    asked.close()
+    thread.join()
+    close(copy, sent, requests, frames)
+
+
+def test_another_environment_of_a_loop_that_stands_still_is_not_drawn(document, monkeypatch):
+    monkeypatch.setattr(mirror, "ENV_WAIT", 0.05)
+    touch = tgdsl.compile(document)
+    stage = SimStage(touch, tgdsl.simulate(touch, num_envs=2))
+    stage.update(touch(stage.sim.state()))
+    (requests, asked), (frames, sent) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
+    opening = mirror._Opening(mirror._tables(touch), stage.outputs, stage.model, 2, mirror._frame(stage, 0), "127.0.0.1", 0)
+    copy = MirrorStage(opening, frames, asked)
+    copy.body_poses(1)
+    assert copy.readings == {}
+    close(copy, sent, asked, requests, frames)
+
+
+def test_a_stage_with_nothing_to_draw_is_refused(document):
+    bare = document.with_name("bare.yaml")
+    bare.write_text(DOCUMENT.split("sensors:")[0] + "sensors:\n  hum: {kind: actuation_audio, samples: 32, substeps: 5}\n")
+    touch = tgdsl.compile(bare)
+    with pytest.raises(TgdslError, match="to draw"):
+        tgdsl.show(touch, tgdsl.simulate(touch, num_envs=1, substeps=5))
+
+
+@pytest.mark.slow
+def test_a_loop_sends_frames_while_a_browser_is_connected_and_outlives_the_page(document, capfd):
+    touch = tgdsl.compile(document)
+    sim = tgdsl.simulate(touch, num_envs=2)
+    page = tgdsl.show(touch, sim, port=8350)
+
+    def loop(seconds: float, is_over: Callable[[], bool] = lambda: False) -> int:
+        begin, before = time.monotonic(), page.num_frames
+        while time.monotonic() - begin < seconds and not is_over():
+            sim.step()
+            page.update(touch(sim.state()))
+            time.sleep(0.002)
+        return page.num_frames - before
+
+    assert loop(0.5) == 0
+    for _ in range(2):  # closed and opened again
+        address = page.url.replace("http", "ws")
+        with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as browser:
+            browser.send(msgspec.msgpack.encode(CAMERA))
+            threading.Thread(target=read_all, args=(browser,), daemon=True).start()
+            before = page.num_frames
+            loop(60.0, lambda before=before: page.num_frames > before + 2)
+            assert page.num_frames > before + 2
+            assert loop(1.0) <= 31  # 30 per second
+        loop(60.0, lambda: loop(1.0) == 0)
+        assert loop(0.5) == 0
+    page._process.kill()
+    page._thread.join()
+    assert loop(0.1) == 0
+    assert "the loop goes on without it" in capfd.readouterr().err
+    page.close()
+
+
+def read_all(browser) -> None:
+    try:
+        while True:
+            browser.recv()
+    except ConnectionClosed:
+        pass
