@@ -94,6 +94,13 @@ def test_environments_leave_triton_alone():
     ) == ["False"]
 
 
+def test_changelog_citation_and_package_name_one_version():
+    (released, date), *_ = re.findall(r"^## (\d\S+) \((.+)\)$", (REPOSITORY / "CHANGELOG.md").read_text(), re.M)
+    assert f'\nversion = "{released}"\n' in (REPOSITORY / "pyproject.toml").read_text()
+    citation = (REPOSITORY / "CITATION.cff").read_text()
+    assert f"\nversion: {released}\n" in citation and f"\ndate-released: {date}\n" in citation
+
+
 def test_the_version_on_the_command_line(here, tmp_path):
     assert here(tmp_path, "--version") == (0, f"tgdsl {version('tgdsl')}\n", "")
 

@@ -15,7 +15,7 @@ from tgdsl.sensors import KINDS
 
 pytestmark = pytest.mark.slow
 REPOSITORY = Path(__file__).parents[2]
-SOURCES = ("tgdsl", "robots", "examples", "benchmarks", "tests", "README.md", "CHANGELOG.md", "LICENSE")
+SOURCES = ("tgdsl", "robots", "examples", "benchmarks", "tests", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE")
 
 
 @pytest.fixture(scope="module")

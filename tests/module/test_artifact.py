@@ -158,9 +158,12 @@ def rewritten(artifact, path, text: str) -> None:
 def test_other_versions_and_other_contents(artifact, tmp_path):
     path, plain = tmp_path / "other.safetensors", json.loads(load_plan(artifact).to_json())
     rewritten(artifact, path, json.dumps(plain | {"format": FORMAT + 1}))
-    assert refused(path) == f"plan format {FORMAT + 1} is not {FORMAT}, which this version of tgdsl reads; compile again"
+    assert (
+        refused(path)
+        == f"plan format {FORMAT + 1} is not {FORMAT}, which this version of tgdsl reads; compile the document again"
+    )
     rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "format"}))
-    assert refused(path) == f"plan format None is not {FORMAT}, which this version of tgdsl reads; compile again"
+    assert refused(path) == f"plan format None is not {FORMAT}, which this version of tgdsl reads; compile the document again"
     rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "layout"}))
     assert refused(path).startswith("not a plan: ")
     rewritten(artifact, path, json.dumps(plain | {"layout": 3}))

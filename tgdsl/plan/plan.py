@@ -28,7 +28,9 @@ from tgdsl.quantities import QUANTITIES
 from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.pairs import PairedObject, PairTable
 
-FORMAT = 17  # version of the Plan; a reader refuses any other
+FORMAT = 17
+"""Version of the Plan; a reader refuses any other. 0.3 must read what 0.2 writes: a new field has a default, and a change
+that breaks old files converts them in `Plan.from_json`."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Plan:
             version, digest, _ = (plain.pop(name, None) for name in ("format", "arrays", "taxels_id"))
             if version != FORMAT:
                 problem = f"plan format {version!r} is not {FORMAT}, which this version of tgdsl reads"
-                raise ArtifactError(f"{problem}; compile again")
+                raise ArtifactError(f"{problem}; compile the document again")
             if digest != _digest(arrays):
                 raise ArtifactError("the arrays are not those that the plan was written with")
             hints, requested = get_type_hints(Plan), plain.pop("quantities")
