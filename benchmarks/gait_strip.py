@@ -68,10 +68,7 @@ def images(
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
             if trace is not None:
-                scene, first = renderer.scene, renderer.scene.ngeom
-                trace.draw(scene, model, data, i)
-                for geom in scene.geoms[first : scene.ngeom]:
-                    geom.emission = 0.9 if np.ptp(geom.rgba[:3]) > 0.2 else 0.0  # grey ones read nothing
+                draw_taxels(renderer.scene, model, data, trace, i)
             yield Image.fromarray(renderer.render())
 
 
@@ -81,6 +78,14 @@ def strip(frames: Iterable[Image.Image]) -> Image.Image:
     for i, frame in enumerate(frames):
         image.paste(frame, (i % COLUMNS * WIDTH, i // COLUMNS * HEIGHT))
     return image.quantize(128)
+
+
+def draw_taxels(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData, trace: TouchTrace, step: int) -> None:
+    """Add the taxels to a scene; those that read something glow."""
+    first = scene.ngeom
+    trace.draw(scene, model, data, step)
+    for geom in scene.geoms[first : scene.ngeom]:
+        geom.emission = 0.9 if np.ptp(geom.rgba[:3]) > 0.2 else 0.0  # grey ones read nothing
 
 
 def darken(model: mujoco.MjModel, body: int) -> None:

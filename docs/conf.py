@@ -10,7 +10,14 @@ project = "tgdsl"
 author = "The tgdsl authors"
 version = release = installed_version("tgdsl")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "tgdsl_docs.extension"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "tgdsl_docs.extension",
+]
 exclude_patterns = ["_ext"]
 default_role = "code"
 nitpicky = True
@@ -27,5 +34,7 @@ python_maximum_signature_line_length = 100
 
 html_theme = "furo"
 html_title = f"tgdsl {version}"
+html_theme_options = {"navigation_with_keys": True}
 html_copy_source = False
+html_show_sphinx = False
 copybutton_prompt_text = "$ "

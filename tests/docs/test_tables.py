@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tgdsl.commands.examples import example_names
 from tgdsl.sensors import KINDS
 
 REPOSITORY = Path(__file__).parents[2]
@@ -29,6 +30,13 @@ def test_the_comparison_has_every_kind_with_its_file():
 def test_the_page_of_installing_has_every_extra():
     extras = tomllib.loads(text_of("pyproject.toml"))["project"]["optional-dependencies"]
     assert set(FIRST_CELL.findall(text_of("docs/start/install.md"))) == extras.keys()
+
+
+def test_the_list_of_examples_has_each_with_existing_pictures():
+    text = text_of("examples/README.md")
+    files = [file.relative_to(REPOSITORY / "examples").as_posix() for file in example_names().values()]
+    assert [file for file in files if f"]({file})" not in text] == []
+    assert [link for link in re.findall(r"\]\(([^)]+)\)", text) if not (REPOSITORY / "examples" / link).exists()] == []
 
 
 def test_every_kind_has_its_example():

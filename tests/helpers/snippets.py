@@ -51,9 +51,10 @@ class Snippet:
 
 
 def pages() -> list[Path]:
-    """Return the README and all pages that are written by hand."""
+    """Return the READMEs and all pages that are written by hand."""
     return [
         REPOSITORY / "README.md",
+        REPOSITORY / "examples" / "README.md",
         REPOSITORY / "docs" / "index.md",
         *sorted(page for folder in FOLDERS for page in (REPOSITORY / "docs" / folder).glob("*.md")),
     ]

@@ -1,4 +1,4 @@
-"""Pages generated at build time from what they describe: kinds, grammar, commands, API, observations, the README as a page.
+"""Pages generated at build time from what they describe: kinds, grammar, commands, API, observations, the READMEs as pages.
 
 They are written to `generated/` of the source folder, before Sphinx looks for pages.
 """
@@ -16,7 +16,7 @@ from tgdsl_docs.api import api_pages, escape_docstring, hide_colons, is_external
 from tgdsl_docs.commands import command_pages
 from tgdsl_docs.grammar import grammar_pages
 from tgdsl_docs.kinds import kind_pages
-from tgdsl_docs.links import overview, resolve_links
+from tgdsl_docs.links import outside_pages, resolve_links
 from tgdsl_docs.observations import observation_pages
 
 FOLDER = "generated"
@@ -28,7 +28,7 @@ def generate(app: Sphinx) -> None:
     source = Path(app.srcdir)
     accuracy = Accuracy()
     pages: dict[str, str] = {"accuracy.md": accuracy.page()}
-    others = (grammar_pages(), command_pages(), api_pages(), observation_pages(source), {"overview.md": overview()})
+    others = (grammar_pages(), command_pages(), api_pages(), observation_pages(source), outside_pages())
     for made in (kind_pages(source, accuracy), *others):
         pages |= made
     shutil.rmtree(source / FOLDER, ignore_errors=True)

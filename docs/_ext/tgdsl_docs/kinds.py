@@ -92,8 +92,10 @@ def _page(kind: Kind, block: str, outputs: list[Any], measured: Mapping[str, Any
     path = f"{package.__name__.replace('.', '/')}.py"
     schema = kind.spec.model_json_schema()
     own, inherited = _fields(kind)
+    picture = f"images/gallery/kind_{kind.name}.png"
+    shown = f"![A reading of this kind](../../{picture})\n\n" if (source / picture).is_file() else ""
     parts = [
-        f"# `{kind.name}`\n\n{_body(about, kind)}\n",
+        f"# `{kind.name}`\n\n{shown}{_body(about, kind)}\n",
         f"Defined in [{path}](../../../{path}), with a float64 reference.\n{_mentions(kind, source)}",
         f"\n## Example\n\nFrom [every_sensor.yaml](../../../{EXAMPLE}):\n\n```yaml\nsensors:\n{block}\n```\n",
         table(("reading", "shape", "channels"), _readings(kind, outputs)),

@@ -10,6 +10,8 @@ import tgdsl
 
 ROOT = Path(tgdsl.__file__).resolve().parents[1]
 """The repository."""
+PAGES = {"README.md": "overview", "examples/README.md": "gallery"}
+"""Files outside the documentation that become pages of the folder `generated`."""
 LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 """A link that is no picture."""
 
@@ -29,8 +31,8 @@ def resolve_links(text: str, page: Path, source: Path) -> str:
             return match[0]
         path, _, anchor = target.partition("#")
         place = Path(os.path.normpath(page.parent / path))
-        if place == source.parent / "README.md":
-            home = os.path.relpath(source / "generated" / "overview.md", page.parent)
+        if name := PAGES.get(os.path.relpath(place, source.parent)):
+            home = os.path.relpath(source / "generated" / f"{name}.md", page.parent)
             return f"[{label}]({home}{'#' + anchor if anchor else ''})"
         if place.is_dir():
             return label if label.startswith("`") else f"{label} (`{os.path.relpath(place, source.parent)}`)"
@@ -42,8 +44,15 @@ def resolve_links(text: str, page: Path, source: Path) -> str:
     return "".join(part if i % 2 else LINK.sub(resolved, part) for i, part in enumerate(parts))
 
 
-def overview() -> str:
-    """Return the README as a page of the folder `generated`."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    text = re.sub(r"\]\(docs/", "](../", text)
-    return re.sub(r"\]\((?!\.\./|[a-z]+:|#)", "](../../", text)
+def outside_pages() -> dict[str, str]:
+    """Return the files of `PAGES` as pages of the folder `generated`, by their names."""
+    return {f"{name}.md": _moved(file) for file, name in PAGES.items()}
+
+
+def _moved(file: str) -> str:
+    """Return the text of a file of the repository, with links that start from docs/generated."""
+
+    def target(match: re.Match[str]) -> str:
+        return f"]({os.path.relpath(Path(file).parent / match[1], 'docs/generated')}"
+
+    return re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)", target, (ROOT / file).read_text(encoding="utf-8"))
