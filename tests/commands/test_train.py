@@ -5,13 +5,18 @@ import os
 import shlex
 import signal
 import sys
+import time
 
 import numpy as np
 import pytest
-from small_runs import ARGUMENTS
+import torch
+from silent_browser import silent_browser
+from small_runs import ARGUMENTS, small_learner
 from small_tasks import small_task
 
+from tgdsl.commands.train import shown
 from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.playing.stage import LearnerStage
 from tgdsl.rl.train.folder import RunFolder, read_checkpoint
 from tgdsl.rl.train.learner import Learner
 
@@ -318,3 +323,55 @@ def test_an_interrupted_run_leaves_its_policy_and_says_how_to_go_on(base, here, 
     code, out, error = here(base, *shlex.split(error.splitlines()[-1])[-6:], "--iterations", "3", "--episodes", "0")
     assert code == 0, error
     assert "after 3 iterations" in out
+
+
+def test_the_stage_of_a_learner_has_each_control_step_and_changes_nothing(tmp_path):
+    bare, _ = small_learner(tmp_path)
+    viewed, _ = small_learner(tmp_path)
+    stage, frames = LearnerStage(viewed.env), []
+
+    def keep(moment):
+        stage.keep(moment)
+        frames.append((stage.time, stage.notes(1), moment))
+
+    viewed.on_step = keep
+    for learner in (bare, viewed):
+        torch.manual_seed(0)
+        learner.iterate()
+        learner.iterate()
+    assert len(frames) == 8  # four control steps per iteration
+    for i, (now, notes, moment) in enumerate(frames):
+        assert now == pytest.approx((i + 1) * viewed.env.control_step)
+        rewards = sum(value for name, value in notes.items() if not name.startswith("score"))
+        assert rewards * viewed.env.control_step == pytest.approx(float(moment.step.reward[1]), abs=1e-6)
+    for name, value in bare.algorithm.actor.state_dict().items():
+        assert torch.equal(value, viewed.algorithm.actor.state_dict()[name])
+
+
+@pytest.mark.slow
+def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_path):
+    bare, _ = small_learner(tmp_path)
+    viewed, _ = small_learner(tmp_path)
+    torch.manual_seed(0)
+    with shown(viewed) as page:
+        viewed.iterate()
+        for _ in range(2):
+            with silent_browser(page.url):
+                begin, before = time.monotonic(), page.num_frames
+                while page.num_frames == before and time.monotonic() - begin < 60:
+                    viewed.iterate()
+                assert page.num_frames > before
+        page._process.kill()
+        viewed.iterate()
+    torch.manual_seed(0)
+    while bare.iteration < viewed.iteration:
+        bare.iterate()
+    for name, value in bare.algorithm.actor.state_dict().items():
+        assert torch.equal(value, viewed.algorithm.actor.state_dict()[name])
+
+
+@pytest.mark.slow
+def test_view_names_the_page(base, here):
+    code, out, error = here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS, "--view")
+    assert code == 0, error
+    assert out.startswith("view: http://localhost:")

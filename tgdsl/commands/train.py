@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shlex
 import sys
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +16,12 @@ from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
     from tgdsl.rl.load import LoadedTask
+    from tgdsl.rl.playing.rollout import Moment
     from tgdsl.rl.train.folder import RunFolder
     from tgdsl.rl.train.learner import Learner
     from tgdsl.rl.train.ranks import Ranks
     from tgdsl.rl.train.run import Run
+    from tgdsl.view.mirror import LoopPage
 
 ENVS = 8192
 INITIAL_STD = "train.networks.initial_std:"
@@ -46,6 +49,8 @@ class Train:
     """Folder of the run; default: out/NAME of the document, or that of the run that is resumed."""
     episodes: int = 1000
     """Episodes of the evaluation at the end; 0: none."""
+    view: bool = False
+    """Show an environment of the learner in the browser."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -112,7 +117,8 @@ class Train:
             run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
             if ranks.is_first and run.board is None:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
-            run.learn_with_bar(self.iterations, self.minutes, loaded.spec.train.iterations)
+            with shown(learner) if self.view and ranks.is_first else nullcontext():
+                run.learn_with_bar(self.iterations, self.minutes, loaded.spec.train.iterations)
             if ranks.is_first:
                 self._finish(learner, folder, origin, run)
         finally:
@@ -139,3 +145,25 @@ class Train:
             learner.write_policy(card | {"score": evaluation.plain()}, folder.policy)
             args.write_json(folder.evaluation, evaluation.plain())
             print(evaluation)
+
+
+@contextmanager
+def shown(learner: Learner) -> Iterator[LoopPage]:
+    """Show the environments of a learner in the browser; its page takes the processor time that learning leaves."""
+    from tgdsl.rl.playing.stage import LearnerStage
+    from tgdsl.view.mirror import LOWEST_PRIORITY, LoopPage
+
+    stage = LearnerStage(learner.env)
+    page = LoopPage(stage, priority=LOWEST_PRIORITY)
+    print(f"view: {page.url}", flush=True)
+
+    def send(moment: Moment) -> None:
+        stage.keep(moment)
+        page.refresh()
+
+    learner.on_step = send
+    try:
+        yield page
+    finally:
+        learner.on_step = None
+        page.close()

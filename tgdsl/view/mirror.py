@@ -44,7 +44,7 @@ from tgdsl.view.stages import Poses, SimStage, Stage
 Array = np.ndarray
 ENV_WAIT = 1.0  # longest wait for the first frame of another environment [s]
 BROWSER_LOOK = 0.2  # time between looks for a browser [s]
-PRIORITY = 10  # of the page's process, as `nice` has it
+PRIORITY, LOWEST_PRIORITY = 10, 19  # of the page's process, as `nice` has it
 _CHILD = "from tgdsl.view.mirror import serve; serve()"
 
 
@@ -80,12 +80,13 @@ class _Opening:
     frame: Frame
     host: str
     port: int
+    priority: int = PRIORITY
 
 
 class LoopPage:
     """The page of a loop of one's own. Its process ends with `close`, or with the loop's process."""
 
-    def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
+    def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT, priority: int = PRIORITY):
         """Open the page of a stage that the loop advances; see `Page` for host and port.
 
         Raises:
@@ -103,7 +104,7 @@ class LoopPage:
         env = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
         self._process = subprocess.Popen([sys.executable, "-c", _CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env)
         frame, tables = _frame(stage, 0), _tables(stage.touch)
-        self._send(_Opening(tables, tuple(stage.outputs), stage.model, stage.num_envs, frame, host, port))
+        self._send(_Opening(tables, tuple(stage.outputs), stage.model, stage.num_envs, frame, host, port, priority))
         try:
             answer = pickle.load(cast(BinaryIO, self._process.stdout))
         except EOFError:
@@ -268,7 +269,7 @@ def serve() -> None:
     pickle.dump(page.url, sink)
     sink.flush()
     if hasattr(os, "nice"):
-        os.nice(PRIORITY)
+        os.nice(opening.priority)
     while not stage.is_over:
         if page.server.get_clients():
             page.run(seconds=BROWSER_LOOK)

@@ -53,3 +53,24 @@ class TaskStage(Stage):
     def close(self) -> None:
         """Release the simulator."""
         self.env.close()
+
+
+class LearnerStage(TaskStage):
+    """Environments that a learner steps; `keep` takes each control step."""
+
+    def __init__(self, env: TouchEnv):
+        self.env, self.touch, self.model = env, env.touch, env.sim.model
+        self.num_envs, self.control_step = env.num_envs, env.control_step
+        self.time, self.readings = 0.0, env.now.readings
+        self._moment = None
+
+    def keep(self, moment: Moment) -> None:
+        """Take a control step that was just made."""
+        self._moment, self.readings = moment, self.env.now.readings
+        self.time += self.control_step
+
+    def advance(self) -> None:
+        """Leave the environments to the learner."""
+
+    def restart(self) -> None:
+        """Leave the environments to the learner."""

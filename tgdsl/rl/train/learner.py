@@ -13,7 +13,7 @@ import io
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -94,6 +94,7 @@ class Learning(Actor):
     rates: ClassVar[str]  # what of the document makes smaller steps
     groups: dict[str, list[str]]
     std: list[float] | None = None  # standard deviation of its actions
+    on_step: Callable[[Moment], None] | None = None  # called after each control step
 
     def __init__(self, env: TouchEnv, ranks: Ranks, steps: int, desynchronise: bool = True):
         self.env, self.ranks, self.iteration, self.samples = env, ranks, 0, 0
@@ -135,6 +136,8 @@ class Learning(Actor):
         for moment in rollout(self, self.env, self._num_steps):
             self._keep(moment)
             self._tally.add(moment.step)
+            if self.on_step is not None:
+                self.on_step(moment)
 
     def learn(self) -> None:
         """Learn from the rollout."""
