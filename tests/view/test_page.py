@@ -28,6 +28,7 @@ from tgdsl.runtime.xhand1.log.log import Fault
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.protocol import JOINTS, STATE_SIZE, decode_state
 from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
+from tgdsl.view.meshes import body_surfaces
 from tgdsl.view.page import Page
 from tgdsl.view.stages import RunStage, SceneStage, Stage
 
@@ -73,17 +74,23 @@ def opened(stage: Stage) -> Iterator[Page]:
         stage.close()
 
 
+def disc_of(page: Page):
+    """Return the discs of the chosen reading's only link."""
+    ((handle, _),) = page.scene.layers[0]._members
+    return handle
+
+
 def test_discs_are_at_the_taxels_in_the_frame_of_their_body(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
         table, model = touch.taxels["touch"], page.stage.model
         (body,) = {model.body(name).id for name in table["body"]}
-        disc = page._discs[body]
+        disc = disc_of(page)
         apart = np.linalg.norm(disc.batched_positions - table["pos"], axis=1)
         assert apart.max() < 3e-4  # lifted off the surface
         turned = Rotation.from_quat(disc.batched_wxyzs, scalar_first=True).apply([0, 0, 1])
         np.testing.assert_allclose(turned, table["normal"], atol=1e-6)
-        np.testing.assert_allclose(page._frames[body].position, model.body("pad").pos, atol=1e-9)
+        np.testing.assert_allclose(page.scene.frames[body].position, model.body("pad").pos, atol=1e-9)
 
 
 def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_written(document):
@@ -93,46 +100,46 @@ def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_writte
             page.stage.advance()
         page.draw()
         force = page.stage.readings["touch"][0].norm(dim=-1)
-        (disc,) = page._discs.values()
+        disc = disc_of(page)
         most = int(force.argmax())
         assert force[most] > 0.01
         blue = disc.batched_colors[:, 2].astype(int)
         assert blue[most] == blue[force.numpy() > 0].min()
         page._pick(most)
         page.draw()
-        assert f"taxel {most}" in page._reads.content
-        shown = float(re.search(r"([\d.e-]+) N", page._reads.content)[1])
+        assert f"taxel {most}" in page.panel.value.content
+        shown = float(re.search(r"([\d.e-]+) N", page.panel.value.content)[1])
         assert shown == pytest.approx(float(force[most]), rel=1e-3)
 
 
 def test_a_slider_moves_its_actuator_and_a_keyframe_moves_the_sliders(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
-        page._sliders[0].value = -0.015
+        page.panel.sliders[0].value = -0.015
         page.run(seconds=0.5)
         low = page.stage.body_poses(0)[0][2, 2]
-        page._keyframe.value = "up"
+        page.panel.keyframe.value = "up"
         page.run(seconds=0.7)
-        assert page._sliders[0].value == pytest.approx(0.01)
+        assert page.panel.sliders[0].value == pytest.approx(0.01)
         assert page.stage.body_poses(0)[0][2, 2] > low + 0.004
 
 
 def test_another_reading_has_its_own_channels(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
-        page._channel.value = "force_x"
-        page._reading.value = "near"
+        page.panel.channel.value = "force_x"
+        page.panel.reading.value = "near"
         page._react()
         page.draw()
         channels = next(output.channels for output in touch.outputs if output.name == "near")
-        assert page._channel.options == ("magnitude", *channels)
-        assert page._channel.value == "magnitude"
+        assert page.panel.channel.options == ("magnitude", *channels)
+        assert page.panel.channel.value == "magnitude"
 
 
 def test_pause_stops_and_step_once_makes_one_step(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
-        page._paused.value = True
+        page.panel.paused.value = True
         page.run(seconds=0.2)
         assert page.stage.time == 0
         page._step_once()
@@ -160,7 +167,7 @@ def test_a_recorded_run_is_where_mujoco_had_it(document, tmp_path):
     np.testing.assert_allclose(stage.body_poses(0)[0], data.xpos, atol=1e-12)
     assert np.array_equal(stage.readings["touch"].numpy(), readings[7])
     with opened(stage) as page:
-        page._instant.value = 3
+        page.panel.instant.value = 3
         page._react()
         assert stage.step_index == 3
 
@@ -182,10 +189,10 @@ def test_what_is_no_run_is_refused_with_what_it_lacks(tmp_path):
 def test_another_stage_replaces_the_discs(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
-        first = page._discs
+        first = disc_of(page)
         page.show(SceneStage(touch))
-        assert page._discs.keys() == first.keys()
-        assert all(page._discs[body] is not first[body] for body in first)
+        assert disc_of(page) is not first
+        assert len(disc_of(page).batched_positions) == len(first.batched_positions)
 
 
 def test_a_stage_with_nothing_to_draw_is_a_problem_and_the_one_before_stays(document):
@@ -197,7 +204,7 @@ def test_a_stage_with_nothing_to_draw_is_a_problem_and_the_one_before_stays(docu
         shown = page.stage
         page.run(lambda: changes.pop() if changes else None, seconds=0.1)
         assert page.stage is shown
-        assert "nothing" in page._problem.content or "to draw" in page._problem.content
+        assert "nothing" in page.panel.problem.content or "to draw" in page.panel.problem.content
     with pytest.raises(TgdslError, match="to draw"):
         Page(SceneStage(tgdsl.compile(bare)), port=8300)
 
@@ -228,8 +235,8 @@ def test_the_plot_begins_again_when_another_environment_is_chosen(document):
     with opened(SceneStage(tgdsl.compile(document), num_envs=2)) as page:
         page.run(seconds=0.3)
         assert len(page._history) > 1
-        assert page._env is not None
-        page._env.value = 1
+        assert page.panel.env is not None
+        page.panel.env.value = 1
         page._react()
         page.draw()
         assert len(page._history) == 1
@@ -238,8 +245,8 @@ def test_the_plot_begins_again_when_another_environment_is_chosen(document):
 def test_frames_are_saved_as_they_were_drawn(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch, num_envs=2)) as page:
-        assert page._env is not None
-        page._env.value = 1
+        assert page.panel.env is not None
+        page.panel.env.value = 1
         expected = []
         for _ in range(3):
             page.stage.advance()
@@ -252,6 +259,146 @@ def test_frames_are_saved_as_they_were_drawn(document):
             for name in expected[0]:
                 np.testing.assert_array_equal(arrays[name][-3:], np.stack([frame[name] for frame in expected]))
             assert len(arrays["time"]) == 4  # the first frame is that of the start
+
+
+# What is drawn, and switches ---------------------------------------------------------------------------------------------------
+
+
+def test_a_contact_is_below_the_ball_and_carries_what_its_actuator_does_not(document):
+    stage = SceneStage(tgdsl.compile(document), num_envs=2)
+    for _ in range(200):
+        stage.advance()
+    ball, weight, stiffness = stage.model.body("ball"), 0.2 * 9.81, 400.0
+    for env in (0, 1):
+        contacts = stage.contacts(env)
+        np.testing.assert_allclose(contacts.pos, [[0.01, 0, 0.055]], atol=5e-4)  # half of how deep the ball is in
+        normal_force = weight + stiffness * float(stage.sim.qpos[env, 0])  # the actuator's target is 0
+        on_pad = contacts.forces_on(frozenset({stage.model.body("pad").id}))
+        np.testing.assert_allclose(on_pad, [[0, 0, -normal_force]], rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(contacts.forces_on(frozenset({ball.id})), -on_pad)
+    stage.close()
+
+
+def test_contacts_are_drawn_and_switched_off(document):
+    with opened(SceneStage(tgdsl.compile(document))) as page:
+        for _ in range(100):
+            page.stage.advance()
+        page.draw()
+        assert "1 contacts, largest" in page.panel.status.content
+        ((begin, end),) = page.scene._forces.points
+        np.testing.assert_allclose(begin[:2], [0.01, 0], atol=1e-3)
+        assert end[2] < begin[2]  # the ball presses the pad down
+        page.panel.parts["contacts"].value = False
+        page.draw()
+        assert not page.scene._points.visible
+        assert not page.scene._forces.visible
+
+
+def test_links_groups_and_sensors_are_switched_on_and_off(tmp_path):
+    side = '<body name="side" pos="0 .1 .05"><geom name="side" type="box" size=".02 .02 .005"/></body>'
+    (tmp_path / "press.xml").write_text(SCENE.replace('<body name="ball"', f'{side}<body name="ball"'))
+    grid = "{method: grid, rows: 2, columns: 2, direction: [0, 0, -1], radius: 6 mm}"
+    text = DOCUMENT.replace("{pad: {", f"{{side: {grid}, pad: {{").replace("{all: [pad]}", "{all: [pad, side], one: [side]}")
+    (tmp_path / "press.yaml").write_text(text)
+    with opened(SceneStage(tgdsl.compile(tmp_path / "press.yaml"))) as page:
+
+        def shown() -> set[str]:
+            page._react()
+            page.draw()
+            return {link for link, (handle,) in page.scene.layers[0]._handles.items() if handle.visible}
+
+        assert shown() == {"pad", "side"}
+        page.panel.links["pad"].value = False
+        assert shown() == {"side"}
+        page.panel.group.value = "one"
+        page.panel.links["pad"].value = True
+        assert shown() == {"side"}
+        page.panel.group.value = "all"
+        assert shown() == {"pad", "side"}
+        page.panel.parts["taxels"].value = False
+        assert shown() == set()
+        page.panel.also["near"].value = True
+        page._react()
+        assert [layer.output.name for layer in page.scene.layers] == ["touch", "near"]
+        page.panel.parts["robot"].value = False
+        page._react()
+        assert {mesh.visible for body in page.scene.robot for mesh, _ in page.scene._meshes[body]} == {False}
+
+
+def test_a_link_and_a_picked_taxel_are_plotted_and_named(document):
+    with opened(SceneStage(tgdsl.compile(document))) as page:
+        for _ in range(100):
+            page.stage.advance()
+        page.panel.plotted.value = "pad"
+        page._react()
+        page.draw()
+        force = page.stage.readings["touch"][0, :, :3].norm(dim=-1)
+        assert "sum of pad" in page.panel.value.content
+        assert page._history[-1][1] == pytest.approx(float(force.sum()), rel=1e-3)
+        most = int(force.argmax())
+        page._pick(most)
+        page.draw()
+        assert page.scene._name.text == f"pad, taxel {most}: {float(force[most]):.4g} N"
+        place = ", ".join(f"{1e3 * x:.1f}" for x in page.stage.touch.taxels["touch"]["pos"][most])
+        assert f"({place}) mm" in page.panel.value.content
+
+
+def test_objects_have_the_colours_of_their_materials():
+    text = """<mujoco><asset><texture name="t" type="2d" builtin="flat" rgb1="1 .5 0" width="4" height="4"/>
+    <material name="m" texture="t" rgba=".8 .8 .8 .5"/></asset><worldbody><body><geom size=".1" material="m"/>
+    <geom size=".1" rgba="0 1 0 1" material="m"/><geom size=".1"/></body></worldbody></mujoco>"""
+    orange, green, none = (surface.colour for surface in body_surfaces(mujoco.MjModel.from_xml_string(text), 1))
+    assert orange == pytest.approx((0.8, 0.4, 0, 0.5), abs=0.005)
+    assert green == (0, 1, 0, 1)
+    assert none is None
+
+
+def test_another_environment_shows_its_own_object(document):
+    own = document.with_name("variants.yaml")
+    shapes = "variants: [{type: sphere, size: [20 mm], density: 600}, {type: box, size: [10 mm, 12 mm, 14 mm], density: 600}]"
+    own.write_text(DOCUMENT.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
+    with opened(SceneStage(tgdsl.compile(own), num_envs=2)) as page:
+        assert page.panel.env is not None
+        ball = page.stage.model.body("ball").id
+
+        def half_widths() -> np.ndarray:
+            page._react()
+            page.draw()
+            ((mesh, _),) = page.scene._meshes[ball]
+            return np.ptp(mesh.vertices, axis=0) / 2
+
+        np.testing.assert_allclose(half_widths(), 0.02, atol=1e-3)
+        page.panel.env.value = 1
+        np.testing.assert_allclose(half_widths(), [0.01, 0.012, 0.014], atol=1e-6)
+        page.panel.env.value = 0
+        np.testing.assert_allclose(half_widths(), 0.02, atol=1e-3)
+
+
+def test_temperatures_colour_the_surfaces_of_links(document):
+    warm = document.with_name("warm.yaml")
+    objects = "{body: ball, material: aluminium, temperature: 60 degC}"
+    sensors = (
+        "  heat: {kind: temperature_grid, links: all, feels: [ball], spacing: 10 mm, material: aluminium, outputs: surface}\n"
+    )
+    warm.write_text(DOCUMENT.split("sensors:")[0].replace("{body: ball}", objects) + "sensors:\n" + sensors)
+    with opened(SceneStage(tgdsl.compile(warm))) as page:
+        for _ in range(100):
+            page.stage.advance()
+        page.draw()
+        (layer,) = page.scene.layers
+        values = page.stage.readings["heat"][0, :, 0].numpy()
+        assert np.ptp(values) > 0.01
+        warmest = layer.rows.pos[layer.read(page.stage.readings["heat"], 0, layer.channels[0]).value.argmax()]
+        np.testing.assert_allclose(warmest, page.stage.touch.rows["heat"]["pos"][values.argmax()])
+        area = 0.0
+        for mesh, row in layer._members:
+            corners = mesh.vertices[mesh.faces]
+            apart = np.abs(corners.mean(axis=1) - layer.rows.pos[row]).max(axis=1)
+            assert apart.max() < 0.0101  # a triangle's centre is in its cell, or in one next to it
+            area += np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+        assert area == pytest.approx(2 * (0.06**2 + 2 * 0.06 * 0.01), rel=1e-4)
+        page._react()
+        assert {mesh.visible for mesh, _ in page.scene._meshes[page.stage.model.body("pad").id]} == {False}
 
 
 # Hands -------------------------------------------------------------------------------------------------------------------------
@@ -289,14 +436,14 @@ def test_a_log_of_a_hand_is_posed_at_its_angles_and_forces(tmp_path):
     assert stage.time == pytest.approx(0.02)
     assert stage.notes(0) == {"then no reading": "HandTimeoutError: no reply"}
     with opened(stage) as page:
-        assert "[counts]" in page._legend.content
-        assert page._instant is not None
-        page._instant.value = 4
+        assert "[counts]" in page.panel.legend.content
+        assert page.panel.instant is not None
+        page.panel.instant.value = 4
         page._react()
         page.draw()
         assert stage.step_index == 4
         total = np.linalg.norm(counts[4], axis=1).sum()
-        assert float(re.search(r"([\d.e+-]+) counts", page._reads.content)[1]) == pytest.approx(total, rel=1e-3)
+        assert float(re.search(r"([\d.e+-]+) counts", page.panel.value.content)[1]) == pytest.approx(total, rel=1e-3)
 
 
 def test_a_calibration_gives_the_log_of_a_hand_newtons(tmp_path):
@@ -326,7 +473,7 @@ def test_an_emulated_hand_is_shown_and_an_unplugged_one_says_so():
         with opened(stage) as page:
             stage.advance()
             page.draw()
-            assert "13 counts" in page._reads.content
+            assert "13 counts" in page.panel.value.content
             emulator.unplug()
             assert soon(lambda: (stage.advance(), "NO NEW READING" in stage.notes(0))[1])
             emulator.replug()
@@ -427,7 +574,7 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
         assert soon(lambda: total(view) > 0)
         before = total(view)
         write(view, "lift", "-0.02")
-        assert soon(lambda: page._sliders[0].value == pytest.approx(-0.02))
+        assert soon(lambda: page.panel.sliders[0].value == pytest.approx(-0.02))
         assert soon(lambda: abs(total(view) - before) > 0.1 * before)
         view.locator("input[value='magnitude']").first.dispatch_event("click")
         view.get_by_role("option", name="force_z").dispatch_event("click")
@@ -451,7 +598,7 @@ def test_a_browser_shows_a_run_and_scrubs_it(browser, document, tmp_path):
         view = open_page(browser, page)
         assert soon(lambda: drawn_share(view) > 0.02)
         view.get_by_text("pause").locator("xpath=ancestor::*[.//input][1]").locator("input").dispatch_event("click")
-        assert soon(lambda: page._paused.value)
+        assert soon(lambda: page.panel.paused.value)
         write(view, "step", "2")
         with np.load(tmp_path / "readings.npz") as arrays:
             time_then = arrays["time"][2]
@@ -477,7 +624,7 @@ def test_a_browser_shows_the_log_of_a_hand_and_scrubs_it(browser, tmp_path):
         view = open_page(browser, page)
         assert soon(lambda: drawn_share(view) > 0.02)
         view.get_by_text("pause").locator("xpath=ancestor::*[.//input][1]").locator("input").dispatch_event("click")
-        assert soon(lambda: page._paused.value)
+        assert soon(lambda: page.panel.paused.value)
         write(view, "step", "2")
         view.get_by_text("then no reading").wait_for()
         view.close()

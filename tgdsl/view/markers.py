@@ -173,8 +173,7 @@ def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tenso
     same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
     read = read_now(values, env)
     value = magnitude(read, output.units)
-    is_vector = len(same) == 3 and output.channels[0].endswith("_x")
-    stem = output.channels[0].removesuffix("_x")
+    quantity, is_vector = quantity_of(output)
     unit, scale = "" if output.units[0] == "1" else output.units[0], 1.0
     if unit and 0 < value.max() < 0.1:
         scale, prefix = _PREFIXES[1 if value.max() >= 1e-4 else 2]
@@ -186,10 +185,16 @@ def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tenso
         value=scale * value,
         scale=scale,
         vector=in_world(scene.model, pose, bodies, np.zeros_like(pos), read[:, same])[1] if is_vector else None,
-        quantity=f"|{stem}|" if len(same) > 1 else stem,
+        quantity=quantity,
         unit=unit,
         threshold=THRESHOLDS.get(output.units[0], 0.0),
     )
+
+
+def quantity_of(output: Output) -> tuple[str, bool]:
+    """Return what the magnitude of a reading is of, such as `|force|`, and whether the reading is a vector."""
+    num, stem = output.units.count(output.units[0]), output.channels[0].removesuffix("_x")
+    return f"|{stem}|" if num > 1 else stem, num == 3 and output.channels[0].endswith("_x")
 
 
 def magnitude(values: Float[Array, "taxel channel"], units: Sequence[str]) -> Float[Array, " taxel"]:

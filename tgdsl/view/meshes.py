@@ -6,6 +6,7 @@ Shapes: `face` triangles.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,6 +21,7 @@ from tgdsl.view.raster import Mesh
 
 Array = np.ndarray
 GeomType = mujoco.mjtGeom
+_NO_COLOUR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default for geoms: a material counts where a geom has this colour
 _PRIMITIVES = {
     GeomType.mjGEOM_BOX: lambda size: trimesh.creation.box(2 * size),
     GeomType.mjGEOM_SPHERE: lambda size: trimesh.creation.icosphere(subdivisions=3, radius=size[0]),
@@ -58,18 +60,54 @@ def body_triangles(
 
     If one of `links` has its taxels on a geom or mesh that does not collide, those that do not collide are shown instead.
     """
+    parts = [(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))]
+    parts += [_triangles(model, geom) for geom in _shown_geoms(model, body, links)]
+    corners, normals = zip(*parts, strict=True)
+    return np.concatenate(corners), np.concatenate(normals)
+
+
+class Surface(NamedTuple):
+    """Triangles of one colour in the frame of their body."""
+
+    corners: Float[Array, "face 3 3"]  # [m]
+    normals: Float[Array, "face 3 3"]
+    colour: tuple[float, float, float, float] | None  # red, green, blue, opacity, from 0 to 1; None: the model gives none
+
+
+def body_surfaces(model: mujoco.MjModel, body: int, links: Iterable[Link] = ()) -> list[Surface]:
+    """Return the triangles of `body_triangles` by the colour of their geoms."""
+    by_colour: dict[tuple[float, float, float, float] | None, list[tuple[Array, Array]]] = {}
+    for geom in _shown_geoms(model, body, links):
+        corners, normals = _triangles(model, geom)
+        if len(corners):
+            by_colour.setdefault(geom_colour(model, geom), []).append((corners, normals))
+    return [
+        Surface(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)), colour) for colour, parts in by_colour.items()
+    ]
+
+
+def geom_colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float] | None:
+    """Return a geom's colour, or else its material's times the mean of the material's texture; None if it has neither."""
+    own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    if not np.allclose(own, _NO_COLOUR) or material < 0:
+        return None if np.allclose(own, _NO_COLOUR) else tuple(own.tolist())
+    rgba = model.mat_rgba[material].astype(np.float64)
+    texture = int(model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
+    if texture >= 0:
+        channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+        num = int(model.tex_height[texture]) * int(model.tex_width[texture])
+        pixels = model.tex_data[start : start + channels * num].reshape(num, channels)
+        rgba[:3] *= pixels[:, :3].mean(axis=0) / 255
+    return tuple(rgba.tolist())
+
+
+def _shown_geoms(model: mujoco.MjModel, body: int, links: Iterable[Link]) -> list[int]:
     names = {link.name for link in links}
     geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
     colliding = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
     others = [i for i in geoms if i not in colliding]
     is_on_others = any(names & _names(model, i) for i in others) and not any(names & _names(model, i) for i in colliding)
-    corners, normals = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3))]
-    for geom in (others if is_on_others else colliding) or geoms:
-        rotation = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).as_matrix().T
-        corner, normal = _triangles(model, geom)
-        corners.append(corner @ rotation + model.geom_pos[geom])
-        normals.append(normal @ rotation)
-    return np.concatenate(corners), np.concatenate(normals)
+    return (others if is_on_others else colliding) or geoms
 
 
 def _names(model: mujoco.MjModel, geom: int) -> set[str]:
@@ -78,6 +116,13 @@ def _names(model: mujoco.MjModel, geom: int) -> set[str]:
 
 
 def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
+    """Return corners and normals of a geom in its body's frame; none of one without a bounded surface."""
+    corners, normals = _local_triangles(model, geom)
+    rotation = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).as_matrix().T
+    return corners @ rotation + model.geom_pos[geom], normals @ rotation
+
+
+def _local_triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
     """Return corners and normals of a geom in its own frame; none of one without a bounded surface."""
     kind, mesh = GeomType(int(model.geom_type[geom])), int(model.geom_dataid[geom])
     if kind in (GeomType.mjGEOM_MESH, GeomType.mjGEOM_SDF) and mesh >= 0:

@@ -24,6 +24,7 @@ from tgdsl.runtime.connect import simulate
 from tgdsl.runtime.rollout import substeps_of
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.scene import scene_model
+from tgdsl.view.contacts import Contacts, contacts_of, simulated_contacts
 from tgdsl.view.overview import drawn_outputs
 
 Array = np.ndarray
@@ -69,6 +70,14 @@ class Stage(ABC):
         """Return what else there is to say of this instant in one environment, by name, such as a task's reward terms."""
         return {}
 
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return the model of one environment, its objects as they are there."""
+        return self.model
+
+    def contacts(self, env: int) -> Contacts | None:
+        """Return the contacts of one environment; None where they are unknown."""
+        return None
+
     def close(self) -> None:  # noqa: B027
         """Release the simulator; of a recorded run, nothing."""
 
@@ -105,6 +114,12 @@ class SimStage(Stage):
 
     def body_poses(self, env: int) -> Poses:
         return self.sim.body_poses(env)
+
+    def env_model(self, env: int) -> mujoco.MjModel:
+        return self.sim.env_model(env) if self.touch.inputs.objects else self.model
+
+    def contacts(self, env: int) -> Contacts:
+        return simulated_contacts(self.sim, env)
 
 
 class SceneStage(SimStage):
@@ -160,6 +175,12 @@ class RunStage(RecordedStage):
     def body_poses(self, env: int) -> Poses:
         self._data.qpos[:] = self._qpos[self.step_index, env]
         return kinematic_poses(self.model, self._data)
+
+    def contacts(self, env: int) -> Contacts:
+        """Return where bodies are in contact; runs do not record the forces."""
+        self.body_poses(env)
+        mujoco.mj_collision(self.model, self._data)
+        return contacts_of(self.model, self._data, with_force=False)
 
 
 def kinematic_poses(model: mujoco.MjModel, data: mujoco.MjData) -> Poses:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
+from tgdsl.view.contacts import Contacts, simulated_contacts
 from tgdsl.view.stages import Stage
 
 Array = np.ndarray
@@ -49,6 +51,14 @@ class TaskStage(Stage):
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         """Return where the simulator has the bodies."""
         return self.env.sim.body_poses(env)
+
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return the simulator's model of one environment."""
+        return self.env.sim.env_model(env) if self.touch.inputs.objects else self.model
+
+    def contacts(self, env: int) -> Contacts:
+        """Return the contacts in one environment."""
+        return simulated_contacts(self.env.sim, env)
 
     def close(self) -> None:
         """Release the simulator."""

@@ -1,0 +1,267 @@
+"""Readings in the scene of the live page: a disc for each taxel or body, or surfaces of links in the colours of their cells.
+
+Shapes: `row` rows of one reading that are drawn.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple
+
+import matplotlib
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from matplotlib.colors import Colormap, Normalize
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from trimesh.remesh import subdivide_to_size
+
+from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
+from tgdsl.view.boxes import FLAT, boxes_of, is_boxed
+from tgdsl.view.markers import magnitude, quantity_of, read_now, rows_of
+from tgdsl.view.meshes import body_triangles
+from tgdsl.view.sound import sounding
+from tgdsl.view.style import HEAT, WARMTH
+
+Array = np.ndarray
+MAGNITUDE = "magnitude"
+REST = (62, 72, 88)  # colour of what reads nothing
+LIFT = 2e-4  # how far discs and arrows begin above the surface [m]
+_DISC_RADIUS = (0.0006, 0.0022)
+_HEAT = HEAT.with_extremes(under="#{:02x}{:02x}{:02x}".format(*REST))
+_SIGNED = matplotlib.colormaps["coolwarm"]
+
+
+class Rows(NamedTuple):
+    """Rows of a reading in the frames of their bodies."""
+
+    body: Int[Array, " row"]
+    link: list[str]
+    pos: Float[Array, "row 3"]  # [m]
+    normal: Float[Array, "row 3"]  # outward unit normal
+    size: Float[Array, " row"]  # width of the patch that a row stands for [m]; 0 marks an inactive filler
+    label: list[str]
+
+
+class Shown(NamedTuple):
+    """What the rows read in one environment, and their colours."""
+
+    value: Float[Array, " row"]  # [`unit`]
+    unit: str
+    quantity: str
+    norm: Normalize
+    colours: Colormap
+    vector: Float[Array, "row 3"] | None = None  # of vectors that are not small, in the frames of their bodies [`unit`]
+
+    @property
+    def label(self) -> str:
+        """Quantity and unit."""
+        return f"{self.quantity} [{self.unit}]"
+
+    @property
+    def colour(self) -> UInt8[Array, "row 3"]:
+        """The colour of each row."""
+        return (255 * np.asarray(self.colours(self.norm(self.value)))[:, :3]).astype(np.uint8)
+
+
+class Layer(ABC):
+    """One reading in the scene. The ends of its colours are the lowest and the highest value so far.
+
+    Attributes:
+        output: The reading.
+        channels: What it can be coloured by.
+        rows: What is drawn.
+    """
+
+    total = "sum"  # how rows are summed up: the name of NumPy's function
+    output: Output
+    channels: tuple[str, ...]
+    rows: Rows
+
+    def __init__(self) -> None:
+        self._ends: dict[str, tuple[float, float]] = {}
+        self._handles: dict[str, list[Any]] = {}  # what is drawn of each link
+
+    def show(self, links: Collection[str]) -> None:
+        """Show these links, and hide the others."""
+        for link, handles in self._handles.items():
+            for handle in handles:
+                handle.visible = link in links
+
+    def remove(self) -> None:
+        """Take the layer out of the scene."""
+        for handles in self._handles.values():
+            for handle in handles:
+                handle.remove()
+
+    @abstractmethod
+    def read(self, readings: Tensor, env: int, channel: str) -> Shown:
+        """Return what one environment reads; of stacked calls the last one, of sound its root mean square."""
+
+    @abstractmethod
+    def paint(self, colour: UInt8[Array, "row 3"]) -> None:
+        """Colour the rows."""
+
+    def _widened(self, channel: str, value: Float[Array, " row"]) -> tuple[float, float]:
+        """Return the lowest and highest value so far."""
+        finite = value[np.isfinite(value)]
+        low, high = self._ends.get(channel, (np.inf, -np.inf))
+        self._ends[channel] = float(finite.min(initial=low)), float(finite.max(initial=high))
+        return self._ends[channel]
+
+
+class DiscLayer(Layer):
+    """A disc at each taxel or body; `rank` is 0 for the chosen reading: others have smaller discs on top."""
+
+    def __init__(
+        self, scene: Any, model: mujoco.MjModel, touch: TactileModule, output: Output, rank: int, pick: Callable[[int], None]
+    ):
+        super().__init__()
+        self.output, self.channels = output, (MAGNITUDE, *output.channels)
+        self._is_sound = output.sensor in {sensor.name for sensor in sounding(touch.plan)}
+        names, taxels = rows_of(touch, output)
+        body = np.array([model.body(name).id for name in names], dtype=np.int64)
+        table = touch.taxels[output.sensor]
+        if output.rows == "body":
+            links = [str(table["link"][table["body"] == name][0]) for name in names]
+            labels = list(names)
+        else:
+            links = [str(link) for link in table["link"]]
+            labels = [f"{link}, taxel {i}" for i, link in enumerate(links)]
+        normal = taxels.normal / np.linalg.norm(taxels.normal, axis=1, keepdims=True)
+        self.rows = Rows(body, links, taxels.pos, normal, taxels.size, labels)
+        angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])
+        faces = np.array([[0, 1 + i, 1 + (i + 1) % 16] for i in range(16)])
+        self._members = []
+        for link, owner in dict.fromkeys(zip(links, body.tolist(), strict=True)):
+            rows = np.flatnonzero((body == owner) & (np.array(links) == link) & (taxels.size > 0))
+            if not len(rows):
+                continue
+            turns = [Rotation.align_vectors(n[None], [[0, 0, 1]])[0].as_quat(scalar_first=True) for n in normal[rows]]
+            handle = scene.add_batched_meshes_simple(
+                f"/body{owner}/{output.name}/{link}",
+                corners,
+                faces,
+                np.array(turns),
+                taxels.pos[rows] + (1 + rank) * LIFT * normal[rows],
+                batched_scales=0.6**rank * np.clip(0.45 * taxels.size[rows], *_DISC_RADIUS),
+                batched_colors=np.tile(np.array(REST, dtype=np.uint8), (len(rows), 1)),
+                side="double",
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            handle.on_click(lambda event, rows=rows: pick(int(rows[event.instance_index])))
+            self._members.append((handle, rows))
+            self._handles.setdefault(link, []).append(handle)
+
+    def read(self, readings: Tensor, env: int, channel: str) -> Shown:
+        output = self.output
+        if self._is_sound:
+            values = readings[env].detach().double().square().mean(dim=0).sqrt().cpu().numpy()
+        else:
+            values = read_now(readings, env)
+        if channel != MAGNITUDE:
+            i = output.channels.index(channel)
+            most = max(map(abs, self._widened(channel, values[:, i])))
+            return Shown(
+                values[:, i], _unit(output.units[i]), channel, Normalize(-most - 1e-9, most + 1e-9, clip=True), _SIGNED
+            )
+        value = magnitude(values, output.units)
+        quantity, vector = quantity_of(output)
+        most = max(1e-9, self._widened(channel, value)[1])
+        along = values[:, :3] * (value > 0)[:, None] if vector else None
+        return Shown(value, _unit(output.units[0]), quantity, Normalize(1e-12, most, clip=False), _HEAT, along)
+
+    def paint(self, colour: UInt8[Array, "row 3"]) -> None:
+        for handle, rows in self._members:
+            handle.batched_colors = colour[rows]
+
+
+class SurfaceLayer(Layer):
+    """The surfaces of links, each triangle in the colour of the nearest cell, as `Boxes.painter` has it."""
+
+    total = "mean"
+
+    def __init__(self, scene: Any, model: mujoco.MjModel, touch: TactileModule, output: Output, pick: Callable[[int], None]):
+        super().__init__()
+        self.output, self.channels = output, (output.channels[0],)
+        boxes = boxes_of(touch, output, torch.zeros(1, *output.shape), 0)
+        layout, self._chosen = boxes.layout, boxes.chosen
+        self._quantity, self._unit = boxes.label.split(" [")[0], boxes.unit
+        links = [layout.links[i] for i in layout.link_id]
+        length = np.linalg.norm(layout.normal, axis=1, keepdims=True)
+        normal = np.where(length > 1e-6, layout.normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])  # cells of a plate: 0
+        body = np.array([model.body(link.body).id for link in links], dtype=np.int64)
+        labels = [f"{link.body}, cell {i}" for i, link in zip(boxes.chosen, links, strict=True)]
+        self.rows = Rows(body, [link.name for link in links], layout.pos, normal, np.sqrt(layout.area), labels)
+        self.bodies = frozenset(body.tolist())  # those whose surface this layer draws
+        self._members: list[tuple[Any, int]] = []
+        for i, link in enumerate(layout.links):
+            rows = np.flatnonzero(layout.link_id == i)
+            owner = model.body(link.body).id
+            corners, _ = body_triangles(model, owner, [link])
+            if not len(rows) or not len(corners):
+                continue
+            sides = boxes.size[rows[0]]
+            vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+            vertices, faces = subdivide_to_size(vertices, faces, float(np.median(sides)), max_iter=20)
+            nearest = KDTree(layout.pos[rows] / sides).query(vertices[faces].mean(axis=1) / sides)[1]
+            for cell in np.unique(nearest):
+                own = vertices[faces[nearest == cell]].reshape(-1, 3)
+                places, merged = np.unique(own.round(9), axis=0, return_inverse=True)
+                row = int(rows[cell])
+                handle = scene.add_mesh_simple(
+                    f"/body{owner}/{output.name}/{link.name}/{row}",
+                    places,
+                    merged.reshape(-1, 3),
+                    color=REST,
+                    flat_shading=True,
+                )
+                handle.on_click(lambda _, row=row: pick(row))
+                self._members.append((handle, row))
+                self._handles.setdefault(link.name, []).append(handle)
+
+    def read(self, readings: Tensor, env: int, channel: str) -> Shown:
+        value = read_now(readings, env)[:, 0]
+        low, high = self._widened(channel, value)
+        if high - low < 1e-6 * max(1.0, abs(high)):
+            low, high = low - FLAT, high + FLAT
+        return Shown(value[self._chosen], self._unit, self._quantity, Normalize(low, high), WARMTH)
+
+    def paint(self, colour: UInt8[Array, "row 3"]) -> None:
+        for handle, row in self._members:
+            handle.color = tuple(colour[row].tolist())
+
+
+def layer_of(
+    scene: Any,
+    model: mujoco.MjModel,
+    touch: TactileModule,
+    output: Output,
+    rank: int,
+    pick: Callable[[int], None],
+) -> Layer:
+    """Draw a reading; `pick` is called with the row that a user clicks.
+
+    Args:
+        scene: Viser's scene.
+        model: The compiled scene, whose bodies are nodes `/body<id>`.
+        touch: The module.
+        output: Which reading.
+        rank: How many readings are drawn below this one.
+        pick: What to do with a click.
+    """
+    if is_boxed(touch, output):
+        return SurfaceLayer(scene, model, touch, output, pick)
+    return DiscLayer(scene, model, touch, output, rank, pick)
+
+
+def _unit(unit: str) -> str:
+    return {"1": "", "degC": "°C"}.get(unit, unit)

@@ -1,0 +1,108 @@
+"""The controls of the live page. The page reads what they are set to before each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.colors import to_hex
+
+from tgdsl.module.outputs import Output
+from tgdsl.view.layers import Shown
+from tgdsl.view.stages import Stage
+
+Array = np.ndarray
+EVERY = "all"  # of links: no choice
+
+
+class Actions(NamedTuple):
+    """What the page does when a button is clicked; `save` is called with viser's client."""
+
+    step_once: Callable[[], None]
+    restart: Callable[[], None]
+    save: Callable[[Any], None]
+
+
+class Panel:
+    """The handles of a page's controls."""
+
+    def __init__(self, gui: Any, stage: Stage, outputs: Mapping[str, Output], reading: str | None, actions: Actions):
+        import viser.uplot as uplot
+
+        names, groups = list(outputs), stage.touch.plan.layout.groups
+        reading = reading if reading in names else names[0]
+        self.problem, self.status = gui.add_markdown(""), gui.add_markdown("")
+        self.env = gui.add_slider("environment", 0, stage.num_envs - 1, 1, 0) if stage.num_envs > 1 else None
+        self.instant = gui.add_slider("step", 0, max(1, (stage.num_steps or 2) - 1), 1, 0) if stage.num_steps else None
+        self.paused = gui.add_checkbox("pause", False)
+        self.speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
+        gui.add_button("step once").on_click(lambda _: actions.step_once())
+        gui.add_button("restart").on_click(lambda _: actions.restart())
+        gui.add_button("save last minute").on_click(lambda event: actions.save(event.client))
+        with gui.add_folder("touch"):
+            self.reading = gui.add_dropdown("reading", names, initial_value=reading)
+            self.channel = gui.add_dropdown("channel", ("",))
+            self.legend = gui.add_html("")
+            self.value = gui.add_markdown("")
+            self.plotted = gui.add_dropdown("plot", (EVERY,))
+            series = (uplot.Series(label="t [s]"), uplot.Series(label="reading", stroke="#c2410c", width=2))
+            data = (np.array([0.0, 1.0]), np.array([0.0, 0.0]))
+            self.plot = gui.add_uplot(data, series, scales={"x": uplot.Scale(time=False)}, aspect=2.0)
+        self.notes = gui.add_markdown("")
+        with gui.add_folder("show", expand_by_default=False):
+            self.parts = {name: gui.add_checkbox(name, True) for name in ("robot", "objects", "taxels", "arrows", "contacts")}
+            self.is_plain = gui.add_checkbox("robot in grey", True)
+            self.also = {name: gui.add_checkbox(f"also {name}", False) for name in names} if len(names) > 1 else {}
+            self.group = gui.add_dropdown("links of", (EVERY, *groups))
+            links = dict.fromkeys(link.name for sensor in stage.touch.plan.sensors for link in sensor.links)
+            self.links = {name: gui.add_checkbox(name, True) for name in links}
+        self.sliders: list[Any] = []
+        if stage.control is not None and len(stage.control):
+            with gui.add_folder("actuators"):
+                keys = (stage.model.key(i).name for i in range(stage.model.nkey))
+                self.keyframe = gui.add_dropdown("keyframe", ("", *filter(None, keys)))
+                for i, (low, high) in enumerate(stage.model.actuator_ctrlrange):
+                    low, high = (float(low), float(high)) if stage.model.actuator_ctrllimited[i] else (-1.0, 1.0)
+                    value = float(np.clip(stage.control[i], low, high))
+                    name = stage.model.actuator(i).name or f"actuator {i}"
+                    self.sliders.append(gui.add_slider(name, low, high, (high - low) / 200, value))
+
+    @property
+    def env_index(self) -> int:
+        """The environment that is chosen."""
+        return 0 if self.env is None else int(self.env.value)
+
+    @property
+    def readings(self) -> list[str]:
+        """The readings to draw; the chosen one is first."""
+        return [self.reading.value, *(name for name, box in self.also.items() if box.value and name != self.reading.value)]
+
+    @property
+    def shown_links(self) -> set[str]:
+        """The links that are switched on."""
+        return {name for name, box in self.links.items() if box.value}
+
+    def offer(self, channels: Sequence[str], links: Sequence[str]) -> None:
+        """Offer the channels and links of another reading."""
+        self.channel.options = tuple(channels)
+        self.plotted.options = (EVERY, *dict.fromkeys(links))
+        self.channel.value, self.plotted.value = channels[0], EVERY
+
+    def set_sliders(self, control: Float[Array, " actuator"]) -> None:
+        """Set the sliders to controls, or as near as their ranges allow."""
+        for slider, value in zip(self.sliders, control, strict=True):
+            slider.value = float(np.clip(value, slider.min, slider.max))
+
+
+def legend(shown: Shown) -> str:
+    """Return the bar of a reading's colours as HTML."""
+    low, high = float(shown.norm.vmin or 0.0), float(shown.norm.vmax or 1.0)
+    stops = ", ".join(to_hex(shown.colours(x)) for x in np.linspace(0, 1, 9))
+    low_text = "0" if abs(low) < 1e-11 else f"{low:.3g}"
+    return (
+        f'<div style="padding:0 0.75em"><div>{shown.label}</div>'
+        f'<div style="height:0.7em;background:linear-gradient(to right, {stops})"></div>'
+        f'<div style="display:flex;justify-content:space-between"><span>{low_text}</span><span>{high:.3g}</span></div></div>'
+    )
