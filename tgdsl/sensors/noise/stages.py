@@ -1,4 +1,4 @@
-"""The stages that act on each taxel alone, in their order; `crosstalk` has the one between taxels.
+"""The stages in their order; `Crosstalk`, the only one between taxels, is the last class.
 
     radius          R̃_j = max(0, R_j + ε_j), ε_j ~ U[−ρ, ρ] at each reading, before the distance query [m]
     gain            x ← γ_j x, γ_j ~ U[γ_low, γ_high] at reset; of an elastomer the depth at each taxel
