@@ -4,25 +4,26 @@
     s = ℓ Σ_h a_h w(h κ|ω|) sin(hφ) + β_fric |ω| √(f_s/2) n + a_hum sin(φ_hum)                [Pa]
     φ̇ = 2πκ ω,   φ̇_hum = 2π f_hum                                                             [rad/s]
 
-sound pressure at 1 m, with ω the joint's velocity [rad/s], τ what its actuators exert [N·m], f₀ = κ|ω| the fundamental of its
-whine [Hz], a_h the strength of its h-th multiple [1], n independent normal numbers at the sample rate f_s [Hz], so that
-friction has the spectral density (β_fric ω)² [Pa²/Hz] whatever that rate, and a_hum the hum of a motor that is switched on. Of
-slides ω is in m/s and τ in N.
+s is the sound pressure at 1 m. ω is the joint's velocity [rad/s] and τ the torque of its actuators [N·m]; for slides they are
+in m/s and N. f₀ = κ|ω| is the fundamental of the whine [Hz] and a_h the strength of its h-th multiple [1]. n is white normal
+noise at the sample rate f_s [Hz], so friction has the spectral density (β_fric ω)² [Pa²/Hz] at any rate. a_hum is the hum of a
+motor that is switched on.
 
-- Within a step ω and ℓ are linear between the values at its ends, so that nothing jumps; φ is the exact integral of ω and goes
-  on from step to step, backwards where the joint turns back, so the pitch follows |ω|.
-- w fades a multiple out between 0.40 and 0.45 of the sample rate, so that none is aliased, and in up to 20 Hz: a joint that
-  stands under load makes no steady pressure.
-- At the first call after a reset φ = 0, and velocity and load are taken as constant before it.
+- Within a step ω and ℓ are linear between the values at its ends, so nothing jumps. φ is the exact integral of ω and continues
+  from step to step, backwards where the joint turns back, so the pitch follows |ω|.
+- w fades a multiple out between 0.40 and 0.45 of the sample rate, which avoids aliasing. It fades in up to 20 Hz, so a joint
+  that stands under load makes no steady pressure.
+- At the first call after a reset φ = 0, and velocity and load count as constant before it.
 
-A sample k = 1 … K is at the time t + kΔt/K of a step that begins at t; the last one is at its end.
+Sample k = 1 … K of a step that begins at t is at the time t + kΔt/K; the last one is at the step's end.
 
-Source: the paper, appendix on audio, "Actuation audio". Departures: φ is integrated and levels are linear within a step; the
-paper specifies neither, nor multiples above the sample rate. It makes all three of two-pole resonators, which lose their phase
-when they are retuned.
+Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio".
 
-Limits: the default strengths are of no real motor; measure them. Harmonics are modelled, side bands and resonances of the
-housing are not. Sound comes from the joint's anchor.
+Departures: φ is integrated and levels are linear within a step; the paper specifies neither, nor multiples above the sample
+rate. The paper makes all three parts with two-pole resonators, which lose their phase when they are retuned.
+
+Limits: the default levels describe no real motor; measure yours. Side bands and resonances of the housing are not modelled. The
+sound comes from the joint's anchor.
 """
 
 from __future__ import annotations

@@ -2,10 +2,12 @@
 
     y_j(t) = 1  if  d_j(t) > η_on  or  (y_j(t−1) = 1 and d_j(t) > η_off),  else 0             [1]
 
-with d_j the penetration depth of probe j [m] (see `contact_depth`), η_on the threshold and η_off ≤ η_on the release threshold
+d_j is the penetration depth of probe j [m] (see `contact_depth`), η_on the threshold and η_off ≤ η_on the release threshold
 [m]; t counts calls. With η_off = η_on the kind has no state. After a reset y = 0.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "ContactProbe". Departures: none.
+Source: Chung et al., *Tactile Genesis*, appendix, "ContactProbe".
+
+Departures: none.
 """
 
 from __future__ import annotations

@@ -2,16 +2,18 @@
 
     d_j = max_g max(0, R_j − φ_g(q_j)),    q_j = p_L + R_L x_j                                [m]
 
-with x_j the probe's position in the frame of its link, p_L and R_L the link's world pose, q_j the probe's world position, R_j
-its radius [m], and φ_g(q) the signed distance to geom g [m], negative inside, over all geoms of the sensed objects whose gate
-is open. Inactive probes (R_j = 0) read 0.
+x_j is the probe's position in the frame of its link, p_L and R_L the link's world pose, q_j the probe's world position and R_j
+its radius [m]. φ_g(q) is the signed distance to geom g [m], negative inside. g runs over all geoms of the sensed objects whose
+gate is open. Inactive probes (R_j = 0) read 0.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Probe geometry and contact-depth query" (the `sdf` backend) and
 "ContactDepthProbe".
 
-Departures: distances are exact for every MuJoCo primitive, where the paper's implementation interpolates boxes, cylinders
-and capsules on a grid. The gate is an option; the paper's is `contact_pair`. With that gate a probe reads up to R_j as soon
-as any point of its link is in contact with the object: depth is measured from the probe's sphere, not from the link's surface.
+Departures: distances are exact for every MuJoCo primitive; the paper's implementation interpolates boxes, cylinders and
+capsules on a grid. The gate is an option here; the paper's is `contact_pair`.
+
+Limits: depth is measured from the probe's sphere, not from the link's surface. With the gate `contact_pair` a probe therefore
+reads up to R_j as soon as any point of its link touches the object.
 """
 
 from __future__ import annotations

@@ -4,48 +4,49 @@
     f_j = k_n s_j m_j + c_n s_j v_n,j + k_t v_t,j                                             [N]
     τ_j = x_j × f_j + k_ω (ω · m_j) m_j                                                       [N·m]
 
-where d_j > 0, and zero elsewhere. All vectors are in the frame of the taxel's link: d_j penetration depth [m] and m_j unit
-normal out of the object (see `contact_depth`), v_j velocity of the object's material at the probe relative to the probe [m/s],
-v_n = (v · m) m and v_t = v − v_n, ω angular velocity of the object relative to the link [rad/s], x_j position of the probe [m].
-Coefficients: stiffness k_n [N/m^α], normal damping c_n [N·s/m^(1+α)], tangential damping k_t [N·s/m], spin damping k_ω
-[N·m·s/rad], depth exponent α [1]. Force and torque act on the link, the torque about the link's origin: friction points along
-the object's motion.
+where d_j > 0, and zero elsewhere. All vectors are in the frame of the taxel's link. d_j is the penetration depth [m] and m_j
+the unit normal out of the object (see `contact_depth`). v_j is the velocity of the object's material at the probe relative to
+the probe [m/s], v_n = (v · m) m its normal and v_t = v − v_n its tangential part. ω is the angular velocity of the object
+relative to the link [rad/s] and x_j the probe's position [m]. Coefficients: stiffness k_n [N/m^α], normal damping c_n
+[N·s/m^(1+α)], tangential damping k_t [N·s/m], spin damping k_ω [N·m·s/rad], depth exponent α [1]. Force and torque act on the
+link, the torque about the link's origin; friction points along the object's motion.
 
 Options, all off by default, applied in this order:
 
-    densification D     s_j = d_j^α/(1 − min(d_j/D, 0.99)) in place of d_j^α
+    densification D     s_j = d_j^α/(1 − min(d_j/D, 0.99)) replaces d_j^α
     loop Q, r           f_n,j ← max(0, f_n,j + Q e_j/r),  e_j ← clamp(e_j + Δd_j, −r, r), and 0 where d_j = 0
     balance solver      f_n,j ← λ_j W,  λ_j = q_j Q/(Q² + ε²),  q_j = max(0, f_n,j),  Q = Σ_j q_j,  W = Σ_c f_c · m_c
                         f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = λ_j Σ_c |f_c − (f_c · m_c) m_c|,  spin within ± l_j R_j
     friction_cone μ     f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = μ max(0, f_n,j), which replaces the l_j above
     torque_about taxel  τ_j without x_j × f_j
 
-with f_n,j = f_j · m_j, f_t,j = k_t v_t,j and the spin torque k_ω (ω · m_j) as above; j over the taxels of one body, c over the
-solver's contacts on that body with all objects of the sensor, f_c their forces on the body [N] and m_c their normals; R_j the
-probe's radius [m].
+with f_n,j = f_j · m_j, f_t,j = k_t v_t,j and the spin torque k_ω (ω · m_j). j runs over the taxels of one body and c over the
+solver's contacts on that body with all objects of the sensor. f_c is the contact's force on the body [N], m_c its normal and
+R_j the probe's radius [m].
 
-With `balance: solver` the magnitudes of a body's normal forces, each along its own m_j, sum to the solver's W, in the
-proportions of the law above: where normals diverge, under a ball or near an edge, their vector sum is smaller. Friction
-follows the law up to a limit, the cone of `friction_cone` or else the solver's total tangential force; with the latter a
-frictionless contact has none. The spin torque is limited to l_j R_j: a contact patch is no larger than its probe. Forces stay
-bounded as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. A negative (tensile) f_n,j has no share of W. ε is the normal force
-below which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. The
-force of contacts beyond `slots` is included, at the centre of the others. The law has no static friction; `force_taxel` has.
+With `balance: solver` the magnitudes of a body's normal forces, each along its own m_j, sum to the solver's W in the
+proportions of the law above. Under a ball or near an edge the normals diverge, and the vector sum is smaller than W. Friction
+follows the law up to a limit: the cone of `friction_cone`, or else the solver's total tangential force, so that a frictionless
+contact has none. The spin torque is limited to l_j R_j, because a contact patch is no larger than its probe. Forces stay
+bounded as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. A tensile f_n,j gets no part of W. ε is the normal force below
+which a body counts as unloaded [N]: there the sum over taxels fades to zero. The force of contacts beyond `slots` acts at the
+centre of the others.
 
-`densification` is for lattices and foams, which stiffen as their cells close: with α < 1 the force rises, levels off and rises
-again. `loop` is the loop of loading and unloading of filled rubbers and magnetic elastomers: r the depth over which the
-branches part, 2 Q their distance. It is an elastoplastic element (Prandtl's stop operator) beside the law, so that with α = 1
-the force is a Prandtl–Ishlinskii operator of the depth with one play of width r. It depends on the path of the depth, not on
-its rate.
+`densification` models lattices and foams, which stiffen as their cells close. With α < 1 the force rises, levels off and rises
+again. `loop` models the hysteresis of filled rubbers and magnetic elastomers: r is the depth over which the branches separate
+and 2 Q their distance. It adds an elastoplastic element (Prandtl's stop operator) to the law, so that with α = 1 the force is
+a Prandtl–Ishlinskii operator of the depth with one play of width r. It depends on the path of the depth, not on its rate.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults; the
-loop: Visintin, *Differential Models of Hysteresis* (1994), chapter III; densification: Gibson and Ashby, *Cellular Solids*
-(1997), chapter 5, here a hyperbola.
+Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults. The loop: Visintin,
+*Differential Models of Hysteresis* (1994), chapter III. Densification: Gibson and Ashby, *Cellular Solids* (1997), chapter 5,
+here a hyperbola.
 
-Departures: the paper's tangential and spin terms have the opposite sign, −k_t v_t and −k_ω (ω · m) m, which is the force on
-the object while its normal force is the one on the sensor; `model: paper` keeps them. Velocities are of the material at
-the probe from the velocities of body frame origins, which equals the paper's form from centres of mass. As in the paper the
-force follows depth, not load, unless balanced: its sum over a pad is not the weight of an object at rest. The options are ours.
+Departures: the paper's tangential and spin terms have the opposite sign, −k_t v_t and −k_ω (ω · m) m. That is the force on the
+object, although its normal force is the one on the sensor; `model: paper` keeps these signs. Velocities of the material are
+computed from the velocities of body frame origins, which equals the paper's form from centres of mass. The options are ours.
+
+Limits: unless balanced, the force follows depth and not load, as in the paper: its sum over a pad is not an object's weight.
+The law has no static friction; `force_taxel` has.
 """
 
 from __future__ import annotations

@@ -3,18 +3,19 @@
     f_b = Σ_o f_bo,   c_b = 1 if |f_b| > threshold, else 0                                    [N], [1]
     s_b = Σ_o Σ_c max(0, f_boc · n_boc)                                                       [N]
 
-with f_bo the solver's net contact force of object o on body b [N], over all its contacts (there are no slots), in the frame of
-the body; the threshold in [N]; and, for the normal force s_b alone, f_boc and n_boc the force of each contact c and its unit
-normal out of the object. One row per body that carries the sensor, in the order of the layout. Forces of several objects are
-summed before the threshold: a body squeezed between two objects with equal forces reads zero and no contact, and s_b twice that
-force; to separate objects, give each its own sensor. The bit is a step function and has no gradient.
+f_bo is the solver's net contact force of object o on body b, over all its contacts, in the body's frame [N]. f_boc is the
+force of each contact c and n_boc its unit normal out of the object. There is one row per body that carries the sensor, in the
+order of the layout. Forces of several objects are summed before the threshold, so a body squeezed between two objects with
+equal forces reads zero and no contact, while s_b is twice that force. To separate objects, give each its own sensor.
 
-The normal force is a sum of magnitudes: two opposing contacts add up, and friction is not part of it. It reads contacts one by
-one, `slots` of each pair of body and object. What others carry is shared out over these, see `quantities.contacts`: exact where
-all normals are the same, as under a flat face.
+s_b is a sum of magnitudes: two opposing contacts add up, and friction is not part of it. It reads contacts one by one, `slots`
+for each pair of body and object; the others' force is distributed over these (see `quantities.contacts`).
 
 Source: MuJoCo's contact sensor, with the reduction `netforce` for f_b and contact by contact for s_b (XML reference,
 sensor/contact).
+
+Limits: the bit is a step function and has no gradient. With more contacts than `slots`, s_b is exact only where all normals of
+the pair agree, as under a flat face.
 """
 
 from __future__ import annotations

@@ -1,26 +1,27 @@
-"""Microphone: the sound pressure at a point, the sum over all sources of sound, each later and fainter by its distance.
+"""Microphone: the sound pressure at a point, the sum over all sources, each delayed and attenuated by its distance.
 
     p(t) = Σ_i l_i s_i(t − a_i(t)) / max(r_i, r_min)^p,   r_i = c a_i,   a_i = |m(t) − x_i(t − a_i)|/c          [Pa]
 
-with s_i the sound pressure at 1 m from row i of a sensor that makes sound [Pa], l_i a factor for that sensor; r_i the distance
-in metres from the source, at the instant of emission, to the microphone, and c the speed of sound
-[m/s]. The sources that it hears are sensors of the document; it reads what they find at the same physics step, see
-`sensors.upstream`: K samples, the last one at the step's end. So it reads a block of K samples, of each step of a call.
+s_i is the sound pressure at 1 m of row i of a sensor that makes sound [Pa] and l_i a factor for that sensor. r_i is the
+distance from the source, at the instant of emission, to the microphone [m], and c the speed of sound [m/s]. The sources are
+other sensors of the document, read at the same physics step (see `sensors.upstream`). A reading is a block of K samples for
+each step of a call; the last sample is at the step's end.
 
-- Time: a_i is exact at the ends of steps (`age_of_sound`), where source and microphone move evenly in between, and linear
-  within a step. So a tone of frequency f is heard at f (1 − v_m/c)/(1 + v_s/c), with the speeds v_m and v_s of microphone and
-  source away from one another.
-- Between samples it is interpolated by 24 of them (`delayed`), exact up to 0.4 of the sample rate. These look ahead, so
-  that sound arrives at least 12 samples after its emission: from sources nearer than 12 c/f_s it is late, but as loud as at
-  their distance.
+- Time: a_i is exact at the ends of steps (`age_of_sound`) where source and microphone move uniformly, and linear within a step.
+  So a tone of frequency f is heard at f (1 − v_m/c)/(1 + v_s/c), with the speeds v_m and v_s of microphone and source away from
+  each other.
+- Between samples, 24 of them are interpolated (`delayed`), exact up to 0.4 of the sample rate. The filter looks ahead, so sound
+  arrives at least 12 samples after its emission. Sources nearer than 12 c/f_s are late, but as loud as at their distance.
 - Level is linear within a step.
-- A source farther than `reach` is not heard, and a warning says so. After a reset there has been no sound, and all stood still.
+- A source beyond `reach` is not heard, and a warning says so. After a reset there has been no sound, and all was at rest.
 
-Source: the paper, appendix on audio (1/r^p and r/c); Pierce, *Acoustics*, 4.1 and 11.5, for the retarded time of a source that
-moves. Departures: the paper specifies neither motion nor interpolation between samples.
+Source: Chung et al., *Tactile Genesis*, appendix on audio (1/r^p and r/c). Retarded time of a moving source: Pierce,
+*Acoustics*, 4.1 and 11.5.
 
-Limits: free field. There is neither reflection nor obstacle, directivity, absorption by air, nor the factor of a fast source's
-level.
+Departures: motion and interpolation between samples, which the paper does not specify.
+
+Limits: free field, without reflections, obstacles, directivity or absorption by air. The level of a fast source follows its
+distance alone.
 """
 
 from __future__ import annotations

@@ -4,21 +4,22 @@
     f = −k ρ S0 a + k_s ρ Σ_t                                                       [N]
     τ = −k ρ S1 × a                    Σ = S0 v + ω × S1,   Σ_t = Σ − (Σ · a) a     [N·m]
 
-summed over the sensed objects, in the frame of the taxel's link, with q position of the taxel, R its radius [m], a its outward
-normal, p points of an object's outer surface, v velocity of the object's material at q relative to the taxel [m/s], ω angular
-velocity of the object relative to the link [rad/s]; Σ [m⁴/s] is ∫ (R − |p − q|)₊ (v + ω × (p − q)) dA. A is the surface area of
-all sensed objects (planes, which are infinite, are not counted) or `reference_area` [m²]; k [N/m] and k_s [N·s/m²] are
-`normal_stiffness` and `shear_damping`, `density` has no unit. Force and torque act on the link: surface in front pushes it
+summed over the sensed objects, in the frame of the taxel's link. q is the taxel's position, R its radius [m] and a its outward
+normal; p runs over an object's outer surface. v is the velocity of the object's material at q relative to the taxel [m/s] and ω
+the object's angular velocity relative to the link [rad/s], so Σ = ∫ (R − |p − q|)₊ (v + ω × (p − q)) dA [m⁴/s]. A is the
+surface area of all sensed objects except planes, which are infinite, or `reference_area` [m²]. k [N/m] and k_s [N·s/m²] are
+`normal_stiffness` and `shear_damping`; `density` has no unit. Force and torque act on the link: surface in front pushes it
 back, and tangential motion drags it along. The torque is about the taxel, or about the link's origin: τ + x × f with x the
 taxel's position. There is no contact gate.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "ProximityTaxel", with its parameters as defaults. Its sum over N sampled
 points with ρ = density / N converges to density ∫ … dA / A; `backend: points` sums over sampled points as the paper does.
 
-Departures: the paper's normal force and its torque have the opposite sign, +k ρ S0 a and +k ρ S1 × a, which pull the sensor
-towards the object; and its slip is of v + ω_object × (p − q), with the object's absolute angular velocity, so that a hand that
-rotates together with an object reads slip. `model: paper` keeps both. As in the paper the tangential force does not contribute
-to the torque about the taxel.
+Departures: the paper's normal force and its torque have the opposite sign, +k ρ S0 a and +k ρ S1 × a, which pulls the sensor
+towards the object. The paper's slip is v + ω_object × (p − q) with the object's absolute angular velocity, so a hand that
+rotates together with an object reads slip. `model: paper` keeps both.
+
+Limits: as in the paper, the tangential force does not contribute to the torque about the taxel.
 """
 
 from __future__ import annotations

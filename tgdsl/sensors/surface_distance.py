@@ -1,17 +1,18 @@
-"""Surface distance: signed distance of each probe's centre to each object's surface, before, in and after contact.
+"""Surface distance: signed distance from each probe's centre to each object's surface, before and during contact.
 
     y_jo = min(φ_jo, r_max),    φ_jo = min_g φ_g(q_j)                                         [m]
     u_jo = −φ_jo m_jo where φ_jo ≤ r_max, else 0                                              [m]
 
-with q_j the probe's world position, g over the geoms of object o, φ_g the signed distance [m], negative inside, m_jo the
-gradient of φ_jo, which points out of the object, in the frame of the probe's link, and r_max the range [m]. u_jo points from
-the probe to the nearest point of the surface. There is no contact gate. Inactive probes (radius 0) read y = r_max and u = 0;
-the radius of active ones has no effect.
+q_j is the probe's world position and φ_g the signed distance to geom g of object o [m], negative inside. m_jo is the gradient
+of φ_jo in the frame of the probe's link; it points out of the object. r_max is the range [m]. u_jo points from the probe to
+the nearest point of the surface. There is no contact gate. Inactive probes (radius 0) read y = r_max and u = 0; the radius of
+active probes has no effect.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "SurfaceDistanceProbe".
 
-Departures: the range, beyond which the reading is constant; the sign inside; the vector u. Inside a compound of overlapping
-geoms the magnitude is of the deepest geom alone, which is at most the true one.
+Departures: the range, beyond which the reading is constant, the negative sign inside and the vector u are ours.
+
+Limits: inside overlapping geoms the magnitude is the deepest geom's alone, which is at most the true distance.
 """
 
 from __future__ import annotations

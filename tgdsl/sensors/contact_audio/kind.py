@@ -1,69 +1,70 @@
-"""Contact audio: what bodies sound like that are struck and scraped, as a block of samples per physics step.
+"""Contact audio: the sound of bodies that are struck and scraped, as a block of samples per physics step.
 
-Each mode i of a body that rings is a phasor z_i [N·s], which is struck by impulses and decays:
+Each mode i of a ringing body is a phasor z_i [N·s] that impulses excite and that decays:
 
     ż_i = (−d_i + 2πi f_i) z_i + Σ_n u_n δ(t − t_n)                                            [N·s]
     s(t) = Σ_i g_i Im z_i(t)                                                                  [m/s]
 
-with its frequency f [Hz], the decay rate d of its amplitude [1/s], and its gain g [1/kg]. An impulse J at t = 0 alone sounds as
-J Σ g e^(−dt) sin(2πft): the pseudo-velocity of the surface, see `modal.modes`. Sample k = 1 … K of a physics step is s at
-k Δt/K after its start, so that the rate is K/Δt, and samples at common times are the same for all K.
+f is its frequency [Hz], d the decay rate of its amplitude [1/s] and g its gain [1/kg]. One impulse J at t = 0 sounds as
+J Σ g e^(−dt) sin(2πft), the pseudo-velocity of the surface (see `modal.modes`). Sample k = 1 … K of a physics step is s at
+k Δt/K after its start, so the rate is K/Δt, and samples at common times are equal for all K.
 
 Five impulses u act in each step:
 
     u_0 = J, t_0 = 0;   u_n = ξ_n √(m_s W Δt/4), t_n = (n − 1 + j_n/16) Δt/4, n = 1 … 4        [N·s], [s]
 
-with ξ_n ~ N(0, 1) and j_n one of 0 … 15, all alike probable and drawn anew in each step:
+with ξ_n ~ N(0, 1) and j_n uniform in 0 … 15, both drawn at each step:
 
-- J is the impulse of a collision, over all steps that it takes the solver, once it has been passed on: see `impulses`. It is
-  summed over what touches the body.
-- The noise is of sliding: W = Σ F |v_t| over the contacts, with the normal force F [N] and the sliding speed v_t [m/s], and
-  m_s [kg] the variance of the impulses of one second at 1 N and 1 m/s [N²·s²]. The energy that it brings is a fixed part of
-  that of friction, and the level grows by 10 dB with ten times the force or ten times the speed.
+- J is the impulse of a collision, summed over its steps in the solver and over all that touches the body (see `impulses`).
+- The noise is from sliding: W = Σ F |v_t| over the contacts, with the normal force F [N] and the sliding speed v_t [m/s]. m_s
+  [kg] is the variance of one second's impulses at 1 N and 1 m/s [N²·s²]. The noise gets a fixed fraction of the friction's
+  energy, and its level grows by 10 dB with ten times the force or ten times the speed.
 
-`gains: contact` weights what a contact brings by the mode shapes φ_i there: J and W of a contact count for mode i as s_i J and
-s_i² W, with its share s_i = φ_i(x) · n / a_i of the centre x of a pair's contacts, the mean n of their normals into the body,
-and the root mean square a_i of φ_i along the normal over the surface; see `shares`. So s_i² is 1 in the mean over the surface,
-and g_i stays. An impulse is weighted by where its load acted while it grew. What is heard remains a mean over the surface.
+`gains: contact` weights a contact by the mode shapes φ_i there: J and W count for mode i as s_i J and s_i² W, with
+s_i = φ_i(x) · n / a_i. x is the centre of a pair's contacts, n the mean of their normals into the body and a_i the root mean
+square of φ_i along the normal over the surface (see `shares`). So s_i² has the mean 1 over the surface and g_i is unchanged. An
+impulse is weighted by where its load acted while it grew. The reading remains a mean over the surface.
 
-`outputs: bands` reads instead, at the end of each step, the mean square of what is heard of the modes in each third octave:
+`outputs: bands` reads, at the end of each step, the mean square of the modes in each third octave:
 
     E_b = ½ Σ_(i in b) g_i² |z_i|²   [m²/s²],   or   10 lg(1 + E_b/E₀), E₀ = (1 µm/s)²   [dB]
 
-A step is one matrix, made in float64 beforehand: exact at any step, without drift. Components of phasors within 1e-12 N·s of
-zero are flushed to it.
+A step is one matrix, computed in float64 when the module is built: exact for any step and without drift. Components of phasors
+within 1e-12 N·s of zero are flushed to it.
 
-A microphone hears it at the frames of the bodies that ring, as ρc √(A/4π) s at 1 m [Pa]: what a surface of A = 0.01 m² radiates
-that moves with s, at all frequencies alike (Kinsler et al., *Fundamentals of Acoustics*, 7.5).
+A microphone hears this kind at the frames of the ringing bodies, as ρc √(A/4π) s at 1 m [Pa]. That is the pressure that a
+surface of A = 0.01 m² radiates if it moves with s, equal at all frequencies (Kinsler et al., *Fundamentals of Acoustics*, 7.5).
 
-`model: force`: no impulse is collected; the force F on a body drives each of its modes, a damped oscillator of unit modal mass
+With `model: force` no impulse is collected. The force F on a body drives each mode, a damped oscillator of unit modal mass
 whose surface moves with q_i, at every step:
 
     q̈ + 2d q̇ + (d² + ω²) q = F,   ω = 2πf,   s(t) = Σ_i g_i q̇_i(t)                           [m/s]
 
-q is per g [N·s²], q̇ an impulse [N·s]. The phasor z is the vibration about the deflection that F alone would hold:
+q is per g [N·s²] and q̇ an impulse [N·s]. The phasor z is the vibration about the deflection that F alone would hold:
 
     z(t) = ∫ e^(λ(t−t′)) F(t′) dt′ + F(t)/λ,   ż = λz + Ḟ/λ,   λ = −d + iω,   q̇ = Re z − (d/ω) Im z
 
-F is linear within a step, from F₀ at its start, the normal forces of the step before [N], to F₁ at its end, so the integral is
-closed for any Δt:
+F is linear within a step, from F₀ at its start, the normal force of the step before [N], to F₁ at its end. The integral is
+then closed for any Δt:
 
     z(t) = e^(λt) z(0) + (F₁ − F₀)/Δt · (e^(λt) − 1)/λ²,   0 ≤ t ≤ Δt                          [N·s]
 
-A collision short to the mode's period leaves |z| = Σ F Δt, its impulse, whatever Δt and its duration; any other the spectrum of
-its force, |∫ F e^(−λt) dt|. A steady force adds nothing, and the first one of an episode counts as steady. F is summed over
-what touches the body, with `gains: contact` as s_i F. Noise of sliding is as above. Bands read z, which rings on if the force
-stays as it is.
+A collision that is short compared with the mode's period leaves |z| = Σ F Δt, its impulse, whatever Δt and its duration. Any
+other leaves the spectrum of its force, |∫ F e^(−λt) dt|. A steady force adds nothing, and the first force of an episode counts
+as steady. F is summed over all that touches the body, with `gains: contact` as s_i F. Sliding noise is as above. Bands read z,
+which rings on if the force stays constant.
 
-`model: paper`: y[k] = a₁ y[k−1] − a₂ y[k−2] + u[k], a₁ = 2r cos(2πfΔt/K), a₂ = r², r = e^(−dΔt/K), and s = Σ g y, with
-u[1] = Δt (F − F_before)₊ and noise at each sample; how loud an impact is then depends on K and Δt.
+With `model: paper` y[k] = a₁ y[k−1] − a₂ y[k−2] + u[k], a₁ = 2r cos(2πfΔt/K), a₂ = r², r = e^(−dΔt/K), and s = Σ g y, with
+u[1] = Δt (F − F_before)₊ and noise at each sample. The loudness of an impact then depends on K and Δt.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio"; Duhamel's integral of a force that is linear
-between samples, Nigam and Jennings, *Bull. Seism. Soc. Am.* 59 (1969); noise by the power of friction as in van den Doel, Kry
-and Pai, *FoleyAutomatic* (SIGGRAPH 2001). Departures: the response and the impulses above, see `model: paper`.
+Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio". Duhamel's integral of a force that is linear
+between samples: Nigam and Jennings, *Bull. Seism. Soc. Am.* 59 (1969). Noise by the power of friction: van den Doel, Kry and
+Pai, *FoleyAutomatic* (SIGGRAPH 2001).
 
-Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it. A load that is
-spread over a body's surface strikes at its centre alone; friction strikes along the normal, as pressing does.
+Departures: the response and the impulses; `model: paper` keeps the paper's.
+
+Limits: modes are linear and independent of other contacts: a hand that holds a glass does not damp it. A load that is spread
+over a body's surface acts at its centre alone. Friction excites modes along the normal, as pressing does.
 """
 
 from __future__ import annotations

@@ -1,38 +1,42 @@
 """Elastomer: displacement of the markers in a soft skin that is pressed and dragged, as a vision-based sensor sees them.
 
-Taxels are both markers and sources, unless `markers` puts markers elsewhere; taxels of one link act on each other. With n_j the
-normal at x_j, Π_n(z) = z − (z · n) n,
-r_ij = Π_nj(x_j − x_i), depth h_i = max(0, s − min_o φ_o(x_i)) of the felt objects o under the skin's height s [m], and t_i
-the tangential displacement of the object's material since the taxel stuck to it [m] (`anchors`), the Gaussian kernel gives
+Taxels are both markers and sources, unless `markers` puts the markers elsewhere. Taxels of one link act on each other. n_j is
+the normal at x_j and Π_n(z) = z − (z · n) n, so r_ij = Π_nj(x_j − x_i) is the tangential offset. The depth of the sensed
+objects o below the skin's height s is h_i = max(0, s − min_o φ_o(x_i)) [m]. t_i is the tangential displacement of the object's
+material since the taxel stuck to it [m] (`anchors`). The Gaussian kernel gives
 
     u_j = Σ_i a_i s_d ( r_ij h_i (c g + (1 − c) ḡ/ρ̄ ρ) + n_j h_i^α g ) + Σ_i a_i s_s Π_nj(t_i) h_i exp(−λ_s |r_ij|²)      [m]
     g = exp(−λ_d |r_ij|²),    ρ = 1/(|r_ij|² + ε²),    ḡ = e^(−1/2)/√(2 λ_d),    ρ̄ = 1/(2 ε),    a_i = A_i/A_ref
 
-with ε [m] the thickness or else the taxels' spacing √mean(A). The elastic kernels give
+with ε [m] the thickness, or without one the taxels' spacing √mean(A). The elastic kernels give
 
     u_j = Σ_i G(r_ij) [τ_i, p_i] A_i,    p_i = K_n h_i,    τ_i = K_t t_i where h_i > 0
 
-with G the displacement [m/N] at the markers' depth in a half-space (`half_space`, K_t = K_n 2 (1 − ν)/(2 − ν)) or in a layer
-of thickness t bonded to a rigid base (`bonded_layer`, K_t = E/(2 (1 + ν) t): dragged all over, its surface moves by the drag),
-tractions in [Pa]. With friction |τ_i| ≤ μ p_i, and the same cap |t_i| ≤ μ h_i K_n/K_t holds for the Gaussian.
-All vectors are in the frame of the taxel's link. Inactive taxels neither press nor move.
+with tractions in [Pa]. G is the displacement at the markers' depth [m/N], in a half-space (`half_space`, K_t = K_n 2
+(1 − ν)/(2 − ν)) or in a layer of thickness t bonded to a rigid base (`bonded_layer`, K_t = E/(2 (1 + ν) t), so that the surface
+of a layer that is dragged all over moves by the drag). With friction |τ_i| ≤ μ p_i; for the Gaussian the same cap is |t_i| ≤ μ
+h_i K_n/K_t. All vectors are in the frame of the taxel's link. Inactive taxels neither press nor move.
 
-With `anchors: points` (Gaussian) the shear's sources are N points on each object, for each link that they may meet
-(`point_anchors`): φ is the signed distance to the link, z_p its place, e_p that where it sank in, A the object's area,
+With `anchors: points` (Gaussian) the sources of shear are N points on each object, for each link that they may meet
+(`point_anchors`). φ is the signed distance to the link, z_p the point's position, e_p its position where it entered the skin,
+and A the object's area:
 
     Σ_p w s_s Π_nj(z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²),    h_p = max(0, s − φ(z_p)),    w = A/(N A_ref)      [m]
 
-Source: Chung et al., *Tactile Genesis*, appendix, "ElastomerTaxel"; K_t/K_n of a half-space by Mindlin (Johnson, *Contact
-Mechanics*, 7.4), K_t of a layer by simple shear.
+Source: Chung et al., *Tactile Genesis*, appendix, "ElastomerTaxel". K_t/K_n of a half-space: Mindlin (Johnson, *Contact
+Mechanics*, 7.4); K_t of a layer: simple shear.
 
-Departures: the paper anchors points that are sampled on the object (`anchors: points`, the default under `model: paper`); by
-default anchors are the taxels' own: four numbers per taxel instead of four per point and link, planes and objects of any size
-too, and shear becomes a fixed matrix, but its sources are as sparse as the taxels. Points follow an object's small features and
-a patch that leaves the taxels behind, with the noise of a random sample. Offsets are exact for each pair on curved links. Sums
-are weighted with areas, so that they do not grow with the number of taxels or points (`model: paper`: a_i = 1, w = 1).
-The printed formula divides the in-plane part by ḡ (`normalize: peak`), the code behind the paper's experiments does not
-(default): with the paper's numbers 1 mm of depth would move markers by some 20 mm. The clamped boundary is solved on the pad's
-own outline. Without friction an elastic skin sticks to what it touches until that leaves, and its shear then ends at once.
+Departures: the paper anchors points that are sampled on the object (`anchors: points`, the default under `model: paper`). By
+default the taxels anchor themselves, with four numbers per taxel. Shear is then a fixed matrix, and planes and objects of any
+size work, but its sources are as sparse as the taxels. Points resolve small features of an object and a patch that leaves the
+taxels, with the noise of a random sample. Offsets are exact for each pair, on curved links too. Sums are weighted with areas,
+so that they do not grow with the number of taxels or points (`model: paper`: a_i = 1, w = 1). The printed formula divides the
+in-plane part by ḡ (`normalize: peak`); the code behind the paper's experiments, like the default here, does not. With the
+paper's numbers the printed formula moves markers by some 20 mm at a depth of 1 mm. The clamped boundary is solved on the pad's
+outline.
+
+Limits: the skin is linear, and a taxel's load depends on its own depth alone. Without friction an elastic skin sticks to an
+object until the object leaves, and its shear then ends at once.
 """
 
 from __future__ import annotations

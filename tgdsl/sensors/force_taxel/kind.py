@@ -5,25 +5,26 @@
     missed = f_net − Σ_j f_j                                                                  [N]
     residual = Σ_c γ_c (x_c × f_c + τ_c) − Σ_j x_j × f_j                                      [N·m]
 
-with c over the solver's contacts of the sensor's objects on one body: contact points x_c [m], forces f_c [N] and torques τ_c
-[N·m] on the link, net force f_net; j over that body's taxels: positions x_j [m], outward normals n_j, areas A_j [m²]; all in
-the link's frame. `footprint` defines the captured fraction γ_c [1] and the weights λ_cj ≥ 0 with Σ_j λ_cj = 1: they favour
-taxels near the contact, on its side of the body and with large depth, and are chosen such that the moment of the taxel forces
-is that of the contacts, as far as non-negative weights can match it.
+c runs over the solver's contacts of the sensor's objects on one body, with points x_c [m], forces f_c [N] and torques τ_c [N·m]
+on the link and the net force f_net. j runs over that body's taxels, with positions x_j [m], outward normals n_j and areas A_j
+[m²]. All vectors are in the link's frame. `footprint` defines the captured fraction γ_c [1] and the weights λ_cj ≥ 0 with
+Σ_j λ_cj = 1. Weights are larger near the contact, on its side of the body and at large depth. They match the moment of the
+contacts as far as non-negative weights can.
 
-So Σ_j f_j + missed = f_net always: the load is conserved, static friction included. Each f_j is a sum of contact forces with
+The load is conserved, static friction included: Σ_j f_j + missed = f_net always. Each f_j is a sum of contact forces with
 non-negative weights, so it stays in every convex cone that contains these, such as the friction cone of a flat face. As a
-contact slides off the sensor, or around an edge of its body, its force passes continuously to `missed`. So does the force of
-contacts further than a footprint from every active taxel, or on the back of the body. The force of contacts beyond `slots` acts
-at the centre of the others, see `quantities.contacts`. Inactive taxels carry nothing. `missed` and `residual` have one row per
-body. The residual is a pure couple, since the distributed forces sum to the captured ones: it is the same about any point.
+contact slides off the sensor, or around an edge of its body, its force passes continuously to `missed`. `missed` also has the
+force of contacts further than a footprint from every active taxel, or on the back of the body. The force of contacts beyond
+`slots` acts at the centre of the others (see `quantities.contacts`). Inactive taxels carry nothing. `missed` and `residual`
+have one row per body. The residual is a pure couple, the same about any point, since the distributed forces sum to the captured
+ones.
 
-Source: a solver's contacts are points on rigid bodies; this distributes their resultant as on a Winkler foundation, whose
-pressure is proportional to depth (Johnson, *Contact Mechanics*, §4.3), with the moment corrected.
+Source: a solver's contacts are points on rigid bodies. This kind distributes their resultant as a Winkler foundation does,
+whose pressure is proportional to depth (Johnson, *Contact Mechanics*, §4.3), and corrects the moment.
 
-Limits: a probe has one depth, of the object that it is deepest in, so two objects within one footprint share their taxels.
-Weights follow depth and distance per taxel, not per area. With the gate `contact_pair` depth jumps where a contact begins; the
-forces still sum to the solver's.
+Limits: a probe has one depth, into the deepest object, so two objects within one footprint share their taxels. Weights follow
+depth and distance per taxel, not per area. With the gate `contact_pair` depth jumps where a contact begins; the forces still
+sum to the solver's.
 """
 
 from __future__ import annotations

@@ -1,37 +1,38 @@
-"""Temperature grid: heat in links that are divided into cells, and between them and what they touch.
+"""Temperature grid: heat in links that are divided into cells, and between these and what they touch.
 
-The box of each link is nx × ny × nz cells of one material, and θ_i = T_i − T_a the temperature of one above ambient [K]. A step
-of Δt does, one after the other:
+The box of each link has nx × ny × nz cells of one material, and θ_i = T_i − T_a is a cell's temperature above ambient [K]. A
+step of Δt solves, one after the other:
 
 1. radiation beyond its tangent at ambient, εσ (T⁴ − T_a⁴ − 4 T_a³ θ), from the surfaces of cells (`losses`);
-2. at once: conduction within the link, θ̇ = α ∇²θ with α = k/(ρc), the losses (h + 4εσ T_a³) θ from its faces, a source, P/N in
-   each cell or q A_i at a face, all exact in time (`diffusion`), and contact with bodies and links for all of them at once,
-   C_i θ̇_i = Σ_n g_in (φ_n − θ_i) (`conduction`): exact for steady flows and between bodies of one temperature, else with two
-   numbers for a flow's course in the step (`response`); g_in from the patches' areas, both conductivities and the constriction
-   of heat to a small spot (`patch_flow`).
+2. all else together: conduction θ̇ = α ∇²θ with α = k/(ρc), the losses (h + 4εσ T_a³) θ from the faces, a source of P/N in each
+   cell or q A_i at a face, and contact with bodies and links, C_i θ̇_i = Σ_n g_in (φ_n − θ_i).
+
+Conduction, linear losses and sources are exact in time (`diffusion`). Contact is exact for steady flows, and between bodies of
+one temperature each; otherwise two numbers describe a flow's course in the step (`conduction`). g_in follows from the area of
+the patch, both conductivities and the constriction of heat to a small spot (`patch_flow`).
 
     y ← T + (y − T_before) e^(−Δt/τ) − (T − T_before)(1 − e^(−Δt/τ)) τ/Δt                                  [°C]
 
-is what a sensing element of time constant τ reads of it, exact where T is linear between calls. C_i = ρcV_i is the heat
-capacity of a cell [J/K]. Losses and conduction without a source leave no temperature beyond those of links and surroundings
-before, however long Δt is. The splitting between 1 and 2 is of first order in Δt. Objects with cells have their losses in 1,
-all of them. The patch of a contact has the area of the convex hull of contact points, or that of a Hertzian contact under their
-normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
+is the reading of a sensing element with time constant τ, exact where T is linear between calls. C_i = ρcV_i is a cell's heat
+capacity [J/K]. Without a source, losses and conduction keep temperatures within those of links and surroundings for any Δt.
+The splitting of 1 and 2 is of first order in Δt; objects with cells have all their losses in 1. The area of a patch is that of
+the contact points' convex hull, or A = π (3 F R/4E*)^(2/3) of a Hertzian contact under the normal force F, whichever is larger.
 
-What the objects hold is part of the sensor's state: one temperature each, of a body that conducts from the patch to its middle
-as a cube of its volume would, or a grid of their own with `cells`. A new episode begins at the temperatures that the document
-or the state gives, and its first reading is these.
+The heat of objects is part of the sensor's state. An object has one temperature, and conducts from a patch to its middle as a
+cube of its volume would, or a grid with `cells`. An episode begins at the temperatures of the document or the state, and the
+first reading is these.
 
-Sums are compensated: a float32 module keeps what it adds to 2⁻⁴⁸ of a temperature, and what leaves one cell enters another.
-`<sensor>/heat` has by link what it stores above ambient, and what came in at this call from source, radiation, convection and
-contact [J]; `<sensor>/objects` the same of each object, with its temperature.
+Sums are compensated: a float32 module keeps increments to 2⁻⁴⁸ of a temperature, and heat that leaves one cell enters another.
+`<sensor>/heat` reports for each link the heat stored above ambient, and this call's heat from source, radiation, convection and
+contact [J]. `<sensor>/objects` reports the same for each object, and its temperature.
 
-Source: Incropera et al., *Fundamentals of Heat and Mass Transfer*; Johnson, *Contact Mechanics*, 4.2 (Hertz); the order of
-steps and the lag are the paper's. Departures from it: fluxes act on areas, conduction is implicit, the area of a point contact
-is an area, and the lag is exact: see `paper_step` for the printed formulas.
+Source: Incropera et al., *Fundamentals of Heat and Mass Transfer*; Johnson, *Contact Mechanics*, 4.2 (Hertz). The order of
+steps and the lag are from Chung et al., *Tactile Genesis*.
 
-Limits: a link is a solid box; material where the box stands over counts, and exposed faces are the box's. Patches do not shade
-faces from losses.
+Departures: fluxes act on areas, conduction is implicit, the area of a point contact is an area, and the lag is exact.
+`paper_step` has the printed formulas.
+
+Limits: a link is a solid box, with the box's heat capacity and exposed faces. Patches do not shade faces from losses.
 """
 
 from __future__ import annotations
