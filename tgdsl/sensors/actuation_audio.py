@@ -74,7 +74,7 @@ def audible() -> float:
 
 
 class ActuationAudioSpec(OnJointsSpec):
-    """What motors and joints sound like."""
+    """The sound of motors and joints."""
 
     kind: Literal["actuation_audio"]
     """Sound of each actuated joint, as sound pressure at 1 m: blocks of samples [Pa]."""
@@ -93,7 +93,7 @@ class ActuationAudioSpec(OnJointsSpec):
     friction: NonNegative = 2e-6
     """Noise by velocity, β_fric [Pa/√Hz per rad/s; slides: per m/s]."""
     hum: NonNegative = 1e-4
-    """Hum of a motor that is switched on, whatever it does, a_hum [Pa]."""
+    """Hum of a motor that is switched on, moving or not, a_hum [Pa]."""
     hum_frequency: Frequency = 120.0
     """Its frequency, f_hum [Hz]."""
 

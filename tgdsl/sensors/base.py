@@ -39,13 +39,13 @@ class AnySensorSpec(SpecModel):
     readout: Literal["clean", "measured", "both"] = "measured"
     """`measured` with the imperfections of `noise`, `clean` without, or `both`: `<name>` and `<name>/clean`."""
     rate: Annotated[Frequency | None, Usual("frequency", low=0.1, high=1e5)] = None
-    """Sample rate [Hz]; between samples it reads the last one; default: a sample at every call."""
+    """Sample rate [Hz]; between samples the reading is held; default: a sample at every call."""
     history: History | None = None
     """Calls in a reading, stacked or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
     accuracy: AccuracyField = None
-    """Largest RMS error of its reading on states of the scene, before noise: a fraction of the largest change, `1 %`, an
-    amount, `0.02 mm`, or one of each quantity, `{force: 5 mN, torque: 1 %}`. Fields that the document leaves out, here and in
-    the objects that it feels, then get the cheapest values that meet it."""
+    """Largest RMS error of the reading over states of the scene, before noise: a fraction of the largest change, `1 %`, an
+    amount, `0.02 mm`, or one per quantity, `{force: 5 mN, torque: 1 %}`. Fields that the document leaves out, here and in the
+    sensed objects, then get the cheapest values that meet it."""
     is_on_taxels: ClassVar[bool] = True
     """Whether `links` chooses among the links that the layout gives taxels; else among all bodies of the robot."""
     needs_taxels: ClassVar[bool] = True
@@ -91,10 +91,10 @@ class LinkSpec(SensorSpec):
 
 
 class ProbeSpec(SensorSpec):
-    """A sensor whose taxels are spherical probes that feel objects."""
+    """A sensor whose taxels are spherical probes that sense objects."""
 
     feels: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Objects that the probes can feel."""
+    """Objects that the probes sense."""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -103,11 +103,11 @@ class ProbeSpec(SensorSpec):
 
 
 class ContactProbeSpec(ProbeSpec):
-    """Probes that feel objects in contact with their link."""
+    """Probes that sense objects in contact with their link."""
 
     gate: Literal["contact_pair", "geometric"] = "contact_pair"
-    """When probes feel an object: `contact_pair` only while the simulator has it in contact with the taxel's link (the paper);
-    `geometric` whenever a probe's sphere reaches into it, so a 4 mm probe feels it 4 mm before the touch."""
+    """When probes sense an object: `contact_pair` only while the simulator has it in contact with the taxel's link (the paper);
+    `geometric` whenever a probe's sphere overlaps it, so a 4 mm probe senses it 4 mm before contact."""
 
     @property
     def is_gated(self) -> bool:

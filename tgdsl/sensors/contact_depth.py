@@ -46,7 +46,7 @@ class ContactDepthSpec(ContactProbeSpec):
     """Penetration depth of each probe [m]."""
 
     kind: Literal["contact_depth"]
-    """How far each probe's sphere reaches into what it touches [m]."""
+    """Penetration depth of each probe's sphere into the sensed objects [m]."""
 
 
 def reference(

@@ -124,7 +124,7 @@ class KinematicTaxelSpec(ContactProbeSpec):
     balance: Literal["none", "solver"] = "none"
     """`solver` has a body's taxels press with the solver's normal force, and bounds their friction; `none` as in the paper."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8
-    """Contacts per pair of body and object whose normals `balance` takes [1]."""
+    """Contacts per pair of body and object whose normals `balance` uses [1]."""
 
     @model_validator(mode="after")
     def _is_used(self) -> KinematicTaxelSpec:

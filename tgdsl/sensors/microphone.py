@@ -67,24 +67,24 @@ Speed = Annotated[float, Quantity("speed", gt=0.0)]
 
 
 class MicrophoneSpec(AnySensorSpec):
-    """What a point hears of the sensors that make sound."""
+    """The sound pressure at a point, from the sensors that make sound."""
 
     kind: Literal["microphone"]
     """Sound pressure at a point [Pa]: the sum over all sources, each delayed and fainter by its distance; blocks of samples."""
     pos: Position | None = None
-    """Where it is [m]: in the world, or with `body` in that body's frame."""
+    """Position [m]: in the world, or with `body` in that body's frame."""
     body: str | None = None
-    """Body of the scene that carries it; default: it is fixed in the world. At its frame's origin unless `pos` says where."""
+    """Body of the scene that carries it, at its frame's origin unless `pos` is given; default: fixed in the world."""
     hears: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    """Sensors whose sound it hears; default: all of the document that make sound."""
+    """Sensors to hear; default: all sensors of the document that make sound."""
     levels: dict[str, Positive] = {}
-    """By what the sound of a sensor is multiplied [1], by its name; default: 1."""
+    """Factor on the sound of each sensor, by its name [1]; default: 1."""
     falloff: NonNegative = 1.0
     """Exponent p of the level 1/r^p, r in metres [1]; 1 for a point source in a free field."""
     nearest: Annotated[PositiveLength, Usual("length", low=1e-3, high=1.0)] = 0.01
     """Distance below which a source gets no louder [m]."""
     reach: Annotated[PositiveLength, Usual("length", low=0.05, high=100.0)] = 10.0
-    """Distance beyond which nothing is heard [m]: sound is remembered for as long as it travels so far."""
+    """Distance beyond which nothing is heard [m]; it sets how long sound is remembered."""
     speed: Annotated[Speed, Usual("speed", high=7000.0)] = 343.0
     """Speed of sound, c [m/s]; default: air at 20 °C."""
     is_on_taxels: ClassVar[bool] = False

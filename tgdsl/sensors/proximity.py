@@ -72,7 +72,7 @@ class ProximitySpec(ProbeSpec):
     """Root mean square error that a field may have, as a fraction of full scale [1]."""
     gradient_tolerance: Annotated[float | None, Quantity("number", gt=0.0), Field(lt=1.0)] = None
     """Error that 99.9 % of the gradients of S0 by place may have, as a fraction of the largest one [1]: fields are then sums of
-    quadratic B-splines, whose gradients have no jumps. Default: gradients are as good as they come out."""
+    quadratic B-splines, whose gradients have no jumps. Default: the error of gradients is not limited."""
     max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
     """Largest size of an object's fields, or of its lists of points [bytes]."""
     outputs: Annotated[tuple[Literal["force", "torque"], ...], Field(min_length=1)] = ("force", "torque")
@@ -82,9 +82,9 @@ class ProximitySpec(ProbeSpec):
     shear_damping: NonNegative = 10.0
     """k_s, force per depth and velocity [N·s/m²]."""
     density: Positive = 100.0
-    """Total weight of the felt surface, or of its points [1]."""
+    """Total weight of the sensed surface, or of its points [1]."""
     reference_area: Area | None = None
-    """A, area that the density is spread over [m²]; default: the area of all felt objects except planes."""
+    """A, area that the density is spread over [m²]; default: the area of all sensed objects except planes."""
     torque_about: Literal["taxel", "link"] = "taxel"
     """Point that the torque is about: the taxel (the paper), or the link's origin."""
     model: Literal["tgdsl", "paper"] = "tgdsl"

@@ -69,7 +69,7 @@ ModesField = Annotated[
 
 
 class ContactAudioSpec(ProbeSpec):
-    """What bodies sound like that are struck and scraped."""
+    """The sound of bodies that are struck and scraped."""
 
     kind: Literal["contact_audio"]
     """Sound of each body that is struck or scraped: blocks of samples [m/s], or energies by band [m²/s²]."""
@@ -80,8 +80,8 @@ class ContactAudioSpec(ProbeSpec):
     bodies: dict[str, ModesField] = {}
     """Other modes, by names of links (of objects with `of: object`) or shell wildcards; the first that matches counts."""
     gains: Literal["mean", "contact"] = "mean"
-    """How strongly a contact strikes each mode: `mean`, by its gain, wherever it is; `contact`, by its mode shape there and
-    along the contact's normal too, over that in the mean. That needs modes of the shape."""
+    """How strongly a contact excites each mode: `mean`, by the mode's gain alone; `contact`, also by its mode shape at the
+    contact along the normal, relative to the mean. This needs modes of the shape."""
     samples: Annotated[StrictInt, Field(ge=1)] = 16
     """Samples per physics step, K: the sample rate is K over the time step."""
     substeps: Annotated[StrictInt, Field(ge=1)] = 1
@@ -89,9 +89,9 @@ class ContactAudioSpec(ProbeSpec):
     timestep: Annotated[Time | None, Usual("time", low=1e-5, high=0.1)] = None
     """Time that a physics step takes [s]; default: that of the scene."""
     settling: Annotated[Time, Usual("time", low=1e-4, high=1.0)] = 0.02
-    """Time in which a load counts as steady, τ [s]: what presses more slowly makes no sound. For `model: physical` alone."""
+    """Time after which a load counts as steady, τ [s]: a slower press makes no sound. For `model: physical` alone."""
     loudest: Annotated[StrictInt, Field(ge=1)] | None = None
-    """Most modes of each body that are computed, those that ring with most energy, g²/4d; default: all that are heard."""
+    """Largest number of modes computed for each body, those with most energy, g²/4d; default: all audible ones."""
     scrape: NonNegative = 1e-5
     """Noise of sliding, m_s [kg]: with a normal force of 1 N at 1 m/s, variance of the impulses of one second [N²·s²]."""
     outputs: Literal["samples", "bands"] = "samples"
@@ -99,8 +99,8 @@ class ContactAudioSpec(ProbeSpec):
     scale: Literal["linear", "decibel"] | None = None
     """Of `bands`: `linear` [m²/s²], the default, or `decibel`, 10 lg(1 + E/E₀) with E₀ = (1 µm/s)²."""
     model: Literal["physical", "force", "paper"] = "physical"
-    """`physical`: impulses of collisions; `force`: the force drives the modes, so that a contact excites what is slower than it
-    lasts; `paper`: the two-pole response as printed, and impulses of each rise of the force, however many steps it takes."""
+    """`physical`: impulses of collisions; `force`: the force drives the modes, so that a contact excites modes slower than
+    itself; `paper`: the two-pole response as printed, and impulses of each rise of the force, however many steps it takes."""
     slots: Annotated[StrictInt, Field(ge=1)] = 4
     """Contacts per pair of body and object that are read one by one."""
     needs_taxels: ClassVar[bool] = False

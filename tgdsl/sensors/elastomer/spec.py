@@ -184,11 +184,11 @@ class ElastomerSpec(ContactProbeSpec):
     friction: NonNegative | None = None
     """μ, friction coefficient of the skin [1]; null: it never slides, as in the paper."""
     anchors: Literal["taxels", "points"] | None = None
-    """What carries an anchor: each taxel, on the object that it touches, or `points` sampled on each object, on the skin
-    (the paper; gaussian); default: `taxels`, under `model: paper` `points`."""
+    """What sticks: each taxel, to the object that it touches, or `points` sampled on each object, to the skin (the paper;
+    gaussian). Default: `taxels`, or `points` with `model: paper`."""
     markers: str | None = None
-    """Resolution of the layout whose taxels on the sensor's links are the markers that are read, at places of their own; the
-    sensor's own taxels are then what presses. Default: the taxels are the markers."""
+    """Resolution of the layout whose taxels on the sensor's links are the markers that are read; the sensor's taxels are then
+    the sources alone. Default: the taxels are the markers."""
     points: Annotated[StrictInt, Field(ge=1)] = 1000
     """Points of each object, for `anchors: points`."""
     enter: Annotated[Radius, Usual("length", high=0.1)] = 1e-5

@@ -67,7 +67,7 @@ SPACINGS = 3.0  # default radius of a footprint, in spacings of the taxels: the 
 
 
 class ForceTaxelSpec(ContactProbeSpec):
-    """The solver's contact force, shared out over the taxels."""
+    """The solver's contact force, distributed over the taxels."""
 
     kind: Literal["force_taxel"]
     """Force [N] or pressure [Pa] of each taxel, which sum to the solver's contact force."""
@@ -79,7 +79,7 @@ class ForceTaxelSpec(ContactProbeSpec):
     moment_iterations: Annotated[StrictInt, Field(ge=0, le=64)] = 4
     """Newton steps towards the contacts' moment; 0: shares by depth and distance alone [1]."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8
-    """Contacts per pair of body and object that are shared out; what others carry acts at the centre of these [1]."""
+    """Contacts per pair of body and object that are distributed one by one; the others' force acts at their centre [1]."""
 
     def radii(self, layout: Layout) -> np.ndarray:
         """Return r_f of each body [m]."""

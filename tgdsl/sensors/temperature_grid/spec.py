@@ -55,7 +55,7 @@ class TemperatureGridSpec(LinkSpec):
     cells: Cells | None = None
     """How many cells the box of each link is divided into, along x, y and z of the link's frame."""
     spacing: Annotated[PositiveLength | None, Usual("length", low=1e-5, high=0.1)] = None
-    """In place of `cells`: their size, at most [m]."""
+    """Largest size of the cells, instead of `cells` [m]."""
     region: Region = ()
     """Part of each link's surface whose box is divided, such as a geom by its name; default: all of the link's surface."""
     material: MaterialField
@@ -67,11 +67,10 @@ class TemperatureGridSpec(LinkSpec):
     temperature: Temperature | None = None
     """Temperature at which the links begin an episode [°C]; default: ambient."""
     scheme: Literal["exact", "spectral", "semi_implicit"] = "exact"
-    """Conduction within a link in a step: `exact` of the cells' own equations, never beyond the temperatures around; `spectral`
-    of the continuous solid's modes, which oversteps a jump by up to 4 % of it; `semi_implicit`, of first order in time (the
-    paper)."""
+    """Conduction within a link in a step: `exact` for the cells' equations, without overshoot; `spectral` by the modes of the
+    continuous solid, which overshoots a jump by up to 4 %; `semi_implicit`, of first order in time (the paper)."""
     model: Literal["physical", "paper"] = "physical"
-    """`paper`: the formulas as printed, which neither have the units of a heat flow nor are stable."""
+    """`paper`: the formulas as printed, which are unstable and lack the units of a heat flow."""
     source: HeatSource | None = None
     """Heat that is made in the links; default: none."""
     emissivity: Literal["material"] | Annotated[float, Quantity("number", ge=0.0, le=1.0)] | None = None
@@ -79,12 +78,12 @@ class TemperatureGridSpec(LinkSpec):
     convection: HeatTransfer | None = None
     """Convection from the exposed faces and the objects: heat transfer coefficient [W/(m²·K)]; default: none."""
     exposed: Annotated[tuple[Face, ...], Field(min_length=1)] = FACES
-    """Faces that radiate and that air cools."""
+    """Faces that lose heat by radiation and convection."""
     contact_area: Literal["manifold"] | Area = "manifold"
     """Area of a patch: `manifold`, the contact points' convex hull, or by Hertz from the force, whichever is larger; or this,
     whenever they touch [m²]. A side whose material has no Young's modulus, as skin, counts as rigid."""
     contact_conductance: HeatTransfer | None = None
-    """Conductance of the interface itself, of roughness or a film [W/(m²·K)]; default: it is no resistance."""
+    """Conductance of the interface itself, such as roughness or a film [W/(m²·K)]; default: no resistance."""
     curvature_radius: Annotated[PositiveLength | None, Usual("length", low=1e-4, high=1.0)] = None
     """Radius of the links' surface where they touch, for Hertz [m]; default: half of the shortest side of its box."""
     slots: Annotated[StrictInt, Field(ge=1, le=32)] = 4
@@ -92,7 +91,7 @@ class TemperatureGridSpec(LinkSpec):
     lag: Annotated[Annotated[float, Quantity("time", gt=0.0)] | None, Usual("time", low=1e-4, high=100.0)] = None
     """Time constant of the sensing element, by which readings trail temperatures [s]; default: none."""
     outputs: Literal["cells", "surface", "max", "mean"] = "cells"
-    """What is read: every cell, those at the faces of the box, or one number of each link."""
+    """Rows of the reading: every cell, the cells at the faces of the box, or the maximum or mean of each link."""
 
     @model_validator(mode="after")
     def _check(self) -> TemperatureGridSpec:
