@@ -114,13 +114,11 @@ def made(touch, pos, force, net, found=True):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:contacts of pad")
-@pytest.mark.parametrize("which", ["double", "single", "compiled"])
+@pytest.mark.parametrize("which", ["double", "single"])
 def test_what_is_lacking_acts_at_the_centre_of_what_is_shown(tmp_path, which):
     """Two contacts of 1 N and 3 N show 4 of 10 N: moment about the pad's origin as of 10 N at (3 x₂ + x₁) / 4, to 1e-5."""
     sensors = {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 2}}
     touch = compiled(tmp_path, ONE, ITEM, sensors, dtype=torch.float64 if which == "double" else torch.float32)
-    if which == "compiled":
-        touch.compile()
     pos, force = [[-0.01, 0.004, 0.01], [0.012, -0.008, 0.01]], [[0.0, 0, -1], [0.5, 0, -3]]
     net = [0.5, 1.0, -10.0]
     readings = touch(made(touch, pos, force, net))
