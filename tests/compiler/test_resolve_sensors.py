@@ -126,6 +126,14 @@ def test_what_can_never_be_in_contact(folder):
     assert touch.inputs.bodies == ("ghost", "index_1", "index_2", "palm", "thumb_1")
 
 
+@pytest.mark.parametrize("flag", ["contact", "constraint"])
+def test_a_scene_without_contacts_names_the_flag(folder, flag):
+    scene = HAND.replace("<mujoco>", f'<mujoco><option><flag {flag}="disable"/></option>')
+    (folder / "hand.xml").write_text(scene)
+    (found, *_) = problems(folder)
+    assert found.endswith(f'the scene\'s <option> has <flag {flag}="disable"/>; take it out, or use `gate: geometric`')
+
+
 @pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")
 def test_pairs_that_never_meet_are_dropped_and_told(folder):
     """The palm is the parent of its fingers, which MuJoCo does not collide with it; the fingers' tips it does."""

@@ -66,6 +66,14 @@ def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
     assert [geom.mesh for geom in model.geoms] == ["wedge", ""]
 
 
+@pytest.mark.parametrize("reference", ["wedge.STL", "package://hand/wedge.STL"])
+def test_a_mesh_whose_name_has_another_case_is_named(tmp_path, reference):
+    path = urdf_of(tmp_path / "hand", link_of("palm", f"<mesh filename='{reference}'/>"))
+    wedge().export(tmp_path / "hand" / "wedge.stl")
+    with pytest.raises(RobotError, match=r"; there is wedge\.stl$"):
+        load_model(path)
+
+
 def test_urdf_primitives_and_joints(tmp_path):
     links = link_of("base", "<box size='.02 .04 .06'/>") + link_of("a", "<cylinder radius='.01' length='.04'/>")
     path = urdf_of(tmp_path, links + joint_of("j", "base", "a", "revolute"), "hand.xml")  # told by its root, not its name

@@ -19,6 +19,7 @@ from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import BakeError, LowerError, TgdslError, UnfeltWarning, did_you_mean
 from tgdsl.formats.joints import RobotJoints
+from tgdsl.formats.model import Model
 from tgdsl.layout.layout import BURIED, COVERED, Layout, Unfelt, unfelt_ids
 from tgdsl.module.state import SHAPES
 from tgdsl.observations import observations
@@ -61,7 +62,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     sensors, quantities = lowered_sensors(loaded, resolved, kinds, progress), quantities_of(kinds)
     joints = _joints_read(loaded, resolved)
     pruned = passes.prune(sensors, resolved.objects, resolved.link_bodies, resolved.scene)
-    _report_hopeless(loaded, pruned)
+    _report_hopeless(loaded, resolved.scene, pruned)
     object_parts, link_parts = _object_parts(loaded, resolved, sensors, pruned), _link_parts(loaded, resolved, sensors, pruned)
     joined = passes.join(sensors)
     shared = passes.share(sensors, joined, resolved.layout, quantities)
@@ -278,13 +279,15 @@ def _warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None
         warnings.warn(f"{file}: {problem}", UnfeltWarning, stacklevel=3)
 
 
-def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
+def _report_hopeless(loaded: Loaded, scene: Model, pruned: Pruned) -> None:
     """Note sensors that can never feel an object of theirs."""
     for sensor, target in pruned.hopeless:
         spec = loaded.spec.sensors[sensor]
         path: Path = ("sensors", sensor, "feels", list(spec.objects).index(target))
         if spec.is_gated:
             problem, hint = "the simulator does not collide them", "let them collide, or use `gate: geometric`"
+            if flag := scene.flag_without_contacts:
+                problem, hint = f'the scene\'s <option> has <flag {flag}="disable"/>', "take it out, or use `gate: geometric`"
             problem = f'"{target}" can never be in contact with a link of this sensor: {problem}'
         else:
             problem, hint = f'"{target}" and the links of this sensor are one rigid body', "put a joint between them"

@@ -114,10 +114,16 @@ class Model:
     def can_collide(self, first: str, second: str) -> bool:
         return self.geoms_can_collide(*([geom.id for geom in self.touchable(body)] for body in (first, second)))
 
+    @property
+    def flag_without_contacts(self) -> str:
+        """The scene's `<flag>` that is disabled and without which MuJoCo makes no contacts; empty if there is none."""
+        off, flags = mujoco.mjtDisableBit, self.compiled.opt.disableflags
+        return "contact" if flags & off.mjDSBL_CONTACT else "constraint" if flags & off.mjDSBL_CONSTRAINT else ""
+
     def geoms_can_collide(self, geoms: Iterable[int], others: Iterable[int]) -> bool:
         """Return whether MuJoCo can ever report a contact between some geoms and some others, by their indices."""
         model = self.compiled
-        if model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+        if self.flag_without_contacts:
             return False
         pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
         for a, b in itertools.product(geoms, others):

@@ -167,19 +167,19 @@ def _number_names(robot: ET.Element) -> None:
 
 def _mesh_file(name: str, urdf: Path) -> Path:
     scheme, _, inside = name.partition("://")
+    folders = urdf.resolve().parents
     if scheme in ("package", "model"):
         package, _, rest = inside.partition("/")
-        for folder in urdf.resolve().parents:
-            if package in (folder.name, _package_name(folder)) and (folder / rest).is_file():
-                return folder / rest
-            if (folder / inside).is_file():
-                return folder / inside
-        raise RobotError(f'{urdf}: mesh "{name}": no folder above the file holds "{inside}"')
-    result = urdf.resolve().parent / name.removeprefix("file://")
-    if not result.is_file():
-        alike = [file.name for file in result.parent.glob("*") if file.name.lower() == result.name.lower()]
-        raise RobotError(f'{urdf}: mesh "{name}": there is no file {result}' + (f"; there is {alike[0]}" if alike else ""))
-    return result
+        own = [folder / rest for folder in folders if package in (folder.name, _package_name(folder))]
+        files, problem = [*own, *(folder / inside for folder in folders)], f'no folder above the file holds "{inside}"'
+    else:
+        files = [folders[0] / name.removeprefix("file://")]
+        problem = f"there is no file {files[0]}"
+    for file in files:
+        if file.is_file():
+            return file
+    alike = [other.name for file in files for other in file.parent.glob("*") if other.name.lower() == file.name.lower()]
+    raise RobotError(f'{urdf}: mesh "{name}": {problem}' + (f"; there is {alike[0]}" if alike else ""))
 
 
 def _package_name(folder: Path) -> str | None:
