@@ -50,7 +50,7 @@ def answer(stage: SimStage, requests, frames) -> None:
     """Answer requests for frames, as a loop does, until there are no more."""
     try:
         while True:
-            frame = mirror._frame(stage, pickle.load(requests))
+            frame = mirror.frame_of(stage, pickle.load(requests), b"")
             pickle.dump(pickle.loads(pickle.dumps(frame)), frames)
             frames.flush()
     except EOFError:
@@ -74,7 +74,9 @@ def test_a_mirror_has_the_poses_and_readings_of_the_environment_that_is_asked_fo
     stage = SimStage(touch, sim)
     stage.update(touch(sim.state()))
     (requests, asked), (frames, sent) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
-    opening = mirror._Opening(mirror._tables(touch), stage.outputs, stage.model, 3, mirror._frame(stage, 0), "127.0.0.1", 0)
+    opening = mirror._Opening(
+        mirror._tables(touch), stage.outputs, stage.model, 3, mirror.frame_of(stage, 0, b""), "127.0.0.1", 0
+    )
     copy = MirrorStage(pickle.loads(pickle.dumps(opening)), frames, asked)
     thread = threading.Thread(target=answer, args=(stage, requests, sent))
     thread.start()
@@ -83,11 +85,29 @@ def test_a_mirror_has_the_poses_and_readings_of_the_environment_that_is_asked_fo
         np.testing.assert_allclose(pos[2], [0.01, 0.0, 0.0749 + lift[env, 0]], atol=1e-12)
         np.testing.assert_array_equal(quat, sim.body_poses(env)[1])
         np.testing.assert_array_equal(copy.readings["touch"][env], stage.readings["touch"][env])
+        expected, contacts = stage.contacts(env), copy.contacts(env)
+        assert contacts is not None and expected is not None
+        np.testing.assert_array_equal(contacts.pos, expected.pos)
     assert float(copy.readings["touch"].norm()) > 0
     assert copy.time == stage.time
     asked.close()
     thread.join()
     close(copy, sent, requests, frames)
+
+
+def test_the_model_of_an_object_that_differs_is_sent_once(document):
+    own = document.with_name("variants.yaml")
+    shapes = "variants: [{type: sphere, size: [20 mm], density: 600}, {type: sphere, size: [15 mm], density: 600}]"
+    own.write_text(DOCUMENT.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
+    touch = tgdsl.compile(own)
+    stage = SimStage(touch, tgdsl.simulate(touch, num_envs=2))
+    there = mirror.shapes_of(stage.env_model(0))
+    assert mirror.frame_of(stage, 0, there).model is None
+    model = mirror.frame_of(stage, 1, there).model
+    assert model is not None
+    radius = pickle.loads(pickle.dumps(model)).geom("tgdsl/ball/0").size[0]
+    assert radius == pytest.approx(0.015)
+    assert mirror.frame_of(stage, 1, mirror.shapes_of(model)).model is None
 
 
 def test_another_environment_of_a_loop_that_stands_still_is_not_drawn(document, monkeypatch):
@@ -96,7 +116,9 @@ def test_another_environment_of_a_loop_that_stands_still_is_not_drawn(document, 
     stage = SimStage(touch, tgdsl.simulate(touch, num_envs=2))
     stage.update(touch(stage.sim.state()))
     (requests, asked), (frames, sent) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
-    opening = mirror._Opening(mirror._tables(touch), stage.outputs, stage.model, 2, mirror._frame(stage, 0), "127.0.0.1", 0)
+    opening = mirror._Opening(
+        mirror._tables(touch), stage.outputs, stage.model, 2, mirror.frame_of(stage, 0, b""), "127.0.0.1", 0
+    )
     copy = MirrorStage(opening, frames, asked)
     copy.body_poses(1)
     assert copy.readings == {}

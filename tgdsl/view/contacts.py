@@ -5,6 +5,7 @@ Shapes: `contact` contacts of one environment.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import mujoco
@@ -31,12 +32,15 @@ class Contacts(NamedTuple):
         return np.where((is_in[:, 0] & ~is_in[:, 1])[:, None], -self.force, self.force)
 
 
-def simulated_contacts(sim: Simulation, env: int) -> Contacts:
-    """Return the contacts of an environment where it is now, by MuJoCo's forward dynamics on the CPU; the simulation stays."""
-    model = sim.env_model(env)
+def state_of(sim: Simulation, env: int) -> dict[str, Array]:
+    """Return copies of the arrays that MuJoCo integrates in one environment, by their names."""
+    return {name: sim.arrays[name][env].detach().cpu().numpy().copy() for name in INTEGRATED}
+
+
+def simulated_contacts(model: mujoco.MjModel, state: Mapping[str, Array]) -> Contacts:
+    """Return the contacts of a state, by MuJoCo's forward dynamics on the CPU."""
     data = mujoco.MjData(model)
-    for name in INTEGRATED:
-        value = sim.arrays[name][env].detach().cpu().numpy()
+    for name, value in state.items():
         if name == "time":
             data.time = float(value)
         else:

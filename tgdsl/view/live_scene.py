@@ -15,7 +15,7 @@ from tgdsl.view.cameras import facing_camera
 from tgdsl.view.contacts import Contacts
 from tgdsl.view.layers import LIFT, Layer, Rows, Shown, SurfaceLayer, layer_of
 from tgdsl.view.markers import Markers, Pose
-from tgdsl.view.meshes import body_surfaces, robot_bodies
+from tgdsl.view.meshes import body_surfaces, robot_bodies, shapes_of
 from tgdsl.view.stages import Poses, Stage
 
 Array = np.ndarray
@@ -41,7 +41,7 @@ class LiveScene:
         self._meshes: dict[int, list[tuple[Any, Any]]] = {}
         for body in range(stage.model.nbody):
             self._add_body(stage.model, body)
-        self._shapes = _shapes_of(stage.model)
+        self._shapes = shapes_of(stage.model)
         self.layers: list[Layer] = []
         self._arrows = scene.add_line_segments("/arrows", np.zeros((1, 2, 3)), _FORCE, thickness=2.0, thickness_units="screen")
         self._points = scene.add_point_cloud(
@@ -61,7 +61,7 @@ class LiveScene:
         for body, frame in self.frames.items():
             frame.position, frame.wxyz = pos[body], quat[body]
         model = self._stage.env_model(env)
-        if model is not self._stage.model and (shapes := _shapes_of(model)) != self._shapes:
+        if model is not self._stage.model and (shapes := shapes_of(model)) != self._shapes:
             self._shapes = shapes
             for body in set(self.frames) - self.robot:
                 for mesh, _ in self._meshes.pop(body):
@@ -159,12 +159,6 @@ class LiveScene:
 
     def _plain(self, body: int) -> tuple[int, int, int]:
         return CARRIER if body in self._carriers else ROBOT if body in self.robot else OBJECT
-
-
-def _shapes_of(model: mujoco.MjModel) -> bytes:
-    """Return what differs between models of the same bodies whose objects differ."""
-    names = ("geom_size", "geom_type", "geom_dataid", "geom_pos", "geom_contype", "numeric_data")
-    return b"".join(getattr(model, name).tobytes() for name in names)
 
 
 def _joined(corners: Float[Array, "face 3 3"], normals: Float[Array, "face 3 3"]) -> tuple[Array, Array]:

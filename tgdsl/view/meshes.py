@@ -137,3 +137,9 @@ def _local_triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "fa
     is_flat = kind in (GeomType.mjGEOM_BOX, GeomType.mjGEOM_CYLINDER)
     normals = shape.face_normals[:, None].repeat(3, axis=1) if is_flat else shape.vertex_normals[shape.faces]
     return np.array(shape.triangles), normals
+
+
+def shapes_of(model: mujoco.MjModel) -> bytes:
+    """Return what differs between models of the same bodies whose objects differ."""
+    names = ("geom_size", "geom_type", "geom_dataid", "geom_pos", "geom_contype", "numeric_data")
+    return b"".join(getattr(model, name).tobytes() for name in names)

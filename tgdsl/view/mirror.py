@@ -36,8 +36,10 @@ from tgdsl.console.tables import TaxelTable
 from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output, outputs_of
+from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.view.meshes import shapes_of
 from tgdsl.view.page import FRAME, LOCAL, NETWORK_WARNING, PORT, Page, check_viser, drawn
 from tgdsl.view.stages import Poses, SimStage, Stage
 
@@ -57,6 +59,8 @@ class Frame(NamedTuple):
     quat: Float[Array, "body 4"]  # w, x, y, z
     readings: Mapping[str, Array]  # by name, without `env`
     notes: Mapping[str, float | str]
+    state: Mapping[str, Array] | None  # see `Stage.state`
+    model: mujoco.MjModel | None  # of this environment, if its shapes are others than those of the frame before
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,11 @@ class _Tables:
     outputs: tuple[Output, ...]
     taxels: Mapping[str, TaxelTable]
     rows: Mapping[str, TaxelTable]
+
+    @property
+    def inputs(self) -> Inputs:
+        """What the module reads of a scene."""
+        return self.plan.inputs
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,8 @@ class LoopPage:
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         env = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
         self._process = subprocess.Popen([sys.executable, "-c", _CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env)
-        frame, tables = _frame(stage, 0), _tables(stage.touch)
+        self._shapes = shapes_of(stage.model)  # of the model that the page has
+        frame, tables = self._frame(0), _tables(stage.touch)
         self._send(_Opening(tables, tuple(stage.outputs), stage.model, stage.num_envs, frame, host, port, priority))
         try:
             answer = pickle.load(cast(BinaryIO, self._process.stdout))
@@ -126,7 +136,7 @@ class LoopPage:
         """Send the stage's frame if the page has asked for one."""
         env, self._wanted = self._wanted, None
         if env is not None:
-            self._frames.put(_frame(self._stage, env))
+            self._frames.put(self._frame(env))
             self.num_frames += 1
 
     def close(self) -> None:
@@ -136,6 +146,11 @@ class LoopPage:
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
             cast(BinaryIO, pipe).close()
+
+    def _frame(self, env: int) -> Frame:
+        frame = frame_of(self._stage, env, self._shapes)
+        self._shapes = self._shapes if frame.model is None else shapes_of(frame.model)
+        return frame
 
     def _send(self, value: Any) -> None:
         sink = cast(BinaryIO, self._process.stdin)
@@ -170,10 +185,22 @@ def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int 
     return page
 
 
-def _frame(stage: Stage, env: int) -> Frame:
+def frame_of(stage: Stage, env: int, shapes: bytes) -> Frame:
+    """Return a frame for a page that has a model of these shapes."""
     pos, quat = stage.body_poses(env)
+    model = stage.env_model(env)
+    is_other = bool(stage.touch.inputs.objects) and shapes_of(model) != shapes
     readings = {o.name: stage.readings[o.name][env].detach().cpu().numpy().copy() for o in stage.outputs if stage.readings}
-    return Frame(env, stage.time, pos.copy(), quat.copy(), readings, dict(stage.notes(env)))
+    return Frame(
+        env,
+        stage.time,
+        pos.copy(),
+        quat.copy(),
+        readings,
+        dict(stage.notes(env)),
+        stage.state(env),
+        model if is_other else None,
+    )
 
 
 def _tables(touch: TactileModule) -> _Tables:
@@ -195,7 +222,7 @@ class MirrorStage(Stage):
     def __init__(self, opening: _Opening, source: BinaryIO, sink: BinaryIO):
         self.touch = cast(TactileModule, opening.tables)
         self.model, self.num_envs, self._outputs = opening.model, opening.num_envs, opening.outputs
-        self._source, self._sink = source, sink
+        self._source, self._sink, self._env_model = source, sink, opening.model
         self._arrived: SimpleQueue[Frame] = SimpleQueue()
         self._env, self._is_waiting, self.is_over = 0, False, False
         self._take(opening.frame)
@@ -228,6 +255,14 @@ class MirrorStage(Stage):
             self.readings = {}
         return self._frame.pos, self._frame.quat
 
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return the model of the last frame's environment."""
+        return self._env_model
+
+    def state(self, env: int) -> Mapping[str, Array] | None:
+        """Return the state of the last frame."""
+        return self._frame.state
+
     def _ask(self) -> None:
         if not self._is_waiting:
             self._is_waiting = True
@@ -242,6 +277,7 @@ class MirrorStage(Stage):
 
     def _take(self, frame: Frame) -> None:
         self._frame, self.time = frame, frame.time
+        self._env_model = self._env_model if frame.model is None else frame.model
         values = {name: torch.from_numpy(array) for name, array in frame.readings.items()}
         self.readings = {name: value.expand(self.num_envs, *value.shape) for name, value in values.items()}
 

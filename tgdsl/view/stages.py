@@ -24,7 +24,7 @@ from tgdsl.runtime.connect import simulate
 from tgdsl.runtime.rollout import substeps_of
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.scene import scene_model
-from tgdsl.view.contacts import Contacts, contacts_of, simulated_contacts
+from tgdsl.view.contacts import Contacts, contacts_of, simulated_contacts, state_of
 from tgdsl.view.overview import drawn_outputs
 
 Array = np.ndarray
@@ -76,6 +76,11 @@ class Stage(ABC):
 
     def contacts(self, env: int) -> Contacts | None:
         """Return the contacts of one environment; None where they are unknown."""
+        state = self.state(env)
+        return None if state is None else simulated_contacts(self.env_model(env), state)
+
+    def state(self, env: int) -> Mapping[str, Array] | None:
+        """Return the arrays that MuJoCo integrates in one environment, by their names; None if it is not simulated."""
         return None
 
     def close(self) -> None:  # noqa: B027
@@ -118,8 +123,8 @@ class SimStage(Stage):
     def env_model(self, env: int) -> mujoco.MjModel:
         return self.sim.env_model(env) if self.touch.inputs.objects else self.model
 
-    def contacts(self, env: int) -> Contacts:
-        return simulated_contacts(self.sim, env)
+    def state(self, env: int) -> Mapping[str, Array]:
+        return state_of(self.sim, env)
 
 
 class SceneStage(SimStage):

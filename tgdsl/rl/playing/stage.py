@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
-from tgdsl.view.contacts import Contacts, simulated_contacts
+from tgdsl.view.contacts import state_of
 from tgdsl.view.stages import Stage
 
 Array = np.ndarray
@@ -56,9 +56,9 @@ class TaskStage(Stage):
         """Return the simulator's model of one environment."""
         return self.env.sim.env_model(env) if self.touch.inputs.objects else self.model
 
-    def contacts(self, env: int) -> Contacts:
-        """Return the contacts in one environment."""
-        return simulated_contacts(self.env.sim, env)
+    def state(self, env: int) -> Mapping[str, Array]:
+        """Return the simulator's state of one environment."""
+        return state_of(self.env.sim, env)
 
     def close(self) -> None:
         """Release the simulator."""
