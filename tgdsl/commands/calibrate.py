@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from tgdsl.commands import arguments as args
+from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_write, with_folder
 
@@ -69,12 +70,17 @@ class CalibrateSensor:
         if self.compare is not None:
             if self.fit or self.out is not None or self.plot is not None:
                 raise TgdslError("--compare prints a table of its own models, expected no --fit, --out or --plot")
-            print(compare(self.document, list(self.recordings), self.compare, **options))
+            with StatusLine() as progress:
+                progress("fitting each model")
+                table = compare(self.document, list(self.recordings), self.compare, **options)
+            print(table)
             return
         for file in (self.out, self.plot):
             if file is not None:
                 args.refuse_to_replace(file, self.force)
-        fit = calibrate(self.document, list(self.recordings), self.fit, **options)
+        with StatusLine() as progress:
+            progress("fitting")
+            fit = calibrate(self.document, list(self.recordings), self.fit, **options)
         print(fit)
         if self.out is not None:
             print(f"document: {fit.document(self.out)}")

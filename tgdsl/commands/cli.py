@@ -47,6 +47,44 @@ Command = subcommands(
     *(Import, ExportUsd, Export, ExportDataset, Verify, Cache, Bench, Doctor, Grasps, Hand, Calibrate),
 )
 
+EXAMPLES = {
+    "examples list": "",
+    "examples copy": "xhand1_palm tasks/find_ridge",
+    "compile": "hand.yaml -o hand.safetensors --set resolution=high",
+    "explain": "hand.yaml",
+    "schema": "-o tgdsl.schema.json",
+    "run": "hand.yaml --keyframes rest squeeze --view left",
+    "listen": "examples/materials_audio.yaml",
+    "play": "examples/tasks/find_ridge.yaml --policy policies/find_ridge.pt",
+    "train": "examples/tasks/find_ridge.yaml --device cpu --envs 128 --minutes 2",
+    "distill": "examples/tasks/in_palm_rotate_cube.yaml --teacher policies/in_palm_rotate_cube.pt --minutes 4",
+    "sweep": "examples/tasks/sweep.yaml",
+    "evaluate": "examples/tasks/find_ridge.yaml --policy policies/find_ridge.pt --episodes 256",
+    "deploy": "examples/tasks/grip_force.yaml --policy policies/grip_force_agg_force.pt --episodes 16",
+    "view": "hand.yaml",
+    "render": "xhand1 --resolutions low high --view back",
+    "links": "xhand1",
+    "layout new": "hand.urdf --density 4/cm2 -o layout.yaml",
+    "layout freeze": "hand.yaml -o frozen.yaml",
+    "import": "hand.usd -o hand.xml",
+    "export-usd": "hand.xml -o hand.usda",
+    "export": "hand.yaml --to onnx",
+    "export-dataset": "task.yaml --policy policy.pt --episodes 100",
+    "verify": "hand.onnx",
+    "cache": "--clear",
+    "bench": "hand.yaml --sensors skin --envs 1024,4096 --device cuda",
+    "doctor": "",
+    "grasps": "examples/tasks/screwdriver.yaml --num 512",
+    "hand probe": "",
+    "hand monitor": "--port emulator",
+    "hand tare": "-o hand.yaml",
+    "hand record": "press.npz --seconds 20 --calibration hand.yaml",
+    "hand replay": "press.npz --speed 2",
+    "calibrate sensor": 'skin.yaml press.npz --fit skin.thickness="1 mm:9 mm" --hold-out blocks -o fitted.yaml',
+    "calibrate hand": "--log press.npz --loads loads.yaml",
+}
+"""Arguments of each command that its help shows."""
+
 
 def main() -> None:
     """Run one command; a mistake of the user's ends in its message and exit code 2, never in a traceback."""
@@ -83,7 +121,20 @@ def _run() -> None:
     if wrong := [word for word in sys.argv[1:] if word.partition("=")[0] == "--resolution"]:
         raise TgdslError(f"{wrong[0]}: there is no such option; write --set resolution=high")
     about = "Touch for robot learning. `tgdsl --version` prints the version."
-    tyro.cli(Command, prog="tgdsl", description=about).run()
+    try:
+        command = tyro.cli(Command, prog="tgdsl", description=about)
+    except SystemExit:
+        if example := example_of(sys.argv[1:]):
+            print(example)
+        raise
+    command.run()
+
+
+def example_of(words: list[str]) -> str:
+    """Return the last line of a command's help; empty if the words do not ask for it."""
+    *command, last = words or [""]
+    name = " ".join(command)
+    return f"example: tgdsl {name} {EXAMPLES[name]}".rstrip() if name in EXAMPLES and last in ("-h", "--help") else ""
 
 
 def _discard_output() -> None:

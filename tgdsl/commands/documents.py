@@ -86,7 +86,7 @@ class Run:
     """Step a document's scene on the CPU, show the readings, and write them and a picture."""
 
     document: args.DocumentOrArtefact
-    keyframes: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="")] = None
+    keyframes: Annotated[tuple[str, ...] | None, args.optional("NAME [NAME ...]")] = None
     """Keyframes of the scene whose controls are held and moved between, in turn; the first is the start. Default: rest and
     squeeze if the scene has them; else the hand closes on the first object that fits between its fingers."""
     seconds: Seconds = 1.0
@@ -193,7 +193,7 @@ class Listen:
     document: args.DocumentOrArtefact
     sensors: args.Names = ()
     """Sensors to listen to; default: all that make or hear sound. Of several rows the sum is heard."""
-    keyframes: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="")] = None
+    keyframes: Annotated[tuple[str, ...] | None, args.optional("NAME [NAME ...]")] = None
     """Keyframes of the scene whose controls are held and moved between, in turn; default: as of `run`."""
     seconds: Seconds = 1.0
     controls: args.OptionalFile = None

@@ -39,7 +39,7 @@ class Copy:
     The files have the same paths as in the repository, so commands of the documentation work in the folder.
     """
 
-    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = ()
+    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME ...]", help_behavior_hint="")] = ()
     """Names from `tgdsl examples list`, such as xhand1_palm or tasks/find_ridge; default: all."""
     out: args.OutFolder = Path()
     """Folder in which examples/, robots/ and policies/ are created."""

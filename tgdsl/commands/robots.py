@@ -94,7 +94,9 @@ class Freeze:
 
         document = args.robot_document(self.hand, self.layout)
         args.refuse_to_replace(self.out, self.force)
-        spec, layouts = all_layouts(document, args.parsed_overrides(self.set), self.resolutions)
+        with StatusLine() as progress:
+            progress("placing taxels")
+            spec, layouts = all_layouts(document, args.parsed_overrides(self.set), self.resolutions)
         files = frozen_files(spec, layouts, self.out, Path(self.hand).name)
         for path in files:
             args.refuse_to_replace(path, self.force)

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from tgdsl.commands.cli import Command
+from tgdsl.commands.cli import Command, example_of
 
 WIDTH = "110"
 """Columns of the help."""
@@ -44,4 +44,5 @@ def help_of(words: tuple[str, ...]) -> str:
     printed = io.StringIO()
     with redirect_stdout(printed), suppress(SystemExit):
         tyro.cli(Command, prog="tgdsl", args=[*words, "--help"])  # type: ignore[arg-type]
-    return "\n".join(line.rstrip() for line in printed.getvalue().splitlines())
+    lines = [*printed.getvalue().splitlines(), example_of([*words, "--help"])]
+    return "\n".join(line.rstrip() for line in lines)
