@@ -168,12 +168,12 @@ def reading_section(rows: Sequence[dict[str, str]], text: str) -> str:
         lines.append(_line([*cells, f"{relative} ({low} to {high})"]))
     first = rows[0]
     said = (
-        f"`{command}`: while the teacher acts, ridge regression from the numbers of one instant to the sum of normal forces on "
-        f"the object, by MuJoCo's own contact forces; {first['train_episodes']} episodes to fit, {first['test_episodes']} "
-        f"others to test, {int(first['instants']):,} instants of them. Intervals are over test episodes. `none`: joint "
-        "positions, velocities and last action."
+        f"`{command}` fits a ridge regression while the teacher acts. From the numbers of one instant it predicts the sum of "
+        f"normal forces on the object, which MuJoCo's contact forces give. {first['train_episodes']} episodes fit it, "
+        f"{first['test_episodes']} others test it ({int(first['instants']):,} instants). Intervals are over test episodes. "
+        "`none` has joint positions, velocities and last action."
     )
-    return "\n\n".join(["### The force that can be read", said, "\n".join(lines)])
+    return "\n\n".join(["### How well each type predicts the force", said, "\n".join(lines)])
 
 
 def written(text: str, made: str, file: Path = PAGE) -> str:
@@ -254,8 +254,8 @@ def _conditions(runs: Sequence[Ablation]) -> str:
     simulations = [own for run in runs for own in run.made["simulations"].values()]
     devices = ", ".join(dict.fromkeys(device for own in simulations for device in own["devices"]))
     legs, envs = max(len(own["begun"]) for own in simulations), dict.fromkeys(f"{own['envs']:,}" for own in simulations)
-    said = f"`{made['document']}`, taught by `{made['teacher']}` on {devices}: {' and '.join(envs)} environments"
-    said += f", {max(each.row.minutes for each in runs[0].taught):.1f} min" if len(runs) == 1 else ", a run each"
+    said = f"Task `{made['document']}`, teacher `{made['teacher']}`, on {devices}: {' and '.join(envs)} environments"
+    said += f", {max(each.row.minutes for each in runs[0].taught):.1f} min" if len(runs) == 1 else ", one run per row"
     said += f" in {legs} legs" if legs > 1 else ""
     rates = simulations[0]["rates"]
     said += f", at rates of {' and then '.join(rates)}" if len(set(rates)) > 1 else ""
@@ -268,7 +268,7 @@ def _conditions(runs: Sequence[Ablation]) -> str:
         bound = f"{FLAT * low:.3g}" if low == high else f"{FLAT * low:.3g} to {FLAT * high:.3g}"
         said += f"Flat: within ±{bound} over the last third. "
     else:
-        said += "Without the scores of teacher and joints at rest no curve is called flat. "
+        said += "Without the scores of teacher and joints at rest, no curve is called flat. "
     paper = paper_samples(task)
     if paper is None:
         return said + "The paper does not have this task."
@@ -285,7 +285,7 @@ def _verdicts(found: Sequence[Judged], is_less_better: bool) -> str:
     pairs = [(one, other) for i, one in enumerate(found) for other in _beside(one, found[i + 1 :])]
     apart = sum(bool(worse_than(a, [b], is_less_better) or worse_than(b, [a], is_less_better)) for a, b in pairs)
     said = [
-        f"{flat} of {len(found)} curves have flattened; {apart} of {len(pairs)} pairs of types in one place are told apart."
+        f"{flat} of {len(found)} curves are flat. The rule separates {apart} of {len(pairs)} pairs of types in the same place."
     ]
     for i, axis in enumerate(("placement", "resolution", "noise")):
         for one in found:

@@ -97,7 +97,7 @@ def test_a_teacher_that_is_no_better_than_rest(kept, tmp_path):
     """No curve can be flat within nothing."""
     folder = kept()
     evaluation(folder / "made_up" / "rest.json", 12.0)
-    assert "Flat: within ±0 over the last third" in tables(folder) and "0 of 5 curves have flattened" in tables(folder)
+    assert "Flat: within ±0 over the last third" in tables(folder) and "0 of 5 curves are flat." in tables(folder)
 
 
 def test_page_and_plots_are_written_together_into_folders_that_are_made(kept, tmp_path):
@@ -153,7 +153,7 @@ def test_without_a_yardstick_no_curve_is_flat(kept, tmp_path):
     assert judged(read_ablation(folder / "made_up"))[0].is_flat  # what feels nothing stands in for rest
     (folder / "made_up" / "teacher.json").unlink()
     assert {own.is_flat for own in judged(read_ablation(folder / "made_up"))} == {None}
-    assert "no curve is called flat" in tables(folder) and "0 of 5 curves have flattened" in tables(folder)
+    assert "no curve is called flat" in tables(folder) and "0 of 5 curves are flat." in tables(folder)
 
 
 def test_placements_resolutions_and_noises(kept):
@@ -165,7 +165,7 @@ def test_placements_resolutions_and_noises(kept):
     ablation = read_ablation(folder / "made_up")
     assert [own.row.resolution for own in ablation.taught if own.row.type == "none"] == ["low", "med"]
     text = tables(folder)
-    assert "8 of 8 pairs of types in one place are told apart" in text and "is worse than hand" not in text
+    assert "separates 8 of 8 pairs of types in the same place" in text and "is worse than hand" not in text
     table = rows_of(folder / "made_up" / "table.csv")
     for row in table:
         if row["placement"] == "tips" and row["noise"] == "clean":

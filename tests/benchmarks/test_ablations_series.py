@@ -63,7 +63,8 @@ def test_a_name_that_sorts_in_between_does_not_part_a_series(kept, tmp_path):
 
 
 def test_a_series_has_one_plot(kept, tmp_path):
-    page = tmp_path / "page.md"
+    page = tmp_path / "background" / "page.md"
+    page.parent.mkdir()
     page.write_text(f"{BEGIN}\n{END}\n")
     assert write_page(kept, page) == [page, tmp_path / "images" / "ablation_nets.png"]
 
