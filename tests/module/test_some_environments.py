@@ -122,7 +122,8 @@ def test_a_look_before_the_first_call_fixes_nothing(touch):
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager(folder, with_grad):
+@torch.no_grad()
+def test_compiled_equals_eager(folder):
     """Rings, filters, walks, windows, held samples, bits: three graphs, of calls, of masked ones and of looks."""
     noise = {"read_delay": 0.013, "hysteresis": {"strength": 0.5, "time_constant": 0.05}, "drift": 1e-5}
     sensors = {

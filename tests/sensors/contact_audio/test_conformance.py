@@ -73,7 +73,6 @@ class TestOfObjects(TestSamples):
 
 
 class TestBands(TestSamples):
-    test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     parameters = {**COMMON, "outputs": "bands"}
 
     def test_something_is_felt(self, scene):
@@ -86,7 +85,6 @@ class TestBands(TestSamples):
 
 class TestLevels(TestSamples):
     parameters = {**COMMON, "outputs": "bands", "scale": "decibel"}
-    test_compiled_equals_eager = None
     test_something_is_felt = TestBands.test_something_is_felt
 
 
@@ -97,7 +95,6 @@ class TestSubsteps(TestSamples):
 
 
 class TestForce(TestSamples):
-    test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     parameters = {**COMMON, "model": "force"}
 
 

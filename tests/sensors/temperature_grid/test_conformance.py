@@ -68,7 +68,6 @@ class TestFixedAreas(TestTemperatureGrid):
 
 
 class TestSurface(TestTemperatureGrid):
-    test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     parameters = {"cells": [3, 3, 3], "material": "copper", "scheme": "spectral", "outputs": "surface", "temperature": 30.0}
     rest = 30.0
 
@@ -88,7 +87,6 @@ class TestLinksThatTouch(TestTemperatureGrid):
 
 
 class TestPaper(TestTemperatureGrid):
-    test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     objects = HEAT | {"other": {"body": "tip", "material": "skin"}}
     parameters = {
         "cells": [2, 3, 2], "material": "skin", "model": "paper", "contact_area": "1 mm2", "temperature": 30.0, "lag": 0.3,
