@@ -63,13 +63,29 @@ def test_there_is_a_page_for_each_kind_and_each_page(built):
         assert (built / source.relative_to(REPOSITORY / "docs").with_suffix(".html")).is_file()
 
 
-def test_pictures_are_drawn_and_the_search_finds_a_page(page):
+def test_pictures_are_drawn(page):
     tab, address = page
-    for name in ("index", "background/performance", "background/hands", "start/learn"):
+    for name in (
+        "index",
+        "generated/overview",
+        "generated/gallery",
+        "generated/kinds/contact",
+        "background/hands",
+        "start/learn",
+    ):
         tab.goto(f"{address}/{name}.html", wait_until="load")
         widths = tab.eval_on_selector_all(".content img, article img", "images => images.map(image => image.naturalWidth)")
         assert widths and min(widths) > 0, name
-    tab.goto(f"{address}/search.html?q=permittivity")
+
+
+@pytest.mark.parametrize(("word", "expected"), [("permittivity", "how-to/kind"), ("read_delay", "background/noise")])
+def test_the_search_finds_a_page(page, word, expected):
+    tab, address = page
+    tab.goto(f"{address}/search.html?q={word}")
     tab.wait_for_selector("#search-results li a", timeout=30_000)
     found = tab.eval_on_selector_all("#search-results li a", "links => links.map(link => link.getAttribute('href'))")
-    assert any("how-to/kind" in href for href in found), found
+    assert any(expected in href for href in found), found
+
+
+def test_the_api_links_to_source(built):
+    assert 'href="../../_modules/tgdsl/' in (built / "generated" / "api" / "functions.html").read_text(encoding="utf-8")
