@@ -54,7 +54,7 @@ class Copy:
         contents = {self.out / file.relative_to(top): file.read_bytes() for file in files}
         if changed := [str(file) for file, content in contents.items() if file.exists() and file.read_bytes() != content]:
             raise TgdslError(f"already there, with other content: {listed(changed)}; remove them, or name another folder by -o")
-        atomic_write_all(contents)
+        atomic_write_all({file: content for file, content in contents.items() if not file.exists()})
         print("\n".join(str(self.out / file.relative_to(top)) for file in files if top / "robots" not in file.parents))
         print(f"with robots: {len(contents)} files, {sum(map(len, contents.values())) / 1e6:.1f} MB")
 
