@@ -1,14 +1,16 @@
 """Sphinx's configuration: `make docs` builds these pages, and those that `_ext/tgdsl_docs` generates, into build/docs."""
 
 import sys
-from importlib.metadata import version as installed_version
+import tomllib
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
+from tgdsl_docs.links import ROOT
+
 project = "tgdsl"
 author = "The tgdsl authors"
-version = release = installed_version("tgdsl")
+version = release = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 extensions = [
     "myst_parser",
@@ -34,6 +36,8 @@ python_maximum_signature_line_length = 100
 
 html_theme = "furo"
 html_title = f"tgdsl {version}"
+html_static_path = ["_static"]
+html_css_files = ["pictures.css"]
 html_theme_options = {"navigation_with_keys": True}
 html_copy_source = False
 html_show_sphinx = False
