@@ -18,7 +18,7 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.view.cameras import facing_camera, pose_of
 from tgdsl.view.markers import Markers, Pose, is_visible, markers_of
 from tgdsl.view.meshes import mesh_of
-from tgdsl.view.picture import drawing, picture, short_names
+from tgdsl.view.picture import distal, drawing, picture, short_names
 from tgdsl.view.raster import Camera, rasterise
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
@@ -227,6 +227,17 @@ FINGER = """
 <body name="ball" pos="0 0 1"><freejoint/><geom size=".01"/></body>
 </worldbody></mujoco>
 """
+
+
+@pytest.mark.parametrize("joint", ["type='slide' axis='0 1 0'", "type='hinge' axis='1 0 0' pos='0 0 .03'"])
+def test_a_jaw_whose_origin_is_its_middle_points_away_from_its_mount(joint: str) -> None:
+    """It hangs below the mount, and its taxels are about its origin: they do not say which end is distal."""
+    jaw = f"<body name='jaw' pos='0 .03 -.05'><joint {joint}/><geom type='box' size='.01 .004 .03'/></body>"
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><body name='mount'><geom size='.01'/>{jaw}</body></worldbody></mujoco>"
+    )
+    along, is_tip = distal(model, "jaw", np.array([[0.0, -0.004, z] for z in (-0.02, 0.0, 0.02)]))
+    assert is_tip and along[2] < 0 and abs(along[2]) > abs(along[:2]).max()
 
 
 @pytest.mark.parametrize("along", [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])

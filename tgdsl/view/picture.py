@@ -157,7 +157,8 @@ def _draw_maps(
 def distal(model: mujoco.MjModel, body: str, pos: Float[Array, "taxel 3"]) -> tuple[Float[Array, " 3"], bool]:
     """Return the direction in a body's frame in which the robot goes on from its joint, and whether it ends there.
 
-    It leads to the bodies that move against this one, or else to its taxels, at `pos` in its frame [m].
+    It leads to the bodies that move against this one, or else to its taxels, at `pos` in its frame [m]. It begins at the
+    joint's anchor, or at the parent's origin where the joint slides, as a slide has no anchor.
     """
     own = model.body(body).id
     state = mujoco.MjData(model)
@@ -169,7 +170,11 @@ def distal(model: mujoco.MjModel, body: str, pos: Float[Array, "taxel 3"]) -> tu
     ends = [i for i in range(model.nbody) if model.body_parentid[i] in rigid and model.body_jntnum[i] and i != base]
     rotation = state.xmat[own].reshape(3, 3)
     end = state.xpos[ends].mean(axis=0) if ends else state.xpos[own] + rotation @ pos.mean(axis=0)
-    return (end - state.xpos[base]) @ rotation, not ends
+    joint, start = int(model.body_jntadr[base]), state.xpos[base]
+    if joint >= 0:
+        slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        start = state.xpos[model.body_parentid[base]] if slides else state.xanchor[joint]
+    return (end - start) @ rotation, not ends
 
 
 def turned(table: Array, along: Float[Array, " 3"]) -> tuple[Float[Array, " 3"], int]:
