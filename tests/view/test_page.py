@@ -135,6 +135,13 @@ def test_another_reading_has_its_own_channels(document):
         assert page.panel.channel.value == "magnitude"
 
 
+def test_a_choice_has_no_option_twice(document):
+    """A browser refuses to show such a page; the document has a group named "all"."""
+    with opened(SceneStage(tgdsl.compile(document))) as page:
+        for dropdown in (page.panel.group, page.panel.plotted, page.panel.reading, page.panel.channel):
+            assert len(dropdown.options) == len(set(dropdown.options))
+
+
 def test_pause_stops_and_step_once_makes_one_step(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:

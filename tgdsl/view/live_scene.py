@@ -21,6 +21,7 @@ from tgdsl.view.stages import Poses, Stage
 Array = np.ndarray
 CARRIER, ROBOT, OBJECT = (176, 181, 190), (128, 134, 145), (60, 112, 186)  # links with taxels, other links, objects
 ARROW = 0.03  # length of the arrow of the largest vector so far [m]
+STILL, STILL_TURN = 1e-5, 1e-4  # a body that moved less since it was drawn stays [m], [quaternion]
 _FORCE, _CONTACT = (30, 30, 30), (190, 24, 120)
 _CONTACT_SIZE = 0.0025  # width of a contact point [m]
 
@@ -38,6 +39,7 @@ class LiveScene:
         scene = server.scene
         scene.set_up_direction("+z")
         self.frames = {body: scene.add_frame(f"/body{body}", show_axes=False) for body in range(stage.model.nbody)}
+        self._pos, self._quat = np.full((stage.model.nbody, 3), np.inf), np.full((stage.model.nbody, 4), np.inf)  # as drawn
         self._meshes: dict[int, list[tuple[Any, Any]]] = {}
         for body in range(stage.model.nbody):
             self._add_body(stage.model, body)
@@ -58,8 +60,10 @@ class LiveScene:
     def move(self, poses: Poses, env: int) -> None:
         """Put the bodies where they are; redraw objects that have another shape in this environment."""
         pos, quat = poses
-        for body, frame in self.frames.items():
-            frame.position, frame.wxyz = pos[body], quat[body]
+        apart = np.maximum(np.abs(pos - self._pos).max(axis=1) / STILL, np.abs(quat - self._quat).max(axis=1) / STILL_TURN)
+        for body in np.flatnonzero(apart > 1):
+            self._pos[body], self._quat[body] = pos[body], quat[body]
+            self.frames[int(body)].position, self.frames[int(body)].wxyz = pos[body], quat[body]
         model = self._stage.env_model(env)
         if model is not self._stage.model and (shapes := shapes_of(model)) != self._shapes:
             self._shapes = shapes

@@ -14,7 +14,7 @@ from tgdsl.view.layers import Shown
 from tgdsl.view.stages import Stage
 
 Array = np.ndarray
-EVERY = "all"  # of links: no choice
+EVERY = "(all)"  # of links: no choice; a group may be named "all"
 
 
 class Actions(NamedTuple):
