@@ -16,6 +16,7 @@ import pytest
 from faulty_lines import FaultyEmulator
 from first_order_hands import first_order_hand
 from hand_logs import write_log
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from xhand1_hands import PATIENT
 
@@ -27,7 +28,9 @@ from tgdsl.runtime.xhand1.emulator.emulator import TipForces
 from tgdsl.runtime.xhand1.log.log import Fault
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.protocol import JOINTS, STATE_SIZE, decode_state
+from tgdsl.scene.scene import scene_model
 from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
+from tgdsl.view.heat_maps import HeatMaps
 from tgdsl.view.meshes import body_surfaces
 from tgdsl.view.page import Page
 from tgdsl.view.stages import RunStage, SceneStage, Stage
@@ -407,6 +410,96 @@ def test_temperatures_colour_the_surfaces_of_links(document):
         assert {mesh.visible for mesh, _ in page.scene._meshes[page.stage.model.body("pad").id]} == {False}
 
 
+def test_a_heat_map_has_a_grid_with_its_distal_end_up_and_scattered_taxels_as_dots(document):
+
+    touch = tgdsl.compile(document)
+    table = touch.taxels["touch"]
+    maps = HeatMaps(scene_model(touch.plan.scene), table)
+    colour = np.zeros((len(table["pos"]), 3), dtype=np.uint8)
+    colour[:, 0], colour[:, 1] = 10 * np.arange(len(colour)), 7
+    image = maps.image(colour)
+    assert set(np.unique(image[image[..., 1] == 7][:, 0])) == set(colour[:, 0])
+
+    def middle(taxel: int) -> np.ndarray:
+        return np.argwhere((image == colour[taxel]).all(axis=-1)).mean(axis=0)
+
+    cells = {(int(row), int(column)): i for i, (row, column) in enumerate(zip(table["row"], table["column"], strict=True))}
+    down, right = middle(cells[3, 0]) - middle(cells[0, 0]), middle(cells[0, 3]) - middle(cells[0, 0])
+    assert abs(down @ right) < 1e-9
+    outward = np.cross(*(table["pos"][cells[cell]] - table["pos"][cells[0, 0]] for cell in ((3, 0), (0, 3))))
+    assert np.sign(down[0] * right[1] - down[1] * right[0]) == np.sign(outward @ table["normal"][0])  # seen from outside
+    scattered = table.copy()
+    scattered["row"] = scattered["column"] = -1
+    dots = HeatMaps(scene_model(touch.plan.scene), scattered).image(colour)
+    assert set(np.unique(dots[dots[..., 1] == 7][:, 0])) == set(colour[:, 0])
+
+
+def test_the_heat_map_of_a_reading_has_its_colours(document):
+    with opened(SceneStage(tgdsl.compile(document))) as page:
+        for _ in range(100):
+            page.stage.advance()
+        page._last_due.clear()
+        page.draw()
+        assert page.panel.maps.visible
+        hottest = page.scene.layers[0].read(page.stage.readings["touch"], 0, "magnitude").colour
+        image = page.panel.maps.image.reshape(-1, 3)
+        assert {tuple(each) for each in hottest.tolist()} <= {tuple(each) for each in image.tolist()}
+        page.panel.parts["heat maps"].value = False
+        page._last_due.clear()
+        page.draw()
+        assert not page.panel.maps.visible
+
+
+def test_observations_are_live_values(document):
+    observed = document.with_name("observed.yaml")
+    observed.write_text(DOCUMENT + "observations:\n  policy: [{type: force, of: touch}, {type: joint_pos}]\n")
+    with opened(SceneStage(tgdsl.compile(observed))) as page:
+        for _ in range(100):
+            page.stage.advance()
+        page._last_due.clear()
+        page.draw()
+        force = page.stage.readings["touch"][0, :, :3]
+        lift = float(page.stage.sim.qpos[0, 0])
+        assert page.panel.group_values is not None
+        rows = {
+            cells[1].strip(): cells[2].strip()
+            for line in page.panel.group_values.content.splitlines()[2:]
+            if (cells := line.split("|"))
+        }
+        low, high = map(float, rows["touch"].split(" … "))
+        assert (low, high) == pytest.approx((float(force.min()), float(force.max())), rel=0.01)
+        assert float(rows["joint_pos"]) == pytest.approx(lift, rel=0.02)
+
+
+def test_a_task_is_moved_by_its_policy_or_by_hand():
+    task = View(ROOT / "examples/tasks/in_palm_rotate_cube.yaml")._stage()
+    with opened(task) as page:
+        assert page.panel.by_hand is not None
+        task.advance()
+        page._react()
+        assert [slider.value for slider in page.panel.sliders] == [0.0] * len(task.env.joint_names)  # without a policy
+        page.panel.by_hand.value = True
+        page.panel.sliders[1].value = 0.5
+        page._react()
+        before = task.env.now.joint_pos[0, 1].item()
+        for _ in range(10):
+            task.advance()
+        assert task.acted(0)[1] == pytest.approx(0.5)
+        assert abs(task.env.now.joint_pos[0, 1].item() - before) > 0.01
+        page.panel.by_hand.value = False
+        page._react()
+        task.advance()
+        assert (task.acted(0) == 0).all()
+        page._last_due.clear()
+        page.draw()
+        assert page.panel.observed is not None and page.panel.group_values is not None
+        assert page.panel.observed.options == tuple(task.env.groups)
+        joint = task.env.joint_names[1]
+        written = re.search(rf"position of {joint} \| (\S+) \| rad", page.panel.group_values.content)
+        assert float(written[1]) == pytest.approx(float(task.env.observe()["proprio"][0, 1]), rel=0.01, abs=1e-3)
+        assert "object_distance" in page.panel.notes.content
+
+
 # Hands -------------------------------------------------------------------------------------------------------------------------
 
 
@@ -589,6 +682,18 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
         view.context.set_offline(False)
         view.reload()
         view.get_by_text("16 taxels").wait_for()
+        with view.expect_download() as download:
+            view.get_by_role("button", name="screenshot").dispatch_event("click")
+        download.value.save_as(document.with_name("view.png"))
+        with Image.open(document.with_name("view.png")) as image:
+            assert len(image.getcolors(1 << 24)) > 100
+        view.get_by_role("button", name="record video").dispatch_event("click")
+        assert soon(lambda: page._recording is not None and len(page._recording._frames) > 2)
+        with view.expect_download() as download:
+            view.get_by_role("button", name="stop and save video").dispatch_event("click")
+        download.value.save_as(document.with_name("view.gif"))
+        with Image.open(document.with_name("view.gif")) as video:
+            assert video.n_frames > 1
         document.write_text(DOCUMENT.replace("rows: 4", "rows: 3"))
         view.get_by_text("12 taxels").wait_for()
         document.write_text(DOCUMENT.replace("kind: proximity", "kind: proximty"))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from tgdsl.view.sound import PEAK, Sound, draw, spectrogram, write_wav
+from tgdsl.view.sound import PEAK, RollingSound, Sound, draw, spectrogram, write_wav
 
 RATE = 8000.0
 
@@ -52,3 +52,19 @@ def test_a_sound_shorter_than_a_window_has_one(tmp_path):
     assert spectrogram(sound).level.shape[1] == 1
     draw([sound, decaying((440.0, 5.0))], tmp_path / "two.png", "two", {"bell": [440.0]})
     assert (tmp_path / "two.png").stat().st_size > 1000
+
+
+def test_a_rolling_sound_keeps_its_last_seconds_and_begins_again_after_a_gap():
+    rate, step, frequency = 8000.0, 0.01, 1000.0
+    rolling = RollingSound("hum", "m/s", 0.5)
+    num = round(rate * step)
+    for i in range(200):
+        at = (i * num + np.arange(num)) / rate
+        rolling.add(np.sin(2 * np.pi * frequency * at), (i + 1) * step, step)
+    assert len(rolling.sound.samples) == 0.5 * rate
+    image = rolling.image(64, 50).astype(int).sum(axis=2)
+    assert abs(image[:, 25].argmax() - 64 * (1 - frequency / (rate / 2))) <= 1  # the bright row: 1 kHz of 4, from below
+    rolling.add(np.zeros(num), 5.0, step)
+    assert len(rolling.sound.samples) == num
+    quiet = rolling.image(64, 50)
+    assert (quiet == quiet[0, 0]).all()

@@ -41,7 +41,7 @@ class Rows(NamedTuple):
     """Rows of a reading in the frames of their bodies."""
 
     body: Int[Array, " row"]
-    link: list[str]
+    link: Array  # names, (row,)
     pos: Float[Array, "row 3"]  # [m]
     normal: Float[Array, "row 3"]  # outward unit normal
     size: Float[Array, " row"]  # width of the patch that a row stands for [m]; 0 marks an inactive filler
@@ -134,7 +134,7 @@ class DiscLayer(Layer):
             links = [str(link) for link in table["link"]]
             labels = [f"{link}, taxel {i}" for i, link in enumerate(links)]
         normal = taxels.normal / np.linalg.norm(taxels.normal, axis=1, keepdims=True)
-        self.rows = Rows(body, links, taxels.pos, normal, taxels.size, labels)
+        self.rows = Rows(body, np.array(links), taxels.pos, normal, taxels.size, labels)
         angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
         corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])
         faces = np.array([[0, 1 + i, 1 + (i + 1) % 16] for i in range(16)])
@@ -200,7 +200,7 @@ class SurfaceLayer(Layer):
         normal = np.where(length > 1e-6, layout.normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])  # cells of a plate: 0
         body = np.array([model.body(link.body).id for link in links], dtype=np.int64)
         labels = [f"{link.body}, cell {i}" for i, link in zip(boxes.chosen, links, strict=True)]
-        self.rows = Rows(body, [link.name for link in links], layout.pos, normal, np.sqrt(layout.area), labels)
+        self.rows = Rows(body, np.array([link.name for link in links]), layout.pos, normal, np.sqrt(layout.area), labels)
         self.bodies = frozenset(body.tolist())  # those whose surface this layer draws
         self._members: list[tuple[Any, int]] = []
         for i, link in enumerate(layout.links):

@@ -21,8 +21,12 @@ from jaxtyping import Float
 
 from tgdsl.errors import TgdslError
 from tgdsl.module.outputs import Output
+from tgdsl.view.capture import Recording, png, view_of
+from tgdsl.view.heat_maps import HeatMaps
+from tgdsl.view.layers import DiscLayer, Layer, Shown
 from tgdsl.view.live_scene import LiveScene
 from tgdsl.view.panel import EVERY, Actions, Panel, legend
+from tgdsl.view.sound import RANGE, RollingSound, sounding
 from tgdsl.view.stages import Poses, Stage
 
 Array = np.ndarray
@@ -30,9 +34,13 @@ LOCAL = "127.0.0.1"
 PORT = 8080
 FRAME = 1 / 30  # least time between two frames [s]
 PLOT_SECONDS = 10.0  # how much of the past the plot shows [s]
+IMAGE = 0.1  # least time between two heat maps or spectrograms [s]
+SPECTROGRAM = (128, 340)  # its rows and columns of pixels
+SOUND_SECONDS = 3.0  # how much of the past the spectrogram shows [s]
 SAVED_FRAMES = 1800  # number of frames that the page can save: the last minute at 30 per second
 NETWORK_WARNING = "the page is served at {}: whoever reaches this machine can see and control it"
 MAX_STEPS = 5  # most control steps per frame: a scene slower than that runs behind real time
+_RECORD = ("record video", "stop and save video")  # label of the button before and during a recording
 
 
 class Page:
@@ -55,6 +63,7 @@ class Page:
             self.server = viser.ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
         if host != LOCAL:
             warnings.warn(NETWORK_WARNING.format(host), stacklevel=2)
+        self._recording: Recording | None = None
         self.show(stage)
 
     @property
@@ -77,6 +86,11 @@ class Page:
         self._seen: dict[str, Any] = {"env": 0, "instant": 0, "group": EVERY, "plotted": EVERY, "keyframe": ""}
         self._history: deque[tuple[float, float]] = deque()
         self._frames_seen: deque[dict[str, Array]] = deque(maxlen=SAVED_FRAMES)
+        self._last_due: dict[str, float] = {}
+        self._maps: dict[str, HeatMaps] = {}
+        units = {output.name: output.units[0] for output in stage.outputs}
+        heard = [sensor.name for sensor in sounding(stage.touch.plan) if sensor.name in units]
+        self._sounds = {name: RollingSound(name, units[name], SOUND_SECONDS) for name in heard}
         self._clicks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         later = self._clicks.put
         with self.server.atomic():
@@ -88,8 +102,11 @@ class Page:
                 lambda: later(self._step_once),
                 lambda: later(self._restart),
                 lambda client: later(lambda: self._save(client)),
+                self._screenshot,
+                self._record_video,
             )
-            self.panel = Panel(self.server.gui, stage, outputs, chosen, actions)
+            self.panel = Panel(self.server.gui, stage, outputs, list(self._sounds), chosen, actions)
+            self.panel.record.label = _RECORD[self._recording is not None]
             self._react()
         self.draw()
         if is_first:
@@ -121,7 +138,7 @@ class Page:
             steps = min(MAX_STEPS, int(due / self.stage.control_step))
             due = min(due - steps * self.stage.control_step, self.stage.control_step)
             for _ in range(steps):
-                self.stage.advance()
+                self._advance()
             self.draw()
             time.sleep(max(0.0, FRAME - (time.monotonic() - start)))
 
@@ -174,13 +191,15 @@ class Page:
         is_shown = np.isin(rows.link, list(links))
         self.scene.draw_arrows(rows, shown, poses, is_shown & panel.parts["arrows"].value)
         panel.legend.content = legend(shown)
+        if self._is_due("images", IMAGE):
+            self._draw_images(layer, shown)
         if self._picked is not None:
             value, name = float(shown.value[self._picked]), rows.label[self._picked]
             place = ", ".join(f"{1e3 * part:.1f}" for part in rows.pos[self._picked])
             self.scene.name_row(rows, self._picked, f"{name}: {value:.4g} {shown.unit}")
             name += f"** at ({place}) mm in its link**"
         else:
-            is_meant = is_shown if panel.plotted.value == EVERY else np.array(rows.link) == panel.plotted.value
+            is_meant = is_shown if panel.plotted.value == EVERY else rows.link == panel.plotted.value
             value = float(getattr(np, layer.total)(shown.value[is_meant])) if is_meant.any() else 0.0
             name = layer.total if panel.plotted.value == EVERY else f"{layer.total} of {panel.plotted.value}"
             self.scene.name_row(rows, None)
@@ -191,6 +210,39 @@ class Page:
         if len(self._history) > 1:
             times, values = np.array(self._history).T
             panel.plot.data = (times, values)
+
+    def _draw_images(self, layer: Layer, shown: Shown) -> None:
+        """Draw the heat maps of taxels, and the spectrogram of the chosen sound."""
+        panel, output = self.panel, layer.output
+        panel.maps.visible = panel.parts["heat maps"].value and output.rows == "taxel" and isinstance(layer, DiscLayer)
+        if panel.maps.visible:
+            if output.sensor not in self._maps:
+                self._maps[output.sensor] = HeatMaps(self.stage.model, self.stage.touch.taxels[output.sensor])
+            panel.maps.image = self._maps[output.sensor].image(shown.colour)
+        if panel.sound is not None and panel.spectrogram is not None:
+            sound = self._sounds[panel.sound.value]
+            panel.spectrogram.image = sound.image(*SPECTROGRAM)
+            top = f"0 to {sound.sound.rate / 2000:.3g} kHz upward"
+            panel.spectrogram.label = f"last {SOUND_SECONDS:g} s, {top}, {RANGE:g} dB below the loudest"
+
+    def _hear(self) -> None:
+        """Keep the sound of the step that the stage has made."""
+        env = self.panel.env_index
+        for name, sound in self._sounds.items():
+            block = self.stage.readings[name][env].detach().double().sum(dim=(1, 2)).cpu().numpy()
+            sound.add(block, self.stage.time, self.stage.control_step)
+
+    def _is_due(self, name: str, period: float) -> bool:
+        """Return whether a period has passed since this was last due [s]."""
+        now = time.monotonic()
+        if now - self._last_due.get(name, -math.inf) < period:
+            return False
+        self._last_due[name] = now
+        return True
+
+    def _advance(self) -> None:
+        self.stage.advance()
+        self._hear()
 
     def _draw_contacts(self, env: int) -> str:
         """Draw the contacts if they are switched on; return what there is to say of them."""
@@ -205,9 +257,14 @@ class Page:
 
     def _draw_text(self, contacts: str) -> None:
         """Write the time, and what the stage notes."""
-        notes = self.stage.notes(self.panel.env_index)
+        env = self.panel.env_index
+        notes = self.stage.notes(env)
         rows = [f"\n| {name} | {f'{value:.4g}' if isinstance(value, float) else value} |" for name, value in notes.items()]
         self.panel.notes.content = f"| | |\n|---|---|{''.join(rows)}" if rows else ""
+        group = self.panel.observed
+        if group is not None and self._is_due("observations", IMAGE):
+            rows = [f"\n| {name} | {_range(values)} | {unit} |" for name, unit, values in self.stage.observed(group.value, env)]
+            self.panel.group_values.content = f"| | | |\n|---|---|---|{''.join(rows)}"
         layer = self.scene.layers[0]
         self.panel.status.content = f"t = {self.stage.time:.2f} s · {len(layer.rows.body)} taxels{contacts}"
         instant = self.panel.instant
@@ -227,6 +284,8 @@ class Page:
             panel.channel.value = self.scene.layers[0].channels[0]
         if self._changed("env", panel.env_index) | self._changed("plotted", panel.plotted.value):
             self._history.clear()
+            for sound in self._sounds.values():
+                sound.clear()
             if self._picked is not None and panel.plotted.value != EVERY:
                 self._picked = None
         if panel.instant is not None and self._changed("instant", int(panel.instant.value)):
@@ -237,10 +296,15 @@ class Page:
                 box.value = name in group
         parts = {name: panel.parts[name].value for name in ("robot", "objects", "taxels")}
         self.scene.show(**parts, plain=panel.is_plain.value, links=panel.shown_links)
-        if panel.sliders and self.stage.control is not None:
-            if self._changed("keyframe", panel.keyframe.value) and panel.keyframe.value:
-                panel.set_sliders(self.stage.model.key(panel.keyframe.value).ctrl)
-            self.stage.control[:] = [slider.value for slider in panel.sliders]
+        if not panel.sliders or self.stage.control is None:
+            return
+        if panel.keyframe is not None and self._changed("keyframe", panel.keyframe.value) and panel.keyframe.value:
+            panel.set_sliders(self.stage.model.key(panel.keyframe.value).ctrl)
+        if panel.by_hand is not None:
+            self.stage.by_hand = panel.by_hand.value
+            if not panel.by_hand.value and (action := self.stage.acted(panel.env_index)) is not None:
+                panel.set_sliders(action)
+        self.stage.control[:] = [slider.value for slider in panel.sliders]
 
     def _changed(self, name: str, value: Any) -> bool:
         """Return whether a control is set to something else than before."""
@@ -256,16 +320,27 @@ class Page:
         if layer.output.name != before:
             self._picked = None
             self._history.clear()
-            self.panel.offer(layer.channels, layer.rows.link)
+            self.panel.offer(layer.channels, layer.rows.link.tolist())
 
     def _step_once(self) -> None:
         self.panel.paused.value = True
-        self.stage.advance()
+        self._advance()
 
     def _save(self, client: Any) -> None:
         """Send the saved frames to the browser that asked for them."""
         if self._frames_seen:
             client.send_file_download("seen.npz", self.saved_frames(), save_immediately=True)
+
+    def _screenshot(self, client: Any) -> None:
+        """Send a picture of a browser's view to it."""
+        client.send_file_download("view.png", png(view_of(client)), save_immediately=True)
+
+    def _record_video(self, client: Any) -> None:
+        """Begin a video of a browser's view, or end it and send it to that browser."""
+        recording, self._recording = self._recording, None if self._recording else Recording(client)
+        self.panel.record.label = _RECORD[self._recording is not None]
+        if recording is not None and (video := recording.stop()) is not None:
+            recording.client.send_file_download("view.gif", video, save_immediately=True)
 
     def _restart(self) -> None:
         self.stage.restart()
@@ -279,6 +354,11 @@ class Page:
         self._history.clear()
         if self._picked is not None:
             self.panel.plotted.value = self._seen["plotted"] = EVERY
+
+
+def _range(values: Float[Array, " feature"]) -> str:
+    """Return one number, or the least and the largest of several."""
+    return " … ".join(dict.fromkeys(f"{end:.3g}" for end in (values.min(), values.max()))) if len(values) else ""
 
 
 def check_viser() -> None:

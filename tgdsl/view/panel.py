@@ -15,20 +15,36 @@ from tgdsl.view.stages import Stage
 
 Array = np.ndarray
 EVERY = "(all)"  # of links: no choice; a group may be named "all"
+PARTS = ("robot", "objects", "taxels", "arrows", "contacts", "heat maps")
+_BLANK = np.full((8, 8, 3), 255, dtype=np.uint8)
 
 
 class Actions(NamedTuple):
-    """What the page does when a button is clicked; `save` is called with viser's client."""
+    """What the page does when a button is clicked; those that save something are called with viser's client."""
 
     step_once: Callable[[], None]
     restart: Callable[[], None]
     save: Callable[[Any], None]
+    screenshot: Callable[[Any], None]
+    record: Callable[[Any], None]
+
+
+def _ends(stage: Stage) -> Float[Array, "2 actuator"]:
+    return np.array([(low, high) for _, low, high in stage.sliders]).T
 
 
 class Panel:
     """The handles of a page's controls."""
 
-    def __init__(self, gui: Any, stage: Stage, outputs: Mapping[str, Output], reading: str | None, actions: Actions):
+    def __init__(
+        self,
+        gui: Any,
+        stage: Stage,
+        outputs: Mapping[str, Output],
+        sounds: Sequence[str],
+        reading: str | None,
+        actions: Actions,
+    ):
         import viser.uplot as uplot
 
         names, groups = list(outputs), stage.touch.plan.layout.groups
@@ -40,7 +56,11 @@ class Panel:
         self.speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
         gui.add_button("step once").on_click(lambda _: actions.step_once())
         gui.add_button("restart").on_click(lambda _: actions.restart())
-        gui.add_button("save last minute").on_click(lambda event: actions.save(event.client))
+        with gui.add_folder("save"):
+            gui.add_button("screenshot").on_click(lambda event: actions.screenshot(event.client))
+            self.record = gui.add_button("video")
+            self.record.on_click(lambda event: actions.record(event.client))
+            gui.add_button("save last minute").on_click(lambda event: actions.save(event.client))
         with gui.add_folder("touch"):
             self.reading = gui.add_dropdown("reading", names, initial_value=reading)
             self.channel = gui.add_dropdown("channel", ("",))
@@ -50,24 +70,37 @@ class Panel:
             series = (uplot.Series(label="t [s]"), uplot.Series(label="reading", stroke="#c2410c", width=2))
             data = (np.array([0.0, 1.0]), np.array([0.0, 0.0]))
             self.plot = gui.add_uplot(data, series, scales={"x": uplot.Scale(time=False)}, aspect=2.0)
+            self.maps = gui.add_image(_BLANK, label="heat maps, distal ends up", jpeg_quality=90, visible=False)
+        self.sound = self.spectrogram = None
+        if sounds:
+            with gui.add_folder("sound"):
+                self.sound = gui.add_dropdown("sensor", sounds)
+                self.spectrogram = gui.add_image(_BLANK, label="spectrogram", jpeg_quality=90)
         self.notes = gui.add_markdown("")
+        self.group_values = self.observed = None
+        if stage.groups:
+            with gui.add_folder("observations", expand_by_default=stage.by_hand is not None):
+                self.observed = gui.add_dropdown("group", stage.groups)
+                self.group_values = gui.add_markdown("")
         with gui.add_folder("show", expand_by_default=False):
-            self.parts = {name: gui.add_checkbox(name, True) for name in ("robot", "objects", "taxels", "arrows", "contacts")}
+            self.parts = {name: gui.add_checkbox(name, True) for name in PARTS}
             self.is_plain = gui.add_checkbox("robot in grey", True)
             self.also = {name: gui.add_checkbox(f"also {name}", False) for name in names} if len(names) > 1 else {}
             self.group = gui.add_dropdown("links of", (EVERY, *groups))
             links = dict.fromkeys(link.name for sensor in stage.touch.plan.sensors for link in sensor.links)
             self.links = {name: gui.add_checkbox(name, True) for name in links}
         self.sliders: list[Any] = []
-        if stage.control is not None and len(stage.control):
-            with gui.add_folder("actuators"):
+        self.by_hand = self.keyframe = None
+        if stage.control is None or not len(stage.control):
+            return
+        with gui.add_folder("actuators" if stage.by_hand is None else "actions"):
+            if stage.by_hand is None:
                 keys = (stage.model.key(i).name for i in range(stage.model.nkey))
                 self.keyframe = gui.add_dropdown("keyframe", ("", *filter(None, keys)))
-                for i, (low, high) in enumerate(stage.model.actuator_ctrlrange):
-                    low, high = (float(low), float(high)) if stage.model.actuator_ctrllimited[i] else (-1.0, 1.0)
-                    value = float(np.clip(stage.control[i], low, high))
-                    name = stage.model.actuator(i).name or f"actuator {i}"
-                    self.sliders.append(gui.add_slider(name, low, high, (high - low) / 200, value))
+            else:
+                self.by_hand = gui.add_checkbox("by hand", False)
+            for (name, low, high), value in zip(stage.sliders, np.clip(stage.control, *_ends(stage)), strict=True):
+                self.sliders.append(gui.add_slider(name, low, high, (high - low) / 200, float(value)))
 
     @property
     def env_index(self) -> int:

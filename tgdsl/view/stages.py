@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,6 +20,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.files.arrays import read_arrays
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
+from tgdsl.observations.observations import HAND_ONLY
 from tgdsl.runtime.connect import simulate
 from tgdsl.runtime.rollout import substeps_of
 from tgdsl.runtime.simulators.simulation import Simulation
@@ -31,6 +32,22 @@ Array = np.ndarray
 Poses = tuple[Float[Array, "body 3"], Float[Array, "body 4"]]
 
 
+class Slider(NamedTuple):
+    """A number that a user may set."""
+
+    name: str
+    low: float
+    high: float
+
+
+class Observed(NamedTuple):
+    """Adjacent features of one kind in a group of observations."""
+
+    name: str
+    unit: str
+    values: Float[Array, " feature"]
+
+
 class Stage(ABC):
     """A scene at one instant."""
 
@@ -40,8 +57,10 @@ class Stage(ABC):
     control_step: float  # duration of one step [s]
     time: float  # the instant [s]
     readings: Mapping[str, Tensor]  # what the taxels read then
-    # values that a user may set, one per actuator; None where something else acts
+    # values that a user may set, one for each of `sliders`; None where something else acts
     control: Float[Array, " actuator"] | None = None
+    by_hand: bool | None = None  # whether `control` acts in place of a policy; None: there is no policy
+    groups: Sequence[str] = ()  # names of the groups of observations
     num_steps: int | None = None  # number of instants of a recorded run; None: the scene goes on without end
     step_index = 0  # which instant of a recorded run this is
 
@@ -69,6 +88,23 @@ class Stage(ABC):
     def notes(self, env: int) -> Mapping[str, float | str]:
         """Return what else there is to say of this instant in one environment, by name, such as a task's reward terms."""
         return {}
+
+    @property
+    def sliders(self) -> Sequence[Slider]:
+        """What `control` sets: the actuators."""
+        ranges = zip(self.model.actuator_ctrlrange.tolist(), self.model.actuator_ctrllimited, strict=True)
+        names = (self.model.actuator(i).name or f"actuator {i}" for i in range(self.model.nu))
+        return [
+            Slider(name, *(ends if is_limited else (-1.0, 1.0))) for name, (ends, is_limited) in zip(names, ranges, strict=True)
+        ]
+
+    def acted(self, env: int) -> Float[Array, " actuator"] | None:
+        """Return what a policy has set the sliders to in one environment; None: nothing has acted yet."""
+        return None
+
+    def observed(self, group: str, env: int) -> Sequence[Observed]:
+        """Return what one environment observes in one of `groups`."""
+        return ()
 
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment, its objects as they are there."""
@@ -132,6 +168,8 @@ class SceneStage(SimStage):
 
     def __init__(self, touch: TactileModule, num_envs: int = 1):
         super().__init__(touch, simulate(touch, num_envs, substeps=substeps_of(touch, 5), on_fault="reset"))
+        hand_only = {term.group for term in touch.plan.observations if term.type in HAND_ONLY}
+        self.groups = () if hand_only else tuple(touch.observations)
         self._begin()
 
     def advance(self) -> None:
@@ -142,6 +180,11 @@ class SceneStage(SimStage):
         self.sim.reset()
         self.touch.reset()
         self._begin()
+
+    def observed(self, group: str, env: int) -> Sequence[Observed]:
+        features = self.touch.observe(self.readings)[group][env].cpu().numpy()
+        units = {output.name: output.units[0] for output in self.touch.outputs}
+        return [Observed(term.name, units.get(term.name, ""), features[term.slice]) for term in self.touch.observations[group]]
 
     def close(self) -> None:
         self.sim.close()

@@ -2,26 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
 from tgdsl.view.contacts import state_of
-from tgdsl.view.stages import Stage
+from tgdsl.view.stages import Observed, Slider, Stage
 
 Array = np.ndarray
 
 
+class _HandedOver(Actor):
+    """Acts as another actor does, or as a stage's `control` where that is `by_hand`."""
+
+    def __init__(self, actor: Actor, stage: Stage):
+        self._actor, self._stage = actor, stage
+
+    def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
+        action = self._actor(obs)
+        return torch.as_tensor(self._stage.control).to(action).expand_as(action) if self._stage.by_hand else action
+
+    def begin(self, ended: Bool[Tensor, " env"]) -> None:
+        self._actor.begin(ended)
+
+
 class TaskStage(Stage):
-    """Environments of a task in which an actor acts, episode after episode."""
+    """Environments of a task in which an actor acts, episode after episode; `control` is an action, from -1 to 1."""
+
+    by_hand: bool | None = False
 
     def __init__(self, env: TouchEnv, actor: Actor, seed: int = 0):
-        self.env, self._actor, self._seed = env, actor, seed
+        self.env, self._seed, self.groups = env, seed, tuple(env.groups)
+        self._actor, self._features = _HandedOver(actor, self), env.describe()
+        self.control = np.zeros(env.num_actions)
         self.touch, self.model = env.touch, env.sim.model
         self.num_envs, self.control_step = env.num_envs, env.control_step
         self.restart()
@@ -39,6 +58,23 @@ class TaskStage(Stage):
         self._moment = next(self._moments)
         self.time += self.control_step
         self.readings = self.env.now.readings
+
+    @property
+    def sliders(self) -> Sequence[Slider]:
+        """The actions of the joints that the policy moves."""
+        return [Slider(name, -1.0, 1.0) for name in self.env.joint_names]
+
+    def acted(self, env: int) -> Float[Array, " joint"] | None:
+        """Return the last action of one environment."""
+        return None if self._moment is None else self._moment.action[env].cpu().numpy()
+
+    def observed(self, group: str, env: int) -> Sequence[Observed]:
+        """Return what the next action is chosen from in one environment."""
+        values = self.env.observe()[group][env].cpu().numpy()
+        return [
+            Observed(f"{each.name}{f' of {each.link}' if each.link else ''}", each.unit, values[place])
+            for place, each in self._features[group]
+        ]
 
     def notes(self, env: int) -> Mapping[str, float]:
         """Return the score, and each reward term of this step [1/s]."""
