@@ -44,7 +44,8 @@ class HeatMaps:
             pixels = self._taxel[first[0] : first[0] + len(map_), first[1] : first[1] + map_.shape[1]]
             pixels[:] = np.where(map_ >= 0, chosen[map_], -1)
             height, width = self._taxel.shape
-            text = name if len(name) <= side // 5 else f"…{name[1 - side // 5 :]}"
+            letters = side // 6
+            text = name if len(name) <= letters else f"…{name[1 - letters :]}"
             x, y = (left + side / 2) / width, 1 - (top + _TITLE / 2) / height
             figure.text(x, y, text, size=6.5, color=INK, ha="center", va="center")
         canvas = figure.canvas

@@ -227,6 +227,7 @@ class SurfaceLayer(Layer):
                 handle.on_click(lambda _, row=row: pick(row))
                 self._members.append((handle, row))
                 self._handles.setdefault(link.name, []).append(handle)
+        self._painted = np.tile(np.array(REST, dtype=np.uint8), (len(self._members), 1))
 
     def read(self, readings: Tensor, env: int, channel: str) -> Shown:
         value = read_now(readings, env)[:, 0]
@@ -236,8 +237,10 @@ class SurfaceLayer(Layer):
         return Shown(value[self._chosen], self._unit, self._quantity, Normalize(low, high), WARMTH)
 
     def paint(self, colour: UInt8[Array, "row 3"]) -> None:
-        for handle, row in self._members:
-            handle.color = tuple(colour[row].tolist())
+        new = colour[[row for _, row in self._members]]
+        for i in np.flatnonzero((new != self._painted).any(axis=1)):
+            self._members[i][0].color = tuple(new[i].tolist())
+        self._painted = new
 
 
 def layer_of(

@@ -45,6 +45,7 @@ class LiveScene:
             self._add_body(stage.model, body)
         self._shapes = shapes_of(stage.model)
         self.layers: list[Layer] = []
+        self._switches: tuple[Any, ...] = ()
         self._arrows = scene.add_line_segments("/arrows", np.zeros((1, 2, 3)), _FORCE, thickness=2.0, thickness_units="screen")
         self._points = scene.add_point_cloud(
             "/contacts", np.zeros((1, 3)), _CONTACT, point_size=_CONTACT_SIZE, point_shape="circle", precision="float32"
@@ -83,6 +84,10 @@ class LiveScene:
 
     def show(self, *, robot: bool, objects: bool, taxels: bool, plain: bool, links: set[str]) -> None:
         """Switch parts on and off; `plain`: the robot in grey in place of its own colours."""
+        switches = (robot, objects, taxels, plain, links, tuple(self.layers), self._shapes)
+        if switches == self._switches:
+            return
+        self._switches = switches
         surfaces = [layer for layer in self.layers if isinstance(layer, SurfaceLayer)]
         covered = frozenset[int]().union(*(layer.bodies for layer in surfaces)) if taxels else frozenset()
         for body, meshes in self._meshes.items():
@@ -146,7 +151,7 @@ class LiveScene:
         centre = 0.5 * (pos.min(axis=0) + pos.max(axis=0))
         reach = max(0.03, float(np.linalg.norm(pos - centre, axis=1).max()))
         initial = self._server.initial_camera
-        initial.position, initial.look_at, initial.up = centre + 2.4 * reach * camera.toward, centre, camera.up
+        initial.position, initial.look_at, initial.up = centre + 2.0 * reach * camera.toward, centre, camera.up
         initial.near = 0.1 * reach
 
     def _add_body(self, model: mujoco.MjModel, body: int) -> None:

@@ -194,16 +194,15 @@ class Page:
         if self._is_due("images", IMAGE):
             self._draw_images(layer, shown)
         if self._picked is not None:
-            value, name = float(shown.value[self._picked]), rows.label[self._picked]
-            place = ", ".join(f"{1e3 * part:.1f}" for part in rows.pos[self._picked])
-            self.scene.name_row(rows, self._picked, f"{name}: {value:.4g} {shown.unit}")
-            name += f"** at ({place}) mm in its link**"
+            value, name = float(shown.value[self._picked]), f"**{rows.label[self._picked]}**"
+            self.scene.name_row(rows, self._picked, f"{rows.label[self._picked]}: {value:.4g} {shown.unit}")
+            name += f" at ({', '.join(f'{1e3 * part:.1f}' for part in rows.pos[self._picked])}) mm"
         else:
             is_meant = is_shown if panel.plotted.value == EVERY else rows.link == panel.plotted.value
             value = float(getattr(np, layer.total)(shown.value[is_meant])) if is_meant.any() else 0.0
-            name = layer.total if panel.plotted.value == EVERY else f"{layer.total} of {panel.plotted.value}"
+            name = f"**{layer.total}**" if panel.plotted.value == EVERY else f"**{layer.total} of {panel.plotted.value}**"
             self.scene.name_row(rows, None)
-        panel.value.content = f"**{name}**: {shown.quantity} {value:.4g} {shown.unit}"
+        panel.value.content = f"{name}: {shown.quantity} {value:.4g} {shown.unit}"
         self._history.append((self.stage.time, value))
         while not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
             self._history.popleft()
@@ -266,7 +265,8 @@ class Page:
             rows = [f"\n| {name} | {_range(values)} | {unit} |" for name, unit, values in self.stage.observed(group.value, env)]
             self.panel.group_values.content = f"| | | |\n|---|---|---|{''.join(rows)}"
         layer = self.scene.layers[0]
-        self.panel.status.content = f"t = {self.stage.time:.2f} s · {len(layer.rows.body)} taxels{contacts}"
+        things = "taxels" if isinstance(layer, DiscLayer) else "cells"
+        self.panel.status.content = f"t = {self.stage.time:.2f} s · {len(layer.rows.body)} {things}{contacts}"
         instant = self.panel.instant
         if instant is not None and self.stage.step_index != int(instant.value):
             instant.value = self._seen["instant"] = self.stage.step_index

@@ -54,13 +54,8 @@ class Panel:
         self.instant = gui.add_slider("step", 0, max(1, (stage.num_steps or 2) - 1), 1, 0) if stage.num_steps else None
         self.paused = gui.add_checkbox("pause", False)
         self.speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
-        gui.add_button("step once").on_click(lambda _: actions.step_once())
-        gui.add_button("restart").on_click(lambda _: actions.restart())
-        with gui.add_folder("save"):
-            gui.add_button("screenshot").on_click(lambda event: actions.screenshot(event.client))
-            self.record = gui.add_button("video")
-            self.record.on_click(lambda event: actions.record(event.client))
-            gui.add_button("save last minute").on_click(lambda event: actions.save(event.client))
+        acts = {"step once": actions.step_once, "restart": actions.restart}
+        gui.add_button_group("time", tuple(acts)).on_click(lambda event: acts[event.target.value]())
         with gui.add_folder("touch"):
             self.reading = gui.add_dropdown("reading", names, initial_value=reading)
             self.channel = gui.add_dropdown("channel", ("",))
@@ -90,6 +85,11 @@ class Panel:
             links = dict.fromkeys(link.name for sensor in stage.touch.plan.sensors for link in sensor.links)
             self.links = {name: gui.add_checkbox(name, True) for name in links}
         self.sliders: list[Any] = []
+        with gui.add_folder("save"):
+            gui.add_button("screenshot").on_click(lambda event: actions.screenshot(event.client))
+            self.record = gui.add_button("video")
+            self.record.on_click(lambda event: actions.record(event.client))
+            gui.add_button("save last minute").on_click(lambda event: actions.save(event.client))
         self.by_hand = self.keyframe = None
         if stage.control is None or not len(stage.control):
             return
