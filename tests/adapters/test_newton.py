@@ -121,7 +121,7 @@ def test_names_that_the_model_lacks_fail_when_the_sensor_is_made(tmp_path):
     with pytest.raises(SimulationError, match=r"the sensors read contacts: hand contacts and observables"):
         SensorTactile(host.model, document(tmp_path, load=LOAD)).update(host.state, host.contacts)
     delayed = DEPTH | {"noise": {"read_delay": 0.004}}
-    with pytest.raises(StateError, match=r"SceneState\.dt is missing"):
+    with pytest.raises(StateError, match=r"SceneState lacks dt"):
         host.read(SensorTactile(host.model, document(tmp_path, delayed=delayed)))
 
 

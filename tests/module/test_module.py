@@ -52,9 +52,9 @@ def touch(document):
 
 def test_what_is_missing_or_misshapen_is_named(touch):
     good = touch.example_state(3)
-    names = "body_pos, body_quat, body_linvel, body_angvel, contact_found"
     table = [
-        ({"body_quat": None}, f"SceneState.body_quat is missing; this module wants {names}"),
+        ({"body_quat": None}, "SceneState lacks body_quat, which this module reads"),
+        ({"body_pos": None, "body_quat": None}, "SceneState lacks body_pos, body_quat, which this module reads"),
         ({"body_pos": good.body_pos[:, :1]}, "SceneState.body_pos has shape (3, 1, 3), expected (env, 2, 3); body: item, pad"),
         ({"body_quat": good.body_quat[:2]}, "SceneState.body_quat holds 2 environments, body_pos 3"),
         (

@@ -144,8 +144,10 @@ def test_noise_is_drawn_once_per_sample(build):
 def test_a_wrong_dt_is_named(build, sensor):
     touch = build(s=sensor)
     assert "dt" in touch.inputs.fields
-    with pytest.raises(StateError, match=r"^SceneState.dt is missing; this module wants body_pos, body_quat, dt$"):
+    with pytest.raises(StateError, match=r"^SceneState lacks dt, .*; set `state.dt` to the seconds since the last call$"):
         touch(pressed(touch, 1e-3))
+    with pytest.raises(StateError, match=r"^SceneState.dt has shape \(1, 1\), expected one number"):
+        touch(pressed(touch, 1e-3, torch.full((1, 1), 0.005)))
     for dt in (0.0, -0.005, float("nan"), float("inf")):
         with pytest.raises(StateError, match=rf"^SceneState.dt is {dt}, expected a finite time above 0 s$"):
             touch(pressed(touch, 1e-3, dt))
@@ -166,9 +168,12 @@ def test_a_dt_that_the_ring_is_too_short_for_is_named(build):
     with pytest.raises(StateError) as caught:
         touch(pressed(touch, 1e-3, 0.005))
     message = 'SceneState.dt is 0.005 s, shorter than at first: the ring of "s" does not hold 0.025 s of so many calls'
-    assert str(caught.value) == f"{message}; begin with the shortest dt"
+    hint = "begin with the shortest dt, or call `touch.free()` to forget the past and start with this dt"
+    assert str(caught.value) == f"{message}; {hint}"
     touch(pressed(touch, 1e-3, 0.010))
     touch(pressed(touch, 1e-3, 0.009))  # three calls, as at first
+    touch.free()
+    touch(pressed(touch, 1e-3, 0.005))
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.005, 0.010, 0.0125, 0.025, 0.04])

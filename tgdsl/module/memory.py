@@ -316,7 +316,8 @@ class Memory(HookedModule):
         for path, (sensor, planned) in self._rings.items():
             if _calls(planned, dt)[0] > memory[path].shape[1]:
                 problem = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
-                raise StateError(f"{problem} {planned.past:g} s of so many calls; begin with the shortest dt")
+                hint = "begin with the shortest dt, or call `touch.free()` to forget the past and start with this dt"
+                raise StateError(f"{problem} {planned.past:g} s of so many calls; {hint}")
 
     def cache_readings(self, readings: Mapping[str, Tensor]) -> None:
         """Note the readings that a call returns, (env, row, channel): where they lie, or once they are kept, that they are."""

@@ -103,13 +103,11 @@ class SceneState:
 
     def checked(self, inputs: Inputs, device: torch.device, with_dt: bool = True) -> dict[str, Tensor]:
         """Return the tensors that a module on a device reads; `with_dt`: whether a time must be there, if it is read."""
-        tensors: dict[str, Tensor] = {}
-        for name in inputs.fields:
-            value = getattr(self, name)
-            if value is None and (name != "dt" or with_dt):
-                raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(inputs.fields)}")
-            if name != "dt":
-                tensors[name] = _checked(name, value, inputs, device)
+        wanted = [name for name in inputs.fields if name != "dt" or with_dt]
+        if missing := [name for name in wanted if getattr(self, name) is None]:
+            hint = "; set `state.dt` to the seconds since the last call" if "dt" in missing else ""
+            raise StateError(f"SceneState lacks {', '.join(missing)}, which this module reads{hint}")
+        tensors = {name: _checked(name, getattr(self, name), inputs, device) for name in inputs.fields if name != "dt"}
         num_envs = tensors["body_pos"].shape[0]
         for name, value in tensors.items():
             if value.shape[0] != num_envs:
@@ -337,6 +335,8 @@ class Incoming:
 
     def _dt_tensor(self, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Return dt as a tensor that is written only when it changes."""
+        if shape := getattr(dt, "shape", ()):
+            raise StateError(f"SceneState.dt has shape {tuple(shape)}, expected one number for all environments [s]")
         if not 0 < dt < math.inf:
             raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
         if self._dt is None or self._dt[0] != dt:
