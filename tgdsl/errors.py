@@ -124,10 +124,11 @@ def did_you_mean(found: str, names: Iterable[str], what: str = "names") -> str:
     known = sorted(set(names))
     if not known:
         return f"there are no {what}"
-    near = difflib.get_close_matches(found, known, n=1, cutoff=0.6)
+    similar = [name for name in known if abs(len(name) - len(found)) <= 3 or name.startswith(found)]
+    near = difflib.get_close_matches(found, similar, n=1, cutoff=0.6)
     if near:
         return f'did you mean "{near[0]}"?'
-    return f"known {what}: {listed(known)}"
+    return f"known {what}: {listed(known, limit=20)}"
 
 
 def raised_at(file: str, error: Exception) -> str:

@@ -100,6 +100,20 @@ def test_the_artefact_simulates_without_the_files(tmp_path):
     )
 
 
+def test_a_model_with_a_floor_needs_no_spec():
+    """The size of a plane is how much of it is drawn; it collides without end."""
+    text = """<mujoco><worldbody><geom type="plane" size="1 2 .1"/>
+    <body name="pad" pos="0 0 .1"><geom type="box" size=".02 .02 .005"/></body>
+    <body name="cube" pos="0 0 .2"><freejoint/><geom type="box" size=".02 .02 .02"/></body></worldbody></mujoco>"""
+    load = {"kind": "link_contact", "links": ["pad"], "feels": ["cube"]}
+    document = {"tgdsl": 1, "objects": {"cube": {"body": "cube"}}, "sensors": {"load": load}}
+    touch = tgdsl.compile(document, scene=mujoco.MjModel.from_xml_string(text))
+    assert touch.inputs == tgdsl.compile(document, scene=mujoco.MjSpec.from_string(text)).inputs
+    sim = tgdsl.simulate(touch, 1)
+    sim.step()
+    assert touch(sim.state())["load"].shape == (1, 1, 4)
+
+
 def test_models_that_a_document_names_must_be_those_in_the_scene(tmp_path):
     spec = mujoco.MjSpec.from_file(write(tmp_path))
     named = DOCUMENT | {"robot": {"model": str(tmp_path / "scene.xml"), "layout": LAYOUT}}

@@ -163,6 +163,15 @@ def test_ambiguous_names_are_refused_with_the_candidates(tmp_path):
     assert torch.allclose(shift, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
 
 
+def test_data_that_was_never_evaluated_is_refused(tmp_path):
+    touch, model = wanting_all(tmp_path)
+    data = mujoco.MjData(model)
+    with pytest.raises(SimulationError, match=r"call mujoco\.mj_forward\(model, data\) first"):
+        tgdsl.read_mujoco(touch, model, [moved(model, 1), data])
+    mujoco.mj_forward(model, data)
+    assert tgdsl.read_mujoco(touch, model, data).body_quat.norm(dim=-1).allclose(torch.ones(1, dtype=torch.float64))
+
+
 def test_a_body_that_the_scene_lacks_is_named_with_the_nearest(tmp_path):
     touch = module(tmp_path)
     other = mujoco.MjModel.from_xml_string(SCENE.replace('"pad"', '"pad_"'))

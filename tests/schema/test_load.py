@@ -187,4 +187,6 @@ def test_hints_list_what_exists():
     assert did_you_mean("x", [], "objects") == "there are no objects"
     assert did_you_mean("bal", ["ball", "cube"]) == 'did you mean "ball"?'
     assert did_you_mean("xyz", ["ball", "cube", "ball"]) == "known names: ball, cube"
+    assert did_you_mean("gaussian", ["gain", "white_noise"]) == "known names: gain, white_noise"
+    assert did_you_mean("normal_stiff", ["normal_stiffness"]) == 'did you mean "normal_stiffness"?'
     assert listed([str(i) for i in range(14)]) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11 and 2 more"

@@ -109,6 +109,9 @@ def _of_model(compiled: mujoco.MjModel) -> Model:
         except RobotError as error:
             raise RobotError(f"{error}; pass the MjSpec that this MjModel was compiled from") from error
         model = read_usd(path)
+    is_plane = model.compiled.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    if len(is_plane) == compiled.ngeom:  # a plane collides without end: its size says how much of it is drawn
+        model.compiled.geom_size[is_plane] = compiled.geom_size[is_plane]
     if lost := [name for name in differing_fields(compiled, model.compiled, is_rounded=True) if name in _KEPT]:
         problem = f"{FILE}: of this MjModel alone, {listed(lost)} would be kept otherwise"
         raise RobotError(f"{problem}; pass the MjSpec that this MjModel was compiled from")

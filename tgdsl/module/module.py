@@ -93,7 +93,11 @@ class TactileModule(HookedModule):
 
     @property
     def taxels(self) -> dict[str, TaxelTable]:
-        """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
+        """The taxels that lie on each sensor's links, as tables: see `taxels.taxel_table`.
+
+        They are the rows of a reading if its `rows` in `outputs` is "taxel". A `link_contact` has a row per body instead,
+        whatever taxels the layout gives its links: `rows` names the body of each row.
+        """
         with_taxels = [sensor for sensor in self.plan.sensors if len(sensor.taxels)]
         return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in with_taxels})
 
@@ -104,7 +108,7 @@ class TactileModule(HookedModule):
 
     @property
     def rows(self) -> dict[str, TaxelTable]:
-        """What the rows of each reading of a sensor are, as tables: of taxels as `taxels` has them, else what the kind says."""
+        """What the rows of each reading are, as tables: a taxel as in `taxels`, a `body`, or what the kind says."""
         return row_tables(self.plan)
 
     @property

@@ -40,11 +40,14 @@ def read_mujoco(
             after a slash, as "palm" is of "robot/palm".
 
     Raises:
-        SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one.
+        SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if data was never
+            evaluated.
     """
     own = inputs or touch.inputs
     reader, geoms = _reader(touch, own, (model,), lambda: (StateReader(own, model, _CPU), model_geoms(model)))
     envs: list[mujoco.MjData] = list(data) if isinstance(data, Sequence) else [data]
+    if any(not env.xquat[0].any() for env in envs):  # the world's orientation, which MuJoCo sets at the first evaluation
+        raise SimulationError("the poses of this MjData are not computed yet; call mujoco.mj_forward(model, data) first")
     arrays = {name: torch.from_numpy(np.stack([getattr(env, name) for env in envs])) for name in reader.arrays}
     fields: dict[str, Any] = reader.read(arrays) | _contacts(own, model, geoms, envs)
     time = torch.tensor([env.time for env in envs], dtype=torch.float64)

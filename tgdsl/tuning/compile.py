@@ -65,7 +65,7 @@ def compile(
             that are met for the first time take seconds, sensors with an `accuracy` a run of the scene.
         scene: A scene that is built already, in place of the document's: an `mujoco.MjSpec`, an `mujoco.MjModel` or a
             `pxr.Usd.Stage`. The document then needs no model: it has the scene's names. Models that it names must be those in
-            the scene.
+            the scene. A scene with contact pairs, height fields or flexes needs its `MjSpec`: an `MjModel` lacks their sources.
 
     Returns:
         The module, not yet compiled by torch: call its `compile()` for fused kernels.

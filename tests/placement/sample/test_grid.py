@@ -179,7 +179,8 @@ def test_grid_errors_say_what_to_change():
     )
     pads = surface_of(box((0.01, 0.01, 0.01), (0.02, 0, 0)), box((0.01, 0.01, 0.01), (-0.02, 0, 0)))
     assert str(error_of(pads, placement("grid", rows=1, columns=1, direction=DOWN))) == (
-        "none of the grid's 1 cells hits the surface; give more `rows` and `columns`"
+        "none of the grid's 1 cells hits the surface along [0, 0, -1]; `direction` points into the surface: "
+        "is [0, 0, 1] meant? Else give more `rows` and `columns`"
     )
     up = placement("grid", rows=1, columns=1, direction=DOWN, region={"facing": [0, 0, -1], "within": "80 deg"})
     assert str(error_of(surface, up)) == "no part of the region is seen along [0, 0, -1]; turn `direction`"

@@ -111,7 +111,10 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
     """Return which of the cells that hit are kept, ascending: all, or the `count` nearest the rectangle's centre."""
     total = placement.rows * placement.columns
     if not len(cell):
-        raise SampleError(f"none of the grid's {total} cells hits the surface", "give more `rows` and `columns`")
+        problem = f"none of the grid's {total} cells hits the surface along {_shown(placement.direction)}"
+        opposite = _shown(tuple(0.0 - component for component in placement.direction))
+        hint = f"`direction` points into the surface: is {opposite} meant? Else give more `rows` and `columns`"
+        raise SampleError(problem, hint)
     if placement.count is None:
         return np.arange(len(cell))
     if placement.count > len(cell):
