@@ -123,6 +123,15 @@ def test_outputs_and_taxels_describe_the_readings(touch):
     ]
 
 
+def test_rows_of_bodies_name_their_links(document):
+    document["sensors"] = {"load": {"kind": "link_contact", "links": "all", "feels": ["item"]}}
+    touch = tgdsl.compile(document)
+    assert touch.outputs[0].rows == "body" and touch.outputs[0].shape == (2, 4)
+    table = touch.rows["load"]
+    assert table["body"].tolist() == ["pad", "tip"] == table["links"].tolist()
+    assert len(touch.taxels["load"]) == 13  # what lies on its links, not the rows
+
+
 def test_readings_are_views_of_channel_major_storage(touch):
     reading = touch(touch.example_state(5))["touch"]
     assert reading.transpose(1, 2).is_contiguous()

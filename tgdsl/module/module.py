@@ -96,7 +96,7 @@ class TactileModule(HookedModule):
         """The taxels that lie on each sensor's links, as tables: see `taxels.taxel_table`.
 
         They are the rows of a reading if its `rows` in `outputs` is "taxel". A `link_contact` has a row per body instead,
-        whatever taxels the layout gives its links: `rows` names the body of each row.
+        whatever taxels the layout gives its links: `rows` has the `body` of each row and its `links`, joined by commas.
         """
         with_taxels = [sensor for sensor in self.plan.sensors if len(sensor.taxels)]
         return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in with_taxels})

@@ -216,6 +216,10 @@ def row_tables(plan: Plan) -> dict[str, TaxelTable]:
                 result[reading.name] = taxel_table(plan.layout_of(sensor))
                 continue
             columns = {**{name: np.array(texts) for name, texts in axis.texts.items()}, **axis.numbers}
+            if axis.name == "body" and "body" in axis.texts:
+                links = plan.layout_of(sensor).links
+                names = [",".join(link.name for link in links if link.body == body) for body in axis.texts["body"]]
+                columns["links"] = np.array(names)
             result[reading.name] = _structured(columns or {"row": np.arange(axis.size)}, axis.size)
     return result
 
