@@ -21,6 +21,9 @@ from tgdsl.geometry.planes import Plane, Vec
 from tgdsl.quantities.base import Planning, Quantity, Request, Scene, Use
 from tgdsl.quantities.reference import ReferenceScene
 
+DEFAULT_SLOTS = 8  # default of `slots` of sensors that read contacts one by one
+DEFAULT_PATCH_SLOTS = 4  # the same of sensors that need the loads of pairs, or their patches of contact
+
 
 class ContactPoints(NamedTuple):
     """Contacts on each body, in its frame; planes (env, body, contact), but `net` (env, body). Unused slots are all zero.
@@ -244,7 +247,7 @@ class PairLoads(NamedTuple):
 class Loads(Request[PairLoads]):
     """Asks how hard each body is pressed by each object, and how fast they slide on one another."""
 
-    slots: int = 4  # contacts per body and object that are read
+    slots: int = DEFAULT_PATCH_SLOTS  # contacts per body and object that are read
     # whose loads they are to be summed up for: geoms that two objects share load a link once, but both objects
     of: Literal["link", "object"] = "link"
     # whether the centre and the mean normal of the contacts are wanted, in the frame of what they are of

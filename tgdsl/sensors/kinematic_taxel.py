@@ -64,7 +64,7 @@ from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.quantities.contacts import ContactPoints, Contacts, ReferenceContacts
+from tgdsl.quantities.contacts import DEFAULT_SLOTS, ContactPoints, Contacts, ReferenceContacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Array,
@@ -123,7 +123,7 @@ class KinematicTaxelSpec(ContactProbeSpec):
     """Point that torques are about: the link's origin as in the paper, or each taxel."""
     balance: Literal["none", "solver"] = "none"
     """`solver` has a body's taxels press with the solver's normal force, and bounds their friction; `none` as in the paper."""
-    slots: Annotated[StrictInt, Field(ge=1)] = 8
+    slots: Annotated[StrictInt, Field(ge=1)] = DEFAULT_SLOTS
     """Contacts per pair of body and object whose normals `balance` uses [1]."""
 
     @model_validator(mode="after")

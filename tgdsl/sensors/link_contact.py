@@ -33,7 +33,7 @@ from tgdsl.fields.models import NonNegative
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
-from tgdsl.quantities.contacts import Contacts
+from tgdsl.quantities.contacts import DEFAULT_SLOTS, Contacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Array,
@@ -62,7 +62,7 @@ class LinkContactSpec(ProbeSpec):
     """Quantities of a reading: the bit, then the force, then the sum of the contacts' normal forces."""
     threshold: NonNegative = 0.0
     """Force above which a body counts as touched [N]."""
-    slots: Annotated[StrictInt, Field(ge=1)] = 8
+    slots: Annotated[StrictInt, Field(ge=1)] = DEFAULT_SLOTS
     """Contacts per pair of body and object whose normal forces are summed, for the output `normal_force` alone [1]."""
     needs_taxels: ClassVar[bool] = False
 

@@ -33,6 +33,7 @@ from tgdsl.errors import LowerError, listed
 from tgdsl.fields.models import Frequency, NonNegative, Number, Positive, Quantity, SpecModel, Usual
 from tgdsl.layout.layout import Layout
 from tgdsl.modal.modes import Modes, ModeShapes, ShapeModes
+from tgdsl.quantities.contacts import DEFAULT_PATCH_SLOTS
 from tgdsl.sensors.base import Alternative, Axis, ProbeSpec, body_axis
 from tgdsl.surfaces.surface import Surface
 from tgdsl.tensors.fusion import materialised
@@ -101,7 +102,7 @@ class ContactAudioSpec(ProbeSpec):
     model: Literal["physical", "force", "paper"] = "physical"
     """`physical`: impulses of collisions; `force`: the force drives the modes, so that a contact excites modes slower than
     itself; `paper`: the two-pole response as printed, and impulses of each rise of the force, however many steps it takes."""
-    slots: Annotated[StrictInt, Field(ge=1)] = 4
+    slots: Annotated[StrictInt, Field(ge=1)] = DEFAULT_PATCH_SLOTS
     """Contacts per pair of body and object that are read one by one."""
     needs_taxels: ClassVar[bool] = False
     is_on_taxels: ClassVar[bool] = False

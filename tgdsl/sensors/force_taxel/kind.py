@@ -43,7 +43,7 @@ from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
-from tgdsl.quantities.contacts import Contacts
+from tgdsl.quantities.contacts import DEFAULT_SLOTS, Contacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Alternative,
@@ -78,7 +78,7 @@ class ForceTaxelSpec(ContactProbeSpec):
     missed. Default: on each body 3 times the taxels' spacing, the root of their mean area."""
     moment_iterations: Annotated[StrictInt, Field(ge=0, le=64)] = 4
     """Newton steps towards the contacts' moment; 0: shares by depth and distance alone [1]."""
-    slots: Annotated[StrictInt, Field(ge=1)] = 8
+    slots: Annotated[StrictInt, Field(ge=1)] = DEFAULT_SLOTS
     """Contacts per pair of body and object that are distributed one by one; the others' force acts at their centre [1]."""
 
     def radii(self, layout: Layout) -> np.ndarray:

@@ -16,6 +16,7 @@ from tgdsl.fields.materials import Material, MaterialField
 from tgdsl.fields.models import Area, PositiveLength, Quantity, SpecModel, Temperature, Usual
 from tgdsl.fields.regions import Region
 from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contacts import DEFAULT_PATCH_SLOTS
 from tgdsl.quantities.patches import is_cell, tables
 from tgdsl.sensors.base import Alternative, LinkSpec, SurfaceOf
 
@@ -86,7 +87,7 @@ class TemperatureGridSpec(LinkSpec):
     """Conductance of the interface itself, such as roughness or a film [W/(m²·K)]; default: no resistance."""
     curvature_radius: Annotated[PositiveLength | None, Usual("length", low=1e-4, high=1.0)] = None
     """Radius of the links' surface where they touch, for Hertz [m]; default: half of the shortest side of its box."""
-    slots: Annotated[StrictInt, Field(ge=1, le=32)] = 4
+    slots: Annotated[StrictInt, Field(ge=1, le=32)] = DEFAULT_PATCH_SLOTS
     """Contacts per link and object that make a patch [1]."""
     lag: Annotated[Annotated[float, Quantity("time", gt=0.0)] | None, Usual("time", low=1e-4, high=100.0)] = None
     """Time constant of the sensing element, by which readings trail temperatures [s]; default: none."""
