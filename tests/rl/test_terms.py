@@ -157,7 +157,9 @@ def test_values_are_set_by_dotted_path(folder):
 
 
 def test_a_term_of_the_wrong_shape_is_named(folder):
-    with pytest.raises(SimulationError, match=r'the term "odd" is of shape \(4, 2\), expected a tensor \(4,\)'):
+    with pytest.raises(
+        SimulationError, match=r'the term "odd" is of shape \(4, 2\) and torch.float64, expected a tensor \(4,\)'
+    ):
         tiny_env(folder, more='terms: {odd: {term: "own.py:Wrong", weight: 1}}\n').step(torch.zeros(4, 2))
 
 
