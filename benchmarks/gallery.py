@@ -91,7 +91,7 @@ def document(name: str) -> tuple[mujoco.MjModel, np.ndarray, TouchTrace]:
     with tempfile.TemporaryDirectory() as folder:
         Run(path, out=Path(folder)).run()
         record = dict(np.load(Path(folder) / "readings.npz"))
-    output = first_on_taxels(touch.outputs)
+    output = first_on_taxels([*touch.outputs])
     trace = TouchTrace(touch, output, 1)
     best = int(np.argmax((np.abs(record[output.name]) > 0.0).sum(axis=(1, 2, 3))))
     trace.add(0, {output.name: torch.as_tensor(record[output.name][best])})
@@ -106,7 +106,7 @@ def task(name: str, shot: Shot) -> tuple[mujoco.MjModel, np.ndarray, TouchTrace]
     obs = env.reset()
     for _ in range(round(shot.seconds / env.control_step)):
         obs = env.step(torch.zeros(1, env.num_actions) if policy is None else policy(obs)).obs
-    trace = TouchTrace(env.touch, first_on_taxels(env.touch.outputs), 1)
+    trace = TouchTrace(env.touch, first_on_taxels([*env.touch.outputs]), 1)
     trace.add(0, env.now.readings)
     return env.sim.env_model(0), env.sim.qpos[0].double().numpy().copy(), trace
 

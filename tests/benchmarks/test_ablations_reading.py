@@ -61,7 +61,7 @@ def test_what_is_written_is_what_the_page_shows(recorded, tmp_path):
     found = readings(recorded, VARIANTS)
     write_readings(found, tmp_path / "grip_force_reading.csv", ["reading", "--envs", "12"])
     text = tables(tmp_path)
-    assert "`python benchmarks/ablations.py reading --envs 12`" in text and "8 episodes to fit, 4 others to test" in text
+    assert "`python benchmarks/ablations.py reading --envs 12`" in text and "8 episodes fit it, 4 others test it" in text
     with (tmp_path / "grip_force_reading.csv").open() as file:
         assert next(file).startswith("# python benchmarks/ablations.py reading")
         rows = list(csv.DictReader(file))

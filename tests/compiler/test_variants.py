@@ -281,7 +281,7 @@ def test_what_a_state_may_hold(tmp_path):
     with pytest.raises(StateError, match=r"SceneState\.variant is torch\.float64, expected torch\.int64 or torch\.int32"):
         touch(state)
     state.variant = None
-    with pytest.raises(StateError, match=r"SceneState\.variant is missing"):
+    with pytest.raises(StateError, match="SceneState lacks variant, which this module reads"):
         touch(state)
 
 

@@ -142,7 +142,7 @@ def test_damaged_header(artifact, tmp_path):
 def test_files_that_are_no_artefacts(tmp_path):
     assert refused(tmp_path / "none.safetensors").startswith("cannot read this artefact: ")
     (tmp_path / "folder.safetensors").mkdir()
-    assert refused(tmp_path / "folder.safetensors").startswith("cannot read this artefact: ")
+    assert refused(tmp_path / "folder.safetensors").startswith("this is a folder, expected an artefact")
     (tmp_path / "hand.yaml").write_text("tgdsl: 1\n")
     assert refused(tmp_path / "hand.yaml") == "this is a document, not an artefact; tgdsl.compile reads documents"
     (tmp_path / "foreign.safetensors").write_bytes(save({"weight": np.zeros(3)}, {"format": "pt"}))

@@ -132,7 +132,7 @@ def test_a_state_without_them_is_an_error(tmp_path):
     with pytest.raises(StateError, match=r"SceneState.joint_pos has shape \(2, 2\), expected \(env, 3\)"):
         touch(state)
     state.joint_pos = None
-    with pytest.raises(StateError, match=r"SceneState\.joint_pos is missing"):
+    with pytest.raises(StateError, match="SceneState lacks joint_pos, which this module reads"):
         touch(state)
 
 

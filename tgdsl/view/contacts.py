@@ -54,9 +54,8 @@ def contacts_of(model: mujoco.MjModel, data: mujoco.MjData, with_force: bool = T
     active = [i for i in range(data.ncon) if not data.contact[i].exclude]
     geoms = data.contact.geom[active].reshape(-1, 2)
     bodies = np.where(geoms < 0, -1, model.geom_bodyid[geoms])
-    force = np.zeros((len(active), 3)) if with_force else None
+    force, local = np.zeros((len(active), 3)), np.zeros(6)
     for row, i in enumerate(active if with_force else ()):
-        local = np.zeros(6)
         mujoco.mj_contactForce(model, data, i, local)
         force[row] = local[:3] @ data.contact.frame[i].reshape(3, 3)
-    return Contacts(data.contact.pos[active].reshape(-1, 3), bodies, force)
+    return Contacts(data.contact.pos[active].reshape(-1, 3), bodies, force if with_force else None)

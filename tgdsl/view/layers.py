@@ -211,7 +211,7 @@ class SurfaceLayer(Layer):
                 continue
             sides = boxes.size[rows[0]]
             vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
-            vertices, faces = subdivide_to_size(vertices, faces, float(np.median(sides)), max_iter=20)
+            vertices, faces = subdivide_to_size(vertices, faces, float(np.median(sides)), max_iter=20)[:2]
             nearest = KDTree(layout.pos[rows] / sides).query(vertices[faces].mean(axis=1) / sides)[1]
             for cell in np.unique(nearest):
                 own = vertices[faces[nearest == cell]].reshape(-1, 3)

@@ -82,7 +82,8 @@ def body_surfaces(model: mujoco.MjModel, body: int, links: Iterable[Link] = ()) 
         if len(corners):
             by_colour.setdefault(geom_colour(model, geom), []).append((corners, normals))
     return [
-        Surface(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)), colour) for colour, parts in by_colour.items()
+        Surface(np.concatenate([corners for corners, _ in parts]), np.concatenate([normals for _, normals in parts]), colour)
+        for colour, parts in by_colour.items()
     ]
 
 

@@ -261,9 +261,10 @@ class Page:
         rows = [f"\n| {name} | {f'{value:.4g}' if isinstance(value, float) else value} |" for name, value in notes.items()]
         self.panel.notes.content = f"| | |\n|---|---|{''.join(rows)}" if rows else ""
         group = self.panel.observed
-        if group is not None and self._is_due("observations", IMAGE):
+        values_shown = self.panel.group_values
+        if group is not None and values_shown is not None and self._is_due("observations", IMAGE):
             rows = [f"\n| {name} | {_range(values)} | {unit} |" for name, unit, values in self.stage.observed(group.value, env)]
-            self.panel.group_values.content = f"| | | |\n|---|---|---|{''.join(rows)}"
+            values_shown.content = f"| | | |\n|---|---|---|{''.join(rows)}"
         layer = self.scene.layers[0]
         things = "taxels" if isinstance(layer, DiscLayer) else "cells"
         self.panel.status.content = f"t = {self.stage.time:.2f} s · {len(layer.rows.body)} {things}{contacts}"

@@ -122,7 +122,7 @@ def test_what_a_state_may_hold(tmp_path):
     with pytest.raises(StateError, match=r"SceneState\.object_material has shape \(4, 2\), expected \(env, 3\)"):
         touch(state)
     state.object_temperature = None
-    with pytest.raises(StateError, match=r"SceneState\.object_temperature is missing"):
+    with pytest.raises(StateError, match="SceneState lacks object_temperature, which this module reads"):
         touch(state)
 
 
