@@ -674,8 +674,9 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
         write(view, "lift", "-0.02")
         assert soon(lambda: page.panel.sliders[0].value == pytest.approx(-0.02))
         assert soon(lambda: abs(total(view) - before) > 0.1 * before)
-        view.locator("input[value='magnitude']").first.dispatch_event("click")
-        view.get_by_role("option", name="force_z").dispatch_event("click")
+        option = view.get_by_role("option", name="force_z", include_hidden=True)  # hidden until a frame is drawn
+        assert soon(lambda: view.locator("input[value='magnitude']").first.dispatch_event("click") or option.count() > 0)
+        option.first.dispatch_event("click")
         assert soon(lambda: view.get_by_text("force_z [N]").count() > 0)
         view.context.set_offline(True)
         view.context.set_offline(False)
