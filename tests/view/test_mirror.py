@@ -5,10 +5,10 @@ import pickle
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
+from press_scene import DOCUMENT
 from silent_browser import silent_browser
 
 import tgdsl
@@ -16,34 +16,6 @@ from tgdsl.errors import TgdslError
 from tgdsl.view import mirror
 from tgdsl.view.mirror import MirrorStage
 from tgdsl.view.stages import SimStage
-
-SCENE = """
-<mujoco model="press"><option timestep="0.002"/><worldbody>
-<body name="pad" pos="0 0 0.05"><geom name="pad" type="box" size=".03 .03 .005" density="800"/></body>
-<body name="ball" pos=".01 0 .0749"><joint name="lift" type="slide" axis="0 0 1" damping="2"/>
-<geom name="ball" type="sphere" size=".02" mass="0.2"/></body>
-</worldbody><actuator><motor name="lift" joint="lift"/></actuator></mujoco>
-"""
-DOCUMENT = """
-tgdsl: 1
-robot:
-  model: press.xml
-  layout:
-    resolutions: {low: {pad: {method: grid, rows: 4, columns: 4, direction: [0, 0, -1], radius: 6 mm}}}
-    groups: {all: [pad]}
-resolution: low
-objects: {ball: {body: ball}}
-sensors:
-  touch: {kind: kinematic_taxel, links: all, feels: [ball]}
-"""
-
-
-@pytest.fixture(scope="module")
-def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("mirror")
-    (folder / "press.xml").write_text(SCENE)
-    (folder / "press.yaml").write_text(DOCUMENT)
-    return folder / "press.yaml"
 
 
 def answer(stage: SimStage, requests, frames) -> None:

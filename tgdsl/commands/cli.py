@@ -26,24 +26,8 @@ from tgdsl.errors import SpecError, TgdslError
 
 # Every command by its name. A command imports what it needs when it runs, so that `tgdsl --help` imports no torch.
 Command = subcommands(
-    *(
-        Examples,
-        Compile,
-        Explain,
-        Schema,
-        Run,
-        Listen,
-        Play,
-        Train,
-        Distill,
-        Sweep,
-        Evaluate,
-        Deploy,
-        View,
-        Render,
-        Links,
-        Layout,
-    ),
+    *(Examples, Compile, Explain, Schema, Run, Listen, Play, Train, Distill, Sweep, Evaluate, Deploy),
+    *(View, Render, Links, Layout),
     *(Import, ExportUsd, Export, ExportDataset, Verify, Cache, Bench, Doctor, Grasps, Hand, Calibrate),
 )
 

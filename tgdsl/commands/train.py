@@ -117,7 +117,7 @@ class Train:
             run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
             if ranks.is_first and run.board is None:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
-            with shown(learner) if self.view and ranks.is_first else nullcontext():
+            with learner_page(learner) if self.view and ranks.is_first else nullcontext():
                 run.learn_with_bar(self.iterations, self.minutes, loaded.spec.train.iterations)
             if ranks.is_first:
                 self._finish(learner, folder, origin, run)
@@ -148,7 +148,7 @@ class Train:
 
 
 @contextmanager
-def shown(learner: Learner) -> Iterator[LoopPage]:
+def learner_page(learner: Learner) -> Iterator[LoopPage]:
     """Show the environments of a learner in the browser; its page takes the processor time that learning leaves."""
     from tgdsl.rl.playing.stage import LearnerStage
     from tgdsl.view.mirror import LOWEST_PRIORITY, LoopPage

@@ -18,7 +18,7 @@ from tgdsl.view.stages import Observed, Slider, Stage
 Array = np.ndarray
 
 
-class _HandedOver(Actor):
+class _ByHand(Actor):
     """Acts as another actor does, or as a stage's `control` where that is `by_hand`."""
 
     def __init__(self, actor: Actor, stage: Stage):
@@ -39,7 +39,7 @@ class TaskStage(Stage):
 
     def __init__(self, env: TouchEnv, actor: Actor, seed: int = 0):
         self.env, self._seed, self.groups = env, seed, tuple(env.groups)
-        self._actor, self._features = _HandedOver(actor, self), env.describe()
+        self._actor, self._features = _ByHand(actor, self), env.describe()
         self.control = np.zeros(env.num_actions)
         self.touch, self.model = env.touch, env.sim.model
         self.num_envs, self.control_step = env.num_envs, env.control_step
