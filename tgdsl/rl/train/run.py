@@ -255,8 +255,10 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
     names = state["groups"].keys() | learner.groups.keys()
     if state["groups"].keys() ^ learner.groups.keys() == {"rnd_state"}:  # RND was turned on or off
         names -= {"rnd_state"}
-    if any(state["groups"].get(name) != learner.groups.get(name) for name in names):
-        raise CheckpointError(f"{file}: learned from the groups {state['groups']}, not {learner.groups}")
+    if other := sorted(name for name in names if state["groups"].get(name) != learner.groups.get(name)):
+        before, now = ({name: groups.get(name) for name in other} for groups in (state["groups"], learner.groups))
+        hint = "a network cannot go on with other groups: begin a new run without --resume"
+        raise CheckpointError(f"{file}: learned from the groups {before}, not {now}; {hint}")
     try:
         learner.load_state_dict(state)
     except (RuntimeError, ValueError, KeyError) as error:
