@@ -264,7 +264,7 @@ def test_contacts_are_drawn_and_switched_off(document):
         for _ in range(100):
             page.stage.advance()
         page.draw()
-        assert "1 contacts, largest" in page.panel.status.content
+        assert "1 contact, largest" in page.panel.status.content
         ((begin, end),) = page.scene._forces.points
         np.testing.assert_allclose(begin[:2], [0.01, 0], atol=1e-3)
         assert end[2] < begin[2]  # the ball presses the pad down

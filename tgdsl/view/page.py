@@ -249,7 +249,7 @@ class Page:
         self.scene.draw_contacts(contacts)
         if contacts is None:
             return ""
-        text = f" · {len(contacts.pos)} contacts"
+        text = f" · {len(contacts.pos)} contact{'s' * (len(contacts.pos) != 1)}"
         if contacts.force is None or not len(contacts.pos):
             return text
         return f"{text}, largest {np.linalg.norm(contacts.force, axis=1).max():.3g} N"

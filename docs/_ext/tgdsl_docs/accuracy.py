@@ -62,9 +62,7 @@ class Accuracy:
             (str(d.number), inline(d.about), d.measured, inline(title or f"`tgdsl bench --{d.answered_in}`"), figure)
             for d, title, figure in importlib.import_module("oracles.sheet").findings(entries)
         ]
-        about = (
-            "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
-        )
+        about = "Findings about the paper's published implementation (Chung et al.), and the comparison that answers each here."
         header = ("", "finding", "there", "answered by", "figure here")
         parts.append(f"## Findings\n\n{about}\n\n{table(header, rows)}")
         return "\n".join(parts)

@@ -53,7 +53,7 @@ def api_pages() -> dict[str, str]:
         place = public[name]
         pages[name] = _page(name, "".join(_class(path) for path in (f"{place.__module__}.{place.__qualname__}", *more)))
     pages["errors"] = _page("Errors", "".join(f".. autoexception:: tgdsl.errors.{name}\n   :members:\n\n" for name in errors))
-    pages["writing"] = _page("Kinds, quantities and sources of one's own", "".join(_part(name) for name in WRITING))
+    pages["writing"] = _page("Your own kinds, quantities and sources", "".join(_part(name) for name in WRITING))
     pages["testing"] = _page(
         "tgdsl.testing", ".. automodule:: tgdsl.testing\n\n" + _class("tgdsl.testing.conformance.KindConformance")
     )

@@ -34,11 +34,15 @@ def grammar_pages() -> dict[str, str]:
     document = document_model(KINDS).model_json_schema()
     layout = LayoutSpec.model_json_schema()
     pages = {
-        "document": _page("Documents", "What is sensed, by which robot, in which scene.", [("Document", document)], kinds),
+        "document": _page(
+            "Documents", "A document names the robot, the scene, the objects and the sensors.", [("Document", document)], kinds
+        ),
         "layout": _page(
             "Layouts", "Where taxels sit. A file, or the document's `robot.layout` in line.", [("Layout", layout)], {}
         ),
-        "task": _page("Tasks", "What is to be learned: see [tasks](../../how-to/tasks.md).", _tasks(), {}),
+        "task": _page(
+            "Tasks", "A task's document says what a policy learns: see [tasks](../../how-to/tasks.md).", _tasks(), {}
+        ),
     }
     return {"grammar/index.md": INDEX} | {f"grammar/{name}.md": text for name, text in pages.items()}
 

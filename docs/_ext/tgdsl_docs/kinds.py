@@ -70,7 +70,7 @@ def _index(outputs: list[Any], measured: Mapping[str, Any]) -> str:
     header = ("kind", "what it measures", "channels of the example", f"ms, {ENVS:,} × {TAXELS}", "float32 error")
     names = "\n".join(kind.name for kind in KINDS)
     return (
-        "# Sensor kinds\n\n[Which kind to use](../../start/which-kind.md) compares them. Channels are those of "
+        "# Sensor kinds\n\n[Which kind to use](../../start/which-kind.md) compares them. The channels are from "
         f"[every_sensor.yaml](../../../{EXAMPLE}).\n\n{table(header, rows)}\n{_about_cost(measured)}\n\n"
         f"```{{toctree}}\n:hidden:\n\n{names}\n```\n"
     )
@@ -99,8 +99,8 @@ def _page(kind: Kind, block: str, outputs: list[Any], measured: Mapping[str, Any
         f"Defined in [{path}](../../../{path}), with a float64 reference.\n{_mentions(kind, source)}",
         f"\n## Example\n\nFrom [every_sensor.yaml](../../../{EXAMPLE}):\n\n```yaml\nsensors:\n{block}\n```\n",
         table(("reading", "shape", "channels"), _readings(kind, outputs)),
-        f"\n## Parameters\n\n{fields_table(schema, own, _link) if own else 'None of its own.'}",
-        f"\n## Parameters that it shares with other kinds\n\n{fields_table(schema, inherited, _link)}",
+        f"\n## Parameters\n\n{fields_table(schema, own, _link) if own else 'This kind adds no parameters.'}",
+        f"\n## Parameters shared with other kinds\n\n{fields_table(schema, inherited, _link)}",
         f"\n## Noise\n\n{_noise(kind)}",
         f"\n## Cost\n\n{_cost(kind, measured)}",
     ]

@@ -13,15 +13,15 @@ FEWER = {"screwdriver": {"grasps.num": 4}}
 """What of a document is less for these pages, and changes no feature."""
 TEXT = """# Observations
 
-The features of each group, in order, of the documents in `examples/tasks/`: what `print(env.describe())` shows. Of other
-documents (`touch`, `placement`, `resolution`, `goal`, `temporal`) they are others.
+This page lists the features of each group, in order, for the documents in `examples/tasks/`, as `print(env.describe())` does.
+A document with another `touch`, `placement`, `resolution`, `goal` or `temporal` has other features.
 
-- A unit is that of the quantity; features are the quantity times `scale`.
-- `world` are the scene's axes, `link` those of the link's body; `–`: no direction.
-- Six numbers of an orientation are its matrix's first column, the turned x axis, then the second one.
-- Rows of a sensor are those of `env.touch.rows[sensor]`: places in the frame of `body`, normals, radii.
-- Velocities are those of the body frame's origin.
-- All is of one instant: after a step, of the start of its last physics step.
+- A feature is the quantity times `scale`; the unit belongs to the quantity.
+- `world` means the scene's axes, `link` the axes of the link's body, `–` no direction.
+- The six numbers of an orientation are the first two columns of its rotation matrix.
+- `env.touch.rows[sensor]` has the rows of a sensor: positions in the frame of `body`, normals, radii.
+- A velocity is the velocity of the body frame's origin.
+- All features belong to one instant: the start of the last physics step.
 """
 
 
