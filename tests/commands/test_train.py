@@ -14,7 +14,7 @@ from silent_browser import silent_browser
 from small_runs import ARGUMENTS, small_learner
 from small_tasks import small_task
 
-from tgdsl.commands.train import shown
+from tgdsl.commands.train import learner_page
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.stage import LearnerStage
 from tgdsl.rl.train.folder import RunFolder, read_checkpoint
@@ -353,7 +353,7 @@ def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_pa
     bare, _ = small_learner(tmp_path)
     viewed, _ = small_learner(tmp_path)
     torch.manual_seed(0)
-    with shown(viewed) as page:
+    with learner_page(viewed) as page:
         viewed.iterate()
         for _ in range(2):
             with silent_browser(page.url):

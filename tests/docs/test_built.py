@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -18,7 +19,7 @@ REPOSITORY = Path(__file__).parents[2]
 SOURCES = ("tgdsl", "robots", "examples", "benchmarks", "tests", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def built(tmp_path_factory):
     """Build from a tree of links, so that generated pages do not come into the repository."""
     folder = tmp_path_factory.mktemp("docs")
@@ -32,14 +33,19 @@ def built(tmp_path_factory):
     return folder / "build"
 
 
+WITH_PICTURES = (
+    "index", "generated/overview", "generated/gallery", "generated/kinds/contact", "background/hands", "start/learn",
+)  # fmt: skip
+
+
 class Silent(SimpleHTTPRequestHandler):
     def log_message(self, format, *args):
         pass
 
 
-@pytest.fixture
-def page(built):
-    """Yield a page of headless Chromium and the address of the built docs."""
+@contextmanager
+def browser_of(built):
+    """Yield a tab of headless Chromium and the address of the built pages."""
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("chromium is not installed (apt-get install chromium): the built docs are not opened in a browser")
@@ -55,37 +61,21 @@ def page(built):
     server.server_close()
 
 
-def test_there_is_a_page_for_each_kind_and_each_page(built):
+def test_pages_are_built_pictures_drawn_and_words_found(built):
+    """One test, as building takes minutes."""
     for kind in KINDS:
         assert (built / "generated" / "kinds" / f"{kind.name}.html").is_file()
     pages = (REPOSITORY / "docs").rglob("*.md")
     for source in (page for page in pages if "generated" not in page.parts):
         assert (built / source.relative_to(REPOSITORY / "docs").with_suffix(".html")).is_file()
-
-
-def test_pictures_are_drawn(page):
-    tab, address = page
-    for name in (
-        "index",
-        "generated/overview",
-        "generated/gallery",
-        "generated/kinds/contact",
-        "background/hands",
-        "start/learn",
-    ):
-        tab.goto(f"{address}/{name}.html", wait_until="load")
-        widths = tab.eval_on_selector_all(".content img, article img", "images => images.map(image => image.naturalWidth)")
-        assert widths and min(widths) > 0, name
-
-
-@pytest.mark.parametrize(("word", "expected"), [("permittivity", "how-to/kind"), ("read_delay", "background/noise")])
-def test_the_search_finds_a_page(page, word, expected):
-    tab, address = page
-    tab.goto(f"{address}/search.html?q={word}")
-    tab.wait_for_selector("#search-results li a", timeout=30_000)
-    found = tab.eval_on_selector_all("#search-results li a", "links => links.map(link => link.getAttribute('href'))")
-    assert any(expected in href for href in found), found
-
-
-def test_the_api_links_to_source(built):
     assert 'href="../../_modules/tgdsl/' in (built / "generated" / "api" / "functions.html").read_text(encoding="utf-8")
+    with browser_of(built) as (tab, address):
+        for name in WITH_PICTURES:
+            tab.goto(f"{address}/{name}.html", wait_until="load")
+            widths = tab.eval_on_selector_all(".content img, article img", "images => images.map(image => image.naturalWidth)")
+            assert widths and min(widths) > 0, name
+        for word, expected in (("permittivity", "how-to/kind"), ("read_delay", "background/noise")):
+            tab.goto(f"{address}/search.html?q={word}")
+            tab.wait_for_selector("#search-results li a", timeout=30_000)
+            links = tab.eval_on_selector_all("#search-results li a", "links => links.map(link => link.getAttribute('href'))")
+            assert any(expected in href for href in links), links

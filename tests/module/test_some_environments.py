@@ -131,7 +131,7 @@ def test_compiled_equals_eager(folder):
         "c": {"kind": "contact", "release_threshold": 1e-4, "history": 3},
     }
     touch = tgdsl.compile(document(folder, sensors))
-    eager, compiled = copy.deepcopy(touch).seed(3), touch.seed(3).compile(backend="aot_eager")
+    eager, compiled = copy.deepcopy(touch).seed(3), touch.seed(3).compile(backend="eager")
     for call, (reset, read, _) in enumerate(schedule(5, 8)):
         state = felt_state(eager, NUM_ENVS, call)
         mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(read, dtype=torch.int64), True)

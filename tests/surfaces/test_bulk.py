@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tgdsl.formats.model import SHAPE_NAMES
 from tgdsl.surfaces.bulk import PRIMITIVES, bulk
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, winding_number
 
 RTOL = 1e-14  # of a few products in float64
 SIZES = {
@@ -136,3 +136,15 @@ def test_a_plane_is_a_half_space():
     found = bulk([SurfaceGeom(geom("plane", (1.0, 1.0, 0.1)), None)])
     assert (found.volume, found.area, found.curvature) == (np.inf, 0.0, 0.0)
     assert (found.center == 0).all()
+
+
+@pytest.mark.parametrize("rounds", [0, 4])
+def test_a_cube_winds_once_around_what_is_inside(rounds):
+    """At a corner it covers an eighth of all directions; the same at each call."""
+    cube = trimesh.creation.box((2, 2, 2))
+    for _ in range(rounds):
+        cube = cube.subdivide()
+    vertices, faces = np.array(cube.vertices), np.array(cube.faces)
+    places = np.array([[0, 0, 0], [0.5, 0.25, -0.75], [1, 1, 1], [0.3, 0.1, 1 + 1e-6], [0.3, 0.1, 1 - 1e-6], [0.5, 0.5, 1.5]])
+    found = np.array([winding_number(vertices, faces, places) for _ in range(20)])
+    np.testing.assert_allclose(found, np.tile([1, 1, 1 / 8, 0, 1, 0], (20, 1)), atol=1e-12)

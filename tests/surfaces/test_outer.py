@@ -11,7 +11,7 @@ from surfaces import plate
 from tgdsl.errors import BakeError
 from tgdsl.surfaces.outer import OPEN, TWISTED, UNCUT, Outer, cut_cells, outer
 from tgdsl.surfaces.solid import Solid
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, winding_number
 
 MM = 1e-3
 CUBE = box((0.04, 0.04, 0.04))
@@ -44,7 +44,7 @@ def surface(*parts: trimesh.Trimesh, is_merged: bool = False) -> Surface:
 def distance(found: Outer, pos) -> np.ndarray:
     """Signed distance [m] of points; around each the surface winds once or not at all."""
     pos = np.array(pos, float)
-    winding = igl.winding_number(found.vertices, found.faces, pos)
+    winding = winding_number(found.vertices, found.faces, pos)
     np.testing.assert_allclose(winding, np.round(winding), atol=1e-4)
     assert set(np.round(winding).tolist()) <= {0.0, 1.0}
     squared, *_ = igl.point_mesh_squared_distance(pos, found.vertices, found.faces)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, StrictBool, StrictInt, Tag, model_validator
 
@@ -39,7 +39,7 @@ class _Primitive(SpecModel):
     """Its size as MuJoCo defines it: radius; radius and half-length; half-lengths along x, y, z [m]."""
 
     @model_validator(mode="after")
-    def _check_size(self) -> Self:
+    def _check_size(self) -> _Primitive:
         if len(self.size) != NUM_SIZES[self.type]:
             raise ValueError(f"a {self.type} has {NUM_SIZES[self.type]} sizes, found {len(self.size)}")
         return self

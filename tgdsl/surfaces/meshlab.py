@@ -22,7 +22,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tgdsl.surfaces.region import LENGTH_TOLERANCE
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.surface import Surface, winding_number
 
 MAX_HOLE = 0.05
 """A component is solid, so that points can be inside it, if the squared length of its border is at most this share of its
@@ -70,7 +70,7 @@ class Shell:
             winding[near] = np.atleast_1d(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(pos[near])))
         doubtful = np.flatnonzero(np.abs(winding - np.round(winding)) > ROUNDING)
         if len(doubtful):
-            winding[doubtful] = np.atleast_1d(igl.winding_number(vertices, faces, pos[doubtful]))
+            winding[doubtful] = winding_number(vertices, faces, pos[doubtful])
         return winding
 
 

@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tgdsl.errors import BakeError
-from tgdsl.surfaces.surface import Surface, face_cross, hole_caps, merged
+from tgdsl.surfaces.surface import Surface, face_cross, hole_caps, merged, winding_number
 
 TOUCH = 1e-6  # distance at which faces touch, over the mesh's size: MuJoCo has its vertices in float32
 STEP = 1e-5  # distance in front of and behind a face at which one looks whether it is inside, over the mesh's size
@@ -89,7 +89,7 @@ def is_inside(
     winding = np.abs(np.atleast_1d(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(pos))))
     doubtful = np.flatnonzero(np.abs(winding - 0.5) < 0.1)
     if len(doubtful):
-        winding[doubtful] = np.abs(igl.winding_number(vertices, faces, np.ascontiguousarray(pos[doubtful])))
+        winding[doubtful] = np.abs(winding_number(vertices, faces, pos[doubtful]))
     return winding >= 0.5
 
 

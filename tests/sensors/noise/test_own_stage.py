@@ -46,7 +46,7 @@ def test_a_module_clips_between_offset_and_quantiser(tmp_path, saturation, compi
     assert touch.plan.sensors[0].noise.terms == ("bias", "saturation", "quantization")
     assert "saturation force [0.2, 0.4] N" in touch.explain()
     if compiled:
-        touch.compile(backend="aot_eager")
+        touch.compile(backend="eager")
     (readings,) = read(touch, range(1))
     clipped, other = readings["s"], readings["c"]
     assert (other[..., :3] > 0.4).any()
