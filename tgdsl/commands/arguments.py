@@ -32,9 +32,9 @@ def optional(metavar: str, *aliases: str) -> Any:
     return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
 
 
-Names = Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="")]
+Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]", help_behavior_hint="")]
 OptionalNumbers = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="")]
-OptionalText = Annotated[str | None, optional("TEXT")]
+OptionalName = Annotated[str | None, optional("NAME")]
 OptionalInt = Annotated[int | None, optional("INT")]
 OptionalFloat = Annotated[float | None, optional("FLOAT")]
 OptionalFile = Annotated[Path | None, optional("FILE")]
@@ -45,29 +45,33 @@ File = Annotated[Path, tyro.conf.arg(metavar="FILE")]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
 OutFolder = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
 Document = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The YAML document.", metavar="FILE")]
-DocumentOrArtefact = Annotated[Document, tyro.conf.arg(help="The YAML document, or an artefact (.safetensors).")]
+DocumentOrArtefact = Annotated[
+    Document, tyro.conf.arg(help="The YAML document, or an artefact (.safetensors) that `tgdsl compile` wrote.")
+]
 Robot = Annotated[
     tyro.conf.Positional[str],
-    tyro.conf.arg(help="A file (MJCF, URDF, USD), or the name of a robot that tgdsl brings.", metavar="ROBOT"),
+    tyro.conf.arg(
+        help="A robot's file (MJCF, URDF, USD), or the name of a robot that comes with tgdsl, such as xhand1.", metavar="ROBOT"
+    ),
 ]
-Layout = Annotated[OptionalFile, tyro.conf.arg(help="Layout of a robot; default: the one next to its file.")]
+Layout = Annotated[OptionalFile, tyro.conf.arg(help="Layout of the robot; default: layout.yaml next to its file.")]
 Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
-Device = Annotated[str, tyro.conf.arg(help="Where physics, touch and networks are computed: cpu, or cuda.")]
-Seed = Annotated[int, tyro.conf.arg(help="Seed of everything random.")]
-Compiled = Annotated[bool, tyro.conf.arg(help="Fuse the module with torch.compile first.")]
-Replace = Annotated[bool, tyro.conf.arg(help="Replace the files if they are there.")]
+Device = Annotated[str, tyro.conf.arg(help="Device of physics, touch and networks: cpu or cuda.", metavar="DEVICE")]
+Seed = Annotated[int, tyro.conf.arg(help="Seed of all random numbers.")]
+Compiled = Annotated[bool, tyro.conf.arg(help="Compile the module with torch.compile first.")]
+Replace = Annotated[bool, tyro.conf.arg(help="Replace existing files.")]
 Groups = Annotated[
     Names,
     tyro.conf.arg(
-        help="Groups of observations that the policy takes, in its order; default: as in its card; without a card, as in "
-        "proprio, tactile_sensors and goal that the task has."
+        help="Observation groups that the policy takes, in its order; default: the groups of its card, or without a card "
+        "proprio, tactile_sensors and goal, if the task has them."
     ),
 ]
 Overrides = Annotated[
     tuple[str, ...],
     tyro.conf.arg(
         name="set",
-        help="Override a value of the document, as in `--set resolution=high`; may be repeated.",
+        help="Override a value of the document, such as `--set resolution=high`.",
         metavar="KEY=VALUE",
     ),
     tyro.conf.UseAppendAction,

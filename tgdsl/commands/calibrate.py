@@ -29,37 +29,37 @@ Intervals = Annotated[
 
 @dataclass(frozen=True)
 class CalibrateSensor:
-    """Fit parameters of sensors to recordings; docs/how-to/calibrate.md describes the recordings."""
+    """Fit parameters of a document's sensors to recordings, which docs/how-to/calibrate.md describes."""
 
     document: tyro.conf.Positional[args.File]
-    """The document; its values are where the search starts."""
-    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RECORDING")]
-    """The recordings: .npz files, or YAML documents of CSV files."""
+    """The document; the search starts from its values."""
+    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], args.optional("RECORDING")]
+    """The recordings, at least one: .npz files, or YAML documents of CSV files."""
     fit: Annotated[tuple[str, ...], args.optional("SENSOR.FIELD")] = ()
-    """Parameters, or with a range to search: `skin.thickness="1 mm:9 mm"`; none: the document predicts the recordings."""
+    """A parameter to fit, or with a range: skin.thickness="1 mm:9 mm". Without any, the document predicts the recordings."""
     compare: args.OptionalFile = None
-    """YAML file with `compare:`, models that are fitted in turn; prints one table."""
+    """A YAML file with `compare:`, a list of models to fit in turn and compare in one table; default: one model."""
     reading: Literal["none", "offset", "scale", "affine"] = "none"
-    """Map of its own that each recording's reading may have: an offset, also a scale, or an affine map of the rows' places."""
+    """Unknowns of each recording's frame: an offset, a scale as well, or an affine map of the rows' positions."""
     gain: bool = False
-    """Each recording may have a gain of its own."""
+    """Fit one gain per recording."""
     robust: bool = False
-    """Rows far off, such as lost markers, count less."""
+    """Give outliers, such as lost markers, less weight."""
     hold_out: Literal["none", "taxel", "blocks", "time", "recording"] = "none"
-    """What is left out in turn to measure the error on it."""
+    """Parts that are held out in turn, to measure the error on unseen data."""
     folds: int = 6
-    """Number of parts for that."""
+    """Number of held-out parts."""
     starts: int = 8
-    """Starts of the search."""
+    """Number of starting points of the search."""
     intervals: Literal["profile", "bootstrap", "none"] = "profile"
-    """How 95 % intervals are computed; `none`: from the derivatives."""
+    """Method of the 95 % intervals; none computes them from derivatives only."""
     seed: int = 0
-    """Seed of starts, folds and the bootstrap."""
+    """Seed of starting points, folds and the bootstrap."""
     set: args.Overrides = ()
     out: args.OptionalOut = None
-    """The document to write with the fitted values, beside the document."""
+    """The document to write, with the fitted values; it must be in the document's folder. Default: no file."""
     plot: args.OptionalFile = None
-    """The picture to write: targets, fits and residuals."""
+    """The picture to write: targets, fits and residuals; default: no file."""
     force: args.Replace = False
 
     def run(self) -> None:
@@ -93,39 +93,39 @@ class CalibrateHand:
     """Fit scale, rotation and tare of fingertips to a log under known loads, or to a simulation of the same motion."""
 
     log: Annotated[Path, tyro.conf.arg(metavar="LOG.npz")]
-    """A log of `tgdsl hand record`."""
+    """The log of `tgdsl hand record`."""
     loads: args.OptionalFile = None
-    """Known loads: a YAML file of intervals and forces."""
+    """Known loads: a YAML file of times [s] and forces [N]; default: --load or --simulation."""
     finger: OptionalFinger = None
-    """The finger that --load is about."""
+    """The finger of --load; required with it."""
     load: Intervals = ()
-    """A known load instead: from when to when after the log's first reading [s], and the force on the fingertip along its
-    link's axes [N]; to be repeated for each, one of them 0 0 0."""
+    """A known load: start and end after the log's first reading [s], and the force on the fingertip in its link's frame [N].
+    One of the loads must be 0 0 0."""
     simulation: args.OptionalFile = None
-    """Forces over time instead: readings.npz of `tgdsl run` (then with --document and --reading), or any .npz with `time` and
-    `tip_force` (step, finger, 3) [N]."""
+    """Simulated forces instead of loads: readings.npz of `tgdsl run`, with --document and --reading, or an .npz file with
+    `time` [s] and `tip_force` (step, finger, 3) [N]."""
     document: args.OptionalFile = None
-    """The document, or artefact, that was run."""
-    reading: str = "touch"
-    """Its reading whose forces (or depths) count."""
+    """The document or artefact of --simulation; required with readings.npz."""
+    reading: Annotated[str, tyro.conf.arg(metavar="NAME")] = "touch"
+    """The reading of --document with the forces or depths."""
     depth_scale: float = 1e4
-    """What makes a force of summed depths, as in the observation `agg_force` [N/m]."""
+    """Force per summed depth, as in the observation `agg_force` [N/m]."""
     max_offset: float = 2.0
-    """How far the simulation's clock may be from the log's, either way [s]."""
+    """Largest offset between the clocks of simulation and log, in either direction [s]."""
     axes: Literal["rotation", "signs"] = "rotation"
-    """Whether the sensor's axes may be turned in any way, or are parallel to the link's but for their signs."""
+    """Orientation of the sensor's axes: any rotation, or parallel to the link's axes with unknown signs."""
     keep_tare: bool = False
-    """Keep the calibration's tare instead of fitting it; then no load of 0 0 0 is needed."""
+    """Keep the tare of --calibration instead of fitting it; no load of 0 0 0 is needed then."""
     ignore_taxels: Annotated[tuple[int, ...], tyro.conf.arg(help_behavior_hint="")] = ()
-    """Numbers of taxels that do not count as saturated, because they always are."""
+    """Indices of taxels that are always saturated, and are ignored; default: none."""
     calibration: args.OptionalFile = None
-    """The calibration to start from; default: the log's."""
+    """The calibration file to start from; default: the log's."""
     others: OptionalFinger = None
-    """Give fingers that no load was on the scale and rotation of this one."""
+    """Use the scale and rotation of this finger for fingers without loads; default: theirs in --calibration."""
     out: args.Out = Path("hand.calibration.yaml")
     """The calibration file to write."""
     plot: args.File = Path("hand.calibration.png")
-    """The picture to write: fitted over known forces."""
+    """The picture to write: fitted forces over known forces."""
     force: args.Replace = False
 
     def run(self) -> None:
@@ -210,7 +210,7 @@ class CalibrateHand:
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Fit to recordings: sensor fits parameters of a document's sensors, hand the counts of a real hand's fingertips."""
+    """Fit sensor parameters, or a real hand's calibration, to recordings."""
 
     action: Annotated[args.subcommands(sensor=CalibrateSensor, hand=CalibrateHand), tyro.conf.arg(name="")]  # type: ignore[valid-type]
     """What to calibrate."""

@@ -104,7 +104,10 @@ def _run() -> None:
         return
     if wrong := [word for word in sys.argv[1:] if word.partition("=")[0] == "--resolution"]:
         raise TgdslError(f"{wrong[0]}: there is no such option; write --set resolution=high")
-    about = "Touch for robot learning. `tgdsl --version` prints the version."
+    about = (
+        "Simulate tactile sensors of robot hands, and train policies with them. Start with `tgdsl examples list`. "
+        "`tgdsl COMMAND --help` has the options of a command and an example; `tgdsl --version` prints the version."
+    )
     try:
         command = tyro.cli(Command, prog="tgdsl", description=about)
     except SystemExit:
@@ -118,7 +121,8 @@ def example_of(words: list[str]) -> str:
     """Return the last line of a command's help; empty if the words do not ask for it."""
     *command, last = words or [""]
     name = " ".join(command)
-    return f"example: tgdsl {name} {EXAMPLES[name]}".rstrip() if name in EXAMPLES and last in ("-h", "--help") else ""
+    full = next((each for each in EXAMPLES if f"{each} ".startswith(f"{name} ")), None)
+    return f"example: tgdsl {full} {EXAMPLES[full]}".rstrip() if full and last in ("-h", "--help") else ""
 
 
 def _discard_output() -> None:

@@ -30,40 +30,40 @@ OPTIONS = {"touch": "types", "placement": "placements", "noise": "noise", "resol
 
 @dataclass(frozen=True)
 class Distill:
-    """Teach students by DAgger, as the document's `distill` says, and evaluate them; write a table, curves and the students.
+    """Teach students by DAgger with the document's `distill` settings, and evaluate them; write students, curves and a table.
 
     There is one per type, placement, noise and seed, all in one simulation per resolution.
     """
 
     task: args.Task
     teacher: args.OptionalFile = None
-    """The teacher: a policy with its card, as tgdsl train writes it."""
+    """The teacher: a policy of `tgdsl train`, and its card; required for a new run."""
     types: Names = None
-    """What students feel: types as `touch` has them, none among them, or all; default: all."""
+    """Types of touch, as for the key `touch` of a task (`none` is one of them), or all; default: all."""
     placements: Names = None
-    """Link groups that feel; default: the document's `placement`."""
+    """Link groups with taxels; default: the document's `placement`."""
     noise: Names = None
-    """Profiles of noise; default: the document's `noise`."""
+    """Noise profiles; default: the document's `noise`."""
     resolutions: Names = None
-    """How densely they feel: a simulation each, one after the other; default: the document's `resolution`."""
+    """Resolutions of the layout, in one simulation after the other; default: the document's `resolution`."""
     seeds: args.OptionalInt = None
-    """Students of each kind; default: 3."""
+    """Seeds per type, placement and noise; default: 3."""
     envs: args.OptionalInt = None
-    """Environments of a simulation; default: about 13824, so that they divide among the students."""
+    """Environments per simulation; default: about 13824, a multiple of the number of students."""
     device: str = "cuda"
-    """Where physics, touch and networks are computed: cuda, or cpu."""
+    """Device of physics, touch and networks: cuda or cpu."""
     iterations: args.OptionalInt = None
-    """Iterations of each simulation, those made before included; default: distill.iterations of the document."""
+    """Iterations per simulation, including earlier parts of the run; default: `distill.iterations` of the document."""
     minutes: args.OptionalFloat = None
-    """Time to learn from now on in each simulation [min], start-up not counted; default: no limit."""
+    """Learning time per simulation from now on, without start-up [min]; default: no limit."""
     seed: args.OptionalInt = None
     """Seed of the environments; default: 0."""
     resume: args.OptionalFolder = None
-    """Folder of a run that goes on from its last checkpoints, with the same students and overrides."""
+    """Folder of an earlier run to continue from its last checkpoints, with its students and overrides; default: a new run."""
     out: args.OptionalOutFolder = None
-    """Folder of the run, with one per resolution in it; default: out/NAME_students."""
+    """Folder of the run, with a subfolder per resolution; default: out/NAME_students."""
     episodes: int = 1000
-    """Episodes of each student's evaluation at the end; 0: none."""
+    """Episodes per student in the final evaluation; 0: no evaluation."""
     set: args.Overrides = ()
 
     def run(self) -> None:

@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from tgdsl.runtime.rollout import Controls, Recorder
     from tgdsl.view.sound import Sound
 
-Seconds = Annotated[float, tyro.conf.arg(help="Duration of each hold and of each move between keyframes [s].")]
+Seconds = Annotated[float, tyro.conf.arg(help="Duration of each hold, and of each move between keyframes [s].")]
 
 
 @dataclass(frozen=True)
 class Compile:
-    """Compile a document to an artefact that `tgdsl.load` and `tgdsl run` take."""
+    """Compile a document to an artefact, which `tgdsl.load` and `tgdsl run` read."""
 
     document: args.Document
     out: args.OptionalOut = None
-    """The artefact; default: the document's name with the ending .safetensors, in the working folder."""
+    """The artefact; default: the document's name with .safetensors, in the working folder."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -52,7 +52,7 @@ class Compile:
 
 @dataclass(frozen=True)
 class Explain:
-    """Say what a document or an artefact computes, what it leaves out and why, and what it costs."""
+    """Print what a document or an artefact computes, what it leaves out and why, and its cost."""
 
     document: args.DocumentOrArtefact
     set: args.Overrides = ()
@@ -65,10 +65,10 @@ class Explain:
 
 @dataclass(frozen=True)
 class Schema:
-    """Write the JSON Schema of documents and layouts, or of tasks, with which editors complete and check them."""
+    """Write the JSON Schema of documents and layouts, or of tasks, for completion and checks in editors."""
 
     tasks: bool = False
-    """Of tasks."""
+    """Write the schema of tasks."""
     out: args.OptionalOut = None
     """The file to write; default: tgdsl.schema.json, or tgdsl.task.schema.json."""
 
@@ -83,27 +83,27 @@ class Schema:
 
 @dataclass(frozen=True)
 class Run:
-    """Step a document's scene on the CPU, show the readings, and write them and a picture."""
+    """Step a document's scene on the CPU and show the readings; write them and a picture."""
 
     document: args.DocumentOrArtefact
     keyframes: Annotated[tuple[str, ...] | None, args.optional("NAME [NAME ...]")] = None
-    """Keyframes of the scene whose controls are held and moved between, in turn; the first is the start. Default: rest and
-    squeeze if the scene has them; else the hand closes on the first object that fits between its fingers."""
+    """Keyframes of the scene; their controls are applied in turn, with moves between them, and the first one is the start.
+    Default: rest and squeeze, if the scene has both, else the hand closes on the first object that fits between its fingers."""
     seconds: Seconds = 1.0
     controls: args.OptionalFile = None
-    """Recorded controls instead: an .npz file with an array `ctrl` (step, actuator) or (step, env, actuator)."""
+    """An .npz file with recorded controls, an array `ctrl` (step, actuator) or (step, env, actuator); default: keyframes."""
     num_envs: int = 1
-    """Environments; the table and the picture show the first."""
+    """Number of environments; the table and the picture show the first."""
     substeps: args.OptionalInt = None
-    """Physics steps per control step; default: as many as sensors that read blocks want, else 5."""
+    """Physics steps per control step; default: the `substeps` of sensors that read blocks, or 5."""
     out: args.OutFolder = Path("out")
-    """Folder for readings.npz, picture.png and, where there are several readings, overview.png."""
+    """Folder for readings.npz, picture.png and, if there are several readings, overview.png."""
     compiled: args.Compiled = False
-    view: args.OptionalText = None
-    """Viewpoint of the pictures: front (what the taxels face), back, left, right, top (from beyond the fingertips),
-    bottom, iso, or AZIMUTH,ELEVATION in degrees, front being about 0,0; default: the one that shows most of the touch."""
+    view: Annotated[str | None, args.optional("VIEW")] = None
+    """Viewpoint of the pictures: front (the side that taxels face), back, left, right, top (from beyond the fingertips),
+    bottom, iso, or AZIMUTH,ELEVATION [degrees; front is about 0,0]. Default: the view with most loaded taxels."""
     temperatures: Annotated[tuple[float, float] | None, args.optional("LOW HIGH")] = None
-    """Ends of the colours of temperatures [°C]; default: the lowest and the highest that are read."""
+    """Range of the colour scale of temperatures [°C]; default: the lowest and the highest reading."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -188,18 +188,18 @@ class Run:
 
 @dataclass(frozen=True)
 class Listen:
-    """Step a document's scene as `run` does, and write what its sensors make or hear of sound: WAV files and a spectrogram."""
+    """Step a document's scene as `tgdsl run` does, and write the sound of its sensors: WAV files and a spectrogram."""
 
     document: args.DocumentOrArtefact
     sensors: args.Names = ()
-    """Sensors to listen to; default: all that make or hear sound. Of several rows the sum is heard."""
+    """Sensors to listen to; default: all sound kinds. A file has the sum over a sensor's rows."""
     keyframes: Annotated[tuple[str, ...] | None, args.optional("NAME [NAME ...]")] = None
-    """Keyframes of the scene whose controls are held and moved between, in turn; default: as of `run`."""
+    """Keyframes of the scene; default: as for `tgdsl run`."""
     seconds: Seconds = 1.0
     controls: args.OptionalFile = None
-    """Recorded controls instead: an .npz file with an array `ctrl` (step, actuator)."""
+    """An .npz file with recorded controls, an array `ctrl` (step, actuator); default: keyframes."""
     out: args.OutFolder = Path("out")
-    """Folder for a `<sensor>.wav` each, and spectrogram.png."""
+    """Folder for one SENSOR.wav per sensor, and spectrogram.png."""
     compiled: args.Compiled = False
     set: args.Overrides = ()
 
@@ -256,18 +256,18 @@ class Listen:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a document's or an artefact's sensors and observations as a program that runs without tgdsl."""
+    """Export the sensors and observations of a document or an artefact as a program that runs without tgdsl."""
 
     document: args.DocumentOrArtefact
     to: Annotated[Literal["pt2", "aoti", "onnx"] | None, args.optional("pt2|aoti|onnx")] = None
-    """pt2: torch.export, for Python with torch; aoti: AOTInductor, for C++ and Python with torch; onnx: ONNX Runtime; default:
-    by the ending of --out, or pt2."""
+    """Format: pt2 (torch.export, for Python with torch), aoti (AOTInductor, for C++ and Python with torch), or onnx (ONNX
+    Runtime). Default: by the ending of --out, or pt2."""
     out: args.OptionalOut = None
-    """The file; default: the document's name with the ending .pt2, .aoti.pt2 or .onnx, in the working folder."""
+    """The file; default: the document's name with .pt2, .aoti.pt2 or .onnx, in the working folder."""
     dt: args.OptionalFloat = None
-    """Time between steps [s]; default: that of the document."""
+    """Time between two calls [s]; default: the document's time step."""
     state_dtype: Literal["float32", "float64"] = "float32"
-    """Dtype of the state's floats."""
+    """Dtype of floating-point inputs."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -288,14 +288,17 @@ class Export:
 
 @dataclass(frozen=True)
 class Verify:
-    """Compare an exported file with the module on random states, in a process without tgdsl; exit code 1 if they differ."""
+    """Compare an exported file with the module on random states; the file runs in a process without tgdsl.
+
+    The exit code is 1 if they differ.
+    """
 
     file: tyro.conf.Positional[args.File]
     """The file that `tgdsl export` wrote."""
     of: args.OptionalFile = None
-    """The document or artefact; default: where it was when the file was exported."""
+    """The document or artefact; default: the path from which the file was exported."""
     calls: int = 100
-    """Calls of each batch, through which memory is carried."""
+    """Calls in a row for each batch size; state is kept between them."""
 
     def run(self) -> None:
         from tgdsl.module.export.program import read_signature
@@ -320,10 +323,10 @@ class Verify:
 
 @dataclass(frozen=True)
 class Cache:
-    """Show the folder, number and size of cached distances, moments and modes; or remove them all."""
+    """Show folder, number and size of cached distance fields, moments and modes, or remove them."""
 
     clear: bool = False
-    """Remove all of it; it is recomputed when it is wanted."""
+    """Remove all entries; the compiler computes them again when needed."""
 
     def run(self) -> None:
         from tgdsl.files import cache

@@ -22,7 +22,7 @@ FILE_NAME = re.compile(r"[\w./-]+\.\w+")
 
 @dataclass(frozen=True)
 class List:
-    """List the examples, each with its name for `copy`, and the kept policies."""
+    """List the examples, by the names that `copy` takes, and the policies that come with them."""
 
     def run(self) -> None:
         names = example_names()
@@ -34,7 +34,7 @@ class List:
 
 @dataclass(frozen=True)
 class Copy:
-    """Copy examples and all files that they name: scenes, robots, tasks, and the kept policies of a task.
+    """Copy examples and all files that they name: scenes, robots, tasks, and the policies that come with a task.
 
     The files have the same paths as in the repository, so commands of the documentation work in the folder.
     """
@@ -61,7 +61,7 @@ class Copy:
 
 @dataclass(frozen=True)
 class Examples:
-    """Examples that come with tgdsl: list names them, copy writes them into a folder."""
+    """List or copy the examples that come with tgdsl."""
 
     action: Annotated[args.subcommands(List, Copy), tyro.conf.arg(name="")]  # type: ignore[valid-type]
     """What to do."""

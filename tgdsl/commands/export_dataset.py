@@ -21,43 +21,43 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportDataset:
-    """Write episodes with touch as a dataset: joints, set-points, the force on each taxel, rewards, success."""
+    """Write episodes with touch as a dataset: joints, set-points, force per taxel, rewards, success."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
-    """A task (.yaml), a recording of tgdsl run, or a log of tgdsl hand record (.npz)."""
+    """A task (.yaml), readings of `tgdsl run`, or a log of `tgdsl hand record` (.npz)."""
     to: Literal["lerobot", "mcap", "zarr"] = "lerobot"
-    """lerobot: LeRobot v3.0; mcap: an MCAP file of JSON messages; zarr: a Zarr store."""
+    """Format: LeRobot v3.0, an MCAP file of JSON messages, or a Zarr store."""
     out: args.OptionalOutFolder = None
-    """Folder to make; default: out/NAME_lerobot and the like."""
+    """Folder of the dataset; default: out/NAME_FORMAT, such as out/find_ridge_lerobot."""
     policy: args.OptionalFile = None
-    """Of a task: the policy that acts."""
+    """Tasks: the policy that acts; default: --actions."""
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
-    """Of a task without a policy: who acts, as for tgdsl play."""
+    """Tasks without a policy: the actions, as for `tgdsl play`."""
     source: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "environments"
-    """Of a policy: where it acts. environments: the task's, many at a time; emulator, xhand1:PORT or a log as for tgdsl
-    deploy, for a policy that feels agg_force."""
+    """Where a policy acts: environments (of the task, in parallel), or emulator, xhand1:PORT or a log, as for `tgdsl deploy`.
+    The last three need a policy with `agg_force`."""
     episodes: int = 16
-    """Of a task: number of episodes."""
+    """Tasks: number of episodes."""
     envs: int = 16
-    """Environments that are stepped together."""
+    """Tasks: number of parallel environments."""
     seconds: args.OptionalFloat = None
-    """On a hand: longest duration of an episode [s]; default: the task's."""
+    """Hands: longest duration of an episode [s]; default: the task's."""
     fps: args.OptionalFloat = None
-    """Frames per second; default: one per control step, of a log 30."""
-    reading: args.OptionalText = None
-    """The force on taxels to export; default: the first."""
+    """Frame rate [Hz]; default: one frame per control step, or 30 for a log."""
+    reading: args.OptionalName = None
+    """Name of the reading with forces on taxels; default: the first."""
     success_score: args.OptionalFloat = None
-    """Score with which an episode succeeds; default: it succeeds if it lasts as long as one may."""
+    """Least score of a success, in the task's unit; default: an episode that lasts to its time limit succeeds."""
     goal: args.OptionalNumbers = ()
-    """On a hand: what the policy is asked for."""
+    """Hands: the goal, in the task's units, such as a force [N]; default: the task's goals."""
     calibration: args.OptionalFile = None
-    """On a hand or of a log: what counts mean."""
+    """Hands and logs: the calibration file; default: the log's."""
     side: Annotated[Literal["right", "left"] | None, args.optional("{right,left}")] = None
-    """Of a log: which hand it is, for the names of links and joints."""
+    """Logs: side of the hand, the prefix of link and joint names; default: names without a prefix."""
     lockstep: bool = False
-    """On an emulated hand: its scene waits for each step; a log is read as fast as possible."""
-    device: str = "cpu"
-    """Where environments are computed: cpu, or cuda."""
+    """Run faster than real time: the emulator waits for each step, a log is read as fast as possible."""
+    device: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "cpu"
+    """Device of the environments: cpu or cuda."""
     seed: args.Seed = 0
     set: args.Overrides = ()
 

@@ -27,11 +27,13 @@ Port = Annotated[
     str | None,
     args.optional("PORT"),
     tyro.conf.arg(
-        help="The hand's serial port; default: the port of the only hand found. `emulator`: an emulated hand at rest."
+        help="The hand's serial port, or `emulator`, an emulated hand at rest; default: the port of the only hand found."
     ),
 ]
-HandId = Annotated[args.OptionalInt, tyro.conf.arg(help="The hand's id, where several are on one port.")]
-Duration = Annotated[float, tyro.conf.arg(help="For how long [s]; default: until Ctrl-C.", help_behavior_hint="")]
+HandId = Annotated[
+    args.OptionalInt, tyro.conf.arg(help="The hand's id, if several hands share the port; default: the only one.")
+]
+Duration = Annotated[float, tyro.conf.arg(help="Duration [s]; default: until Ctrl-C.", help_behavior_hint="")]
 TRIES = 5  # of a tare whose replies are lost or damaged on the way
 
 
@@ -48,12 +50,12 @@ def _until_ctrl_c(view: HandView) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Probe:
-    """List the serial ports and the hands that answer on them: versions, names and serial numbers."""
+    """List serial ports and the hands on them: versions, names and serial numbers."""
 
     port: Annotated[str | None, args.optional("PORT")] = None
-    """The only port to ask; default: all. Whatever is on a port is sent a few bytes, so name it if that could do harm."""
+    """The port to ask; default: all. Every device on a port receives a few bytes, so name the port if that could do harm."""
     hand_id: args.OptionalInt = None
-    """The only id to ask for; default: 0 to 7."""
+    """The id to ask for; default: 0 to 7."""
 
     def run(self) -> None:
         from tgdsl.runtime.xhand1.wire.ports import ask_ports, identify
@@ -69,12 +71,12 @@ class Probe:
 
 @dataclass(frozen=True)
 class Monitor:
-    """Show what the hand feels, live, until Ctrl-C."""
+    """Show the forces at the fingertips, live."""
 
     port: Port = None
     hand_id: HandId = None
     calibration: args.OptionalFile = None
-    """The hand's calibration file; default: forces are counts."""
+    """The hand's calibration file; default: forces stay in counts."""
     seconds: Duration = math.inf
 
     def run(self) -> None:
@@ -92,18 +94,18 @@ class Monitor:
 
 @dataclass(frozen=True)
 class Tare:
-    """Read the fingertips while nothing touches them, and write that into a calibration file."""
+    """Measure the counts of untouched fingertips, and write them to a calibration file."""
 
     out: args.Out = Path("hand.calibration.yaml")
     """The calibration file to write."""
     port: Port = None
     hand_id: HandId = None
     calibration: args.OptionalFile = None
-    """A calibration file that gives everything except the tare; default: counts."""
+    """A calibration file whose tare is replaced; default: forces stay in counts."""
     frames: int = 20
-    """Readings to average, at least 5."""
+    """Number of readings to average, at least 5."""
     max_spread: float = 4.0
-    """Largest difference between two readings of a component that still counts as untouched [counts]."""
+    """Largest spread of a component's readings; above it the fingertip counts as touched [counts]."""
     force: args.Replace = False
 
     def run(self) -> None:
@@ -145,7 +147,7 @@ def _tare(hand: driver.XHand1, num_frames: int) -> driver.Tare:
 
 @dataclass(frozen=True)
 class Record:
-    """Record everything that the hand says, for `tgdsl hand replay`, `tgdsl calibrate hand` and `ReplaySource`."""
+    """Record a log of a hand, for `tgdsl hand replay`, `tgdsl calibrate hand` and `ReplaySource`."""
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT.npz")]
     """The log to write."""
@@ -153,7 +155,7 @@ class Record:
     port: Port = None
     hand_id: HandId = None
     calibration: args.OptionalFile = None
-    """The hand's calibration file, which goes into the log; default: none."""
+    """The hand's calibration file, which the log includes; default: none, forces stay in counts."""
     force: args.Replace = False
 
     def run(self) -> None:
@@ -181,14 +183,14 @@ class Record:
 
 @dataclass(frozen=True)
 class Replay:
-    """Show a log as `monitor` showed the hand."""
+    """Show a log as `tgdsl hand monitor` shows a hand."""
 
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG.npz")]
     """The log."""
     speed: float = 1.0
-    """How much faster than it was; `inf` is as fast as possible."""
+    """Speed relative to real time; inf is as fast as possible."""
     calibration: args.OptionalFile = None
-    """A calibration file; default: the log's."""
+    """The hand's calibration file; default: the log's."""
 
     def run(self) -> None:
         from tgdsl.runtime.xhand1.log.log import Fault
@@ -212,7 +214,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class Hand:
-    """Read a real XHand1: probe, monitor, tare, record, replay. Nothing here can move a joint."""
+    """Read a real XHand1. These commands never move a joint."""
 
     action: Annotated[args.subcommands(Probe, Monitor, Tare, Record, Replay), tyro.conf.arg(name="")]  # type: ignore[valid-type]
     """What to do."""

@@ -29,27 +29,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Play:
-    """Step a task's environments, show returns, score and reward terms, and write a record and a video that shows touch."""
+    """Play a task: show returns, score and reward terms; write a record, and a video that shows touch."""
 
     task: args.Task
     policy: args.OptionalFile = None
-    """A learned policy that acts: a TorchScript file, as tgdsl train and rsl_rl's export_policy_to_jit write it."""
+    """The policy: a TorchScript file from `tgdsl train` or rsl_rl's export_policy_to_jit; default: --actions."""
     groups: args.Groups = ()
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
-    """Who acts where there is no policy: zero, random, script (the task's own, if it has one), or FILE.py:FUNCTION, which takes
-    the environment and its observations by group and returns actions (env, joint) from −1 to 1."""
+    """Actions without a policy: zero, random, script (the task's script, if it has one), or FILE.py:FUNCTION. The function
+    takes the environment and its observations by group, and returns actions (env, joint) between −1 and 1."""
     envs: int = 16
-    """Environments; the video shows the first."""
+    """Number of environments; the video shows the first."""
     seconds: args.OptionalFloat = None
-    """Duration [s]; default: an episode's."""
+    """Duration [s]; default: one episode."""
     seed: args.Seed = 0
     device: args.Device = "cpu"
     out: args.OutFolder = Path("out")
     """Folder for played.npz and played.mp4."""
     video: bool = True
-    """Whether to draw the video."""
-    camera: args.OptionalText = None
-    """The scene's camera of the video; default: the first, or MuJoCo's free camera where there is none."""
+    """Draw the video."""
+    camera: args.OptionalName = None
+    """Camera of the video, by its name in the scene; default: the first, or MuJoCo's free camera if the scene has none."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -117,24 +117,24 @@ class Play:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Play episodes without exploration, the same for all policies; print the score with its 95 % interval, and the gait."""
+    """Play episodes without exploration, equal for all policies; print the score with its 95 % interval, and the gait."""
 
     task: args.Task
     policy: args.OptionalFile = None
-    """A learned policy, as for tgdsl play; default: none, the joints are not moved."""
+    """The policy, as for `tgdsl play`; default: zero actions."""
     groups: args.Groups = ()
     episodes: int = 1000
-    """How many episodes count."""
+    """Number of episodes that count."""
     envs: int = 256
-    """Environments; of each, as many episodes count."""
+    """Number of environments; equally many episodes of each one count."""
     device: args.Device = "cpu"
     seed: args.OptionalInt = None
-    """Seed of the episodes; default: one that is the same for all policies."""
+    """Seed of the episodes; default: a fixed one, so that all policies play the same episodes."""
     out: args.OptionalOut = None
-    """A JSON file to write; default: none."""
+    """A JSON file for the results; default: no file."""
     require: Annotated[str | None, args.optional("BOUNDS")] = None
-    """What score, held and gait have to be, such as "coasting<0.1, penetration<2 mm, held>=95 %"; if they are not, the exit
-    code is 1."""
+    """Bounds on score, held and gait, such as "coasting<0.1, penetration<2 mm, held>=95 %"; the exit code is 1 if one is not
+    met. Default: no bounds."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -170,39 +170,39 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Deploy:
-    """Let a policy act on a source at its task's control rate; print score, latency and rate.
+    """Run a policy on a simulation, a hand or a log at its task's control rate; print score, latency and rate.
 
-    A simulation and an emulated hand have the task's scene, which says how well it went; a real hand and a log have none.
+    Simulations and the emulated hand have the task's scene, so the score is known; a real hand and a log have none.
     """
 
     task: args.Task
     policy: args.File
-    """A learned policy that feels with fingertips: a student of tgdsl distill, with its card."""
+    """The policy: a student of `tgdsl distill` with touch at the fingertips, and its card."""
     source: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "simulation"
-    """simulation, warp, emulator, xhand1:PORT, or a log (.npz)."""
+    """Where it acts: simulation (MuJoCo), warp (MuJoCo Warp), emulator (an emulated hand), xhand1:PORT, or a log (.npz)."""
     episodes: int = 1
-    """Number of episodes; in a scene, the first ones of tgdsl evaluate."""
+    """Number of episodes; in a simulation, the first episodes of `tgdsl evaluate`."""
     seconds: args.OptionalFloat = None
-    """Longest duration of each [s]; default: an episode's, or the whole log."""
+    """Longest duration of an episode [s]; default: the task's, or the whole log."""
     goal: args.OptionalNumbers = ()
-    """What the policy is asked for, in the task's units, such as a force [N]; default: what the scene's task asks for."""
+    """The goal, in the task's units, such as a force [N]; default: the task's goals."""
     groups: args.Groups = ()
     start: Annotated[str | None, args.optional("KEYFRAME")] = None
-    """Keyframe to which a real hand's joints go before the policy acts; default: it begins where they are."""
+    """Keyframe to which a real hand moves before the policy acts; default: the present pose."""
     calibration: args.OptionalFile = None
-    """What a hand's counts mean; default: of a log its own, else they stay counts."""
+    """The hand's calibration file; default: the log's, otherwise forces stay in counts."""
     lockstep: bool = False
-    """Whether an emulator's scene waits for each step, and a log is read as fast as possible."""
+    """Run faster than real time: the emulator waits for each step, a log is read as fast as possible."""
     speed: args.OptionalFloat = None
-    """Leave for a real hand to move, with --current-limit and --kp: how fast its set-points may move [rad/s]."""
+    """Largest speed of a real hand's set-points [rad/s]; default: the hand does not move. It needs all three limits to move."""
     current_limit: args.OptionalInt = None
-    """Largest motor current [mA]."""
+    """Largest motor current of a real hand [mA]; default: the hand does not move."""
     kp: args.OptionalInt = None
-    """Proportional gain [hand's unit]."""
+    """Proportional gain of a real hand [the hand's unit]; default: the hand does not move."""
     seed: args.OptionalInt = None
-    """Seed of the scene; default: that of tgdsl evaluate."""
+    """Seed of the episodes; default: the seed of `tgdsl evaluate`."""
     out: args.OptionalOut = None
-    """An .npz file to write: observations, actions, targets, latencies and scores of each control step."""
+    """An .npz file for observations, actions, targets, latencies and scores of each control step; default: no file."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -266,15 +266,15 @@ class Deploy:
 
 @dataclass(frozen=True)
 class Grasps:
-    """Sample the grasps that episodes of a task begin from; the task finds them in the user's cache, or in a file."""
+    """Sample the grasps with which a task's episodes begin, into the user's cache or a file."""
 
     document: args.Task
     num: args.OptionalInt = None
-    """How many, as many of each variant of the object; default: as the document says."""
+    """Number of grasps, divided equally among the object's variants; default: `grasps.num` of the document."""
     seed: args.OptionalInt = None
-    """Seed of everything random; default: as the document says."""
+    """Seed of all random numbers; default: `grasps.seed` of the document."""
     out: args.OptionalOut = None
-    """A file to write them to, for `grasps: {file: …}` of the document; default: the user's cache alone."""
+    """A file for the grasps, for `grasps: {file: …}` of the document; default: only the user's cache."""
     set: args.Overrides = ()
 
     def run(self) -> None:

@@ -24,42 +24,42 @@ BAR: dict[str, Any] = {"total": 1, "disable": None, "leave": False, "bar_format"
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure what trades speed for error: of each sensor its variants and precisions, of the physics its options.
+    """Measure speed against error: variants and precisions of each sensor, and options of the physics.
 
-    Errors are of states of the document's own scene, run as by `tgdsl run`, against the finest variant in float64.
+    The states are from a run of the document's scene, as by `tgdsl run`. Errors are against the finest variant in float64.
     """
 
     document: Annotated[tyro.conf.Positional[Path | None], args.optional("FILE")] = None
-    """The YAML document; not for `--oracles` and `--hard`."""
+    """The YAML document; required, except with --oracles or --hard."""
     oracles: bool = False
-    """In a clone, compare the package with all closed forms instead: ours, exact, and the paper's formula where it differs."""
+    """Compare the package with all closed forms instead, and with the paper's formulas; needs a clone of the repository."""
     hard: bool = False
-    """In a clone, run the numerical hard cases of all kinds instead."""
-    device: str = "cpu"
-    """Where sensors are computed: cpu, cuda or cuda:1."""
+    """Run the numerical hard cases of all kinds instead; needs a clone of the repository."""
+    device: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "cpu"
+    """Device of the sensors: cpu, cuda or cuda:1."""
     envs: Annotated[str, tyro.conf.arg(metavar="N,N…")] = "256"
-    """Environments of timed calls; the front is drawn at the most."""
+    """Numbers of environments to time; plots show the largest."""
     out: args.OutFolder = Path("report")
     """Folder for bench.html, bench.csv and bench.json."""
     sensors: args.Names = ()
-    """Sensors to measure, `physics` among them; default: all, and physics."""
+    """Sensors to measure, and `physics`; default: all of them, and physics."""
     states: args.OptionalFile = None
-    """States to measure errors on, an .npz file that `--save-states` wrote; default: a run of the scene."""
+    """States on which to measure errors: an .npz file of --save-states; default: a new run of the scene."""
     save_states: args.OptionalFile = None
-    """Write the states of the run to this file."""
+    """An .npz file for the states of the run; default: no file."""
     against: args.OptionalFile = None
-    """The bench.json of an earlier run: says whether errors are the same, and which variants have changed places in time."""
+    """The bench.json of an earlier run, to compare errors and the order of variants by time; default: no comparison."""
     state_envs: int = 16
-    """Environments of that run, which go differently far; half of them verify the errors of the others."""
+    """Environments of that run, with motions of different amplitude; half of them check the errors of the other half."""
     steps: int = 90
-    """Control steps of that run, about."""
+    """Approximate number of control steps of that run."""
     substeps: int = 5
     """Physics steps per control step."""
     repeats: int = 11
-    """Timed calls of each variant."""
+    """Timed calls per variant."""
     compiled: args.Compiled = False
     seed: int = 0
-    """Seed of the environments, the bootstraps and the states that are timed."""
+    """Seed of environments, bootstraps and timed states."""
     set: args.Overrides = ()
 
     def run(self) -> None:

@@ -26,7 +26,7 @@ class Links:
 
     robot: args.Robot
     layout: args.OptionalFile = None
-    """A layout whose groups are shown; default: the one next to the robot's file."""
+    """A layout whose link groups are shown; default: layout.yaml next to the robot's file."""
 
     def run(self) -> None:
         from tgdsl.files.find import layout_of, robot_path
@@ -50,12 +50,12 @@ class New:
     """Propose a layout for a robot: link groups, and taxels at three resolutions; every guess is marked in the file."""
 
     robot: args.Robot
-    density: str = "4/cm2"
-    """Taxels per area at the resolution `med`, such as 4/cm2 or 1e4/m2; `low` has a quarter of it, `high` four times it."""
+    density: Annotated[str, tyro.conf.arg(metavar="DENSITY")] = "4/cm2"
+    """Taxels per area at resolution `med`, such as 4/cm2 or 1e4/m2; `low` has a quarter of it, `high` four times as many."""
     groups: Literal["auto", "none"] = "auto"
-    """Whether to guess the link groups tips, palm, fingers and hand."""
+    """auto guesses the link groups tips, palm, fingers and hand."""
     include: args.Names = ()
-    """Names or wildcards of links outside the hand, such as an arm's, that are to have taxels too."""
+    """Names or wildcards of further links that get taxels, such as an arm's; default: the hand alone."""
     out: args.Out = Path("layout.yaml")
     """The file to write."""
     force: args.Replace = False
@@ -73,18 +73,18 @@ class New:
 
 @dataclass(frozen=True)
 class Freeze:
-    """Write down where a layout's taxels are, to the last bit, so that their rows stay when robot, layout or tgdsl change.
+    """Write the exact positions of a layout's taxels, so that rows stay the same if robot, layout or tgdsl change.
 
-    Makes a layout with the same links and groups, and next to it a table (CSV) of the taxels for each resolution.
+    The new layout has the same links and groups, and a table (CSV) of taxels for each resolution.
     """
 
     hand: Hand
-    """A YAML document, the name of a robot, such as `xhand1`, or a robot's file."""
+    """A YAML document, a robot's file, or the name of a robot, such as xhand1."""
     layout: args.Layout = None
     resolutions: args.Names = ()
-    """Resolutions to write down; default: all of the layout."""
+    """Resolutions to write; default: all resolutions of the layout."""
     out: args.Out = Path("layout_frozen.yaml")
-    """The layout to write; its tables go next to it, layout_frozen.med.csv and so on."""
+    """The layout to write; its tables are written next to it, such as layout_frozen.med.csv."""
     force: args.Replace = False
     set: args.Overrides = ()
 
@@ -107,7 +107,7 @@ class Freeze:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where taxels sit: new proposes a layout, freeze writes down the taxels of one."""
+    """Propose a layout of taxels for a robot, or freeze one."""
 
     action: Annotated[args.subcommands(New, Freeze), tyro.conf.arg(name="")]  # type: ignore[valid-type]
     """What to do."""
@@ -121,18 +121,18 @@ class Render:
     """Draw a hand and its taxels: a panel per resolution, coloured by link group. Nothing is simulated."""
 
     hand: Hand
-    """A YAML document, an artefact (.safetensors), the name of a robot, such as `xhand1`, or a robot's file."""
+    """A YAML document, an artefact (.safetensors), a robot's file, or the name of a robot, such as xhand1."""
     layout: args.Layout = None
     resolutions: args.Names = ()
-    """Resolutions to draw; default: the document's own, or all of the layout."""
-    keyframe: args.OptionalText = None
-    """Keyframe that gives the pose; default: the model's own initial state."""
-    view: str = "front"
-    """From where: front (what the taxels face), back, left, right, top, bottom, iso, or AZIMUTH,ELEVATION in degrees."""
+    """Resolutions to draw; default: the document's, or all resolutions of the layout."""
+    keyframe: args.OptionalName = None
+    """Keyframe of the pose; default: the model's initial state."""
+    view: Annotated[str, tyro.conf.arg(metavar="VIEW")] = "front"
+    """Viewpoint: front (the side that taxels face), back, left, right, top, bottom, iso, or AZIMUTH,ELEVATION [degrees]."""
     size: Annotated[tuple[int, int] | None, args.optional("WIDTH HEIGHT")] = None
-    """Pixels of the picture; default: 750 rows, and as many columns as the hand needs."""
+    """Size of the picture [pixels]; default: 750 high, and as wide as needed."""
     out: args.OptionalOut = None
-    """The picture; default: the hand's name with the ending .png, in the working folder."""
+    """The picture; default: the hand's name with .png, in the working folder."""
     set: args.Overrides = ()
 
     def run(self) -> None:
@@ -168,12 +168,12 @@ class Render:
 
 @dataclass(frozen=True)
 class Import:
-    """Turn a USD stage into MJCF, with its meshes as .obj files in a folder next to it."""
+    """Convert a USD stage to MJCF; its meshes become .obj files in a folder next to it."""
 
     stage: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STAGE")]
     """The stage: .usd, .usda, .usdc or .usdz."""
     out: args.OptionalOut = None
-    """The MJCF file; default: the stage's name with the ending .xml, in the working folder."""
+    """The MJCF file; default: the stage's name with .xml, in the working folder."""
 
     def run(self) -> None:
         from tgdsl.formats.mjcf import write_mjcf
@@ -187,11 +187,13 @@ class Import:
 
 @dataclass(frozen=True)
 class ExportUsd:
-    """Turn an MJCF or URDF file into a USD stage."""
+    """Convert an MJCF or URDF file to a USD stage."""
 
-    robot: Annotated[args.Robot, tyro.conf.arg(help="A file (MJCF, URDF), or the name of a robot that tgdsl brings.")]
+    robot: Annotated[
+        args.Robot, tyro.conf.arg(help="A robot's file (MJCF, URDF), or the name of a robot that comes with tgdsl.")
+    ]
     out: args.OptionalOut = None
-    """The stage: .usda (text), .usdc or .usd; default: the robot's name with the ending .usda, in the working folder."""
+    """The stage: .usda (text), .usdc or .usd; default: the robot's name with .usda, in the working folder."""
 
     def run(self) -> None:
         from tgdsl.files.find import robot_path

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Run every combination of a sweep's settings, each in a folder of its own; runs whose worker dies go on elsewhere."""
+    """Run every combination of a sweep's settings, each in its own folder; a run whose worker dies continues on another."""
 
     document: Document
     address: Annotated[str | None, optional("ADDRESS")] = None
-    """A Ray cluster, as ray.init takes it; default: this machine, by its cores and GPUs."""
+    """Address of a Ray cluster, as for ray.init; default: this machine, with all its cores and GPUs."""
     out: OptionalOutFolder = None
-    """Folder of all runs; default: out/NAME of the document. Runs that it holds whole are not made again; others go on."""
+    """Folder of all runs; default: out/NAME, by the document's name. Finished runs in it are kept, others continue."""
 
     def run(self) -> None:
         from tgdsl.commands.sweep_document import load_sweep

@@ -29,28 +29,28 @@ INITIAL_STD = "train.networks.initial_std:"
 
 @dataclass(frozen=True)
 class Train:
-    """Learn a policy by PPO, as the document's `train` says; write checkpoints, the policy, and how good it is."""
+    """Train a policy by PPO with the document's `train` settings; write checkpoints, the policy, and its evaluation."""
 
     task: args.Task
     envs: args.OptionalInt = None
-    """Environments per process; default: 8192, or as in the run that is resumed."""
+    """Environments per process; default: 8192, or the number of the resumed run."""
     device: str = "cuda"
-    """Where physics, touch and networks are computed: cuda, or cpu. With torchrun each process takes a GPU."""
+    """Device of physics, touch and networks: cuda or cpu. With torchrun, each process takes one GPU."""
     iterations: args.OptionalInt = None
-    """Iterations of the whole run, those made before included; default: train.iterations of the document."""
+    """Iterations of the whole run, including earlier parts; default: `train.iterations` of the document."""
     minutes: args.OptionalFloat = None
-    """Time to learn from now on [min], start-up not counted; default: no limit."""
+    """Learning time from now on, without start-up [min]; default: no limit."""
     seed: args.OptionalInt = None
-    """Random seed; default: 0, or as in the run that is resumed."""
+    """Seed of all random numbers; default: 0, or the seed of the resumed run."""
     resume: args.OptionalFolder = None
-    """Folder of a run that goes on from its last checkpoint, with its overrides; with another --out a run of its own begins
-    from there, with those that are given now alone."""
+    """Folder of an earlier run to continue from its last checkpoint, with its overrides; default: a new run. With another
+    --out, a new run starts from that checkpoint, with the overrides of this command only."""
     out: args.OptionalOutFolder = None
-    """Folder of the run; default: out/NAME of the document, or that of the run that is resumed."""
+    """Folder of the run; default: out/NAME, by the document's name, or the folder of the resumed run."""
     episodes: int = 1000
-    """Episodes of the evaluation at the end; 0: none."""
+    """Episodes of the final evaluation; 0: no evaluation."""
     view: bool = False
-    """Show an environment of the learner in the browser."""
+    """Show the training environments in the browser."""
     set: args.Overrides = ()
 
     def run(self) -> None:

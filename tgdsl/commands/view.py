@@ -19,27 +19,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """Open a live page in the browser: robot and objects, taxels coloured by what they read, sliders of the actuators.
+    """Open a live page in the browser: robot and objects, taxels coloured by their readings, a slider per actuator.
 
     The page of a document follows the file: what is saved is shown within seconds, mistakes with their lines.
     """
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
-    """A document or a task (.yaml), an artefact (.safetensors), a run of `tgdsl run` or a log of `tgdsl hand record` (.npz),
-    `xhand1`, `xhand1:PORT` or `emulator`. A hand is only read."""
+    """A document or a task (.yaml), an artefact (.safetensors), readings of `tgdsl run` or a log of `tgdsl hand record` (.npz),
+    `xhand1`, `xhand1:PORT` or `emulator`. A real hand is only read, never moved."""
     policy: args.OptionalFile = None
-    """A task's policy; default: zero actions."""
+    """The policy that acts in a task; default: zero actions."""
     calibration: args.OptionalFile = None
-    """A hand's calibration file; default: that of the log, else forces are counts."""
+    """The hand's calibration file; default: the log's, otherwise forces stay in counts."""
     envs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
-    """Environments; the page shows one at a time."""
+    """Number of environments; the page shows one at a time."""
     port: int = 8080
-    """Port of the page; where it is taken, the next free one."""
-    address: str = "127.0.0.1"
-    """Address to serve at; 0.0.0.0 lets others in the network see and control the scene."""
+    """Port of the page; if it is in use, the next free one."""
+    address: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address of the server; with 0.0.0.0 others in the network can see and control the scene."""
     seed: args.Seed = 0
     seconds: args.OptionalFloat = None
-    """When to stop [s]; default: at Ctrl-C."""
+    """Time after which the page closes [s]; default: at Ctrl-C."""
     set: args.Overrides = ()
 
     def run(self) -> None:
