@@ -1,4 +1,4 @@
-"""What is kept of students that feel different things, and the page that compares them: docs/background/ablations.md.
+"""Results of students with different touch, and the pages that compare them: docs/background and docs/records/ablations.md.
 
     python benchmarks/ablations.py collect out/ablation in_palm_rotate_types --teacher out/teacher.json --rest out/rest.json
     python benchmarks/ablations.py reading                    # how well the force of grip_force can be read from each type
@@ -6,8 +6,8 @@
 
 `collect` copies a run's tables and thinned curves to docs/measured/ablations, in place of what was kept under the name; a run
 that went on with --resume is collected again. Runs that differ in their overrides alone, as in students' networks, are kept as
-SERIES__WHAT and have one table and plot. `page` writes between the markers of docs/background/ablations.md, and
-a plot of each to docs/images/ablation_NAME.png.
+SERIES__WHAT and have one table and plot. `page` writes between the markers of both pages, and a plot of each run to
+docs/images/ablation_NAME.png.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from ablations_collect import ROWS, collect
 from ablations_kept import KEPT, ROOT
-from ablations_page import PAGE, READING, write_page
+from ablations_page import PAGE, READING, RECORD, write_page, write_summary
 
 from tgdsl.errors import TgdslError
 
@@ -47,7 +47,7 @@ def read(given: argparse.Namespace) -> None:
 
 
 def paged(given: argparse.Namespace) -> None:
-    for file in write_page(given.kept, given.page):
+    for file in (*write_page(given.kept, given.page), write_summary(given.kept, given.summary)):
         print(file)
 
 
@@ -73,7 +73,8 @@ def main() -> None:
     own.set_defaults(run_it=read)
     own = kinds.add_parser("page")
     own.add_argument("--kept", type=Path, default=KEPT)
-    own.add_argument("--page", type=Path, default=PAGE)
+    own.add_argument("--page", type=Path, default=RECORD, help="page for the tables of all runs")
+    own.add_argument("--summary", type=Path, default=PAGE, help="page for the table of mean scores")
     own.set_defaults(run_it=paged)
     given = parser.parse_args()
     try:

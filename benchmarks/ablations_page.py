@@ -1,4 +1,7 @@
-"""Tables of docs/background/ablations.md, between its markers, from what is kept; what stands around them is left as it is."""
+"""Tables of students, from the kept results, between markers of two pages; the text around the markers stays.
+
+docs/records/ablations.md has a section per run. docs/background/ablations.md has one table: the mean score of each type.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,9 @@ from tgdsl.rl.students.keys import NONE
 from tgdsl.rl.students.results import Row
 
 PAGE = ROOT / "docs" / "background" / "ablations.md"
+RECORD = ROOT / "docs" / "records" / "ablations.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+SUMMARY = "<!-- summary: begin -->", "<!-- summary: end -->"
 PAPER = {"in_palm_rotate": (6000, 24), "in_hand_repose": (6000, 24), "screwdriver": (2000, 12)}
 """Iterations of a student and control steps of each environment per iteration: Chung et al., *Tactile Genesis*, appendix,
 "Training Setup", table of hyperparameters. The steps stand there among the teacher's numbers, as do the environments."""
@@ -176,21 +181,62 @@ def reading_section(rows: Sequence[dict[str, str]], text: str) -> str:
     return "\n\n".join(["### How well each type predicts the force", said, "\n".join(lines)])
 
 
-def written(text: str, made: str, file: Path = PAGE) -> str:
+def summary(folder: Path = KEPT) -> str:
+    """Return a table of mean scores: a row per type, and a column per task, placement and noise.
+
+    Runs that compare one type alone, as over resolutions or encoders, have no column.
+
+    Raises:
+        KeptError: If kept results cannot be read.
+    """
+    columns = [
+        (run, [each for each in run.taught if each.where == where])
+        for run in kept_ablations(folder)
+        if not what_of(run.name) and len({each.row.type for each in run.taught}) > 2
+        for where in dict.fromkeys(each.where for each in run.taught if each.row.type != NONE)
+    ]
+    types = dict.fromkeys(each.row.type for _, taught in columns for each in taught)
+    heads = []
+    for run, taught in columns:
+        noise = f", {taught[0].row.noise}" if len({each.row.noise for each in run.taught} - {""}) > 1 else ""
+        heads.append(f"`{Path(run.made['document']).stem}`, {taught[0].row.placement}{noise} [{run.made['unit']}]")
+    lines = [_line(["type", *heads]), _line(["---", *["---:"] * len(heads)])]
+    for name in (*types, NONE):
+        rows = [[each.row for each in (*taught, *run.taught) if each.row.type == name] for run, taught in columns]
+        lines.append(_line([f"`{name}`", *(f"{row[0].score:.3f}" if row else "–" for row in rows)]))
+    for name, kept in (("teacher", "teacher"), ("joints at rest", "rest")):
+        scores = [getattr(run, kept) for run, _ in columns]
+        lines.append(_line([f"*{name}*", *(f"{score['score']:.3f}" if score else "–" for score in scores)]))
+    return "\n".join(lines)
+
+
+def written(text: str, made: str, file: Path = RECORD, markers: tuple[str, str] = (BEGIN, END)) -> str:
     """Return a page's text with other tables between its markers.
 
     Raises:
         KeptError: If it has no markers.
     """
-    before, begin, rest = text.partition(BEGIN + "\n")
-    _, end, after = rest.partition(END)
+    first, last = markers
+    before, begin, rest = text.partition(first + "\n")
+    _, end, after = rest.partition(last)
     if not begin or not end:
-        raise KeptError(f"{file}: expected the lines {BEGIN} and {END}")
+        raise KeptError(f"{file}: expected the lines {first} and {last}")
     return f"{before}{begin}\n{made}\n\n{end}{after}"
 
 
-def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
-    """Write tables and plots; return the files.
+def write_summary(folder: Path = KEPT, page: Path = PAGE) -> Path:
+    """Write the table of mean scores; return the page.
+
+    Raises:
+        KeptError: If kept results cannot be read, or the page has no markers.
+        FileError: If the page cannot be written.
+    """
+    atomic_write_all({page: written(read_text(page), summary(folder), page, SUMMARY).encode()})
+    return page
+
+
+def write_page(folder: Path = KEPT, page: Path = RECORD) -> list[Path]:
+    """Write the tables of all runs, and plots; return the files.
 
     Raises:
         KeptError: If something that is kept cannot be read, or the page has no markers.

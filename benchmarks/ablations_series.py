@@ -1,7 +1,7 @@
 """Runs that differ in their documents' overrides alone, as in the networks of students, side by side.
 
-They are kept as SERIES__WHAT, `cube_encoders__lstm` beside `cube_encoders__cnn`, and have one table and one plot in
-docs/background/ablations.md.
+They are kept as SERIES__WHAT, such as `cube_encoders__lstm` and `cube_encoders__cnn`, and have one table and one plot in
+docs/records/ablations.md.
 """
 
 from __future__ import annotations

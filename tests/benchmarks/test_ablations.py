@@ -17,7 +17,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import ablations
 from ablations_collect import collect
 from ablations_kept import KEPT, LIMIT, KeptError, kept_ablations, read_ablation
-from ablations_page import BEGIN, END, NOTHING, PAGE, judged, paper_samples, tables, worse_than, write_page, written
+from ablations_page import (
+    BEGIN, END, NOTHING, PAGE, RECORD, SUMMARY, judged, paper_samples, summary, tables, worse_than, write_page, written,
+)  # fmt: skip
 from ablations_plots import plot
 from ablations_series import series_of
 
@@ -206,14 +208,23 @@ def test_the_page_has_the_samples_of_the_paper_and_is_the_same_again(kept, tmp_p
     assert [file.read_bytes() for file in write_page(folder, page)] == first
 
 
-def test_the_page_that_is_committed_is_that_of_what_is_kept():
-    text = PAGE.read_text(encoding="utf-8")
+def test_the_committed_pages_are_those_of_the_kept_results():
+    text, page = (file.read_text(encoding="utf-8") for file in (RECORD, PAGE))
     assert text == written(text, tables()), "run: python benchmarks/ablations.py page"
+    assert page == written(page, summary(), PAGE, SUMMARY), "run: python benchmarks/ablations.py page"
     found = kept_ablations()
     pictures = {PAGE.parents[1] / "images" / f"ablation_{series_of(own.name)}.png" for own in found}
     assert sorted((PAGE.parents[1] / "images").glob("ablation_*.png")) == sorted(pictures)
     sizes = [sum(file.stat().st_size for file in (KEPT / own.name).rglob("*.*")) for own in found]
     assert all(size <= LIMIT for size in sizes)
+
+
+def test_the_summary_has_a_row_per_type_and_a_column_per_place(kept):
+    lines = [line.strip("|").split(" | ") for line in summary(kept(places=[("tips", "med", "clean")])).splitlines()]
+    assert [line[0].strip() for line in lines[2:]] == [f"`{name}`" for name in BLIND] + ["*teacher*", "*joints at rest*"]
+    assert lines[0][1].strip() == "`in_palm_rotate`, tips [quarter turns]"
+    scores = {line[0].strip(" `*"): float(line[1]) for line in lines[2:]}
+    assert scores["teacher"] == 12.0 and scores["none"] < scores["bool"] < scores["force"]
 
 
 def test_of_nothing_the_page_says_so(tmp_path):
