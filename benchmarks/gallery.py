@@ -1,10 +1,11 @@
 """Draw the small pictures of `examples/README.md` into docs/images/gallery: examples, tasks, and a panel for each kind.
 
     MUJOCO_GL=egl python benchmarks/gallery.py                  # all, minutes on one core
-    MUJOCO_GL=egl python benchmarks/gallery.py tasks/hot_ball   # these alone
+    MUJOCO_GL=egl python benchmarks/gallery.py tasks/hot_ball   # this picture alone
 
 A document is stepped as by `tgdsl run`, a task by its kept policy or at rest.
-Taxels that read something are large and coloured.
+Taxels that read something are large and coloured. `plugins/plugins` needs `pip install examples/plugins`.
+docs/images/motors.png is the spectrogram of `tgdsl listen examples/every_sensor.yaml --sensors motors`.
 """
 
 from __future__ import annotations
@@ -52,6 +53,8 @@ class Shot:
 SHOTS = {
     "xhand1_palm": Shot("cube", 0.19, 60, -50),
     "noisy_hand": Shot("cube", 0.19, 60, -50),
+    "xhand1_tips": Shot("cube", 0.19, 60, -50),
+    "plugins/plugins": Shot("cube", 0.19, 60, -50),
     "in_hand": Shot("cube", 0.19, 20, -50),
     "bin_balls": Shot("ball2", 0.45, 60, -30, hides="bin"),
     "screwdriver": Shot("screwdriver", 0.34, 225, -25),
@@ -59,6 +62,12 @@ SHOTS = {
     "tasks/in_palm_rotate": Shot("item", 0.19, 60, -50, "in_palm_rotate", 2.0),
     "tasks/in_palm_rotate_cube": Shot("item", 0.19, 60, -50, "in_palm_rotate_cube"),
     "tasks/in_palm_rotate_cube_held": Shot("item", 0.19, 60, -50, "in_palm_rotate_cube_held", 2.1),
+    "tasks/in_palm_rotate_cube_gentle": Shot(
+        "item", 0.19, 60, -50, "in_palm_rotate_cube_held", 2.6, (("action.smoothing", 0.6),)
+    ),
+    "tasks/published/in_palm_rotate": Shot("item", 0.19, 60, -50),
+    "tasks/published/in_hand_repose": Shot("item", 0.24, 60, -50, seconds=0.3),
+    "tasks/published/screwdriver": Shot("screwdriver", 0.34, 225, -30, seconds=0.3, overrides=(("grasps.num", 4),)),
     "tasks/in_hand_repose": Shot("item", 0.24, 60, -50, "in_hand_repose", 0.7),
     "tasks/in_hand_repose_sharpa": Shot("item", 0.28, 60, -50),
     "tasks/screwdriver": Shot("screwdriver", 0.34, 225, -30, "screwdriver", overrides=(("grasps.num", 4),)),
@@ -72,9 +81,11 @@ PANELS += ("proximity", "elastomer", "temperature_grid")
 CROPS = {
     "every_sensor": ("every_sensor.png", (0, 50, 1560, 1133)),
     "warm_palm": ("warm_palm.png", (0, 100, 624, 590)),
+    "learn": ("learn.png", (0, 0, 1200, 600)),
     "materials_audio": ("materials_audio.png", (0, 0, 1000, 585)),
     "kind_contact_audio": ("materials_audio.png", (0, 0, 1000, 300)),
     "kind_microphone": ("materials_audio.png", (0, 880, 1000, 1230)),
+    "kind_actuation_audio": ("motors.png", (0, 0, 900, 265)),
 }
 CROPS |= {
     f"kind_{kind}": ("every_sensor.png", (65 + 388 * (i % 4), 104 + 365 * (i // 4), 330 + 388 * (i % 4), 377 + 365 * (i // 4)))

@@ -14,7 +14,7 @@ from tgdsl.quantities.pairs import Pair
 
 
 def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
-    page = (Path(__file__).parents[2] / "docs" / "how-to" / "adapters.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "genesis.md").read_text(encoding="utf-8")
     lines = re.search(r"^```python\n(import torch\nimport tgdsl\n.*?)^```$", page, flags=re.M | re.S)[1]
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hand.yaml").write_text(json.dumps(document(tmp_path, load=LOAD)), encoding="utf-8")

@@ -18,8 +18,20 @@ import ablations
 from ablations_collect import collect
 from ablations_kept import KEPT, LIMIT, KeptError, kept_ablations, read_ablation
 from ablations_page import (
-    BEGIN, END, NOTHING, PAGE, RECORD, SUMMARY, judged, paper_samples, summary, tables, worse_than, write_page, written,
-)  # fmt: skip
+    BEGIN,
+    END,
+    NOTHING,
+    PAGE,
+    RECORD,
+    SUMMARY,
+    judged,
+    paper_samples,
+    summary,
+    tables,
+    worse_than,
+    write_page,
+    written,
+)
 from ablations_plots import plot
 from ablations_series import series_of
 

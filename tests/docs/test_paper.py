@@ -1,4 +1,4 @@
-"""The page that sets the paper beside tgdsl says what tgdsl's documents have."""
+"""The tables that compare the paper with tgdsl have the values of tgdsl's documents."""
 
 import re
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from tgdsl.rl.load import load_task
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 REPOSITORY = Path(__file__).parents[2]
-SECTIONS = re.split(r"^## ", (REPOSITORY / "docs" / "background" / "paper.md").read_text(encoding="utf-8"), flags=re.M)[1:]
+SECTIONS = re.split(r"^## ", (REPOSITORY / "docs" / "records" / "paper.md").read_text(encoding="utf-8"), flags=re.M)[1:]
 NAMED = {section.partition("\n")[0]: section for section in SECTIONS}
 KEYED = {name: section for name, section in NAMED.items() if re.search(r"^(Document|Defaults): ", section, re.M)}
 PUBLISHED = {name: section for name, section in NAMED.items() if "Published: `" in section}

@@ -11,7 +11,7 @@ of the drives; v and ω the object's velocity and angular velocity.
 
 Source of the names: Chung et al., *Tactile Genesis*, appendix, "Reward terms", which prints no formulas: these are ours.
 `effort` and `object_speed` are ours altogether. That `near` may take the nearest probes alone, `net_force` and `score_limit`
-are choices of the authors' public code: see docs/background/paper.md.
+are choices of the authors' public code: see docs/records/paper.md.
 
 Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 """

@@ -1,4 +1,4 @@
-"""What is known exactly of each kind: its comparisons with closed forms as a table and a plot, and all of them on a page."""
+"""Comparisons of each kind with closed forms, as a table and a plot, and all comparisons on one page."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ class Accuracy:
 
     def of(self, kind: str) -> list[Any]:
         """Return a kind's comparisons."""
-        return [own for comparisons in self.fields.values() for own in comparisons if kind in own.kinds]
+        return [each for comparisons in self.fields.values() for each in comparisons if kind in each.kinds]
 
     def section(self, kind: str) -> str:
-        """Return what a kind's page says of its accuracy; its plot is `accuracy_<kind>.svg` beside it."""
-        found = self.of(kind)
-        if not found:
+        """Return the section on accuracy of a kind's page; the plot is `accuracy_<kind>.svg` in the same folder."""
+        comparisons = self.of(kind)
+        if not comparisons:
             return "Compared with no closed form.\n"
         about = "Computed when these pages were built; [accuracy](../../background/accuracy.md) says how."
-        return f"![Exact values, tgdsl and the paper's formula](accuracy_{kind}.svg)\n\n{_table(found)}\n{about}\n"
+        return f"![Exact values, tgdsl and the paper's formula](accuracy_{kind}.svg)\n\n{_table(comparisons)}\n{about}\n"
 
     def plot(self, kind: str) -> str:
         """Return a kind's plot as an SVG file: its comparisons with most points, those with the paper's first."""
-        found = sorted(self.of(kind), key=lambda own: (own.paper is None, -own.exact.shape[-1]))[:MOST]
-        figure = Figure(figsize=(9.0, 3.1 * -(-len(found) // 2)))
-        for i, own in enumerate(found):
-            axes = figure.add_subplot(-(-len(found) // 2), 2, i + 1)
-            report.draw(own, axes)
-            axes.set_title(own.name, fontsize=8)
+        plotted = sorted(self.of(kind), key=lambda each: (each.paper is None, -each.exact.shape[-1]))[:MOST]
+        figure = Figure(figsize=(9.0, 3.1 * -(-len(plotted) // 2)))
+        for i, comparison in enumerate(plotted):
+            axes = figure.add_subplot(-(-len(plotted) // 2), 2, i + 1)
+            report.draw(comparison, axes)
+            axes.set_title(comparison.name, fontsize=8)
             axes.tick_params(labelsize=7)
         figure.tight_layout()
         text = io.StringIO()
@@ -54,10 +54,10 @@ class Accuracy:
 
     def page(self) -> str:
         """Return the page of all comparisons and of the findings that they answer."""
-        parts = ["# All comparisons\n\n[Accuracy](../background/accuracy.md) says what they are.\n"]
+        parts = ["# All comparisons\n\n[Accuracy](../background/accuracy.md) explains the columns.\n"]
         for field, comparisons in self.fields.items():
             parts.append(f"## {field[0].upper()}{field[1:]}\n\n{_table(comparisons)}")
-        entries = [report.entry_of(own) for comparisons in self.fields.values() for own in comparisons]
+        entries = [report.entry_of(each) for comparisons in self.fields.values() for each in comparisons]
         rows = [
             (str(d.number), inline(d.about), d.measured, inline(title or f"`tgdsl bench --{d.answered_in}`"), figure)
             for d, title, figure in importlib.import_module("oracles.sheet").findings(entries)

@@ -33,7 +33,7 @@ WRITING = {
 """What authors of kinds, quantities and sources use."""
 HEADS = "=-"
 COLON = "\ue000"
-"""Stands for a colon while Napoleon reads an attribute's docstring: it takes what is before the first colon for a type."""
+"""Stands for a colon while Napoleon reads an attribute's docstring: it takes the text before the first colon for a type."""
 
 
 def api_pages() -> dict[str, str]:

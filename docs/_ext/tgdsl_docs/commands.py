@@ -27,7 +27,7 @@ def command_pages() -> dict[str, str]:
 
 
 def command_names(union: Any, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Yield the words of every command, those with commands of their own before these."""
+    """Yield the words of every command; a group comes before its commands."""
     for choice in typing.get_args(union):
         (name,) = (part.name for part in choice.__metadata__ if hasattr(part, "prefix_name"))
         words = (*before, name)

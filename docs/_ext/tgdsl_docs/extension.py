@@ -28,9 +28,16 @@ def generate(app: Sphinx) -> None:
     source = Path(app.srcdir)
     accuracy = Accuracy()
     pages: dict[str, str] = {"accuracy.md": accuracy.page()}
-    others = (grammar_pages(), command_pages(), api_pages(), observation_pages(source), outside_pages())
-    for made in (kind_pages(source, accuracy), *others):
-        pages |= made
+    groups = (
+        kind_pages(source, accuracy),
+        grammar_pages(),
+        command_pages(),
+        api_pages(),
+        observation_pages(source),
+        outside_pages(),
+    )
+    for group in groups:
+        pages |= group
     shutil.rmtree(source / FOLDER, ignore_errors=True)
     for name, text in pages.items():
         path = source / FOLDER / name

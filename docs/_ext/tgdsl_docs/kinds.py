@@ -22,7 +22,7 @@ EXAMPLE = "examples/every_sensor.yaml"
 MEASURED = "docs/measured/gpu_h200.json"
 """Timings of the module alone: see docs/background/performance.md."""
 ENVS, TAXELS = 16384, 100
-"""Size of the rows that the cost is taken from; of kinds per body, one body."""
+"""Size of the rows with the cost; kinds per body have one body."""
 
 
 def kind_pages(source: Path, accuracy: Accuracy) -> dict[str, str]:
@@ -65,8 +65,8 @@ def _index(outputs: list[Any], measured: Mapping[str, Any]) -> str:
     for kind in KINDS:
         about = inline((kind.spec.__doc__ or "").strip().splitlines()[0])
         costs = _rows(kind, measured)
-        shown = (f"{costs[0]['graph']:.3f}", f"{costs[0]['error']:.0e}") if costs else ("", "")
-        rows.append((f"[`{kind.name}`]({kind.name}.md)", about, "; ".join(_channels(kind, outputs)), *shown))
+        cost = (f"{costs[0]['graph']:.3f}", f"{costs[0]['error']:.0e}") if costs else ("", "")
+        rows.append((f"[`{kind.name}`]({kind.name}.md)", about, "; ".join(_channels(kind, outputs)), *cost))
     header = ("kind", "what it measures", "channels of the example", f"ms, {ENVS:,} × {TAXELS}", "float32 error")
     names = "\n".join(kind.name for kind in KINDS)
     return (
@@ -91,15 +91,15 @@ def _page(kind: Kind, block: str, outputs: list[Any], measured: Mapping[str, Any
     about = package.__doc__ or module.__doc__ or ""
     path = f"{package.__name__.replace('.', '/')}.py"
     schema = kind.spec.model_json_schema()
-    own, inherited = _fields(kind)
+    fields, inherited = _fields(kind)
     picture = f"images/gallery/kind_{kind.name}.png"
-    shown = f"![A reading of this kind](../../{picture})\n\n" if (source / picture).is_file() else ""
+    image = f"![A reading of this kind](../../{picture})\n\n" if (source / picture).is_file() else ""
     parts = [
-        f"# `{kind.name}`\n\n{shown}{_body(about, kind)}\n",
+        f"# `{kind.name}`\n\n{image}{_body(about, kind)}\n",
         f"Defined in [{path}](../../../{path}), with a float64 reference.\n{_mentions(kind, source)}",
         f"\n## Example\n\nFrom [every_sensor.yaml](../../../{EXAMPLE}):\n\n```yaml\nsensors:\n{block}\n```\n",
         table(("reading", "shape", "channels"), _readings(kind, outputs)),
-        f"\n## Parameters\n\n{fields_table(schema, own, _link) if own else 'This kind adds no parameters.'}",
+        f"\n## Parameters\n\n{fields_table(schema, fields, _link) if fields else 'This kind adds no parameters.'}",
         f"\n## Parameters shared with other kinds\n\n{fields_table(schema, inherited, _link)}",
         f"\n## Noise\n\n{_noise(kind)}",
         f"\n## Cost\n\n{_cost(kind, measured)}",
@@ -113,12 +113,12 @@ def _link(name: str) -> str:
 
 def _body(text: str, kind: Kind) -> str:
     """Return a module's docstring as Markdown, with links to other kinds."""
-    others = {other.name for other in KINDS} - {kind.name}
+    names = {other.name for other in KINDS} - {kind.name}
     blocks = []
     for block in text.strip().split("\n\n"):
         if not block.startswith("    "):
             block = re.sub(r"^(Source|Departures|Limits)\b", r"**\1**", inline(block))
-            block = re.sub(r"`(\w+)`", lambda m: f"[`{m[1]}`]({m[1]}.md)" if m[1] in others else m[0], block)
+            block = re.sub(r"`(\w+)`", lambda m: f"[`{m[1]}`]({m[1]}.md)" if m[1] in names else m[0], block)
         else:
             block = "```text\n" + "\n".join(line[4:] for line in block.splitlines()) + "\n```"
         blocks.append(block)
@@ -126,15 +126,15 @@ def _body(text: str, kind: Kind) -> str:
 
 
 def _mentions(kind: Kind, source: Path) -> str:
-    """Return links to the pages that treat the kind: those that name its folder or file, or it twice or more."""
+    """Return links to the pages that name the kind at least twice."""
     pages = sorted(page for folder in ("how-to", "background") for page in (source / folder).glob("*.md"))
-    found = [page for page in pages if page.read_text(encoding="utf-8").count(f"`{kind.name}`") >= 2]
-    links = ", ".join(f"[{page.stem}](../../{page.parent.name}/{page.name})" for page in found)
-    return f"More: {links}.\n" if found else ""
+    mentions = [page for page in pages if page.read_text(encoding="utf-8").count(f"`{kind.name}`") >= 2]
+    links = ", ".join(f"[{page.stem}](../../{page.parent.name}/{page.name})" for page in mentions)
+    return f"More: {links}.\n" if links else ""
 
 
 def _fields(kind: Kind) -> tuple[list[str], list[str]]:
-    """Return the names of the fields of the kind itself, and of those that it inherits."""
+    """Return the names of the kind's fields, without and with inheritance."""
     names = [name for name in kind.spec.model_fields if name != "kind"]
     above = {name for base in kind.spec.__mro__[1:] for name in getattr(base, "model_fields", ())}
     return [name for name in names if name not in above], [name for name in names if name in above]

@@ -1,4 +1,4 @@
-"""Links of pages that are also read on a code host: what is no page becomes a download, a folder its name."""
+"""Links of pages that are also read on a code host: links to other files become downloads, links to folders their names."""
 
 from __future__ import annotations
 

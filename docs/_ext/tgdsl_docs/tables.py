@@ -24,10 +24,10 @@ def cell(text: str) -> str:
 
 def split_unit(description: str) -> tuple[str, str]:
     """Return a description without its unit, and the unit; with none or several units nothing is split off."""
-    found = UNIT.findall(description)
-    if len(found) != 1:
+    units = UNIT.findall(description)
+    if len(units) != 1:
         return description, ""
-    return UNIT.sub("", description, count=1), "–" if found[0] == "1" else found[0]
+    return UNIT.sub("", description, count=1), "–" if units[0] == "1" else units[0]
 
 
 def fields_table(schema: Mapping[str, Any], names: Iterable[str], link: Link) -> str:

@@ -12,7 +12,7 @@ the pass begins), a_c = a_0 + clamp(a_s − a_0, ±clip), and h(e) = e², or for
 
 Source: Chung et al., *Tactile Genesis*, appendix. It names the loss, "inv-var MSE", and a clip parameter of 0.1; the formulas
 are ours: σ_t² as the variance, and the clip as PPO bounds values. Normalised actions and Huber's loss are of the authors'
-public code: see docs/background/paper.md; its bound of 1 is ours.
+public code: see docs/records/paper.md; its bound of 1 is ours.
 
 Shapes: `env` environments, `student` students of a stack, `row` environments of a block, `joint`, `target` as in `student.py`.
 """
