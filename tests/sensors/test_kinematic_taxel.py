@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -57,6 +59,23 @@ def test_a_loop_is_a_play_beside_the_law(tmp_path):
     touch(state(touch, pos=[0, 0, 0.05]))
     again = -touch(state(touch, pos=[0, 0, 0.03 - 1e-4]))["s"][0, 0, 2].item()
     assert again == pytest.approx((k + force / width) * 1e-4, rel=1e-9)  # a contact that was lost begins at the origin
+
+
+@pytest.mark.filterwarnings("ignore:poses of bodies are not finite")
+@pytest.mark.parametrize(
+    "options",
+    [{"loop": {"force": 0.4, "width": "1 mm"}}, {"noise": {"hysteresis": {"strength": 0.5, "time_constant": "50 ms"}}}],
+    ids=["loop", "hysteresis"],
+)
+def test_memory_goes_on_after_a_broken_pose_as_if_it_was_not_read(tmp_path, options):
+    def forces(heights):
+        touch = module(tmp_path, [(0.0, 0.0, 0.0)], BOX, kind="kinematic_taxel", **kinematic.STILL, **options)
+        dt = 0.01 if "dt" in touch.inputs.fields else None
+        return [touch(replace(state(touch, pos=[0, 0, z]), dt=dt))["s"][0, 0, 2].item() for z in heights]
+
+    broken = forces([0.027, 0.0265, np.nan, 0.0268, 0.0272])
+    assert np.isnan(broken.pop(2))
+    assert broken == forces([0.027, 0.0265, 0.0268, 0.0272])
 
 
 def test_a_lattice_stiffens_as_its_cells_close():

@@ -102,7 +102,9 @@ class Hysteresis(Stage):
         ramp = torch.where(ratio > 0, -torch.expm1(-ratio) / torch.where(ratio > 0, ratio, 1.0), 1.0)
         decay, ramp = materialised(torch.exp(-ratio)), materialised(ramp)
         lag = torch.where(now.age[..., None] == 0, 0.0, decay * memory.lag + ramp * (signal - memory.last))
-        return signal + self.hysteresis_strength * lag, HysteresisMemory(lag, signal)
+        is_broken = signal.isnan()  # of a pose that is not finite: go on from the last finite signal
+        kept = (torch.where(is_broken, *pair) for pair in ((memory.lag, lag), (memory.last, signal)))
+        return signal + self.hysteresis_strength * lag, HysteresisMemory(*kept)
 
     @staticmethod
     def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:
