@@ -36,7 +36,7 @@ from tgdsl.sensors.known import kinds_by_sensor, quantities_of
 from tgdsl.sensors.noise.pipeline import stages_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype, dtype_of
-from tgdsl.tensors.env_ids import EnvIds, env_mask
+from tgdsl.tensors.env_ids import EnvIds, check_env_ids, env_mask
 from tgdsl.tensors.torch_internals import HookedModule
 
 
@@ -350,6 +350,7 @@ class TactileModule(HookedModule):
             StateError: If there are no such environments.
         """
         if self.num_envs is None:
+            check_env_ids(env_ids, StateError)
             return  # nothing is held yet, and the first call begins an episode
         with torch.no_grad():
             self.memory.reset(env_mask(env_ids, self.num_envs, self.device, StateError, waits=False))

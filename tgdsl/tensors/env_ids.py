@@ -16,6 +16,12 @@ EnvIds = Tensor | np.ndarray | Sequence[int]  # environments: indices, or a bool
 FEW = 0.5  # with more of the environments than this share, something is done for all of them
 
 
+def check_env_ids(env_ids: EnvIds | None, error: type[TgdslError]) -> None:
+    """Raise an error if environments, of a number that is not known yet, are named neither by indices nor by a mask."""
+    if env_ids is not None:
+        _ids_tensor(env_ids, None, error)
+
+
 def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] = SimulationError) -> Int[np.ndarray, " n"]:
     """Return environments (default: all) as indices, in the order in which they are named.
 
@@ -48,14 +54,16 @@ def is_env_mask(env_ids: EnvIds, num_envs: int) -> bool:
     return result.dtype == torch.bool and result.shape == (num_envs,)
 
 
-def _ids_tensor(env_ids: EnvIds, num_envs: int, error: type[TgdslError]) -> Tensor:
+def _ids_tensor(env_ids: EnvIds, num_envs: int | None, error: type[TgdslError]) -> Tensor:
     try:
         return torch.as_tensor(env_ids)
     except (TypeError, ValueError, RuntimeError) as wrong:
         raise error(f"env_ids: found {env_ids!r}, {_expected_ids(num_envs)}") from wrong
 
 
-def _expected_ids(num_envs: int) -> str:
+def _expected_ids(num_envs: int | None) -> str:
+    if num_envs is None:
+        return "expected indices of environments, or a mask of them"
     return f"expected indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
 
 
