@@ -110,6 +110,7 @@ def test_a_sensor_that_the_document_lacks_is_named(tmp_path):
     (found,) = problems(lambda: TouchEnv(task, 2))
     assert found.path == "touch" and found.line == 8
     assert found.what == '"sensors.yaml" has no sensor of kind "proximity", expected one'
+    assert found.hint.startswith("its sensors allow `touch` none, ") and "proximity" not in found.hint
     sensors.write_text(whole + "  nearer: {kind: proximity, links: hand, feels: [ball]}\n")
     (found,) = problems(lambda: TouchEnv(task, 2))
     assert found.what == '"sensors.yaml" has the sensors near, nearer of kind "proximity", expected one'
@@ -194,6 +195,16 @@ def test_what_a_task_of_ones_own_lacks_is_named_at_once(tmp_path):
     )
     (found,) = problems(lambda: load_task(write_task(tmp_path, task="own.py:Own")))
     assert found.what == '"own.py:Own" lacks advance, is_over, reset, score, Spec, score_unit'
+
+
+def test_a_task_of_ones_own_senses_kinds_by_a_tuple(tmp_path):
+    code = "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Own(InPalmRotate):\n    senses = {}\n"
+    (tmp_path / "own.py").write_text(code.format('"link_contact"'))
+    (tmp_path / "other.py").write_text(code.format('("link_contac",)'))
+    (found,) = problems(lambda: load_task(write_task(tmp_path, task="own.py:Own")))
+    assert (found.path, found.what) == ("task", '"own.py:Own": senses is "link_contact", expected a tuple, ("link_contact",)')
+    (found,) = problems(lambda: TouchEnv(write_task(tmp_path, task="other.py:Own"), 2))
+    assert (found.path, found.hint) == ("task", 'did you mean "link_contact"?')
 
 
 @pytest.mark.parametrize(

@@ -164,6 +164,9 @@ def _class_of(
     lacks += [key for key in ("Spec", "score_unit") if base is Task and not hasattr(result, key)]
     if lacks:
         raise SpecError([source.problem(place, f'"{name}" lacks {listed(lacks)}')])
+    senses = getattr(result, "senses", ())
+    if isinstance(senses, str):
+        raise SpecError([source.problem(place, f'"{name}": senses is "{senses}", expected a tuple, ("{senses}",)')])
     return result
 
 

@@ -197,7 +197,10 @@ def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
 
 def types_of(loaded: LoadedTask) -> list[str]:
     """Return the types that the sensors' document has sensors for, and none."""
-    kinds = {sensor.kind for sensor in sensors_document(loaded).spec.sensors.values()}  # type: ignore[attr-defined]
+    return _types([sensor.kind for sensor in sensors_document(loaded).spec.sensors.values()])  # type: ignore[attr-defined]
+
+
+def _types(kinds: Sequence[str]) -> list[str]:
     return ["none", *(name for name, (kind, _) in SENSED.items() if kind in kinds)]
 
 
@@ -258,7 +261,9 @@ def _sensors_of(loaded: LoadedTask, document: Loaded, wanted: Mapping[str, Seque
             continue
         which = f"the sensors {listed(names)}" if names else "no sensor"
         problem = f'"{loaded.spec.document}" has {which} of kind "{kind}", expected one'
-        problems += loaded.error((key,), problem).problems
+        kinds = [other.kind for other in document.spec.sensors.values()]  # type: ignore[attr-defined]
+        hint = f"its sensors allow `touch` {listed(_types(kinds))}" if key == "touch" else did_you_mean(kind, kinds, "kinds")
+        problems += loaded.error((key,), problem, "" if names else hint).problems
     if problems:
         raise SpecError(problems)
     return sensor

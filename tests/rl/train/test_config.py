@@ -82,6 +82,10 @@ def test_mistakes_are_located(tmp_path, train, message):
 
 
 def test_groups_that_are_not_there_are_located(tmp_path):
+    with pytest.raises(SpecError) as raised:
+        observed(loaded(tmp_path, "train: {actor: [gaol, propio], critic: [goals], rnd: {groups: [goa]}}\n"), GROUPS)
+    places = ["train.actor[0]", "train.actor[1]", "train.critic[0]", "train.rnd.groups[0]"]
+    assert [problem.path for problem in raised.value.problems] == places
     with pytest.raises(
         SpecError, match=r'task\.yaml:\d+:\d+: train\.critic\[1\]: there is no group of observations "gaol".*"goal"'
     ):

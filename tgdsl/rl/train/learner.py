@@ -13,7 +13,7 @@ import io
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,7 +24,7 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 from torch import Tensor
 
-from tgdsl.errors import did_you_mean
+from tgdsl.errors import Problem, SpecError, did_you_mean
 from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
 from tgdsl.rl.env import Step, TouchEnv
 from tgdsl.rl.load import LoadedTask
@@ -228,13 +228,25 @@ PPO_OPTIONS = {
 
 def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[str]]:
     """Return the groups of observations of actor, critic and, if there is one, random network distillation."""
-    train = loaded.spec.train
+    train, problems = loaded.spec.train, list[Problem]()
     privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
-    actor = _named(loaded, groups, ("actor",), train.actor) or [name for name in privileged if name != PROPS]
-    result = {"actor": actor, "critic": _named(loaded, groups, ("critic",), train.critic) or privileged}
+    named = {("actor",): train.actor, ("critic",): train.critic}
     if train.rnd != "off":
-        default = [STATE] if STATE in groups else actor
-        result["rnd_state"] = _named(loaded, groups, ("rnd", "groups"), train.rnd.groups) or default
+        named["rnd", "groups"] = train.rnd.groups
+    for place, names in named.items():
+        for i, name in enumerate(names or ()):
+            if name not in groups:
+                problem, hint = f'there is no group of observations "{name}"', did_you_mean(name, groups, "groups")
+                problems.append(loaded.source.problem(("train", *place, i), problem, hint))
+            elif groups[name] == 0:
+                problem = f'the group of observations "{name}" is empty'
+                problems.append(loaded.source.problem(("train", *place, i), problem))
+    if problems:
+        raise SpecError(problems)
+    actor = list(train.actor or [name for name in privileged if name != PROPS])
+    result = {"actor": actor, "critic": list(train.critic or privileged)}
+    if train.rnd != "off":
+        result["rnd_state"] = list(train.rnd.groups or ([STATE] if STATE in groups else actor))
     return result
 
 
@@ -273,17 +285,6 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
         "algorithm": algorithm | {"rnd_cfg": rnd},
         "multi_gpu": None if multi_gpu is None else dict(multi_gpu),
     }
-
-
-def _named(loaded: LoadedTask, groups: Mapping[str, int], place: tuple[str, ...], names: Sequence[str] | None) -> list[str]:
-    """Return the groups that a document names; none if it names none."""
-    for i, name in enumerate(names or ()):
-        if name not in groups:
-            problem = f'there is no group of observations "{name}"'
-            raise loaded.error(("train", *place, i), problem, did_you_mean(name, groups, "groups"))
-        if groups[name] == 0:
-            raise loaded.error(("train", *place, i), f'the group of observations "{name}" is empty')
-    return list(names or ())
 
 
 class Learner(Learning):
