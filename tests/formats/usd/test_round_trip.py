@@ -26,11 +26,11 @@ SHAPES = """
       <geom name="block" type="box" size=".01 .02 .03" pos=".1 0 .2" quat=".3 .5 -.1 .9" rgba="1 0 0 .5"/>
       <body name="base plate" pos="0 .1 0" quat=".7 0 .7 .1">
         <joint name="rail" type="slide" axis="-1 .2 .3" pos=".01 .02 .03" range="-.1 .3" ref=".05" armature=".2" frictionloss=".3"/>
-        <geom name="ball" type="sphere" size=".02" pos="0 .03 0" friction=".3"/>
+        <geom name="ball" type="sphere" size=".02" pos="0 .03 0" friction=".3" group="4"/>
         <body name="arm" pos=".2 0 .1" quat=".1 .9 .2 -.3">
           <joint name="elbow" axis="-1 1e-9 0" pos="0 .01 -.02" ref=".7" range="-.5 2"/>
           <geom name="tube" type="capsule" size=".01 .05" pos="0 0 .1"/>
-          <geom name="seen" type="cylinder" size=".02 .03" contype="0" conaffinity="0"/>
+          <geom name="seen" type="cylinder" size=".02 .03" contype="0" conaffinity="0" group="1"/>
           <body name="wrist" pos="0 .05 0" quat=".6 .1 .2 .7">
             <joint name="socket" type="ball" pos="0 .02 .01"/>
             <geom name="egg" type="ellipsoid" size=".01 .02 .03" contype="0" conaffinity="0"/>
@@ -132,10 +132,11 @@ def points(model: mujoco.MjModel, state: mujoco.MjData, name: str) -> np.ndarray
     return local @ state.geom(name).xmat.reshape(3, 3).T + state.geom(name).xpos
 
 
-def test_geoms_keep_their_kind_size_friction_and_colour(pair):
+def test_geoms_keep_their_kind_size_group_friction_and_colour(pair):
     for name in names(pair[0], "geom"):
         first, second = (model.geom(name) for model in pair)
         assert second.type[0] == first.type[0]
+        assert second.group[0] == first.group[0]
         assert (second.contype[0], second.conaffinity[0]) == (first.contype[0], first.conaffinity[0])
         np.testing.assert_allclose(second.friction[0], first.friction[0], rtol=TOLERANCE)
         np.testing.assert_allclose(second.rgba, first.rgba, rtol=TOLERANCE)

@@ -3,7 +3,8 @@
 Bodies are siblings below the default prim, at their world poses. What USD has no schema for and tgdsl reads back is kept in
 custom attributes named `tgdsl:`, in SI units and radians:
 
-- the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
+- the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), a geom's `group`, and which frame
+  is a `site`;
 - a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
   a joint's `actuatorfrcrange` and its actuator's `forcerange`, of which the drive has the smaller;
   the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
@@ -171,6 +172,7 @@ def _add_geom(writer: attr.StageWriter, geom: int) -> None:
         pos, quat = pos - turn.apply(model.mesh_pos[mesh]), turn.as_quat(canonical=True, scalar_first=True)
     _set_pose(prim, pos, quat, scale)
     attr.set_custom(prim, "name", model.geom(geom).name)
+    attr.set_custom(prim, "group", int(model.geom_group[geom]))
     rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     if material >= 0 and np.array_equal(rgba, np.array(PLAIN_RGBA, dtype=rgba.dtype)):
         rgba = model.mat_rgba[material]
