@@ -38,6 +38,46 @@ def base(tmp_path):
     return tmp_path
 
 
+FIXED = """import torch
+from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.task import Start, Task
+
+
+class Own(Task[TaskSpec]):
+    Spec, score_unit = TaskSpec, "1"
+
+    def reset(self, chosen, episode):
+        return Start({"qpos": self.setup.start})
+
+    def advance(self, now):
+        pass
+
+    def is_over(self, now):
+        return torch.zeros(self.setup.num_envs, dtype=torch.bool)
+
+    def reward(self, now, is_over):
+        return {"none": self.score()}
+
+    def observe(self, now):
+        return {}
+
+    def score(self):
+        return torch.zeros(self.setup.num_envs)
+"""
+
+
+def test_of_an_object_that_cannot_move_no_gait_is_printed(base, here):
+    scene = base / "robots" / "scene.xml"
+    fixed = scene.read_text().replace('<freejoint name="item"/>', "").replace(' 0 0 .0205 1 0 0 0"', '"')
+    scene.write_text(fixed)
+    (base / "code" / "own.py").write_text(FIXED)
+    task = base / "tasks" / "mine" / "task.yaml"
+    task.write_text(task.read_text().partition("randomise")[0])
+    code, out, error = here(base / "tasks" / "mine", "evaluate", "task.yaml", "--episodes", "1")
+    assert code == 0, error
+    assert out.startswith("score 0.000") and len(out.splitlines()) == 1
+
+
 def test_it_is_learned_and_goes_on_from_anywhere(base, here):
     """Its document may also stand elsewhere, as long as it names the same files."""
     task, moved, run = "../tasks/mine/task.yaml", "../../tasks/moved.yaml", "../../here/out/task"

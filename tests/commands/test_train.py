@@ -216,6 +216,8 @@ def test_mistakes(fails, here, base):
     assert "task.yaml is a file, expected a folder" in fails("train", "task.yaml", *ON, "--out", "task.yaml/run")
     assert 'no group of observations "gaol"' in fails("train", "task.yaml", *ON, "--set", "train.actor=[gaol]")
     assert "none.pt: cannot read this file: No such file or directory" in fails("evaluate", "task.yaml", "--policy", "none.pt")
+    if not torch.cuda.is_available():
+        assert 'there is no device "cuda": ' in (said := fails("train", "task.yaml")) and "--device cpu" in said
     assert "--episodes 0: expected at least 1" in fails("evaluate", "task.yaml", "--episodes", "0")
     assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
     said = fails("train", "task.yaml", *ON)

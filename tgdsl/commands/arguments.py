@@ -176,6 +176,16 @@ def progress_bar(job: str, total: int | None = None, unit: str = "step") -> tqdm
     return tqdm(total=total, desc=job, unit=unit, disable=None, leave=False)
 
 
+def check_learning_device(device: str) -> None:
+    """Raise an error if there is no such device; without a GPU, it names the option of a CPU."""
+    from tgdsl.tensors.devices import device_of
+
+    try:
+        device_of(device)
+    except TgdslError as error:
+        raise TgdslError(f"{error}: pass --device cpu" if device.startswith("cuda") else str(error)) from error
+
+
 def check_least(command: object, **least: float) -> None:
     """Raise an error if one of a command's numbers is given, and less than the least."""
     for name, low in least.items():

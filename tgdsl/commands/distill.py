@@ -112,6 +112,7 @@ class Distill:
             if key in overrides and self.resume is not None and overrides[key] != before.get(key):
                 raise TgdslError(f"--set {key}={overrides[key]}: what students feel stays as it is in a run that goes on")
         args.check_least(self, envs=1, iterations=1, minutes=0.0, episodes=0, seeds=1)
+        args.check_learning_device(self.device)
 
     def _settings(self, loaded: LoadedTask, before: dict[str, Any], folder: Path) -> dict[str, Any]:
         """Return who is taught, by whom and where, as plain values; `before`: the same of a run that goes on in a folder."""

@@ -156,11 +156,14 @@ class Evaluate:
                 played = "1 is" if envs == 1 else f"the first {envs} are"
                 print(f'of the {variants} variants of "{env.spec.object}" {played} played: there are no more environments')
             actor = args.actor_for(env, policy, groups=self.groups)
+            moves = bool(env.sim.model.body(env.task.setup.object).weldid)  # else there is no gait
             with StatusLine() as progress:
                 evaluation = evaluate(env, actor, self.episodes, seed, progress)
         finally:
             env.close()
-        print(f"{evaluation}\n\n{evaluation.gait}")
+        print(evaluation)
+        if moves:
+            print(f"\n{evaluation.gait}")
         if self.out is not None:
             args.write_json(with_folder(self.out), evaluation.plain())
         if failures := [failure for one in required if (failure := one.failure(evaluation)) is not None]:

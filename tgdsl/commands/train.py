@@ -65,6 +65,7 @@ class Train:
 
         ranks = Ranks.of()
         device = ranks.device(self.device)
+        args.check_learning_device(device)
         folder = RunFolder(self.out or self.resume or Path("out") / self.task.stem)
         source = RunFolder(self.resume) if self.resume else None
         last_start = source.last_start() if source else {}

@@ -5,9 +5,12 @@ import subprocess
 import sys
 
 import pytest
+import trimesh
+from small_tasks import small_task
 
 from tgdsl.errors import TgdslError
-from tgdsl.rl.train.folder import RunFolder
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.train.folder import RunFolder, changes, run_origin
 
 
 def row_of(iteration):
@@ -89,3 +92,20 @@ def test_a_file_that_tells_no_starts_is_refused(tmp_path, text):
     folder.run.write_text(text)
     with pytest.raises(TgdslError, match=r"run\.json: (expected a file that tgdsl wrote|cannot read this file)"):
         folder.last_start()
+
+
+def test_files_that_were_only_moved_are_no_change(tmp_path, monkeypatch):
+    origins = []
+    for name in ("here", "there"):
+        folder = tmp_path / name
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        small_task(folder)
+        trimesh.creation.box([0.01, 0.01, 0.01]).export(folder / "cap.stl")
+        scene = (folder / "scene.xml").read_text()
+        scene = scene.replace("<worldbody>", '<asset><mesh name="cap" file="cap.stl"/></asset><worldbody>')
+        geom = '<geom name="cap" type="mesh" mesh="cap" contype="0" conaffinity="0" mass="0"/></body>'
+        (folder / "scene.xml").write_text(scene.replace("</body>", geom, 1))
+        env = TouchEnv("task.yaml", 1)
+        origins.append(run_origin(env.loaded, env, 0, {}, 1))
+    assert changes(*origins, type(env.loaded.spec)) == []

@@ -25,6 +25,7 @@ import re
 import sys
 import zipfile
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ import torch
 
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import TEMPORARY, as_file_error, atomic_open, atomic_write, check_writable, new_folder, with_folder
+from tgdsl.plan.plan import Plan
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.policy import differences, provenance, spec_differences, taxel_csv
@@ -212,11 +214,18 @@ def run_origin(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[
         "spec": loaded.spec.model_dump(mode="json"),
         "groups": env.groups,
         "joints": list(env.joint_names),
-        "module": hashlib.sha256(env.touch.plan.to_json().encode()).hexdigest(),
+        "module": _module_digest(env.touch.plan),
         "taxels": env.touch.taxels_id,
         **provenance(loaded, env.sim.model),
         "versions": versions(),
     }
+
+
+def _module_digest(plan: Plan) -> str:
+    """Return a hash of what is compiled, wherever its files are."""
+    scene = replace(plan.scene, assets=tuple(replace(asset, path="") for asset in plan.scene.assets))
+    plan = replace(plan, origin=replace(plan.origin, robot=""), scene=scene)
+    return hashlib.sha256(plan.to_json().encode()).hexdigest()
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec]) -> list[str]:
