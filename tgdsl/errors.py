@@ -17,7 +17,7 @@ class RobotError(TgdslError):
 
 
 class StateError(TgdslError):
-    """A `SceneState` that does not hold what a compiled module wants."""
+    """A `SceneState` that lacks a field of the module's inputs, or has one of another shape, dtype or device."""
 
 
 class ArtifactError(TgdslError):
@@ -25,31 +25,31 @@ class ArtifactError(TgdslError):
 
 
 class TaxelError(TgdslError):
-    """Taxels that are others, or in another order, than those expected: readings would mean something else, row by row."""
+    """Taxels that differ from the expected ones, or are in another order, so that rows of readings would be mixed up."""
 
 
 class SimulationError(TgdslError):
-    """A simulator that cannot run what was asked of it, or that diverged."""
+    """A simulator that cannot run with the given arguments, or that diverged."""
 
 
 class ObservationError(TgdslError):
-    """An observation that its source cannot give."""
+    """An observation that a source cannot provide."""
 
 
 class UnfeltWarning(UserWarning):
-    """A document has taxels that cannot feel what their sensors are to feel."""
+    """A document has taxels that can never sense the objects of their sensors."""
 
 
 class CoarseCellsWarning(UserWarning):
-    """Cells of a temperature grid are too large for what their faces lose."""
+    """Cells of a temperature grid are too large for the heat loss at their faces."""
 
 
 class FileError(TgdslError, OSError):
-    """A file that cannot be written; also caught as the system's own error.
+    """A file that cannot be written; also an `OSError`.
 
     Attributes:
         file: The file.
-        reason: What the system says.
+        reason: Message of the operating system.
     """
 
     def __init__(self, file: object, reason: str):
@@ -58,7 +58,7 @@ class FileError(TgdslError, OSError):
 
 
 class HandError(TgdslError):
-    """Base of every error of a real (or emulated) hand; `tgdsl.runtime.xhand1.wire.errors` has the others."""
+    """Base of all errors of a real or emulated hand; `tgdsl.runtime.xhand1.wire.errors` has the subclasses."""
 
 
 @dataclass(frozen=True, order=True)

@@ -123,21 +123,21 @@ def calibrate(
     """Fit parameters of sensors to recordings.
 
     Args:
-        document: A YAML file, or the same as a mapping. Its values are where the search starts.
+        document: A YAML file, or the same as a mapping. The search starts from its values.
         recordings: `.npz` files, YAML documents of CSV files, or arrays; `tgdsl.calibration.recordings` describes the format.
         fit: Parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`. Without any, only
             nuisances are fitted: the document predicts the recordings.
-        reading: Map of its own that each recording's reading may have: an `offset` of each channel (the camera moved); also a
-            `scale` about the middle of the rows; or an `affine` function of the rows' places. Of all, or by their names.
-        gain: Whether each recording may have a gain of its own.
-        robust: Whether rows far off, such as lost markers, count less (Huber's loss).
-        hold_out: What is left out in turn to measure the error on it: rows at random (`taxel`), `blocks` of neighbouring rows,
-            blocks of `time`, or each `recording` (whose nuisances are then fitted, but no parameter).
-        folds: Number of parts for that.
-        starts: Starts of the search: the document's values and points of a Sobol sequence in the ranges.
+        reading: Nuisance parameters of each recording's frame: an `offset` of each channel (the camera moved), a `scale` about
+            the middle of the rows as well, or an `affine` function of the rows' positions. For all readings, or by name.
+        gain: Fit one gain per recording.
+        robust: Give outliers, such as lost markers, less weight (Huber's loss).
+        hold_out: Parts that are held out in turn, to measure the error on unseen data: random rows (`taxel`), `blocks` of
+            neighbouring rows, blocks of `time`, or each `recording` (only its nuisances are fitted then).
+        folds: Number of held-out parts.
+        starts: Number of starting points: the document's values, and points of a Sobol sequence in the ranges.
         intervals: 95 % intervals by `profile` (for independent noise), by `bootstrap` of rows or samples, or `none`.
-        seed: Seed of starts, folds and the bootstrap.
-        overrides: Values by dotted path, as `tgdsl.compile` takes them.
+        seed: Seed of starting points, folds and the bootstrap.
+        overrides: Values by dotted path, as for `tgdsl.compile`.
         kinds: Your own kinds of sensors.
 
     Raises:

@@ -37,14 +37,14 @@ FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "
 
 
 def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
-    """Add the contact sensors that a module wants to a MuJoCo model: those of `inputs.pairs`, and no others.
+    """Add the contact sensors of a module to a MuJoCo model: one per pair of `inputs.pairs`.
 
-    The first side of a sensor is the object and the second the link, so that MuJoCo's force is the one on the link and its
-    normal points out of the object. Sensors that are already there, by name, are left as they are.
+    The object is the sensor's first side and the link its second, so that MuJoCo's force acts on the link, and its normal
+    points out of the object. Existing sensors of the same name stay.
 
     Args:
         spec: The model, changed in place; compile it afterwards.
-        inputs: What the module wants: `touch.inputs`.
+        inputs: Inputs of the module: `touch.inputs`.
 
     Returns:
         The same model.

@@ -17,13 +17,13 @@ from tgdsl.tensors.devices import device_of, dtype_of
 
 
 def save(touch: TactileModule, path: str | PathLike[str]) -> int:
-    """Write what a module was built from; `tgdsl.load` makes the module again. Its state is not part of it: see `state_dict`.
+    """Write a module as an artefact (.safetensors) for `tgdsl.load`, without its state (see `state_dict`).
 
-    The same document gives the same bytes. The file appears whole or not at all. Returns the bytes written.
+    The same document gives the same bytes. The file appears whole or not at all. Returns its size [bytes].
 
     Raises:
         FileError: If the file cannot be written.
-        TgdslError: If it is no module, or the file's name is that of something else.
+        TgdslError: If `touch` is no module, or the path has another ending.
     """
     if not isinstance(touch, TactileModule):
         raise TgdslError(f"tgdsl.save writes a module that tgdsl.compile returned, found {type(touch).__name__}")
@@ -40,18 +40,18 @@ def load(
     device: torch.device | str = "cpu",
     taxels: Taxels | None = None,
 ) -> TactileModule:
-    """Return the module of an artefact. Neither MuJoCo nor any file that it was compiled from is needed.
+    """Return the module of an artefact. It needs neither MuJoCo nor the files from which it was compiled.
 
     Args:
         path: The artefact.
-        kinds: Sensor kinds of your own, if it was compiled with any that no installed package brings.
-        dtype: Dtype of the readings, float32 or float64, as for `compile`; its name will do.
-        device: Where the module lives.
-        taxels: The taxels that are expected, such as those that a policy learned with: see `tgdsl.check_taxels`.
+        kinds: Your own sensor kinds, if the artefact uses any that no installed package provides.
+        dtype: Dtype of the readings, float32 or float64, as for `compile`, or its name.
+        device: Device of the module.
+        taxels: The expected taxels, such as those of a policy: see `tgdsl.check_taxels`.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged or is of another version.
-        TaxelError: If it has other taxels than expected, or in another order: it says how they differ.
+        TaxelError: If it has other taxels than expected, or in another order: the message says how they differ.
         TgdslError: If it uses a kind that is neither installed nor given, or there is no such dtype or device.
     """
     dtype, device = dtype_of(dtype), device_of(device)

@@ -43,13 +43,12 @@ from tgdsl.tensors.torch_internals import HookedModule
 class TactileModule(HookedModule):
     """All sensors of a document, for any number of environments at once.
 
-    Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel), or (env, step, taxel,
-    channel) where a sensor stacks its last calls. `observe` makes the observations of them. A module whose sensors carry state
-    (see `num_envs`) takes the batch size of its first call, or of the state dict that it loads, and keeps it until `free`; one
-    without state takes any. Noise is drawn from the seed 0, or from that given to `seed`.
+    A call with a `SceneState` returns a dictionary of readings by sensor name, each (env, taxel, channel), or (env, step,
+    taxel, channel) for a sensor with `history`. `observe` computes observation groups (env, feature) from them.
 
-    Each call advances what sensors remember: delays, filters, histories, random numbers. `peek` reads without doing so, and
-    `touch(state, mask)` reads and advances some environments alone.
+    Each call advances the sensors' state: delays, filters, histories, random numbers. `peek` reads without advancing, and
+    `touch(state, mask)` reads and advances only some environments. A module with state (see `num_envs`) keeps the batch size
+    of its first call, or of a loaded state dict, until `free`; a module without state takes any. The default seed is 0.
     """
 
     def __init__(self, plan: Plan, kinds: Sequence[Kind] = KINDS, dtype: torch.dtype = torch.float32):

@@ -31,42 +31,42 @@ CHOICES = ("variant", "object_material")  # fields that say which of several thi
 
 @dataclass
 class SceneState:
-    """What a simulator (or hardware) says of all environments at one instant. Only what `inputs.fields` names is read.
+    """Input of a module: poses, contacts and joints of all environments at one instant.
 
-    All is in world axes. Float tensors may be float64 whatever the module's dtype: relative poses are formed in the state's
-    dtype and then cast, so that far from the origin nothing is lost.
+    A module reads only the fields that `touch.inputs.fields` lists; all others may be None.
 
-    A number that is none is not taken for zero: whatever depends on it, in its environment, is read as not-a-number, what
-    `contact_found` gates included. Poses that are none are warned of once on the CPU. A GPU would have to be waited for, so
-    there `readings[name].isnan()` tells. A slot is unused where force, torque and normal are all zero; where it is then does
-    not matter. A contact whose normal is zero acts where it is, and what needs its normal is read as not-a-number.
+    All vectors are in the world frame. Floats may be float64 with a float32 module: relative poses are computed in the state's
+    dtype and then cast, so that precision does not depend on the distance from the origin.
+
+    NaN is not zero: all readings that depend on it, in its environment, are NaN, also behind `contact_found`. On a CPU the
+    module warns once about NaN poses; on a GPU, check `readings[name].isnan()`. A contact slot is unused if force, torque and
+    normal are all zero. A contact with a zero normal still has a force; readings that need its normal are NaN.
 
     Attributes:
         body_pos: Position of each body's frame [m].
         body_quat: Orientation of each body, w, x, y, z.
         body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
         body_angvel: Angular velocity of the body [rad/s].
-        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive, as that
-            of contacts is. An object's contacts are those on the geoms of `inputs.parts_of`, a link's
-            those on the geoms of `inputs.parts_of_link`.
+        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is positive in contact, such
+            as the number of contacts. `inputs.parts_of` lists the geoms of an object, `inputs.parts_of_link` those of a link.
         contact_pos: Contact points [m].
         contact_force: Force on the link at each point [N].
         contact_torque: Torque on the link at each point [N·m].
         contact_normal: Unit normal out of the object at each point.
-        contact_netforce: The pair's whole force on the link [N]. What the slots lack of it acts at the centre of those.
-        variant: Which of its variants each object has, from 0; 0 for one that has none.
-        object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; read of those with `size: per_env`.
-        object_temperature: Temperature at which each object that holds heat begins an episode [°C]; read of those with
+        contact_netforce: Total force of the pair on the link [N]. Force beyond the slots acts at the centre of the slots.
+        variant: Index of each object's variant, from 0; 0 without variants.
+        object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; for objects with `size: per_env`.
+        object_temperature: Temperature of each object of `inputs.heated` at the start of an episode [°C]; for objects with
             `temperature: {per_env: …}`.
-        object_material: Which of its materials each of these is of, from 0; 0 for one that has just one.
-        joint_pos: Position of each joint, of the same instant as the bodies' poses [rad; slides: m].
-        joint_vel: Velocity of each joint, of that instant [rad/s; slides: m/s].
-        joint_effort: What the actuators exert on each joint at that instant [N·m; slides: N].
-        last_action: Control of each actuator that acted at that instant, in its own unit; before any, that of the start.
+        object_material: Index of the material of each object of `inputs.heated`, from 0; 0 with one material.
+        joint_pos: Position of each joint at the instant of the bodies' poses [rad; slides: m].
+        joint_vel: Velocity of each joint at that instant [rad/s; slides: m/s].
+        joint_effort: Torque of the actuators on each joint at that instant [N·m; slides: N].
+        last_action: Control of each actuator at that instant, in its unit; before the first step, the control of the start.
         dt: Time since the last state [s].
-        time: When the instant is in each environment, by MuJoCo's clock [s]; our simulators say it, no module reads it.
-        substeps: The states after each physics step since the last call but for the last one, which this state is; only if
-            `inputs.substeps` is more than 1. Right after a reset they are all as this state.
+        time: Time of the instant in each environment, on MuJoCo's clock [s]. Simulators set it; no module reads it.
+        substeps: States after the earlier physics steps since the last call, oldest first; this state is the last one. Only
+            read if `inputs.substeps` is more than 1. Right after a reset all of them equal this state.
     """
 
     body_pos: Float[Tensor, "env body 3"] | None = None

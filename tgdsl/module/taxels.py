@@ -86,21 +86,20 @@ Taxels = HasPlan | Mapping[str, Any] | str | PathLike[str]  # taxels that are ex
 
 
 def check_taxels(touch: HasPlan, expected: Taxels, what: str = "this module") -> None:
-    """Refuse a module whose sensors have other taxels than expected, or the same ones in another order.
+    """Raise an error if a module's sensors have other taxels than expected, or the same taxels in another order.
 
-    Tables and ids are compared within rounding, as `layout.identity` says. Sensors of the module that nothing is expected of
-    may have any taxels.
+    Comparisons allow for rounding: see `layout.identity`. Sensors without an expected table may have any taxels.
 
     Args:
         touch: The module.
         expected: Another module; tables by sensor, as `TactileModule.taxels` has them; the file of an artefact (.safetensors)
             or of a rollout (.npz); or the id of a module's taxels, `TactileModule.taxels_id`.
-        what: Whose taxels are checked, as the message begins.
+        what: Name of the module, with which the message begins.
 
     Raises:
-        TaxelError: If they are others: how many rows, and the first that differs, here and there.
+        TaxelError: If taxels differ; the message has the number of rows, and the first row that differs.
         ArtifactError: If an artefact cannot be read.
-        TgdslError: If what is expected is none of these.
+        TgdslError: If `expected` is none of these.
     """
     plan = touch.plan
     if isinstance(expected, str) and _ID.fullmatch(expected):

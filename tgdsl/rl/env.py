@@ -85,7 +85,7 @@ class Step(NamedTuple):
 
 
 class TouchEnv:
-    """Environments of one task: tensors in, tensors out.
+    """Batched environments of one task: actions (env, joint) in, observations, rewards (env,) and ends (env,) out.
 
     Groups of observations: `proprio` (positions [rad], velocities [rad/s] and last action of the joints that the policy moves),
     `tactile_sensors` (none with `touch: none`), `priv_proprio` (`proprio` and the force on each link [N]), and the task's own.

@@ -51,18 +51,18 @@ def bodies_by_name(
     quat_order: Literal["wxyz", "xyzw"] = "wxyz",
     linvel_at: Float[Tensor, "*env own 3"] | None = None,
 ) -> dict[str, Float[Tensor, "env body ..."]]:
-    """Return the fields of a state that are poses and velocities of bodies.
+    """Return poses and velocities of bodies as fields of a `SceneState`, from an engine's arrays.
 
     Args:
-        inputs: What the module reads: `touch.inputs`, or `touch.inputs.renamed(…)` where names differ.
-        names: Names of the engine's bodies, in the order of its arrays. A name may also end in the module's, after a slash, as
-            "robot/palm" does. The body "world", if the module reads it and the engine has none, rests at the origin.
+        inputs: Inputs of the module: `touch.inputs`, or `touch.inputs.renamed(…)` if names differ.
+        names: Names of the engine's bodies, in the order of its arrays. Prefixes that end in a slash are ignored: "robot/palm"
+            matches "palm". If the engine has no body "world", it rests at the origin.
         pos: Position of each body's frame, in the world [m].
         quat: Orientation of each body.
         linvel: Velocity of each body, in the world [m/s].
         angvel: Angular velocity of each body, in the world [rad/s].
-        quat_order: The order of the numbers of `quat`.
-        linvel_at: The point of each body whose velocity `linvel` is, such as its centre of mass, in the body's frame [m];
+        quat_order: Order of the components of `quat`.
+        linvel_at: The point of each body to which `linvel` belongs, such as its centre of mass, in the body's frame [m];
             default: the frame's origin.
 
     Raises:
@@ -182,22 +182,22 @@ def contacts_by_pair(
     num_envs: int = 1,
     is_contact: Bool[Tensor, " contact"] | None = None,
 ) -> dict[str, Float[Tensor, "env pair ..."]]:
-    """Return the fields of a state that are contacts, from an engine's contacts in any order.
+    """Return contacts as fields of a `SceneState`, from an engine's contacts in any order.
 
-    Nothing waits for a GPU. Contacts fill a pair's slots in the order given; beyond the slots they count in the net force.
+    It never waits for a GPU. Contacts fill a pair's slots in the given order; further ones count in the net force.
 
     Args:
-        inputs: What the module reads: `touch.inputs`, or `touch.inputs.renamed(…)` where names differ.
-        geoms: Name of the body of each geom of an environment, which `pairs` are indices of; or `Geoms`.
-        pairs: The two geoms of each contact; negative where it has none.
-        pos: Where each contact is, in the world [m].
+        inputs: Inputs of the module: `touch.inputs`, or `touch.inputs.renamed(…)` if names differ.
+        geoms: Name of the body of each geom of an environment, or `Geoms`; `pairs` has indices into it.
+        pairs: The two geoms of each contact; a negative index means no contact.
+        pos: Position of each contact, in the world [m].
         normal: Unit normal from the first geom to the second, in the world.
-        force: Force on the body of one of them, in the world [N].
+        force: Force on the body of the geom `force_on`, in the world [N].
         torque: Torque about `pos` on the same body, in the world [N·m]; default: zero.
         force_on: The geom on whose body `force` and `torque` act: the first or the second.
         env: The environment of each contact; default: the first.
         num_envs: Number of environments.
-        is_contact: Which rows are contacts; default: whatever carries force.
+        is_contact: Which rows are contacts; default: rows with a force.
 
     Raises:
         SimulationError: If the engine lacks a body or geom, or several names match it.

@@ -62,37 +62,37 @@ def connect(
     scene: SteppedScene | None = None,
     **options: Any,
 ) -> Connection:
-    """Connect a module to what it shall feel.
+    """Connect a module to a simulation, an emulated or real hand, or a log.
 
     Args:
-        touch: The module; while an emulator is connected, it is the emulator's.
-        source: `simulation`: its own scene, in MuJoCo. `emulator`: the same behind the serial protocol of an XHand1.
-            `xhand1`: the hand on the only USB serial port; `xhand1:/dev/ttyUSB0`: on this one. A path that ends in `.npz`: a
-            recorded log. `warp`: its own scene in MuJoCo Warp on a GPU; `warp:cuda:1`: on this one. Installed packages may
-            bring others, see `known_sources`.
+        touch: The module; while an emulator is connected, only the emulator calls it.
+        source: `simulation`: the module's scene in MuJoCo. `emulator`: the same scene behind the serial protocol of an XHand1.
+            `xhand1`: the hand on the only USB serial port; `xhand1:/dev/ttyUSB0`: on this port. A path with the ending `.npz`:
+            a recorded log. `warp`: the scene in MuJoCo Warp on a GPU; `warp:cuda:1`: on this GPU. Installed packages may add
+            sources, see `known_sources`.
         num_envs: Number of environments; more than 1 only for a simulation.
         control_step: Duration of one control step [s]; in a scene, a whole number of physics steps.
-        keyframe: Keyframe that a scene starts from; default: the model's own initial state.
-        calibration: What a hand's counts mean, or the file that says it; default: of a log its own, else they stay counts.
-        motion: Leave for a hand to move, and how far; default: it is only read. A simulation needs none.
-        addresses: Which hand on the line; default: the one with id 0.
-        timing: Times of the line. Where replies may take long, a step waits for a reading as long as two of them.
-        lockstep: Nothing runs in real time: the emulator's scene moves when stepped, a log is read as fast as possible. A
-            simulation is always so, a real hand never.
-        taxels: The taxels that the module shall have, such as those that a policy learned with: another module, its tables, an
-            artefact, a rollout or an id, see `module.taxels.check_taxels`.
-        scene: A scene, such as a task's, that a simulation or an emulator steps instead of the module's; it is
-            closed with the connection, and starts where it says, not at the keyframe.
-        **options: Options of this kind of source alone, such as the `nconmax` and `njmax` of `warp`. Those above are left out
-            where a source has no use for them, so that one script serves all.
+        keyframe: Keyframe at which a scene starts; default: the model's initial state.
+        calibration: Calibration of a hand's counts, or its file; default: the log's, otherwise forces stay in counts.
+        motion: Limits of a real hand's motion, which permit it to move; default: the hand is only read.
+        addresses: The hand on the serial line; default: id 0.
+        timing: Timing of the serial line. A step waits for a reading as long as two replies may take.
+        lockstep: Do not run in real time: the emulator's scene advances by steps, and a log is read as fast as possible. A
+            simulation always does this, a real hand never.
+        taxels: The expected taxels, such as those of a policy: another module, its tables, an artefact, a rollout or an id, see
+            `tgdsl.check_taxels`.
+        scene: A scene, such as a task's, that a simulation or an emulator steps instead of the module's. It is closed with the
+            connection, and ignores `keyframe`.
+        **options: Options of this source, such as `nconmax` and `njmax` of `warp`. A source ignores arguments above that do not
+            concern it, so that one script serves all sources.
 
     Raises:
         TaxelError: If the module has other taxels than expected, or in another order. Nothing was opened then.
-        ObservationError: If the source cannot give what the module observes. No hand was touched then.
+        ObservationError: If the source cannot provide the module's observations. The hand was not opened then.
         SpecError: If the calibration file has mistakes.
-        SimulationError: If the scene cannot be stepped like this.
-        HandError: If the hand does not answer, or may not move like this.
-        TgdslError: If there is no such source, or it has no such option.
+        SimulationError: If the scene cannot be stepped with these arguments.
+        HandError: If the hand does not answer, or its motion is not permitted.
+        TgdslError: If the source or one of the options does not exist.
     """
     name = str(source)
     kind = kind_of(name)
@@ -124,16 +124,16 @@ def simulate(
     Args:
         touch: The module.
         num_envs: Number of environments.
-        device: Where physics runs: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" is MuJoCo Warp. States are on the module's
-            device; both on one GPU need no copies.
+        device: Device of the physics: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" MuJoCo Warp. States are on the module's
+            device; if both are on one GPU, nothing is copied.
         **options: `substeps`, `threads`, `keyframe`, `options`, `watch`, `per_env`, `on_fault`, `nconmax`, `njmax`, `model`,
-            `prepare`, `graph`: see `SimOptions`. With `substeps=1`, the default, `state` is of the instant before the step:
-            see `Simulation`.
+            `prepare`, `graph`: see `SimOptions`. With `substeps=1`, the default, `state` belongs to the instant before the
+            step: see `Simulation`.
 
     Raises:
         ArtifactError: If an asset of the scene is missing or has changed.
-        SimulationError: If the device is not supported, an argument is for another device, or the scene lacks what the module
-            wants.
+        SimulationError: If the device is not supported, an argument is for another device, or the scene lacks bodies or
+            joints of the module.
     """
     if not isinstance(touch, TactileModule):
         example = f"tgdsl.compile({touch!r})" if isinstance(touch, (str, PathLike)) else "tgdsl.compile(document)"

@@ -27,20 +27,19 @@ _CONTACT_ARRAYS = ("geom", "pos", "dist", "includemargin", "efc_address")
 def read_mujoco(
     touch: TactileModule, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData], *, inputs: Inputs | None = None
 ) -> SceneState:
-    """Return the state of a scene that is stepped by `mujoco.mj_step`, (env, …), float64, on the module's device.
+    """Return the state of a scene that `mujoco.mj_step` steps: tensors (env, …), float64, on the module's device.
 
-    Poses, velocities and contacts are those of MuJoCo's last evaluation, joints and controls are of now: call `mj_forward`
-    first, as `mj_step` leaves the former a step behind. What MuJoCo does not know, such as `dt` or `variant`, is left None.
+    Call `mj_forward` first: `mj_step` leaves poses, velocities and contacts one step behind joints and controls. Fields that
+    MuJoCo does not know, such as `dt` and `variant`, are None.
 
     Args:
         touch: The module that will read the state.
         model: The scene. It needs no contact sensors.
         data: Its data, or the data of several environments.
-        inputs: `touch.inputs.renamed(…)` where names differ; by default a name may also be the end of one name in the scene
-            after a slash, as "palm" is of "robot/palm".
+        inputs: `touch.inputs.renamed(…)` if names differ. By default "palm" also matches one name such as "robot/palm".
 
     Raises:
-        SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if data was never
+        SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if `data` was never
             evaluated.
     """
     own = inputs or touch.inputs
@@ -83,11 +82,10 @@ def _contacts(inputs: Inputs, model: mujoco.MjModel, geoms: Geoms, envs: Sequenc
 def read_warp(
     touch: TactileModule, mj_model: mujoco.MjModel, model: Any, data: Any, *, inputs: Inputs | None = None
 ) -> SceneState:
-    """Return the state of a scene that is stepped by MuJoCo Warp, (env, …), float32, on the device of `data`.
+    """Return the state of a scene that MuJoCo Warp steps: tensors (env, …), float32, on the device of `data`.
 
-    It is gathered from MuJoCo Warp's arrays, where they lie, in the order of torch's and Warp's current streams; from the
-    second call on it can be captured in a `torch.cuda.graph`. No contact sensors are needed. As for `read_mujoco`, call
-    `mujoco_warp.forward` first.
+    Reads MuJoCo Warp's arrays in place, ordered by torch's and Warp's current streams. From the second call on it can be
+    captured in a `torch.cuda.graph`. It needs no contact sensors. Call `mujoco_warp.forward` first, as for `read_mujoco`.
 
     Args:
         touch: The module that will read the state, on the device of `data`.
@@ -98,7 +96,7 @@ def read_warp(
 
     Raises:
         SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if the module is on
-            another device; if MuJoCo Warp is of a version that contacts cannot be read of.
+            another device; if this version of MuJoCo Warp has other contact arrays.
     """
     own = inputs or touch.inputs
     return _reader(touch, own, (mj_model, model, data), lambda: _warp_reader(touch, own, mj_model, model, data))()

@@ -53,28 +53,27 @@ def compile(
 
     Args:
         document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
-        resolution: Instead of the document's own.
-        sensors: Names of the document's sensors that are wanted: of the others nothing is computed; default: all.
+        resolution: Resolution that replaces the document's.
+        sensors: Names of the sensors to compile; default: all of the document.
         overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
         kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
-        dtype: Dtype of the readings and of all computation: float32 or float64; its name will do. Narrower floats
-            are refused, as their rounding of places is as large as the depths; cast the readings instead,
-            `readings["s"].to(torch.bfloat16)`.
-        device: Where the module lives.
-        progress: Called with a line for each long job, such as "object mug: distances", each time that something begins; meshes
-            that are met for the first time take seconds, sensors with an `accuracy` a run of the scene.
-        scene: A scene that is built already, in place of the document's: an `mujoco.MjSpec`, an `mujoco.MjModel` or a
-            `pxr.Usd.Stage`. The document then needs no model: it has the scene's names. Models that it names must be those in
-            the scene. A scene with contact pairs, height fields or flexes needs its `MjSpec`: an `MjModel` lacks their sources.
+        dtype: Dtype of readings and computation, float32 or float64, or its name. Narrower floats would round positions by as
+            much as penetration depths; cast the readings instead, `readings["s"].to(torch.bfloat16)`.
+        device: Device of the module.
+        progress: Called with a line when a long job begins, such as "object mug: distances". A new mesh takes seconds, and a
+            sensor with an `accuracy` takes a run of the scene.
+        scene: A scene that replaces the document's: an `mujoco.MjSpec`, an `mujoco.MjModel` or a `pxr.Usd.Stage`. The document
+            then uses the scene's names and needs no model; models that it names must be in the scene. A scene with contact
+            pairs, height fields or flexes must be an `MjSpec`, since an `MjModel` lacks their sources.
 
     Returns:
         The module, not yet compiled by torch: call its `compile()` for fused kernels.
 
     Raises:
-        SpecError: All mistakes in the document and its layout, with file, line and column; an `accuracy` that nothing holds.
+        SpecError: All mistakes in the document and its layout, with file, line and column; an `accuracy` out of reach.
         RobotError: If a robot or scene cannot be read, or has something unsupported.
-        TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides are
-            no mapping.
+        TgdslError: If the dtype is neither float32 nor float64, the device does not exist, an entry of `kinds` is no `Kind`, or
+            `overrides` is no mapping.
     """
     dtype, device = dtype_of(dtype), device_of(device)
     if not isinstance(overrides, Mapping | None):

@@ -169,13 +169,13 @@ class LoopPage:
 
 
 def show(touch: TactileModule, sim: Simulation, *, host: str = LOCAL, port: int = PORT) -> LoopPage:
-    """Show a simulation that a loop of one's own steps, in the browser; call the page's `update` with each step's readings.
+    """Show a simulation of your own loop in the browser; call the page's `update` with the readings of each step.
 
     Args:
         touch: The module.
         sim: The simulation.
-        host: Address to serve at: see `Page`.
-        port: Port to serve at.
+        host: Address of the server: see `Page`.
+        port: Port of the server.
 
     Raises:
         TgdslError: If viser is not installed, or the module has nothing to draw.

@@ -291,8 +291,8 @@ _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in
 class BatchSimulation(Simulation):
     """Environments in MuJoCo's `Batch` on CPU threads, in float64. `qpos`, `qvel` and `ctrl` share MuJoCo's memory.
 
-    A physics step moves joints on, but leaves poses, velocities and contacts as they were at its start, which is a state's
-    instant: so joints are kept from just before it.
+    A physics step advances joints, but poses, velocities and contacts stay those of its start. A state is of that instant, so
+    its joints are those from before the step.
 
     Attributes:
         batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).

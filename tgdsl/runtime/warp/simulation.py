@@ -119,20 +119,20 @@ DEFAULT_NCONMAX = 48  # default capacity for contacts per environment
 class WarpSimulation(Simulation):
     """Environments in MuJoCo Warp, in float32; `qpos`, `qvel` and `ctrl` are on the physics' device.
 
-    Contacts of a pair come in any order; where there are more than slots, any of them are kept. Its solver stops at 1e-6 where
-    MuJoCo's stops at 1e-8: forces of sliding contacts agree to 3e-3 of the largest one, and to 2e-4 after
-    `warp_model.opt.tolerance.fill_(1e-8)`; those of contacts that stick to 1e-5 either way.
+    Contacts of a pair have no fixed order; if there are more than slots, an arbitrary subset stays. The solver's tolerance is
+    1e-6, MuJoCo's 1e-8: forces of sliding contacts agree to 3e-3 of the largest, and to 2e-4 after
+    `warp_model.opt.tolerance.fill_(1e-8)`; forces of sticking contacts agree to 1e-5 with both.
 
-    Devices are "cuda", "cuda:1", or "cpu", which is slow and meant for tests. On a GPU nothing waits for it unless the host's
-    own numbers are handed in or asked for. Faults there are therefore reported by a later call: `check` looks at once.
+    Devices are "cuda", "cuda:1", or "cpu", which is slow and meant for tests. Calls do not wait for the GPU unless host values
+    are passed in or read. A later call reports a fault on the GPU; `check` reports it at once.
 
     Attributes:
-        model: The compiled scene; where objects differ between environments, that of the first, and with a spare body at the
-            end if some of their variants are meshes.
-        arrays: Live tensors (env, …) of what MuJoCo integrates, and of what states are read from. In `sensordata` the contact
-            sensors that `tgdsl.instrument` adds are zero: their contacts are read elsewhere.
-        parameters: Live tensors (env, …) of the model's fields that may differ between environments. What MuJoCo derives from
-            them, such as `body_subtreemass`, is not derived again.
+        model: The compiled scene; if objects differ between environments, the scene of the first, with an extra body at the
+            end if some variants are meshes.
+        arrays: Live tensors (env, …) of MuJoCo's integrated quantities, and of the quantities of states. In `sensordata` the
+            contact sensors of `tgdsl.instrument` are zero: contacts are read elsewhere.
+        parameters: Live tensors (env, …) of the model's fields that may differ between environments. Derived fields, such as
+            `body_subtreemass`, are not updated.
         warp_model: MuJoCo Warp's model.
         warp_data: MuJoCo Warp's data.
     """
