@@ -85,7 +85,7 @@ CROPS = {
     "materials_audio": ("materials_audio.png", (0, 0, 1000, 585)),
     "kind_contact_audio": ("materials_audio.png", (0, 0, 1000, 300)),
     "kind_microphone": ("materials_audio.png", (0, 880, 1000, 1230)),
-    "kind_actuation_audio": ("motors.png", (0, 0, 900, 265)),
+    "kind_actuation_audio": ("motors.png", (0, 14, 900, 265)),
 }
 CROPS |= {
     f"kind_{kind}": ("every_sensor.png", (65 + 388 * (i % 4), 104 + 365 * (i // 4), 330 + 388 * (i % 4), 377 + 365 * (i // 4)))
