@@ -200,14 +200,15 @@ def _of_reading(
     if isinstance(spec, ReadingObservation):
         channel_names: Sequence[str] = _channels(loaded, path, spec, reading)
     else:
-        channel_names, rows = observations.WANTED[spec.type]
-        if reading.rows != rows or not set(channel_names) <= set(reading.channels):
-            problem = f'"{spec.type}" needs {", ".join(channel_names)} of each {rows}, which "{spec.of}" does not read'
+        channel_names = spec.needs
+        if reading.rows != spec.rows or not set(channel_names) <= set(reading.channels):
+            problem = f'"{spec.type}" needs {", ".join(channel_names)} of each {spec.rows}, which "{spec.of}" does not read'
             loaded.note(path, problem, f"it reads {', '.join(reading.channels)} of each {reading.rows}")
             return []
-    constants = dict(sorted(observations.lower(spec, layout).items()))
+    constants = dict(sorted(spec.lower(layout).items()))
     channels = tuple(reading.channels.index(channel) for channel in channel_names)
-    per_call = observations.num_features(spec.type, len(channels), reading.num_rows, len(layout.links))
+    is_per_link = isinstance(spec, observations.PerLink)
+    per_call = len(spec.features) * len(layout.links) if is_per_link else len(channels) * reading.num_rows
     axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
     return [PlannedObservation(group, i, spec.type, spec.of, channels, max(reading.steps, 1) * per_call, constants, axes)]
 

@@ -100,7 +100,7 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
             folded = constants.tree["observations"][term.key]
             reading = readings[term.reading]
             steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-            features = [observations.observe(term.type, step, term.channels, folded) for step in steps]
+            features = [observations.TYPES[term.type].observe(step, term.channels, folded) for step in steps]
         groups.setdefault(term.group, []).extend(features)
     return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 

@@ -13,8 +13,9 @@ Shapes: `env` environments, `taxel` taxels of the sensor, `link` links that carr
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 import numpy as np
 import torch
@@ -25,6 +26,8 @@ from torch import Tensor
 from tgdsl.errors import ObservationError
 from tgdsl.fields.models import Positive, Quantity, SpecModel
 from tgdsl.layout.layout import Layout
+
+_FORCE, _TORQUE = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("force", "torque"))
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,28 @@ PROPRIOCEPTION = {
 """By name: that of the observation type, of the field of `SceneState` and of the reading, which no sensor may have."""
 
 
-class JointObservation(SpecModel):
+class Observation(SpecModel):
+    """Base of all types."""
+
+    @staticmethod
+    def observe(
+        reading: Float[Tensor, "env row channel"], channels: tuple[int, ...], constants: Mapping[str, Tensor]
+    ) -> Float[Tensor, "env feature"]:
+        """Return the features of a reading.
+
+        Args:
+            reading: The reading.
+            channels: Indices of the wanted channels in the reading.
+            constants: The arrays of `lower`, as tensors; `rows`, where only some rows are wanted, and which.
+        """
+        if "rows" in constants:
+            reading = reading.index_select(1, constants["rows"])
+        if channels == tuple(range(reading.shape[2])):
+            return reading.transpose(1, 2).flatten(1)
+        return torch.cat([reading[:, :, channel] for channel in channels], dim=1)
+
+
+class JointObservation(Observation):
     """What all types have in common that observe a robot's joints or actuators."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
@@ -86,18 +110,45 @@ class LastActionObservation(JointObservation):
 JointSpec = JointPosObservation | JointVelObservation | JointEffortObservation | LastActionObservation  # any of them
 
 
-class NoneObservation(SpecModel):
+class NoneObservation(Observation):
     """No touch at all: nothing is added to the group; the policy that others are compared with."""
 
     type: Literal["none"]
     """Nothing."""
 
 
-class OfReading(SpecModel):
+LinkFeature = tuple[str, str, str, float]
+"""Name, unit, frame and scale of a feature: see `tgdsl.rl.task.Features`."""
+
+
+class OfReading(Observation):
     """What all types have in common that observe a reading."""
 
     of: str
     """The reading that is observed: a sensor's name, `<sensor>/clean`, or a report such as `<sensor>/missed`."""
+    needs: ClassVar[tuple[str, ...]] = ()  # channels of the reading that it takes, in order
+    rows: ClassVar[str] = "taxel"  # what the reading has rows of
+    task_kind: ClassVar[str] = ""  # kind of the sensor that tasks with `touch: <type>` take; "": tasks do not have it
+
+    def lower(self, layout: Layout) -> dict[str, np.ndarray]:
+        """Return the constants of `observe`."""
+        return {}
+
+
+class PerLink(OfReading):
+    """What all types have in common that give numbers of links; by default sums over the taxels of each."""
+
+    @property
+    def features(self) -> tuple[LinkFeature, ...]:
+        """The features of a link, in order."""
+        raise NotImplementedError
+
+    def lower(self, layout: Layout) -> dict[str, np.ndarray]:
+        return {"operator": (layout.link_id[:, None] == np.arange(len(layout.links))).astype(np.float64)}
+
+    @staticmethod
+    def observe(reading: Tensor, channels: tuple[int, ...], constants: Mapping[str, Tensor]) -> Tensor:
+        return reading[:, :, channels[0]] @ constants["operator"]
 
 
 class ReadingObservation(OfReading):
@@ -117,15 +168,32 @@ class BoolObservation(OfReading):
 
     type: Literal["bool"]
     """Contact bit per taxel."""
+    needs = ("contact",)
+    task_kind = "contact"
 
 
-class AggBoolObservation(OfReading):
+class AggBoolObservation(PerLink):
     """Contact bit per link: whether more than a number of its taxels are in contact; of a `contact` sensor."""
 
     type: Literal["agg_bool"]
     """Contact bit per link."""
     more_than: Annotated[StrictInt, Field(ge=0)] = 2
     """Taxels that must be exceeded."""
+    needs = ("contact",)
+    task_kind = "contact"
+
+    @property
+    def features(self) -> tuple[LinkFeature, ...]:
+        return ((f"contact of more than {self.more_than} taxels", "1", "", 1.0),)
+
+    def lower(self, layout: Layout) -> dict[str, np.ndarray]:
+        return super().lower(layout) | {"more_than": np.asarray(float(self.more_than))}
+
+    @staticmethod
+    def observe(reading: Tensor, channels: tuple[int, ...], constants: Mapping[str, Tensor]) -> Tensor:
+        count = PerLink.observe(reading, channels, constants)
+        bit = (count > constants["more_than"]).to(reading.dtype)
+        return torch.where(count.isnan(), count, bit)
 
 
 class DepthObservation(OfReading):
@@ -133,9 +201,11 @@ class DepthObservation(OfReading):
 
     type: Literal["depth"]
     """Depth per taxel [m]."""
+    needs = ("depth",)
+    task_kind = "contact_depth"
 
 
-class AggForceObservation(OfReading):
+class AggForceObservation(PerLink):
     """Force per link estimated as scale · P · Σ depth · normal, of a `contact_depth` sensor."""
 
     type: Literal["agg_force"]
@@ -144,9 +214,19 @@ class AggForceObservation(OfReading):
     """Factor from summed depth to the unit of the hand's aggregate force [unit/m]."""
     axes: Literal["xyz", "zyx"] = "zyx"
     """Order of the link-frame axes; `zyx` is that of the XHand1's aggregate pressure."""
+    needs = ("depth",)
+    task_kind = "contact_depth"
+
+    @property
+    def features(self) -> tuple[LinkFeature, ...]:
+        return tuple((f"sum of depth times normal, {axis}", "m", "link", self.scale) for axis in self.axes)
+
+    def lower(self, layout: Layout) -> dict[str, np.ndarray]:
+        normals, belongs = layout.normal[:, ["xyz".index(axis) for axis in self.axes]].T, super().lower(layout)["operator"]
+        return {"operator": np.concatenate([self.scale * normal[:, None] * belongs for normal in normals], axis=1)}
 
 
-class CopObservation(OfReading):
+class CopObservation(PerLink):
     """Force on each link [N] and its centre of pressure [m], link frame, of a `kinematic_taxel` or `force_taxel` sensor.
 
     The force is F = Σ f_j, the centre c = Σ p_j x_j / Σ p_j, with f_j the force on taxel j, x_j its position, n_j its outward
@@ -157,6 +237,27 @@ class CopObservation(OfReading):
     """Force [N] and centre of pressure [m] per link."""
     threshold: Annotated[float, Quantity("force", ge=0.0)] = 0.0
     """Normal force of a link up to which it has no centre of pressure [N]."""
+    needs = _FORCE
+
+    @property
+    def features(self) -> tuple[LinkFeature, ...]:
+        centre = ((f"centre of pressure, {axis}", "m", "link", 1.0) for axis in "xyz")
+        return (*((name, "N", "link", 1.0) for name in self.needs), *centre)
+
+    def lower(self, layout: Layout) -> dict[str, np.ndarray]:
+        operator = super().lower(layout)["operator"]
+        moment = np.concatenate([layout.pos[:, axis, None] * operator for axis in range(3)], axis=1)
+        return {"operator": operator, "moment": moment, "normal": layout.normal.T, "threshold": np.asarray(self.threshold)}
+
+    @staticmethod
+    def observe(reading: Tensor, channels: tuple[int, ...], constants: Mapping[str, Tensor]) -> Tensor:
+        x, y, z = force = [reading[:, :, channel] for channel in channels]
+        normal_x, normal_y, normal_z = constants["normal"].unbind()
+        pressing = (-(x * normal_x + y * normal_y + z * normal_z)).clamp(min=0)
+        total = pressing @ constants["operator"]
+        is_free = (total <= constants["threshold"]).repeat(1, 3)
+        centre = pressing @ constants["moment"] / torch.where(is_free, 1.0, total.repeat(1, 3))
+        return torch.cat([*(part @ constants["operator"] for part in force), torch.where(is_free, 0.0, centre)], dim=1)
 
 
 class ForceObservation(OfReading):
@@ -164,6 +265,8 @@ class ForceObservation(OfReading):
 
     type: Literal["force"]
     """Force per taxel [N]."""
+    needs = _FORCE
+    task_kind = "kinematic_taxel"
 
 
 class ForceTorqueObservation(OfReading):
@@ -171,6 +274,8 @@ class ForceTorqueObservation(OfReading):
 
     type: Literal["force_torque"]
     """Force [N] and torque [N·m] per taxel."""
+    needs = _FORCE + _TORQUE
+    task_kind = "kinematic_taxel"
 
 
 class ElastomerObservation(OfReading):
@@ -178,6 +283,8 @@ class ElastomerObservation(OfReading):
 
     type: Literal["elastomer"]
     """Displacement of each marker [m]."""
+    needs = ("displacement_x", "displacement_y", "displacement_z")
+    task_kind = "elastomer"
 
 
 class ProximityObservation(OfReading):
@@ -185,6 +292,8 @@ class ProximityObservation(OfReading):
 
     type: Literal["proximity"]
     """Force and torque signal per taxel."""
+    needs = _FORCE + _TORQUE
+    task_kind = "proximity"
 
 
 class LinkBoolObservation(OfReading):
@@ -192,6 +301,8 @@ class LinkBoolObservation(OfReading):
 
     type: Literal["link_bool"]
     """Contact bit per body."""
+    needs = ("contact",)
+    rows = "body"
 
 
 class LinkForceObservation(OfReading):
@@ -199,9 +310,11 @@ class LinkForceObservation(OfReading):
 
     type: Literal["link_force"]
     """The solver's force on each body [N]."""
+    needs = _FORCE
+    rows = "body"
 
 
-class TaxelCountsObservation(SpecModel):
+class TaxelCountsObservation(Observation):
     """Raw force of each of an XHand1's own taxels [counts]; from hardware alone.
 
     Flattened channel-major: x of the thumb's 120 taxels in the order of the wire, then of the index, middle, ring and little
@@ -212,7 +325,7 @@ class TaxelCountsObservation(SpecModel):
     """Raw force of each of the hand's own taxels [counts]; from hardware alone."""
 
 
-class TaxelSaturatedObservation(SpecModel):
+class TaxelSaturatedObservation(Observation):
     """Whether a component of each of an XHand1's own taxels is at the end of its range; from hardware alone.
 
     120 bits of the thumb in the order of the wire, then of the index, middle, ring and little finger.
@@ -241,89 +354,16 @@ ObservationSpec = Annotated[
     NoneObservation | ReadingSpec | JointSpec | TaxelCountsObservation | TaxelSaturatedObservation, Field(discriminator="type")
 ]
 
-_FORCE, _TORQUE, _MARKER = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("force", "torque", "displacement"))
-WANTED: dict[str, tuple[tuple[str, ...], str]] = {
-    "bool": (("contact",), "taxel"),
-    "agg_bool": (("contact",), "taxel"),
-    "depth": (("depth",), "taxel"),
-    "agg_force": (("depth",), "taxel"),
-    "cop": (_FORCE, "taxel"),
-    "force": (_FORCE, "taxel"),
-    "force_torque": (_FORCE + _TORQUE, "taxel"),
-    "elastomer": (_MARKER, "taxel"),
-    "proximity": (_FORCE + _TORQUE, "taxel"),
-    "link_bool": (("contact",), "body"),
-    "link_force": (_FORCE, "body"),
+TYPES: dict[str, type[Observation]] = {
+    get_args(model.model_fields["type"].annotation)[0]: model for model in get_args(get_args(ObservationSpec)[0])
 }
-"""Channels of a reading that an observation type takes, in order, and what the reading has rows of; `reading` takes any."""
+"""All observation types by name."""
 
 HAND_ONLY = {"taxel_counts": 5 * 120 * 3, "taxel_saturated": 5 * 120}
 """Observation types of the real hand alone, and how many features each has."""
-
-
-def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
-    """Return the folded operator of an aggregate: matrices (taxel, feature), thresholds, normals (axis, taxel)."""
-    num_links = len(layout.links)
-    belongs = (layout.link_id[:, None] == np.arange(num_links)).astype(np.float64)
-    if isinstance(spec, AggBoolObservation):
-        return {"operator": belongs, "more_than": np.asarray(float(spec.more_than))}
-    if isinstance(spec, AggForceObservation):
-        axes = ["xyz".index(axis) for axis in spec.axes]
-        per_axis = [spec.scale * layout.normal[:, axis, None] * belongs for axis in axes]
-        return {"operator": np.concatenate(per_axis, axis=1)}
-    if isinstance(spec, CopObservation):
-        moment = np.concatenate([layout.pos[:, axis, None] * belongs for axis in range(3)], axis=1)
-        return {"operator": belongs, "moment": moment, "normal": layout.normal.T, "threshold": np.asarray(spec.threshold)}
-    return {}
 
 
 def hand_only_error(group: str, index: int, type_: str) -> ObservationError:
     """Return the error of an observation that only the real hand has."""
     problem = f'observation {group}[{index}] is "{type_}", which only a real XHand1 has'
     return ObservationError(f'{problem}, and no simulation; read one with tgdsl.connect(touch, "xhand1")')
-
-
-def num_features(type_: str, num_channels: int, num_rows: int, num_links: int) -> int:
-    """Return how many features an observation type gives of one call's reading."""
-    if type_ == "agg_bool":
-        return num_links
-    if type_ == "agg_force":
-        return 3 * num_links
-    if type_ == "cop":
-        return 6 * num_links
-    return num_channels * num_rows
-
-
-def observe(
-    type_: str,
-    reading: Float[Tensor, "env row channel"],
-    channels: tuple[int, ...],
-    constants: dict[str, Tensor],
-) -> Float[Tensor, "env feature"]:
-    """Return the features of one observation.
-
-    Args:
-        type_: The observation type.
-        reading: The reading.
-        channels: Indices of the wanted channels in the reading.
-        constants: The arrays of `lower`, as tensors; `rows`, where only some rows are wanted, and which.
-    """
-    if type_ == "agg_bool":
-        count = reading[:, :, channels[0]] @ constants["operator"]
-        bit = (count > constants["more_than"]).to(reading.dtype)
-        return torch.where(count.isnan(), count, bit)
-    if type_ == "agg_force":
-        return reading[:, :, channels[0]] @ constants["operator"]
-    if type_ == "cop":
-        x, y, z = force = [reading[:, :, channel] for channel in channels]
-        normal_x, normal_y, normal_z = constants["normal"].unbind()
-        pressing = (-(x * normal_x + y * normal_y + z * normal_z)).clamp(min=0)
-        total = pressing @ constants["operator"]
-        is_free = (total <= constants["threshold"]).repeat(1, 3)
-        centre = pressing @ constants["moment"] / torch.where(is_free, 1.0, total.repeat(1, 3))
-        return torch.cat([*(part @ constants["operator"] for part in force), torch.where(is_free, 0.0, centre)], dim=1)
-    if "rows" in constants:
-        reading = reading.index_select(1, constants["rows"])
-    if channels == tuple(range(reading.shape[2])):
-        return reading.transpose(1, 2).flatten(1)
-    return torch.cat([reading[:, :, channel] for channel in channels], dim=1)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from tgdsl.console.tables import text_table
-from tgdsl.observations.observations import WANTED, AggBoolObservation, AggForceObservation
+from tgdsl.observations.observations import TYPES, OfReading, PerLink
 from tgdsl.rl.groups import link_forces, runs_of
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.sensed import PER_LINK, Sensed, Source, sensors_document
+from tgdsl.rl.sensed import Sensed, Source, sensors_document
 from tgdsl.rl.task import Features, Task
 from tgdsl.rl.terms import ObservationTerm, Term
 
@@ -93,25 +93,22 @@ def _touch(sensed: Sensed, source: Source, substeps: int) -> list[Features]:
     (term,) = (term for term in touch.plan.observations if term.group == source.observation)
     assert term.reading is not None
     (output,) = (output for output in touch.outputs if output.name == term.reading)
-    table, scale, is_aggregate = touch.rows[term.reading], 1.0, term.type in PER_LINK
+    table, spec = touch.rows[term.reading], TYPES[term.type].model_validate({"type": term.type, "of": term.reading})
+    assert isinstance(spec, OfReading)
     links = table["link" if "link" in (table.dtype.names or ()) else "body"].tolist()
-    if is_aggregate:
-        links = list(dict.fromkeys(links))
-        channels = [(f"sum of depth times normal, {axis}", "m", "link") for axis in term.axes]
-        scale = AggForceObservation.model_fields["scale"].default if channels else 1.0
-        least = AggBoolObservation.model_fields["more_than"].default
-        channels = channels or [(f"contact of more than {least} taxels", "1", "")]
+    if isinstance(spec, PerLink):
+        links, channels = list(dict.fromkeys(links)), spec.features
     else:
-        has_axes = term.type in WANTED and len(WANTED[term.type][0]) > 1
-        channels = [(output.channels[i], output.units[i], "link" if has_axes else "") for i in term.channels]
+        frame = "link" if len(spec.needs) > 1 else ""
+        channels = tuple((output.channels[i], output.units[i], frame, 1.0) for i in term.channels)
     columns = range(term.num_features) if source.columns is None else source.columns.tolist()
     has_calls, features = term.num_features > len(channels) * len(links), []
     for index, group in groupby(columns, key=lambda column: column // len(links)):
         call, channel = divmod(index, len(channels))
-        name, unit, frame = channels[channel]
+        name, unit, frame, scale = channels[channel]
         for link, rows in runs_of(links, [column % len(links) for column in group]):
             text = f"{name} of call {call}" if has_calls else name
-            places = range(0) if is_aggregate else rows
+            places = range(0) if isinstance(spec, PerLink) else rows
             features.append(Features(text, len(rows), unit, frame, link, scale, places, term.reading))
     steps = [replace(each, name=f"{each.name} of physics step {step}") for step in range(substeps) for each in features]
     return steps or features

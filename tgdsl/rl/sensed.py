@@ -18,6 +18,7 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import SpecError, did_you_mean, listed
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
+from tgdsl.observations.observations import TYPES, PerLink
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.spec import SENSED
 from tgdsl.runtime.simulators.simulation import Simulation
@@ -27,7 +28,7 @@ from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.compile import compile as compile_document
 
 GROUP = "tactile_sensors"  # the observation group of what a policy feels
-PER_LINK = ("agg_bool", "agg_force")  # types that have numbers of links, not of taxels
+PER_LINK = tuple(name for name, model in TYPES.items() if issubclass(model, PerLink))  # types that have numbers of links
 CLEAN = "clean"  # the noise profile that has none
 
 

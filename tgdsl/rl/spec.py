@@ -7,28 +7,18 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StrictInt, model_validator
 
 from tgdsl.fields.models import NonNegative, Positive, Quantity, Radius, Range, RangeOf, SpecModel
+from tgdsl.observations.observations import TYPES
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.train.spec import Time, TrainSpec, Whole
 
-TouchType = Literal[
-    "none", "bool", "agg_bool", "depth", "agg_force", "force", "force_torque", "elastomer", "proximity", "force_taxel",
-    "temperature",
-]  # fmt: skip
-"""What a policy feels, by one word: none, the paper's eight types, forces that match the load, and temperatures."""
 SENSED: dict[str, tuple[str, str]] = {
-    "bool": ("contact", "bool"),
-    "agg_bool": ("contact", "agg_bool"),
-    "depth": ("contact_depth", "depth"),
-    "agg_force": ("contact_depth", "agg_force"),
-    "force": ("kinematic_taxel", "force"),
-    "force_torque": ("kinematic_taxel", "force_torque"),
-    "elastomer": ("elastomer", "elastomer"),
-    "proximity": ("proximity", "proximity"),
+    **{name: (kind, name) for name, model in TYPES.items() if (kind := getattr(model, "task_kind", ""))},
     "force_taxel": ("force_taxel", "force"),
     "temperature": ("temperature_grid", "reading"),
 }
-"""The kind of sensor that each type reads, and the observation that is made of it."""
+"""By a word of `touch:`, the kind of sensor that the policy feels with, and the observation that is made of its reading."""
+TouchType = Literal["none", *SENSED]  # type: ignore
 ForceRange = Annotated[Range, RangeOf("force")]
 Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]  # between the bounds that MuJoCo has
 Power = Annotated[float, Quantity("number", ge=1.0)]
@@ -163,7 +153,7 @@ class TaskSpec(SpecModel):
     """How physics is stepped."""
     episode: Annotated[float, Quantity("time", gt=0.0), Field(le=1e6)] = 10.0
     """Duration of an episode [s]."""
-    touch: TouchType = "force_torque"
+    touch: TouchType = "force_torque"  # type: ignore
     """What a policy feels."""
     placement: str = "hand"
     """Links that feel: a link group of the layout."""

@@ -22,8 +22,7 @@ from torch import Tensor
 from tgdsl.errors import ObservationError, SimulationError
 from tgdsl.module.memory import last_step
 from tgdsl.module.module import TactileModule
-from tgdsl.observations import observations
-from tgdsl.observations.observations import HAND_ONLY
+from tgdsl.observations.observations import HAND_ONLY, AggForceObservation
 from tgdsl.plan.sensors import PlannedObservation
 from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.stepped_scene import SteppedScene
@@ -73,7 +72,7 @@ class SimulatedTips:
             if planned not in features:
                 constants = self._touch.constants.tree["observations"][planned.key]
                 reading = last_step(readings[str(planned.reading)])
-                features[planned] = observations.observe(planned.type, reading, planned.channels, constants)[0]
+                features[planned] = AggForceObservation.observe(reading, planned.channels, constants)[0]
             by_axis = features[planned].reshape(3, len(term.fingers))[:, link].double().cpu().numpy()
             result[finger] = by_axis[np.argsort(term.axes)]
         return result
