@@ -1,9 +1,14 @@
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
 
 import tgdsl
-from tgdsl.errors import SpecError
+from tgdsl.errors import SpecError, TgdslError
+from tgdsl.observations import observations
+from tgdsl.observations.observations import OfReading, PerLink, register
+from tgdsl.schema.document import json_schema
 
 SCENE = """
 <mujoco><worldbody>
@@ -139,3 +144,57 @@ def test_a_reading_with_the_wrong_rows_is_a_mistake(tmp_path):
         tgdsl.compile(observing(tmp_path, {"policy": [{"type": "link_bool", "of": "contact"}]}))
     with pytest.raises(SpecError, match=r'"elastomer" needs displacement_x, .* of each taxel, which "touch" does not read'):
         tgdsl.compile(observing(tmp_path, {"policy": [{"type": "elastomer", "of": "touch"}]}))
+
+
+def test_all_types_are_one_graph(tmp_path, readings):
+    touch = tgdsl.compile(observing(tmp_path, {**TERMS, "cop": [{"type": "cop", "of": "touch"}]}), dtype=torch.float64)
+    traced = torch.compile(touch.observe, backend="eager", fullgraph=True)(readings)
+    torch.testing.assert_close(traced, touch.observe(readings), rtol=0, atol=0)
+
+
+class DeepestObservation(PerLink):
+    """Largest depth on each link [m], of a `contact_depth` sensor."""
+
+    type: Literal["deepest"]
+    """Largest depth on each link [m]."""
+    needs = ("depth",)
+
+    @property
+    def features(self):
+        return (("largest depth", "m", "", 1.0),)
+
+    @staticmethod
+    def observe(reading, channels, constants):
+        return (reading[:, :, channels[0], None] * constants["operator"]).amax(dim=1)
+
+
+@pytest.fixture
+def deepest(monkeypatch):
+    monkeypatch.setattr(observations, "TYPES", dict(observations.TYPES))
+    register(DeepestObservation)
+
+
+def test_documents_modules_and_artefacts_have_it(tmp_path, deepest, monkeypatch):
+    touch = tgdsl.compile(observing(tmp_path, {"policy": [{"type": "deepest", "of": "depth"}]}), dtype=torch.float64)
+    readings = touch(touch.example_state(3))
+    depth = readings["depth"][:, :, 0]
+    assert torch.equal(touch.observe(readings)["policy"], torch.stack([depth[:, :4].amax(1), depth[:, 4:].amax(1)], dim=1))
+    traced = torch.compile(touch.observe, backend="eager", fullgraph=True)
+    assert torch.equal(traced(readings)["policy"], touch.observe(readings)["policy"])
+    tgdsl.save(touch, tmp_path / "touch.safetensors")
+    loaded = tgdsl.load(tmp_path / "touch.safetensors", dtype="float64")
+    assert torch.equal(loaded.observe(readings)["policy"], touch.observe(readings)["policy"])
+    assert "DeepestObservation" in json_schema()["$defs"]
+    monkeypatch.undo()
+    with pytest.raises(TgdslError, match='the observation type "deepest" is not known; install its package'):
+        tgdsl.load(tmp_path / "touch.safetensors")
+
+
+def test_a_name_is_given_once(deepest):
+    class Other(OfReading):
+        type: Literal["deepest"]
+
+    with pytest.raises(TgdslError, match='two observation types are called "deepest"; rename one'):
+        register(Other)
+    with pytest.raises(TgdslError, match='OfReading has no field `type: Literal\\["its_name"\\]`'):
+        register(OfReading)

@@ -207,8 +207,7 @@ def _of_reading(
             return []
     constants = dict(sorted(spec.lower(layout).items()))
     channels = tuple(reading.channels.index(channel) for channel in channel_names)
-    is_per_link = isinstance(spec, observations.PerLink)
-    per_call = len(spec.features) * len(layout.links) if is_per_link else len(channels) * reading.num_rows
+    per_call = spec.num_features(len(channels), reading.num_rows, len(layout.links))
     axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
     return [PlannedObservation(group, i, spec.type, spec.of, channels, max(reading.steps, 1) * per_call, constants, axes)]
 

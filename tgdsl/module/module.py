@@ -29,6 +29,7 @@ from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, obs
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
 from tgdsl.module.state import Incoming, SceneState, example_state
 from tgdsl.module.taxels import SavedTaxels, images_of, row_tables, taxel_table
+from tgdsl.observations.observations import known_types
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
@@ -62,6 +63,7 @@ class TactileModule(HookedModule):
         self.saved_taxels = SavedTaxels(plan)
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(quantity for quantity in quantities_of(kinds) if quantity.name in plan.quantities)
+        known_types([term.type for term in plan.observations])
         self._stages = {sensor.name: stages_of(sensor.noise.terms if sensor.noise else ()) for sensor in plan.sensors}
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan, self._kinds))
         self.memory = Memory(plan.sensors, plan.readings(), self._kinds)

@@ -13,7 +13,7 @@ Shapes: `env` environments, `taxel` taxels of the sensor, `link` links that carr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, get_args
 
@@ -23,8 +23,9 @@ from jaxtyping import Float
 from pydantic import Field, StrictInt
 from torch import Tensor
 
-from tgdsl.errors import ObservationError
+from tgdsl.errors import ObservationError, TgdslError
 from tgdsl.fields.models import Positive, Quantity, SpecModel
+from tgdsl.files.plugins import installed
 from tgdsl.layout.layout import Layout
 
 _FORCE, _TORQUE = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("force", "torque"))
@@ -55,13 +56,7 @@ class Observation(SpecModel):
     def observe(
         reading: Float[Tensor, "env row channel"], channels: tuple[int, ...], constants: Mapping[str, Tensor]
     ) -> Float[Tensor, "env feature"]:
-        """Return the features of a reading.
-
-        Args:
-            reading: The reading.
-            channels: Indices of the wanted channels in the reading.
-            constants: The arrays of `lower`, as tensors; `rows`, where only some rows are wanted, and which.
-        """
+        """Return the features of a reading: of some of its channels, by index, with the arrays of `lower` as tensors."""
         if "rows" in constants:
             reading = reading.index_select(1, constants["rows"])
         if channels == tuple(range(reading.shape[2])):
@@ -134,6 +129,10 @@ class OfReading(Observation):
         """Return the constants of `observe`."""
         return {}
 
+    def num_features(self, num_channels: int, num_rows: int, num_links: int) -> int:
+        """Return how many features `observe` gives of one call's reading."""
+        return num_channels * num_rows
+
 
 class PerLink(OfReading):
     """What all types have in common that give numbers of links; by default sums over the taxels of each."""
@@ -145,6 +144,9 @@ class PerLink(OfReading):
 
     def lower(self, layout: Layout) -> dict[str, np.ndarray]:
         return {"operator": (layout.link_id[:, None] == np.arange(len(layout.links))).astype(np.float64)}
+
+    def num_features(self, num_channels: int, num_rows: int, num_links: int) -> int:
+        return len(self.features) * num_links
 
     @staticmethod
     def observe(reading: Tensor, channels: tuple[int, ...], constants: Mapping[str, Tensor]) -> Tensor:
@@ -354,10 +356,44 @@ ObservationSpec = Annotated[
     NoneObservation | ReadingSpec | JointSpec | TaxelCountsObservation | TaxelSaturatedObservation, Field(discriminator="type")
 ]
 
-TYPES: dict[str, type[Observation]] = {
-    get_args(model.model_fields["type"].annotation)[0]: model for model in get_args(get_args(ObservationSpec)[0])
-}
-"""All observation types by name."""
+TYPES: dict[str, type[Observation]] = {}
+"""All observation types by name: tgdsl's, those of installed packages once `known_types` was called, and registered ones."""
+GROUP = "tgdsl.observations"  # group of the entry points by which packages bring types
+
+
+def register(model: type[Observation]) -> None:
+    """Make a type known to all documents and artefacts that are read from now on.
+
+    Raises:
+        TgdslError: If it is no type, or another one has its name.
+    """
+    if wrong := _wrong(model):
+        raise TgdslError(wrong)
+    (name,) = get_args(model.model_fields["type"].annotation)
+    if TYPES.setdefault(name, model) is not model:
+        raise TgdslError(f'two observation types are called "{name}"; rename one')
+
+
+def _wrong(model: object) -> str:
+    if not (isinstance(model, type) and issubclass(model, Observation)):
+        return f"found {model!r}, expected a subclass of tgdsl.observations.observations.OfReading"
+    names = get_args(model.model_fields["type"].annotation) if "type" in model.model_fields else ()
+    return "" if len(names) == 1 else f'{model.__name__} has no field `type: Literal["its_name"]`'
+
+
+for _model in get_args(get_args(ObservationSpec)[0]):
+    register(_model)
+
+
+def known_types(names: Collection[str] = ()) -> tuple[type[Observation], ...]:
+    """Return all types; raise `TgdslError` if one of these names is not among them."""
+    for model, _ in installed(GROUP, "observation type", _wrong):
+        register(model)
+    if missing := set(names) - TYPES.keys():
+        problem = f'the observation type "{min(missing)}" is not known; install its package'
+        raise TgdslError(f"{problem}, or `tgdsl.observations.observations.register` it")
+    return tuple(TYPES.values())
+
 
 HAND_ONLY = {"taxel_counts": 5 * 120 * 3, "taxel_saturated": 5 * 120}
 """Observation types of the real hand alone, and how many features each has."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import Field, StringConstraints, Tag, create_model
 
 from tgdsl.fields.models import TEXT_OR_OTHER, SpecModel, Text
-from tgdsl.observations.observations import ObservationSpec
+from tgdsl.observations.observations import Observation, ObservationSpec, known_types
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import KINDS, Kind
@@ -66,12 +66,14 @@ class Spec(SpecModel):
 
 
 def document_model(kinds: tuple[Kind, ...] = KINDS, needs_sensors: bool = True) -> type[Spec]:
-    """Return the document model whose sensors are of the given kinds, with the knobs of all known stages of noise."""
-    return _document_model(kinds, needs_sensors, more_knobs())
+    """Return the document model with sensors of the given kinds, all known stages of noise and types of observations."""
+    return _document_model(kinds, needs_sensors, more_knobs(), known_types())
 
 
 @cache
-def _document_model(kinds: tuple[Kind, ...], needs_sensors: bool, knobs: tuple[type[SpecModel], ...]) -> type[Spec]:
+def _document_model(
+    kinds: tuple[Kind, ...], needs_sensors: bool, knobs: tuple[type[SpecModel], ...], types: tuple[type[Observation], ...]
+) -> type[Spec]:
     noise: Any = noise_model(knobs)
     specs = tuple(kind.spec for kind in kinds)
     if knobs:
@@ -83,7 +85,10 @@ def _document_model(kinds: tuple[Kind, ...], needs_sensors: bool, knobs: tuple[t
     need: dict[str, Any] = {"min_length": 1} if needs_sensors else {"default": {}}
     sensors = (dict[Name, union], Field(description="Sensors by name.", **need))
     profiles = (dict[Name, noise], Spec.model_fields["noise"])
-    return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, sensors=sensors, noise=profiles)
+    term: Any = Annotated[Union[types], Field(discriminator="type")]  # type: ignore  # noqa: UP007
+    groups = (dict[Name, Annotated[tuple[term, ...], Field(min_length=1)]], Spec.model_fields["observations"])
+    parts = {"sensors": sensors, "noise": profiles, "observations": groups}
+    return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, **parts)
 
 
 def json_schema(kinds: tuple[Kind, ...] | None = None) -> dict[str, Any]:
