@@ -38,7 +38,7 @@ from marginal import apart, contacts, contacts_at, is_marginal, ordered
 
 from tgdsl.compiler.pipeline import placed
 from tgdsl.formats.robot import load_model
-from tgdsl.placement.propose.text import new_layout
+from tgdsl.placement.propose.text import new_draft, write_layout
 
 DEPTH, FORCE, MEAN = 1e-6, 0.01, 0.02
 """Limits: depth [m], relative force at a state, relative mean force of a run."""
@@ -277,7 +277,7 @@ def over_a_run(twins: Twins) -> Iterator[tuple[str, str, bool]]:
 def taxels(mjcf: Path, usd: Path, folder: Path) -> Iterator[tuple[str, str, bool]]:
     """Yield how many rows of taxels are at the same place: of a layout proposed for the first, sampled on both."""
     layout = folder / "layout.yaml"
-    new_layout(load_model(mjcf), "4/cm2", True, layout, True)
+    write_layout(new_draft(load_model(mjcf), "4/cm2", True, layout, True), layout)
     rows = []
     for robot in (mjcf, usd):
         found = placed({"tgdsl": 1, "robot": {"model": str(robot), "layout": str(layout)}}, resolutions=["med"]).layouts["med"]

@@ -9,7 +9,7 @@ from documents import DOCUMENT, LAYOUT, POISSON, valid, write
 from tgdsl.fields import units
 from tgdsl.files.find import robots_folder
 from tgdsl.formats.robot import load_model
-from tgdsl.placement.propose.text import new_layout
+from tgdsl.placement.propose.text import new_draft
 from tgdsl.schema.load import load
 
 CONTACT = "kind: contact"
@@ -142,9 +142,9 @@ def test_a_density_per_square_metre(tmp_path):
     )
     robot = load_model(tmp_path / "hand.xml")
     with pytest.warns(UserWarning, match="--density") as caught:
-        new_layout(robot, "4", True, tmp_path / "one.yaml", False)
+        new_draft(robot, "4", True, tmp_path / "one.yaml", False)
     assert str(caught[0].message) == '--density 4: found 4 /m2, usually at least 100 /m2; was "4 /cm2" or "4 /mm2" meant?'
-    new_layout(robot, "4/cm2", True, tmp_path / "two.yaml", False)
+    new_draft(robot, "4/cm2", True, tmp_path / "two.yaml", False)
 
 
 def test_valid_documents_stay_quiet():

@@ -16,6 +16,7 @@ from tgdsl.files.write import atomic_write_all, check_writable, with_folder
 
 if TYPE_CHECKING:
     from tgdsl.compiler.pipeline import Placed
+    from tgdsl.placement.propose.propose import Draft
 
 Hand = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HAND")]
 
@@ -59,16 +60,36 @@ class New:
     out: args.Out = Path("layout.yaml")
     """The file to write."""
     force: args.Replace = False
+    view: bool = False
+    """Change the proposal in the browser, and write the file from there."""
 
     def run(self) -> None:
         from tgdsl.files.find import robot_path
         from tgdsl.formats.robot import load_model
-        from tgdsl.placement.propose.text import new_layout
+        from tgdsl.placement.propose.text import new_draft, write_layout
 
         with StatusLine() as progress:
             robot, with_groups = load_model(robot_path(self.robot)), self.groups == "auto"
-            lines = new_layout(robot, self.density, with_groups, self.out, self.force, self.include, progress)
-        print("\n".join(lines))
+            draft = new_draft(robot, self.density, with_groups, self.out, self.force, self.include, progress)
+        if self.view:
+            self._show(draft)
+        else:
+            print("\n".join(write_layout(draft, self.out)))
+
+    def _show(self, draft: Draft) -> None:
+        from tgdsl.view.layout_page import LayoutPage
+
+        with StatusLine() as progress:
+            progress("placing taxels")
+            page = LayoutPage(draft, self.out, self.force)
+        print(f"{self.robot}: {page.url}   (Ctrl-C ends it)", flush=True)
+        try:
+            page.run()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            page.close()
+        print("\n".join(page.written or [f"{self.out}: not written"]))
 
 
 @dataclass(frozen=True)

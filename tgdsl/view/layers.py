@@ -115,6 +115,45 @@ class Layer(ABC):
         return self._ends[channel]
 
 
+def add_discs(
+    scene: Any,
+    path: str,
+    pos: Float[Array, "row 3"],
+    normal: Float[Array, "row 3"],
+    size: Float[Array, " row"],
+    rank: int = 0,
+    colour: tuple[int, int, int] = REST,
+) -> Any:
+    """Add a disc for each row to viser's scene; return their handle.
+
+    Args:
+        scene: Viser's scene.
+        path: Name of the node, below the node of the rows' body.
+        pos: Positions in the frame of the body [m].
+        normal: Outward unit normals in that frame.
+        size: Widths of the patches that rows stand for [m].
+        rank: How many readings are drawn below this one.
+        colour: Red, green and blue.
+    """
+    angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])
+    faces = np.array([[0, 1 + i, 1 + (i + 1) % 16] for i in range(16)])
+    turns = [Rotation.align_vectors(n[None], [[0, 0, 1]])[0].as_quat(scalar_first=True) for n in normal]
+    return scene.add_batched_meshes_simple(
+        path,
+        corners,
+        faces,
+        np.array(turns),
+        pos + (1 + rank) * LIFT * normal,
+        batched_scales=0.6**rank * np.clip(0.45 * size, *_DISC_RADIUS),
+        batched_colors=np.tile(np.array(colour, dtype=np.uint8), (len(pos), 1)),
+        side="double",
+        lod="off",
+        cast_shadow=False,
+        receive_shadow=False,
+    )
+
+
 class DiscLayer(Layer):
     """A disc at each taxel or body; `rank` is 0 for the chosen reading: others have smaller discs on top."""
 
@@ -135,28 +174,13 @@ class DiscLayer(Layer):
             labels = [f"{link}, taxel {i}" for i, link in enumerate(links)]
         normal = taxels.normal / np.linalg.norm(taxels.normal, axis=1, keepdims=True)
         self.rows = Rows(body, np.array(links), taxels.pos, normal, taxels.size, labels)
-        angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-        corners = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)])
-        faces = np.array([[0, 1 + i, 1 + (i + 1) % 16] for i in range(16)])
         self._members = []
         for link, owner in dict.fromkeys(zip(links, body.tolist(), strict=True)):
             rows = np.flatnonzero((body == owner) & (np.array(links) == link) & (taxels.size > 0))
             if not len(rows):
                 continue
-            turns = [Rotation.align_vectors(n[None], [[0, 0, 1]])[0].as_quat(scalar_first=True) for n in normal[rows]]
-            handle = scene.add_batched_meshes_simple(
-                f"/body{owner}/{output.name}/{link}",
-                corners,
-                faces,
-                np.array(turns),
-                taxels.pos[rows] + (1 + rank) * LIFT * normal[rows],
-                batched_scales=0.6**rank * np.clip(0.45 * taxels.size[rows], *_DISC_RADIUS),
-                batched_colors=np.tile(np.array(REST, dtype=np.uint8), (len(rows), 1)),
-                side="double",
-                lod="off",
-                cast_shadow=False,
-                receive_shadow=False,
-            )
+            path = f"/body{owner}/{output.name}/{link}"
+            handle = add_discs(scene, path, taxels.pos[rows], normal[rows], taxels.size[rows], rank)
             handle.on_click(lambda event, rows=rows: pick(int(rows[event.instance_index])))
             self._members.append((handle, rows))
             self._handles.setdefault(link, []).append(handle)

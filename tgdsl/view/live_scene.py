@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tgdsl.layout.layout import Link
 from tgdsl.module.outputs import Output
 from tgdsl.view.cameras import facing_camera
 from tgdsl.view.contacts import Contacts
@@ -147,27 +148,46 @@ class LiveScene:
         pose = Pose(*self._stage.body_poses(0))
         turn = Rotation.from_quat(pose.quat[rows.body], scalar_first=True)
         pos, normal = pose.pos[rows.body] + turn.apply(rows.pos), turn.apply(rows.normal)
-        camera = facing_camera(Markers(pos, normal, rows.size, np.zeros(len(pos)), "", ""), pose.pos[min(self._near)])
-        centre = 0.5 * (pos.min(axis=0) + pos.max(axis=0))
-        reach = max(0.03, float(np.linalg.norm(pos - centre, axis=1).max()))
-        initial = self._server.initial_camera
-        initial.position, initial.look_at, initial.up = centre + 2.0 * reach * camera.toward, centre, camera.up
-        initial.near = 0.1 * reach
+        aim_camera(self._server, Markers(pos, normal, rows.size, np.zeros(len(pos)), "", ""), pose.pos[min(self._near)])
 
     def _add_body(self, model: mujoco.MjModel, body: int) -> None:
-        """Add a mesh for each colour of a body."""
-        meshes = []
-        for i, (corners, normals, rgba) in enumerate(body_surfaces(model, body, self._links)):
-            own = None if rgba is None else tuple(round(255 * part) for part in rgba[:3])
-            opacity = None if rgba is None or rgba[3] >= 1 else rgba[3]
-            colour = self._plain(body) if body in self.robot or own is None else own
-            style = {"color": colour, "opacity": opacity}
-            mesh = self._server.scene.add_mesh_simple(f"/body{body}/mesh{i}", *_joined(corners, normals), **style)
-            meshes.append((mesh, own))
-        self._meshes[body] = meshes
+        is_plain = body in self.robot
+        self._meshes[body] = add_body(self._server.scene, model, body, self._links, self._plain(body), is_plain)
 
     def _plain(self, body: int) -> tuple[int, int, int]:
         return CARRIER if body in self._carriers else ROBOT if body in self.robot else OBJECT
+
+
+def add_body(
+    scene: Any, model: mujoco.MjModel, body: int, links: Iterable[Link], colour: tuple[int, int, int], is_plain: bool
+) -> list[tuple[Any, Any]]:
+    """Add a mesh for each colour of a body to viser's scene; return their handles and colours, None where it has none.
+
+    Args:
+        scene: Viser's scene, where `/body<id>` is the frame of the body.
+        model: The compiled scene.
+        body: Index of the body.
+        links: The links with taxels; see `body_surfaces`.
+        colour: Red, green and blue of parts without a colour.
+        is_plain: Whether all parts have that colour.
+    """
+    meshes = []
+    for i, (corners, normals, rgba) in enumerate(body_surfaces(model, body, links)):
+        own = None if rgba is None else tuple(round(255 * part) for part in rgba[:3])
+        style = {"color": colour if is_plain or own is None else own, "opacity": rgba[3] if rgba and rgba[3] < 1 else None}
+        mesh = scene.add_mesh_simple(f"/body{body}/mesh{i}", *_joined(corners, normals), **style)
+        meshes.append((mesh, own))
+    return meshes
+
+
+def aim_camera(server: Any, markers: Markers, origin: Float[Array, " 3"]) -> None:
+    """Have the camera look at rows from where most of them face; `origin` is where the hand begins [m]."""
+    camera, pos = facing_camera(markers, origin), markers.pos
+    centre = 0.5 * (pos.min(axis=0) + pos.max(axis=0))
+    reach = max(0.03, float(np.linalg.norm(pos - centre, axis=1).max()))
+    initial = server.initial_camera
+    initial.position, initial.look_at, initial.up = centre + 2.0 * reach * camera.toward, centre, camera.up
+    initial.near = 0.1 * reach
 
 
 def _joined(corners: Float[Array, "face 3 3"], normals: Float[Array, "face 3 3"]) -> tuple[Array, Array]:

@@ -56,21 +56,14 @@ class Page:
 
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
         drawn(stage)
-        check_viser()
-        import viser
-
-        with redirect_stdout(StringIO()):  # viser prints its address
-            self.server = viser.ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
-        if host != LOCAL:
-            warnings.warn(NETWORK_WARNING.format(host), stacklevel=2)
+        self.server = serve(host, port)
         self._recording: Recording | None = None
         self.show(stage)
 
     @property
     def url(self) -> str:
         """The page's address."""
-        host = self.server.get_host()
-        return f"http://{'localhost' if host == LOCAL else host}:{self.server.get_port()}"
+        return url_of(self.server)
 
     def show(self, stage: Stage) -> None:
         """Show a stage in place of the one before; the camera stays.
@@ -96,7 +89,6 @@ class Page:
         with self.server.atomic():
             self.server.scene.reset()
             self.server.gui.reset()
-            self.server.gui.configure_theme(show_share_button=False)  # its tunnel would lead to the internet
             self.scene = LiveScene(self.server, stage, outputs, lambda row: later(lambda: self._pick(row)))
             actions = Actions(
                 lambda: later(self._step_once),
@@ -144,8 +136,7 @@ class Page:
 
     def close(self) -> None:
         """Stop serving."""
-        with redirect_stdout(StringIO()):
-            self.server.stop()
+        stop(self.server)
 
     def draw(self) -> None:
         """Draw the stage as it is now."""
@@ -360,6 +351,31 @@ class Page:
 def _range(values: Float[Array, " feature"]) -> str:
     """Return one number, or the least and the largest of several."""
     return " … ".join(dict.fromkeys(f"{end:.3g}" for end in (values.min(), values.max()))) if len(values) else ""
+
+
+def serve(host: str = LOCAL, port: int = PORT) -> Any:
+    """Return viser's server of a page that is empty; see `Page`."""
+    check_viser()
+    import viser
+
+    with redirect_stdout(StringIO()):  # viser prints its address
+        server = viser.ViserServer(host=host, port=port, label="tgdsl view", verbose=False)
+    server.gui.configure_theme(show_share_button=False)  # its tunnel would lead to the internet
+    if host != LOCAL:
+        warnings.warn(NETWORK_WARNING.format(host), stacklevel=3)
+    return server
+
+
+def url_of(server: Any) -> str:
+    """Return the address of a server's page."""
+    host = server.get_host()
+    return f"http://{'localhost' if host == LOCAL else host}:{server.get_port()}"
+
+
+def stop(server: Any) -> None:
+    """Stop serving a page."""
+    with redirect_stdout(StringIO()):
+        server.stop()
 
 
 def check_viser() -> None:

@@ -273,7 +273,7 @@ def test_a_covered_tip_is_no_part_of_a_hand(tmp_path):
 
 def test_only_links_with_taxels_are_sampled(tmp_path, monkeypatch):
     sampled, original = list[str](), Sampler.sampled
-    monkeypatch.setattr(Sampler, "sampled", lambda own, name: sampled.append(name) or original(own, name))
+    monkeypatch.setattr(Sampler, "sampled", lambda own, name, radius: sampled.append(name) or original(own, name, radius))
     robot = loaded(tmp_path, world(arm(slides())))
     assert sampled == []
     propose(robot, DENSITY, include=("arm2",))

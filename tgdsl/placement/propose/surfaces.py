@@ -76,9 +76,10 @@ class Sampler:
         is_collided: Whether the simulator collides any link that is no scenery.
     """
 
-    def __init__(self, robot: Model, radius: float):
+    def __init__(self, robot: Model):
         """Leave out what the simulator does not collide, unless it collides nothing, as of a robot that is only seen."""
-        self.robot, self.radius, self.colliders = robot, radius, Colliders(robot)
+        self.robot, self.colliders = robot, Colliders(robot)
+        self._pools: dict[tuple[str, bool], Pool | None] = {}  # by link, and whether on its hulls
         self.meshes, self.left_out = link_meshes(robot)
         ids = {name: int(robot.compiled.body(name).id) for name in self.meshes}
         scenery = set(free_standing(kinematic_tree(robot, self.meshes)))
@@ -93,19 +94,19 @@ class Sampler:
         del self.meshes[name]
         self.left_out.append((name, why))
 
-    def sampled(self, name: str) -> LinkSurface | str:
-        """Return what can be touched of a link, or why nothing can."""
+    def sampled(self, name: str, radius: float) -> LinkSurface | str:
+        """Return what taxels of a radius [m] can touch of a link, or why they can touch nothing."""
         try:
-            pool = _pool(self.robot.surface(self.robot.touchable(name)))
+            pool = self._pool(name, as_collided=False)
         except (RobotError, SampleError) as error:
             return _reason(self.robot, error)
         if pool is None:
             return "nothing that can be touched from outside"
         if pool.area < MIN_AREA:
             return _NO_AREA
-        return self._exposed(name, pool) if name in self._feeling else LinkSurface(pool)
+        return self._exposed(name, pool, radius) if name in self._feeling else LinkSurface(pool)
 
-    def _exposed(self, name: str, pool: Pool) -> LinkSurface | str:
+    def _exposed(self, name: str, pool: Pool, radius: float) -> LinkSurface | str:
         """Return what can feel of a colliding link, of which points on its meshes are given."""
         geoms, options = self.robot.touchable(name), dict[str, str | bool]()
         if not all(geom.is_colliding for geom in geoms):
@@ -113,10 +114,10 @@ class Sampler:
         is_covered = self.colliders.cover_of(name, geoms)
         covered = is_covered(pool.pos)
         body = int(self.robot.compiled.body(name).id)
-        buried, _ = self.colliders.is_buried(body, pool.pos, np.full(len(pool.pos), self.radius))
+        buried, _ = self.colliders.is_buried(body, pool.pos, np.full(len(pool.pos), radius))
         if (buried & ~covered).any():
             options["surface"] = "collision"
-            on_hulls = _pool(self.robot.surface(geoms, as_collided=True))
+            on_hulls = self._pool(name, as_collided=True)
             if on_hulls is None:
                 return COVERED
             pool, covered = on_hulls, is_covered(on_hulls.pos)
@@ -125,14 +126,15 @@ class Sampler:
             pool = Pool(pool.pos[~covered], pool.normal[~covered], pool.point_area[~covered])
         return LinkSurface(pool, options) if pool.area > MIN_AREA else COVERED
 
-
-def _pool(surface: Surface) -> Pool | None:
-    """Return points on the outside of a link's surface; None if none of it can be touched from outside."""
-    try:
-        shell = meshlab.outer_shell(surface)
-    except ImportError as error:
-        raise SampleError(f"sampling needs pymeshlab: {error}", "pip install pymeshlab") from error
-    return poisson.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
+    def _pool(self, name: str, as_collided: bool) -> Pool | None:
+        """Return points on the outside of a link's surface; None if none of it can be touched from outside."""
+        if (name, as_collided) not in self._pools:
+            try:
+                shell = meshlab.outer_shell(self.robot.surface(self.robot.touchable(name), as_collided))
+            except ImportError as error:
+                raise SampleError(f"sampling needs pymeshlab: {error}", "pip install pymeshlab") from error
+            self._pools[name, as_collided] = poisson.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
+        return self._pools[name, as_collided]
 
 
 def _reason(robot: Model, error: Exception) -> str:

@@ -15,14 +15,14 @@ from tgdsl.errors import TgdslError, listed
 from tgdsl.fields import units
 from tgdsl.files.write import atomic_write, check_writable, with_folder
 from tgdsl.formats.model import Model
-from tgdsl.placement.propose.propose import FACTORS, LinkProposal, Proposal, escaped, propose
+from tgdsl.placement.propose.propose import FACTORS, Draft, LinkProposal, Proposal, escaped
 
 WIDTH = 120  # lists of names are broken at this column
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*\Z")
 _BRACKETED, _CHARACTER = re.compile(r"\[(.)\]"), r"\1"
 _KEYWORDS = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
 _HEADER = """\
-# A layout for {robot}, proposed by `tgdsl layout new`: nobody has looked at it yet.
+# A layout for {robot}, proposed by `tgdsl layout new`{looked}.
 # Density: {density:g} taxels per cm² at `med`, a quarter of that at `low`, four times as much at `high`; at least 1 a link.
 # `radius` is how far a taxel feels: neighbours overlap a little. To edit: drop links that are not to feel, move links
 # between groups, and give a region (facing, box, sphere, geoms), or `method: grid`, where all around is not what you want.
@@ -43,12 +43,13 @@ _MISREAD = (
     "no hinge of this robot turns by more than 6.28 degrees: its limits look like radians, and its file lacks "
     '`<compiler angle="radian"/>`; sides are guessed as if it said so, but the simulator keeps to the limits as they are'
 )
+_UNSEEN, _CHANGED = ": nobody has looked at it yet", " and changed by hand; comments mark what is guessed"
 _NO_PALM = "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n"
 
 USUAL_DENSITY = (100.0, math.inf)  # below one per dm² another unit was most likely meant [1/m²]
 
 
-def new_layout(
+def new_draft(
     robot: Model,
     density: str,
     with_groups: bool,
@@ -56,8 +57,8 @@ def new_layout(
     is_forced: bool,
     include: Sequence[str] = (),
     progress: Progress = silent,
-) -> list[str]:
-    """Propose a layout for a robot and write it; return what to tell the user.
+) -> Draft:
+    """Propose a layout for a robot that `write_layout` can write.
 
     Raises:
         TgdslError: If the density is none, the file is there already or cannot be written, the robot has no link that can carry
@@ -71,11 +72,21 @@ def new_layout(
         raise TgdslError(f"--density: {density} is out of range, expected more than 0")
     if (problem := units.doubt(per_area, "density", *USUAL_DENSITY)) is not None:
         warnings.warn(f"--density {density}: {'; '.join(problem)}", stacklevel=2)
+    check_new(out, is_forced)
+    return Draft(robot, per_area, with_groups, include, progress)
+
+
+def check_new(out: Path, is_forced: bool) -> None:
+    """Raise `TgdslError` if a layout cannot be written, or may not replace a file."""
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
     check_writable(out)
-    proposal = propose(robot, per_area, with_groups, include, progress)
-    atomic_write(with_folder(out), layout_text(proposal, robot.file.name).encode())
+
+
+def write_layout(draft: Draft, out: Path) -> list[str]:
+    """Write a layout; return what to tell the user."""
+    proposal = draft.proposal
+    atomic_write(with_folder(out), layout_text(proposal, draft.robot.file.name).encode())
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),
@@ -92,7 +103,9 @@ def new_layout(
 
 def layout_text(proposal: Proposal, robot: str) -> str:
     """Return the file's text; the same proposal gives the same text."""
-    parts = [_HEADER.format(robot=quoted(robot), density=proposal.density * 1e-4)]
+    is_changed = proposal.chosen_groups or not all(link.is_guess for link in proposal.links)
+    looked = _CHANGED if is_changed else _UNSEEN
+    parts = [_HEADER.format(robot=quoted(robot), looked=looked, density=proposal.density * 1e-4)]
     parts += [f"# Left out: {line}\n" for line in _by_reason(proposal.left_out)]
     parts += [] if proposal.is_collided else [f"# Mind: {_NOT_COLLIDED}.\n"]
     parts += [f"# Mind: {_MISREAD}.\n"] if proposal.is_misread else []
@@ -129,8 +142,9 @@ def _groups_text(proposal: Proposal) -> str:
         return ""
     lines = ["groups:\n"]
     for name, members in proposal.groups.items():
-        lines.append(f"  # {_ABOUT[name]}\n" + _broken(f"  {name}: [", [quoted(member) for member in members]))
-        if name == "tips" and "palm" not in proposal.groups:
+        about = "" if name in proposal.chosen_groups else f"  # {_ABOUT[name]}\n"
+        lines.append(about + _broken(f"  {name}: [", [quoted(member) for member in members]))
+        if name == "tips" and not {"palm"} & (proposal.groups.keys() | proposal.chosen_groups):
             lines.append(_NO_PALM)
     if any(member.startswith("[") for members in proposal.groups.values() for member in members):
         lines.append("  # A name such as [p]alm means the link palm, where another group has the same name.\n")
@@ -142,11 +156,14 @@ def _link_text(proposal: Proposal, link: LinkProposal, resolution: str) -> str:
     text = f"    {quoted(escaped(link.name))}: {_flow(entry)}\n"
     if resolution != "med":
         return text
-    if link.facing is not None:
-        side = "inner side guessed from how the joints close" + (f"; weak: {link.doubt}" if link.doubt else "")
-    else:
-        side = f"{link.doubt}: all around"
-    notes = [f"    # {1e4 * link.area:.3g} cm², {side}\n"]
+    about = f"{1e4 * link.area:.3g} cm²"
+    if link.density != proposal.density:
+        about += f", {1e-4 * link.density:g} taxels per cm²"
+    if link.is_guess and link.facing is not None:
+        about += ", inner side guessed from how the joints close" + (f"; weak: {link.doubt}" if link.doubt else "")
+    elif link.is_guess:
+        about += f", {link.doubt}: all around"
+    notes = [f"    # {about}\n"]
     notes += [f"    # {_OPTIONS[option]}\n" for option in link.options]
     return "".join(notes) + text
 

@@ -1,0 +1,119 @@
+"""The page of `tgdsl layout new --view`: its controls change the layout, and its button writes the file of the command."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from box_hands import BOX_HAND
+from odd_hands import command
+
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.propose.text import layout_text, new_draft
+from tgdsl.view.layers import LIFT, REST
+from tgdsl.view.layout_page import ALL_AROUND, CHOSEN, LayoutPage
+
+
+@contextmanager
+def opened(folder: Path, is_forced: bool = False) -> Iterator[LayoutPage]:
+    (folder / "hand.xml").write_text(BOX_HAND)
+    out = folder / "layout.yaml"
+    page = LayoutPage(new_draft(load_model(folder / "hand.xml"), "4/cm2", True, out, is_forced), out, is_forced, port=8340)
+    try:
+        yield page
+    finally:
+        page.close()
+
+
+def discs(page: LayoutPage) -> dict[str, int]:
+    return {name: len(handle.batched_positions) for name, (_, handle) in page._discs.items()}
+
+
+def test_controls_change_the_chosen_links_and_the_button_writes_the_file_of_the_command(tmp_path):
+    with opened(tmp_path) as page:
+        before = {name: handle for name, (_, handle) in page._discs.items()}
+        page.chosen.value = "(tips)"
+        page.react()
+        page.density.value = 10.0
+        page.react()
+        assert {name: num for name, num in discs(page).items() if "tip" in name} == {"left_tip": 48, "right_tip": 48}
+        assert page._discs["palm"][1] is before["palm"]  # what has not changed is not drawn again
+        assert {tuple(page._discs[name][1].batched_colors[0]) for name in ("left", "left_tip")} == {REST, CHOSEN}
+        page.chosen.value = "(all)"
+        page.react()
+        page.density.value = 5.0
+        page.react()
+        page._write()
+        assert page.problem.content.endswith("layout.yaml: written")
+        assert sum(discs(page).values()) == int(page.status.content.split()[0])
+        text = page.out.read_text()
+    assert command(tmp_path, "layout", "new", "hand.xml", "--density", "5/cm2", "-o", "again.yaml") == 0
+    assert (tmp_path / "again.yaml").read_text() == text
+
+
+def test_side_box_and_resolution_move_the_taxels(tmp_path):
+    with opened(tmp_path) as page:
+        page._choose("left_tip")
+        page.react()
+        assert page.side.value == "+x" and page._frames["left_tip"].show_axes
+        page.side.value = "-y"
+        page.react()
+        handle = page._discs["left_tip"][1]
+        np.testing.assert_allclose(handle.batched_positions[:, 1], -0.008 - LIFT)
+        slider, least, _ = page._bounds[2]
+        slider.value = (least, 16.0)
+        page.react()
+        assert page._discs["left_tip"][1].batched_positions[:, 2].max() <= 0.016 + 1e-6
+        assert discs(page)["left_tip"] == 6  # 4 taxels on 1 cm² of 10 × 15 mm
+        page.resolution.value = "high"
+        page.react()
+        assert discs(page)["left_tip"] == 24
+        page.side.value = ALL_AROUND
+        page.react()
+        assert "box" in next(
+            line for line in layout_text(page.draft.proposal, "").splitlines() if line.startswith("    left_tip")
+        )
+
+
+def test_links_leave_and_join_groups(tmp_path):
+    with opened(tmp_path) as page:
+        page.members["tips"]["left_tip"].value = False
+        page.members["tips"]["palm"].value = True
+        page.members["palm"]["palm"].value = False
+        page.chosen.value = "(palm)"
+        page.react()
+        assert set(page.draft.proposal.members["tips"]) == {"palm", "right_tip"}
+        assert "0 of them on the chosen 0 cm²" in page.status.content
+        page.react()
+        page.members["palm"]["palm"].value = True
+        page.react()
+        assert page.side.value == ALL_AROUND
+
+
+def test_a_mistaken_value_is_shown_and_nothing_is_written_until_it_is_mended(tmp_path):
+    with opened(tmp_path) as page:
+        num = sum(discs(page).values())
+        page.density.value = 0.0
+        page.react()
+        assert "density: 0/cm2 is out of range, expected more than 0" in page.problem.content
+        page._write()
+        assert not page.out.exists() and "nothing is written" in page.problem.content
+        assert sum(discs(page).values()) == num
+        page.density.value = 4.0
+        page.react()
+        assert page.problem.content == ""
+        page._write()
+        assert page.out.exists()
+
+
+def test_a_file_of_someone_else_is_not_replaced(tmp_path):
+    with opened(tmp_path) as page:
+        page._write()
+        page._write()  # its own is
+        page.out.write_text("mine")
+        page._write()
+        assert "this file is there already; give --force to replace it" in page.problem.content
+        assert page.out.read_text() == "mine"
+    with opened(tmp_path, is_forced=True) as page:
+        page._write()
+        assert page.out.read_text().startswith("# A layout for hand.xml")
