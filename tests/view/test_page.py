@@ -263,6 +263,9 @@ def test_contacts_are_drawn_and_switched_off(document):
     with opened(SceneStage(tgdsl.compile(document))) as page:
         for _ in range(100):
             page.stage.advance()
+        contacts = page.stage.contacts(0)
+        page.scene.draw_contacts(contacts._replace(force=2.7e-7 / np.linalg.norm(contacts.force) * contacts.force))
+        assert not page.scene._forces.visible  # rounding
         page.draw()
         assert "1 contact, largest" in page.panel.status.content
         ((begin, end),) = page.scene._forces.points

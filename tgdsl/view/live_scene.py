@@ -15,7 +15,7 @@ from tgdsl.module.outputs import Output
 from tgdsl.view.cameras import facing_camera
 from tgdsl.view.contacts import Contacts
 from tgdsl.view.layers import LIFT, Layer, Rows, Shown, SurfaceLayer, layer_of
-from tgdsl.view.markers import Markers, Pose
+from tgdsl.view.markers import THRESHOLDS, Markers, Pose
 from tgdsl.view.meshes import body_surfaces, robot_bodies, shapes_of
 from tgdsl.view.stages import Poses, Stage
 
@@ -56,7 +56,7 @@ class LiveScene:
         )
         for handle in (self._arrows, self._points, self._forces):
             handle.visible = False
-        self._largest_contact = 1e-9
+        self._largest_contact = THRESHOLDS["N"]  # smaller forces are rounding, and their arrows too short to draw
         self._name: Any = None
 
     def move(self, poses: Poses, env: int) -> None:
