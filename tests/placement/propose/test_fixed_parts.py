@@ -117,6 +117,19 @@ def test_a_ball_that_nothing_holds_is_a_marker(tmp_path):
     assert set(proposal.groups["tips"]) == {"f0_3", "f1_3", "f2_3", "f3_3", "thumb3"} and "mark" in proposal.groups["fingers"]
 
 
+def test_a_free_body_that_is_welded_to_a_link_is_part_of_it(tmp_path):
+    """Caps on two fingertips, each a tree of its own that an equality holds: they go with the tips, and face as these do."""
+    box = '<geom type="box" size=".006 .008 .006"/>'
+    caps = "".join(f'<body name="cap{i}" pos="0 {0.03 - 0.02 * i:.3g} .387"><freejoint/>{box}</body>' for i in range(2))
+    welds = "".join(f'<weld body1="{one}" body2="{two}"/>' for one, two in (("f0_3", "cap0"), ("cap1", "f1_3")))
+    text = world(palm_and_fingers(thumb(1)) + caps).replace("</mujoco>", f"<equality>{welds}</equality></mujoco>")
+    proposal = proposal_of(tmp_path, text)
+    assert proposal.left_out == ()
+    assert set(proposal.groups["tips"]) == {"f0_3", "f1_3", "f2_3", "f3_3", "thumb3", "cap0", "cap1"}
+    facing = facing_of(proposal)
+    assert facing["cap0"] == facing["cap1"] == facing["f0_3"] == INNER
+
+
 def test_the_second_bar_of_a_linkage_faces_as_the_first(tmp_path):
     """Its middle, at its hinge, is carried nowhere."""
     bar = '<geom type="box" size=".002 .006 .02" pos="0 0 .03"/>'

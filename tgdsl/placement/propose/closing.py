@@ -93,6 +93,7 @@ class Poses:
     def kinematics(self, qpos: Float[np.ndarray, " qpos"]) -> mujoco.MjData:
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
+        self.tree.carry_welded(self.data)
         return self.data
 
     @cached_property

@@ -1,10 +1,10 @@
 """Which link of a robot is a palm, a finger or a fingertip: guessed from its tree of joints, never from its names.
 
-A segment is what moves as one: a body with all that is fixed to it. A chain is what moves against a segment as a whole: a
-child with all below it, and with the siblings that an equality binds to it in a loop. A hand begins at the last segment from
-which two or more chains part; but where chains part again within a finger's length (a metacarpal with two fingers, an arch
-that carries the fingers while the thumb hangs on the wrist), it begins at the first of these. What is before it, such as an
-arm, and what hangs elsewhere, such as a head, is no part of it.
+A segment is what moves as one: a body with all that is fixed to it, and the free bodies that an equality welds to it. A chain
+is what moves against a segment as a whole: a child with all below it, and with the siblings that an equality binds to it in a
+loop. A hand begins at the last segment from which two or more chains part; but where chains part again within a finger's
+length (a metacarpal with two fingers, an arch that carries the fingers while the thumb hangs on the wrist), it begins at the
+first of these. What is before it, such as an arm, and what hangs elsewhere, such as a head, is no part of it.
 
 Shapes: bodies and segments are MuJoCo's body indices; a segment's is that of its first body.
 """
@@ -31,7 +31,7 @@ LEAST = 0.5  # at least one of them turns by so many radians if they were
 RADIANS_AS_DEGREES = float(np.degrees(1.0))  # by how much angles are larger that were read as degrees but meant as radians
 ASSUMED = np.radians(30.0)
 """How far a hinge without limits is taken to turn to either side of its start, where no joint with limits closes a hand."""
-_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 _SERVO_BIAS, _FIXED_GAIN = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtGain.mjGAIN_FIXED)
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
@@ -121,9 +121,27 @@ class KinematicTree:
 
     @cached_property
     def segment(self) -> list[int]:
-        model = self.model
-        weld, root = model.body_weldid.tolist(), model.body_rootid.tolist()
-        return [w or r for w, r in zip(weld, root, strict=True)]
+        return [self.welded.get(s, s) for s in _rigid(self.model)]
+
+    @cached_property
+    def welded(self) -> dict[int, int]:
+        """Bodies that move freely but for an active weld to a link of a robot, and the segment of that link."""
+        model, segment = self.model, _rigid(self.model)
+        carrying = {segment[above] for above in model.body_parentid[segment].tolist()}
+        free = set(model.jnt_bodyid[model.jnt_type == _FREE].tolist()) - carrying
+        result = {}
+        for i in np.flatnonzero((model.eq_type == _LOOPS[1]) & (model.eq_active0 != 0)).tolist():
+            one, two = (segment[body] for body in self.bound_bodies(i))
+            result |= {a: b for a, b in ((one, two), (two, one)) if a in free and b and b not in free}
+        return result
+
+    def carry_welded(self, data: mujoco.MjData) -> None:
+        """Put the welded bodies where their links carry them."""
+        for body, segment in enumerate(_rigid(self.model) if self.welded else ()):
+            if (host := self.welded.get(segment)) is not None:
+                then, now = (state.xmat[host].reshape(3, 3) for state in (self.start, data))
+                data.xpos[body] = data.xpos[host] + now @ then.T @ (self.start.xpos[body] - self.start.xpos[host])
+                data.xmat[body] = (now @ then.T @ self.start.xmat[body].reshape(3, 3)).ravel()
 
     @cached_property
     def parent(self) -> dict[int, int]:
@@ -227,6 +245,10 @@ def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTre
     return KinematicTree(model, {int(model.body(name).id): mesh for name, mesh in surface.items()})
 
 
+def _rigid(model: mujoco.MjModel) -> list[int]:
+    return [w or r for w, r in zip(model.body_weldid.tolist(), model.body_rootid.tolist(), strict=True)]
+
+
 def _hull_area(surface: Surface) -> float:
     """Return the area of a surface's convex hull [m²]; infinite if it is flat."""
     try:
@@ -259,7 +281,7 @@ def loose_parts(tree: KinematicTree) -> list[int]:
 
 def _is_driven(tree: KinematicTree, segment: int) -> bool:
     kinds = [int(tree.model.jnt_type[joint]) for joint in tree.joints(segment)]
-    return 0 < len(kinds) < 3 and int(mujoco.mjtJoint.mjJNT_FREE) not in kinds
+    return 0 < len(kinds) < 3 and _FREE not in kinds
 
 
 def hands(tree: KinematicTree) -> list[Hand]:
