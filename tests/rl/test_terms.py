@@ -1,5 +1,7 @@
 """Terms that a document adds to its task: rewards, reasons to end, groups of observations; a user's own from a file."""
 
+from importlib import import_module
+
 import mujoco
 import numpy as np
 import pytest
@@ -11,8 +13,11 @@ from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl.load import load_task
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
+from tgdsl.rl.tasks import TASKS
+from tgdsl.rl.tasks.grip_force import GripForce
+from tgdsl.rl.tasks.hot_ball import HotBall
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
-from tgdsl.rl.terms import ContactForce, Near
+from tgdsl.rl.terms import ContactForce, HandTask, Near
 
 OWN = '''
 import torch
@@ -274,3 +279,12 @@ def test_parameters_of_shared_terms_are_keys_of_the_document():
     assert Near.for_spec(Reach.Spec.model_validate(common | {"reach": "5 mm"}), {"width": "reach"}).width == 0.005
     with pytest.raises(ValidationError, match="reach"):
         Reach.Spec.model_validate(common | {"reach": "-5 mm"})
+
+
+def test_a_term_of_all_tasks_stands_once():
+    """Terms of `HandTask` are in the reward of each task and in its document, after the task's own unless it repeats them."""
+    for module, name in TASKS.values():
+        task = getattr(import_module(module), name)
+        assert HandTask.terms.keys() <= task.terms.keys() == task.Spec.model_fields["rewards"].annotation.model_fields.keys()
+    assert list(HotBall.terms) == ["approach", "contact", "progress", "latched", "lost", *HandTask.terms]
+    assert GripForce.terms["action_rate"].weight == -0.01 != HotBall.terms["action_rate"].weight

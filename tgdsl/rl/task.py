@@ -249,8 +249,9 @@ class Task(ABC, Generic[S]):
         """Collect the terms of the reward; add `rewards`, their weights, and their parameters to the document's model."""
         super().__init_subclass__(**options)
         terms_of_class = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
-        cls.terms = {**cls.terms, **terms_of_class}
-        if cls.terms and (terms_of_class or "Spec" in vars(cls)):
+        is_first = not any(hasattr(base, "Spec") for base in cls.__bases__)  # of a base without a document terms stand last
+        cls.terms = {**(terms_of_class if is_first else {}), **cls.terms, **terms_of_class}
+        if cls.terms and hasattr(cls, "Spec") and (terms_of_class or "Spec" in vars(cls)):
             weight: Any = Number
             fields: dict[str, Any] = {
                 name: (weight | None, Field(term.weight, description=f"{term.summary} [{term.unit}]."))

@@ -39,7 +39,7 @@ from tgdsl.rl import groups, rotations
 from tgdsl.rl.actuation import ZERO, Actuation, Factor
 from tgdsl.rl.draws import within
 from tgdsl.rl.spec import PushSpec, TaskSpec, Whole
-from tgdsl.rl.task import Features, Now, Rate, Setup, Task, TaskReward
+from tgdsl.rl.task import Features, Now, Rate, S, Setup, Task, TaskReward
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.schema.select import matching
 from tgdsl.tensors.env_ids import put_rows
@@ -478,6 +478,13 @@ class Linear(CurriculumTerm):
         x = iteration if self.by == "iteration" else self.first if score is None else score
         share = min(1.0, max(0.0, (x - self.first) / (self.last - self.first)))
         return self.start + share * (self.end - self.start)
+
+
+class HandTask(Task[S]):
+    """A task whose reward has the terms of all tasks of tgdsl; a task that repeats one sets its own weight and place."""
+
+    action_rate = ActionRate.of_task(-5e-4)
+    work = Work.of_task(-5e-3)
 
 
 _TERMS = (

@@ -52,7 +52,7 @@ from tgdsl.fields.models import Positive, PositiveLength, Range, RangeOf
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.draws import whole
 from tgdsl.rl.spec import TaskSpec, Time
-from tgdsl.rl.task import Features, HandNow, Now, Part, Setup, Start, Task, reward_term
+from tgdsl.rl.task import Features, HandNow, Now, Part, Setup, Start, reward_term
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.tensors.env_ids import may_be_nonempty
 
@@ -82,7 +82,7 @@ class GripForceSpec(TaskSpec):
     """F_crush: a larger sum of normal forces crushes the object [N]."""
 
 
-class GripForce(Task[GripForceSpec]):
+class GripForce(terms.HandTask[GripForceSpec]):
     """The task."""
 
     Spec = GripForceSpec

@@ -38,7 +38,7 @@ from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf, Temperature
 from tgdsl.rl import groups, terms
 from tgdsl.rl.spec import RandomSpec, TaskSpec
-from tgdsl.rl.task import Features, Now, Part, Setup, Start, Task, reward_term
+from tgdsl.rl.task import Features, Now, Part, Setup, Start, reward_term
 
 
 class HotBallRandomSpec(RandomSpec):
@@ -82,7 +82,7 @@ class HotBallSpec(TaskSpec):
         return self
 
 
-class HotBall(Task[HotBallSpec]):
+class HotBall(terms.HandTask[HotBallSpec]):
     """The task."""
 
     Spec = HotBallSpec
@@ -113,9 +113,6 @@ class HotBall(Task[HotBallSpec]):
     def lost(self, now: Now) -> Bool[Tensor, " env"]:
         """The hot ball has left the bin in this step."""
         return self.is_over(now)
-
-    action_rate = terms.ActionRate.of_task(-5e-4)
-    work = terms.Work.of_task(-5e-3)
 
     def __init__(self, spec: HotBallSpec, setup: Setup):
         """Look up the balls, and the cells of each link; raise `LowerError` if another ball is no body that moves freely."""

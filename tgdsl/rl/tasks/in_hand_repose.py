@@ -49,7 +49,7 @@ from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.draws import within
 from tgdsl.rl.spec import Whole
 from tgdsl.rl.students.spec import DistillSpec
-from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
+from tgdsl.rl.task import Now, Setup, Start, reward_term
 from tgdsl.rl.tasks.parts import PlacedTaskSpec, ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.tensors.env_ids import may_be_nonempty
@@ -99,7 +99,7 @@ class InHandReposeSpec(PlacedTaskSpec, ProgressSpec):
         return self
 
 
-class InHandRepose(Task[InHandReposeSpec]):
+class InHandRepose(terms.HandTask[InHandReposeSpec]):
     """The task."""
 
     Spec = InHandReposeSpec

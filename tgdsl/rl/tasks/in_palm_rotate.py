@@ -39,7 +39,7 @@ from torch.linalg import vector_norm
 from tgdsl.fields.models import Angle, PositiveLength
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
-from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
+from tgdsl.rl.task import Now, Setup, Start, reward_term
 from tgdsl.rl.tasks.parts import Holding, HoldSpec, PlacedTaskSpec, ProgressSpec
 
 QUARTER = 0.5 * math.pi
@@ -74,7 +74,7 @@ class InPalmRotateSpec(PlacedTaskSpec, ProgressSpec):
     """What progress pays while the object coasts; by default as much as while it is held."""
 
 
-class InPalmRotate(Task[InPalmRotateSpec]):
+class InPalmRotate(terms.HandTask[InPalmRotateSpec]):
     """The task."""
 
     Spec = InPalmRotateSpec

@@ -46,7 +46,7 @@ from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.grasps.grasps import GraspSpec
 from tgdsl.rl.spec import TaskSpec, Time
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
-from tgdsl.rl.task import Now, Setup, Start, Task, reward_term
+from tgdsl.rl.task import Now, Setup, Start, reward_term
 from tgdsl.rl.tasks.parts import Holding, HoldSpec, ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
@@ -115,7 +115,7 @@ class ScrewdriverSpec(TaskSpec, ProgressSpec):
     """When an episode ends for good as the screwdriver does not turn any more; null: never."""
 
 
-class Screwdriver(Task[ScrewdriverSpec]):
+class Screwdriver(terms.HandTask[ScrewdriverSpec]):
     """The task."""
 
     Spec = ScrewdriverSpec

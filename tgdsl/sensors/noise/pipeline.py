@@ -22,12 +22,10 @@ from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.spec import ALL, Knobs, quantity, range_of
 from tgdsl.sensors.noise.stage import Now, Signal, Stage
-from tgdsl.sensors.noise.stages import Crosstalk, Dead, Delay, Gain, Hysteresis, Offset, Quantization, Radius, Release
+from tgdsl.sensors.noise.stages import STAGES
 from tgdsl.tensors.fusion import materialised
 
 StageType = type[Stage]
-STAGES: tuple[StageType, ...] = (Radius, Gain, Hysteresis, Crosstalk, Delay, Offset, Quantization, Dead, Release)
-"""The stages of tgdsl, in their order."""
 GROUP = "tgdsl.noise_stages"  # group of the entry points by which packages bring stages
 _registered: list[StageType] = []
 

@@ -1,4 +1,4 @@
-"""The stages in their order; `Crosstalk`, the only one between taxels, is the last class.
+"""The stages; `STAGES` at the end has their order.
 
     radius          R̃_j = max(0, R_j + ε_j), ε_j ~ U[−ρ, ρ] at each reading, before the distance query [m]
     gain            x ← γ_j x, γ_j ~ U[γ_low, γ_high] at reset; of an elastomer the depth at each taxel
@@ -397,3 +397,7 @@ def _reference_column(layout: Layout | None, i: int, sigma: float) -> Float[np.n
         if i == j or (are_active and layout.link_id[i] == layout.link_id[j] and layout.normal[i] @ layout.normal[j] > 0):
             kernel[j] = np.exp(-sum((layout.pos[i] - layout.pos[j]) ** 2) / (2 * sigma**2))
     return kernel / kernel.sum()
+
+
+STAGES: tuple[type[Stage], ...] = (Radius, Gain, Hysteresis, Crosstalk, Delay, Offset, Quantization, Dead, Release)
+"""The stages of tgdsl, in their order."""
