@@ -1,6 +1,10 @@
 """Intervals of 95 % on recordings made with known parameters, noise and two clocks, for each kind that has parameters.
 
-`PYTHONPATH=tests/helpers python tests/calibration/test_coverage.py 200` prints the share that holds in 200 sets of each.
+`PYTHONPATH=tests/helpers python tests/calibration/test_coverage.py 200 [CASE …]` prints the share that holds in 200 sets of each.
+
+Kinds without a case: `contact` and `link_contact` read bits, which no derivative reaches; `contact_depth` and
+`surface_distance` have no parameter that changes their number; the scraping of `contact_audio` is a random sound. A fit of
+`temperature_grid` or `microphone` takes minutes, step by step. `proximity` is not tried.
 """
 
 import json
@@ -12,53 +16,82 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from recorded_presses import SCENE, motion
+from scipy import stats
 
 import tgdsl
-from tgdsl.calibration.recordings import velocities
+from tgdsl.calibration.recordings import NAMES_OF, velocities
+from tgdsl.module.state import SHAPES
 
 LAG, NOISE, NUM = 0.12, 0.01, 25
 """How far the sensor's clock is behind the states' [s]; noise over the RMS of the reading; samples."""
+SCENE = """
+<mujoco><worldbody>
+  <body name="pad"><geom type="box" size=".02 .02 .01" pos="0 0 -.01"/></body>
+  <body name="ball" pos="0 0 .05"><freejoint/><geom type="sphere" size=".03"/></body>
+  <body name="arm" pos="0 .1 0"><joint name="hinge"/><geom size=".01" pos="0 .05 0"/></body>
+</worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>
+"""
 
 
 class Case(NamedTuple):
-    """A sensor as guessed, its true parameters, how far the ball is lower [m], and parameters that no reading tells apart."""
+    """Sensor as guessed; true parameters; how far the ball is lower [m]; what nothing tells apart; sets of the slow test."""
 
-    sensor: dict[str, Any]
+    sensors: dict[str, dict[str, Any]]
     true: dict[str, float]
     lower: float = 0.0
     untold: tuple[str, ...] = ()
+    num_tested: int = 6
 
 
-STILL = {"normal_damping": 0, "shear_damping": 0, "outputs": ["force"]}
-ELASTIC = {"shear_strength": 0, "youngs_modulus": 1e5, "normal_stiffness": 1e7}
-MODULI = ("youngs_modulus", "normal_stiffness")
+def on_pad(kind: str, **keys: Any) -> dict[str, dict[str, Any]]:
+    return {"touch": {"kind": kind, "links": "pad", "feels": ["ball"], **keys}}
+
+
+STILL = {"gate": "geometric", "normal_damping": 0, "shear_damping": 0, "outputs": ["force"]}
+SKIN = {"gate": "geometric", "shear_strength": 0}
+ELASTIC = {**SKIN, "youngs_modulus": 1e5, "normal_stiffness": 1e7, "poissons_ratio": 0.3}
+MODULI = ("touch.youngs_modulus", "touch.normal_stiffness")
+WHINE = {
+    "kind": "actuation_audio",
+    "samples": 4,
+    "friction": 0,
+    "hum": 0,
+    "pitch": 0.4,
+    "partials": [1],
+    "load": 1e-3,
+    "power": 0,
+}
 CASES = {
     "kinematic_taxel": Case(
-        {"kind": "kinematic_taxel", **STILL, "normal_stiffness": 500, "depth_exponent": 1},
-        {"normal_stiffness": 900, "depth_exponent": 1.3},
+        on_pad("kinematic_taxel", **STILL, normal_stiffness=500, depth_exponent=1),
+        {"touch.normal_stiffness": 900, "touch.depth_exponent": 1.3},
     ),
     "kinematic_taxel, loop": Case(
-        {"kind": "kinematic_taxel", **STILL, "depth_exponent": 1, "loop": {"force": 0.3, "width": 2e-4}},
-        {"normal_stiffness": 900, "loop.force": 0.5},
+        on_pad("kinematic_taxel", **STILL, depth_exponent=1, loop={"force": 0.3, "width": 2e-4}),
+        {"touch.normal_stiffness": 900, "touch.loop.force": 0.5},
+        num_tested=1,
     ),
     "elastomer, gaussian": Case(
-        {"kind": "elastomer", "shear_strength": 0, "dilation_falloff": 2e4, "dilation_strength": 80},
-        {"dilation_falloff": 3e4, "dilation_strength": 100},
+        on_pad("elastomer", **SKIN, dilation_falloff=2e4, dilation_strength=80),
+        {"touch.dilation_falloff": 3e4, "touch.dilation_strength": 100},
         3e-3,
     ),
     "elastomer, half_space": Case(
-        {"kind": "elastomer", "kernel": "half_space", **ELASTIC, "poissons_ratio": 0.3, "marker_depth": 2e-3},
-        {"poissons_ratio": 0.4, "marker_depth": 1.5e-3},
+        on_pad("elastomer", kernel="half_space", **ELASTIC, marker_depth=2e-3),
+        {"touch.poissons_ratio": 0.4, "touch.marker_depth": 1.5e-3},
         3e-3,
         MODULI,
     ),
     "elastomer, bonded_layer": Case(
-        {"kind": "elastomer", "kernel": "bonded_layer", **ELASTIC, "poissons_ratio": 0.3, "thickness": 4e-3},
-        {"poissons_ratio": 0.4, "thickness": 3e-3},
+        on_pad("elastomer", kernel="bonded_layer", **ELASTIC, thickness=4e-3),
+        {"touch.poissons_ratio": 0.4, "touch.thickness": 3e-3},
         3e-3,
         MODULI,
     ),
+    "force_taxel": Case(
+        on_pad("force_taxel", gate="geometric", footprint=8e-3, moment_iterations=0, slots=1), {"touch.footprint": 1e-2}, 3e-3
+    ),
+    "actuation_audio": Case({"touch": WHINE}, {"touch.load": 2e-3, "touch.pitch": 0.5}, num_tested=1),
 }
 
 
@@ -70,70 +103,97 @@ def document(folder: Path, case: Case) -> Path:
         "tgdsl": 1,
         "robot": {"model": "scene.xml", "layout": {"resolutions": {"r": {"pad": points}}}},
         "objects": {"ball": {"body": "ball"}},
-        "sensors": {"touch": {"links": "pad", "feels": ["ball"], "gate": "geometric", **case.sensor}},
+        "sensors": case.sensors,
     }
     (folder / "touch.yaml").write_text(json.dumps(content))
     return folder / "touch.yaml"
 
 
+def scene_states(lower: float, num: int = 1200) -> dict[str, np.ndarray]:
+    """Return a ball that presses at different depths and speeds and moves a bit sideways, and an arm that is driven."""
+    time = np.linspace(0.0, 3.0, num)
+    pos, quat = np.zeros((num, 3, 3)), np.zeros((num, 3, 4))
+    pos[:, 0, 0] = 1e-3 * np.sin(2 * time)
+    pos[:, 0, 2] = 0.034 - 1.2e-3 * (1 - np.cos(4 * time)) - 4e-4 * np.sin(9 * time) - lower
+    pos[:, 2, 1] = 0.1
+    quat[..., 0] = 1.0
+    down, load = np.array([0.0, 0.0, -1.0]), 2.0 + np.sin(4 * time)
+    contact = {
+        "contact_pos": np.stack([pos[:, 0, 0], 0 * time, 0 * time], axis=1),
+        "contact_force": load[:, None] * down,
+        "contact_normal": np.tile(down, (num, 1)),
+        "contact_torque": np.zeros((num, 3)),
+    }
+    fields = {name: value[:, None, None] for name, value in contact.items()}
+    fields |= {"contact_netforce": contact["contact_force"][:, None], "contact_found": np.ones((num, 1))}
+    fields |= {"joint_vel": 4 * np.cos(3 * time)[:, None], "joint_effort": 1 + 0.5 * np.sin(2 * time)[:, None]}
+    return {"time": time, "body_pos": pos, "body_quat": quat, **fields}
+
+
 def recording(path: Path, case: Case, seed: int) -> dict[str, Any]:
-    """Return poses on one clock, and on another what a sensor with the true parameters read, with noise."""
-    states, clock = motion(1200), np.linspace(0.4, 2.6, NUM)
-    states["body_pos"][:, 0, 2] -= case.lower
-    touch = tgdsl.compile(path, dtype="float64", overrides={f"sensors.touch.{name}": v for name, v in case.true.items()})
-    fields = {name: states[name] for name in ("body_pos", "body_quat")}
-    fields |= velocities(states["time"], fields)
-    now = {}
-    for name in touch.inputs.fields:
-        columns = fields[name].reshape(len(fields[name]), -1).T
+    """Return states on one clock, and on another what a sensor with the true parameters read, with noise."""
+    states, clock = scene_states(case.lower), np.linspace(0.4, 2.6, NUM)
+    touch = tgdsl.compile(path, dtype="float64", overrides={f"sensors.{name}": value for name, value in case.true.items()})
+    fields = states | velocities(states["time"], states)
+    names, now = {"body": ["ball", "pad", "arm"]}, {}
+    for name in (name for name in touch.inputs.fields if name != "dt"):
+        value, axis = fields[name], str(SHAPES[name][0])
+        value = value[:, [names[axis].index(each) for each in touch.inputs.names[axis]]] if axis in names else value
+        columns = value.reshape(len(value), -1).T
         columns = np.stack([np.interp(clock, states["time"], column) for column in columns], axis=1)
-        now[name] = torch.from_numpy(columns.reshape(NUM, *fields[name].shape[1:]))
+        now[name] = torch.from_numpy(columns.reshape(NUM, *value.shape[1:]))
     if touch.has_state:
-        each = [touch(tgdsl.SceneState(**{n: v[i : i + 1] for n, v in now.items()}))["touch"].clone() for i in range(NUM)]
+        dt = float(clock[1] - clock[0])
+        each = [
+            touch(tgdsl.SceneState(**{n: v[i : i + 1] for n, v in now.items()}, dt=dt))["touch"].clone() for i in range(NUM)
+        ]
         target = torch.cat(each).numpy()
     else:
         target = touch(tgdsl.SceneState(**now))["touch"].numpy()
     noise = NOISE * np.sqrt((target**2).mean())
     target = target + np.random.default_rng(seed).normal(0.0, noise, target.shape)
-    (output,) = touch.outputs
+    output = next(output for output in touch.outputs if output.name == "touch")
     of_target = {"target": target, "clock": clock + LAG, "clock_width": 0.2, "unit": output.units[0], "floor": noise}
-    return states | {f"{key}:touch": value for key, value in of_target.items()}
+    used = {name: states[name] for name in ("time", *touch.inputs.fields) if name in states}
+    return used | {NAMES_OF["body"]: np.array(names["body"])} | {f"{key}:touch": value for key, value in of_target.items()}
 
 
-def covered(folder: Path, case: Case, num: int) -> float:
-    """Return how often intervals hold the true value."""
-    path, hits = document(folder, case), []
+def hits(folder: Path, case: Case, num: int) -> list[bool]:
+    """Return which intervals hold the true value, of so many sets."""
+    path, result = document(folder, case), []
     for seed in range(num):
-        fit = tgdsl.calibrate(path, recording(path, case, seed), [f"touch.{name}" for name in case.true], starts=1)
-        hits += [
-            fit.parameters[f"touch.{name}"].low <= v <= fit.parameters[f"touch.{name}"].high for name, v in case.true.items()
-        ]
-    return float(np.mean(hits))
+        fit = tgdsl.calibrate(path, recording(path, case, seed), list(case.true), starts=1)
+        result += [fit.parameters[name].low <= value <= fit.parameters[name].high for name, value in case.true.items()]
+    return result
+
+
+def assert_covered(held: list[bool]) -> None:
+    """Assert that no more intervals miss than in 998 of 1000 runs of intervals that hold 95 %."""
+    assert held.count(False) <= stats.binom.ppf(0.998, len(held), 0.05), held
 
 
 def test_intervals_cover_the_truth(tmp_path):
-    """Of 4 sets: at most 2 of 8 intervals miss, of which 95 % should hold."""
-    assert covered(tmp_path, CASES["elastomer, gaussian"], 4) >= 0.75
+    assert_covered(hits(tmp_path, CASES["elastomer, gaussian"], 4))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_intervals_of_each_kind_cover_the_truth(tmp_path, case):
-    """Of 8 sets: at most 3 of 16 intervals miss, which of intervals that hold 95 % happens in 99 of 100 runs."""
-    assert covered(tmp_path, case, 8) >= 0.8
+    assert_covered(hits(tmp_path, case, case.num_tested))
 
 
-@pytest.mark.parametrize("case", [case for case in CASES.values() if case.untold], ids=lambda c: c.sensor["kernel"])
-def test_what_no_reading_tells_apart_is_named(tmp_path, case):
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.untold])
+def test_what_no_reading_tells_apart_is_named(tmp_path, name):
     """Displacement depends on the ratio of the two moduli alone."""
+    case = CASES[name]
     path = document(tmp_path, case)
     for seed in range(3):
-        names = [f"touch.{name}" for name in case.untold]
-        fit = tgdsl.calibrate(path, recording(path, case, seed), names, starts=1, intervals="none")
-        assert any(all(f"touch.{name}" in text for name in case.untold) for text in fit.warnings), fit.warnings
+        fit = tgdsl.calibrate(path, recording(path, case, seed), list(case.untold), starts=1, intervals="none")
+        assert any(all(name in text for name in case.untold) for text in fit.warnings), fit.warnings
 
 
 if __name__ == "__main__":
     for name, each in CASES.items():
-        with tempfile.TemporaryDirectory() as scratch:
-            print(f"{name}: {covered(Path(scratch), each, int(sys.argv[1])):.3f}", flush=True)
+        if name in sys.argv[2:] or len(sys.argv) == 2:
+            with tempfile.TemporaryDirectory() as scratch:
+                print(f"{name}: {np.mean(hits(Path(scratch), each, int(sys.argv[1]))):.3f}", flush=True)

@@ -127,13 +127,13 @@ class Model:
         tensors: dict[str, Any] = {n: torch.from_numpy(v.astype(np.int64) if n in CHOICES else v) for n, v in used.items()}
         self.module.free()
         if not self.module.has_state and "dt" not in wanted:
-            return self.module(SceneState(**tensors))[reading].numpy()
+            return _rows(self.module(SceneState(**tensors))[reading])
         steps = np.diff(time, prepend=2 * time[0] - time[1] if len(time) > 1 else time[0] - 1.0)
         each = []
         for i, dt in enumerate(steps):
             now: dict[str, Any] = {name: value[i : i + 1] for name, value in tensors.items()}
             each.append(self.module(SceneState(**now, dt=float(dt)))[reading])
-        return torch.cat(each).numpy()
+        return _rows(torch.cat(each))
 
     def _compile(self, changes: Mapping[str, Any]) -> None:
         self._constants: dict[tuple[float, ...], dict[str, np.ndarray]] = {}
@@ -200,6 +200,11 @@ class Model:
         unit = next(iter(units.units_of(quantity.dimension)), "")
         usual = next((part for part in metadata if isinstance(part, Usual)), None)
         return _bounded(path, float(value), quantity, usual, span, unit)
+
+
+def _rows(reading: torch.Tensor) -> np.ndarray:
+    """Return a reading (sample, row, channel), its instants as rows."""
+    return reading.reshape(len(reading), -1, reading.shape[-1]).numpy()
 
 
 def _bounded(path: str, start: float, quantity: Quantity, usual: Usual | None, span: str, unit: str) -> Parameter:

@@ -300,7 +300,8 @@ def _clock(target: Target) -> str:
 def _places(model: Model, reading: str) -> np.ndarray | None:
     """Return where a reading's rows are in their link's frame (row, 3) [m]; None if they have no place."""
     table = model.module.rows.get(reading)
-    return np.asarray(table["pos"]) if table is not None and "pos" in (table.dtype.names or ()) else None
+    is_stacked = any(output.name == reading and len(output.shape) > 2 for output in model.module.outputs)
+    return None if table is None or is_stacked or "pos" not in (table.dtype.names or ()) else np.asarray(table["pos"])
 
 
 def _part(i: int, target: Target, reading: ReadingMap, places: np.ndarray | None, model: Model) -> Part:

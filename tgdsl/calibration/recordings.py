@@ -18,6 +18,9 @@
 Velocities that a module reads and a recording lacks are derivatives of the poses. States are interpolated at the target's
 times.
 
+A reading that holds several instants per call, as sound or a stacked history does, has them as rows, instant by instant; in the
+file they are an axis (sample, instant, row, channel).
+
 Shapes: `step` states, `sample` times of a target, `row` taxels (or markers, bodies, …), `channel` numbers of a row.
 """
 
@@ -245,13 +248,10 @@ class _Reader:
         channels, (factor, unit) = self._channels(name, output), self._unit(name, output)
         if not len(time):
             return None
-        num_rows = output.shape[-2]
-        if len(output.shape) > 2:
-            self.note(key, "this reading stacks calls", "fit it with `history: null`")
-            return None
-        shape = (len(time), num_rows, len(channels))
+        shape = (len(time), *output.shape[:-1], len(channels))
         if value.shape != shape:
-            self.note(key, f"found shape {value.shape}, expected {shape}: samples, {output.rows}s, channels")
+            axes = (*(["instants"] if len(shape) > 3 else []), f"{output.rows}s")
+            self.note(key, f"found shape {value.shape}, expected {shape}: samples, {', '.join(axes)}, channels")
             return None
         try:
             weight = np.broadcast_to(self.arrays.get(weight_key, np.ones(())), shape).astype(np.float64)
@@ -268,6 +268,7 @@ class _Reader:
             self.note(f"clock:{name}", f"found times from {span}", f"expected a common time, or a larger clock_width:{name}")
         floor, zero = self._scalar(f"floor:{name}") or 0.0, self._scalar(f"zero:{name}")
         value = np.where((weight > 0) & np.isfinite(value), value, 0.0) * factor
+        value, weight = (each.reshape(len(time), -1, len(channels)) for each in (value, weight))
         return Target(name, value, weight, channels, time, width, floor * factor, unit, zero)
 
     def _channels(self, name: str, output: Output) -> tuple[int, ...]:
