@@ -120,7 +120,8 @@ def _body(text: str, kind: Kind) -> str:
             block = re.sub(r"^(Source|Departures|Limits)\b", r"**\1**", inline(block))
             block = re.sub(r"`(\w+)`", lambda m: f"[`{m[1]}`]({m[1]}.md)" if m[1] in names else m[0], block)
         else:
-            block = "```text\n" + "\n".join(line[4:] for line in block.splitlines()) + "\n```"
+            lines = [re.sub(r" {3,}(?=\[[^\]]*\]$)", "   ", line[4:]) for line in block.splitlines()]  # units near the equation
+            block = "```text\n" + "\n".join(lines) + "\n```"
         blocks.append(block)
     return "\n\n".join(blocks)
 
