@@ -1,20 +1,21 @@
 """Pictures and videos of a browser's view, of a client that draws as viser's do."""
 
 import io
+import threading
 import time
 from types import SimpleNamespace
 
 import numpy as np
 from PIL import Image
 
-from tgdsl.view.capture import Recording, png, view_of
+from tgdsl.view.page import record, send_picture
 
 
 class Client:
     camera = SimpleNamespace(image_height=300, image_width=600)
 
     def __init__(self, num_frames: int = 1000):
-        self.num_frames, self.sizes = num_frames, []
+        self.num_frames, self.sizes, self.files = num_frames, [], []
 
     def get_render(self, height, width, *, transport_format, timeout):
         if len(self.sizes) == self.num_frames:
@@ -22,10 +23,16 @@ class Client:
         self.sizes.append((height, width))
         return np.full((height, width, 3), 10 * len(self.sizes) % 256, dtype=np.uint8)
 
+    def send_file_download(self, filename, content, *, save_immediately):
+        self.files.append((filename, content))
+
 
 def test_a_picture_has_the_pixels_of_the_window():
     client = Client()
-    with Image.open(io.BytesIO(png(view_of(client)))) as image:
+    send_picture(client)
+    ((name, content),) = client.files
+    assert name == "view.png"
+    with Image.open(io.BytesIO(content)) as image:
         assert image.size == (600, 300)
         assert image.getpixel((5, 5)) == (10, 10, 10)
 
@@ -33,10 +40,8 @@ def test_a_picture_has_the_pixels_of_the_window():
 def test_a_video_plays_as_long_as_it_was_recorded_and_ends_where_the_browser_goes():
     client = Client(num_frames=4)
     begin = time.monotonic()
-    recording = Recording(client)
-    recording._thread.join()
+    video = record(client, threading.Event())
     recorded = time.monotonic() - begin
-    video = recording.stop()
     assert video is not None
     with Image.open(io.BytesIO(video)) as frames:
         assert frames.size == (800, 400)
@@ -50,4 +55,13 @@ def test_a_video_plays_as_long_as_it_was_recorded_and_ends_where_the_browser_goe
 
 
 def test_a_browser_that_is_gone_at_once_gives_no_video():
-    assert Recording(Client(num_frames=0)).stop() is None
+    assert record(Client(num_frames=0), threading.Event()) is None
+
+
+def test_a_video_ends_when_it_is_stopped():
+    client, is_over = Client(), threading.Event()
+    threading.Timer(0.3, is_over.set).start()
+    video = record(client, is_over)
+    assert video is not None
+    with Image.open(io.BytesIO(video)) as frames:
+        assert frames.n_frames == len(client.sizes) < 10

@@ -10,8 +10,9 @@ from odd_hands import command
 
 from tgdsl.formats.robot import load_model
 from tgdsl.placement.propose.text import layout_text, new_draft
-from tgdsl.view.layers import LIFT, REST
+from tgdsl.view.layers import LIFT
 from tgdsl.view.layout_page import ALL_AROUND, CHOSEN, LayoutPage
+from tgdsl.view.style import LIVE_REST
 
 
 @contextmanager
@@ -38,7 +39,7 @@ def test_controls_change_the_chosen_links_and_the_button_writes_the_file_of_the_
         page.react()
         assert {name: num for name, num in discs(page).items() if "tip" in name} == {"left_tip": 48, "right_tip": 48}
         assert page._discs["palm"][1] is before["palm"]  # what has not changed is not drawn again
-        assert {tuple(page._discs[name][1].batched_colors[0]) for name in ("left", "left_tip")} == {REST, CHOSEN}
+        assert {tuple(page._discs[name][1].batched_colors[0]) for name in ("left", "left_tip")} == {LIVE_REST, CHOSEN}
         page.chosen.value = "(all)"
         page.react()
         page.density.value = 5.0

@@ -45,8 +45,7 @@ class Boxes:
         """The range of the colours: as it was asked for, or one that holds all values."""
         if self.ends is not None:
             return Normalize(*self.ends, clip=True)
-        low, high = float(self.value.min()), float(self.value.max())
-        return Normalize(low - FLAT, high + FLAT) if high - low < 1e-6 * max(1.0, abs(high)) else Normalize(low, high)
+        return norm_between(float(self.value.min()), float(self.value.max()))
 
     @property
     def headline(self) -> str:
@@ -80,6 +79,11 @@ class Boxes:
             return result
 
         return paint
+
+
+def norm_between(low: float, high: float) -> Normalize:
+    """Return the range from the lowest to the highest value; where both are the same, `FLAT` to either side."""
+    return Normalize(low - FLAT, high + FLAT) if high - low < 1e-6 * max(1.0, abs(high)) else Normalize(low, high)
 
 
 def is_boxed(touch: TactileModule, output: Output) -> bool:

@@ -72,14 +72,7 @@ def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose:
 
     Up is an axis of the root's frame: the one along which the taxels lie farthest from its origin, of those not pointing at
     the camera. Where taxels are opposed, up is against gravity, and the camera stands beside the gap that they close, turned so
-    far that one side's faces show.
-
-    Args:
-        view: One of `VIEWS`, or azimuth and elevation in degrees.
-        model: The robot.
-        layouts: The taxels, which count in the model's initial state, each by the surface that it stands for.
-        pose: Where the bodies are.
-        root: The hand's first body.
+    far that one side's faces show. Taxels count in the model's initial state, each by the surface that it stands for.
     """
     initial = pose_of(model, None)
     taxels = [taxels_of(model, initial, layout) for layout in layouts]
@@ -130,15 +123,7 @@ def best_camera(markers: Markers, hand: Mesh, model: mujoco.MjModel, layout: Lay
     """Return the camera that those taxels face which read most (see `facing_camera`), or the one that shows most taxels.
 
     Taxels count that are touched, or all where none is. The first camera is kept if it shows half as many as any other or more;
-    it is `front` where the taxels are opposed.
-
-    Args:
-        markers: The taxels.
-        hand: What hides taxels.
-        model: The robot.
-        layout: The taxels that views are named after, see `camera_of`.
-        pose: Where the bodies are.
-        root: The hand's first body.
+    it is `front` where the taxels are opposed. `hand` hides taxels; `layout` has the taxels that views are named after.
     """
     wanted = markers.is_touched if markers.is_touched.any() else markers.size > 0
     weight = markers.value if markers.is_read.any() else np.ones(len(markers.value))

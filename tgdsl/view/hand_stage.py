@@ -28,7 +28,7 @@ from tgdsl.runtime.xhand1.wire.ports import the_hand
 from tgdsl.runtime.xhand1.wire.protocol import FINGERS, HandState
 from tgdsl.scene.scene import scene_model
 from tgdsl.tuning.compile import compile
-from tgdsl.view.hand_table import StreamCounter
+from tgdsl.view.hand_table import StreamStats
 from tgdsl.view.stages import Poses, RecordedStage, Stage, kinematic_poses
 
 Array = np.ndarray
@@ -80,9 +80,8 @@ class LiveHandStage(HandStage):
     def __init__(self, hand: XHand1, calibration: Calibration | None = None):
         super().__init__(calibration)
         self._hand, self.opened = hand, ExitStack()
-        self._counter = StreamCounter()
-        reading = hand.read()
-        self._stats = self._counter.add(reading)
+        self._stats, reading = StreamStats(), hand.read()
+        self._stats.add(reading)
         self._start, self.time = reading.received_at, 0.0
         self._state: HandState = reading.state
         self._take(reading.state.position, reading.state.total_force)
@@ -94,9 +93,9 @@ class LiveHandStage(HandStage):
         except HandClosedError:
             raise
         except HandError as error:
-            self._stats = self._counter.add(Fault.of(error, time.monotonic()))
+            self._stats.add(Fault.of(error, time.monotonic()))
             return
-        self._stats = self._counter.add(reading)
+        self._stats.add(reading)
         self.time, self._state = reading.received_at - self._start, reading.state
         self._take(self._state.position, self._state.total_force)
 

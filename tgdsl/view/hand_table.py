@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,35 +19,26 @@ _PARTS = " ▏▎▍▌▋▊▉"
 _RATE_OVER_S = 1.0
 
 
-@dataclass(frozen=True)
 class StreamStats:
-    """How the readings come."""
-
-    rate: float  # readings per second, over the last second; NaN before the second reading
-    num_faults: int  # failures so far
-    fault: Fault | None  # the failure since the last reading; None if there was none
-
-
-class StreamCounter:
-    """Counts readings and failures as they come."""
+    """How readings and failures come."""
 
     def __init__(self) -> None:
         self._times: deque[float] = deque()
-        self._num_faults = 0
-        self._fault: Fault | None = None
+        self.rate = math.nan  # readings per second, over the last second; NaN before the second reading
+        self.num_faults = 0  # failures so far
+        self.fault: Fault | None = None  # the failure since the last reading; None if there was none
 
-    def add(self, event: Reading | Fault) -> StreamStats:
-        """Take a reading or a failure and return how they come."""
+    def add(self, event: Reading | Fault) -> None:
+        """Count a reading or a failure."""
         if isinstance(event, Fault):
-            self._fault, self._num_faults = event, self._num_faults + 1
-            now = event.time
+            self.fault, self.num_faults, now = event, self.num_faults + 1, event.time
         else:
-            self._fault, now = None, event.received_at
+            self.fault, now = None, event.received_at
             self._times.append(now)
         while self._times and self._times[0] < now - _RATE_OVER_S:
             self._times.popleft()
         elapsed = self._times[-1] - self._times[0] if self._times else 0.0
-        return StreamStats((len(self._times) - 1) / elapsed if elapsed > 0 else math.nan, self._num_faults, self._fault)
+        self.rate = (len(self._times) - 1) / elapsed if elapsed > 0 else math.nan
 
 
 class HandView:
@@ -58,18 +48,18 @@ class HandView:
         """Start without a reading; without a calibration, counts stay counts."""
         self._calibration = calibration or Calibration.none()
         self._title = title
-        self._table, self._counter = LiveTable(), StreamCounter()
+        self._table, self._stats = LiveTable(), StreamStats()
         self._lines = [title, "not one reading came"]
         self._reading: Reading | None = None
 
     def show(self, event: Reading | Fault, now: float | None = None) -> None:
         """Take a reading or a failure, and draw if it is time to; `now` is the time on its clock [s], default: this moment."""
-        stats = self._counter.add(event)
+        self._stats.add(event)
         if not isinstance(event, Fault):
             self._reading = event
         if self._reading is not None:
             age_s = self._reading.age_s(time.monotonic() if now is None else now)
-            self._lines = [self._title, *hand_lines(self._reading, self._calibration, stats, age_s)]
+            self._lines = [self._title, *hand_lines(self._reading, self._calibration, self._stats, age_s)]
         self._table.show(self._lines)
 
     def end(self) -> None:

@@ -22,18 +22,16 @@ from trimesh.remesh import subdivide_to_size
 
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
-from tgdsl.view.boxes import FLAT, boxes_of, is_boxed
+from tgdsl.view.boxes import boxes_of, is_boxed, norm_between
 from tgdsl.view.markers import magnitude, quantity_of, read_now, rows_of
-from tgdsl.view.meshes import body_triangles
+from tgdsl.view.meshes import body_surfaces
 from tgdsl.view.sound import sounding
-from tgdsl.view.style import HEAT, WARMTH
+from tgdsl.view.style import DISC_RADIUS, HEAT, LIVE_REST, WARMTH
 
 Array = np.ndarray
 MAGNITUDE = "magnitude"
-REST = (62, 72, 88)  # colour of what reads nothing
 LIFT = 2e-4  # how far discs and arrows begin above the surface [m]
-_DISC_RADIUS = (0.0006, 0.0022)
-_HEAT = HEAT.with_extremes(under="#{:02x}{:02x}{:02x}".format(*REST))
+_HEAT = HEAT.with_extremes(under="#{:02x}{:02x}{:02x}".format(*LIVE_REST))
 _SIGNED = matplotlib.colormaps["coolwarm"]
 
 
@@ -70,34 +68,26 @@ class Shown(NamedTuple):
 
 
 class Layer(ABC):
-    """One reading in the scene. The ends of its colours are the lowest and the highest value so far.
-
-    Attributes:
-        output: The reading.
-        channels: What it can be coloured by.
-        rows: What is drawn.
-    """
+    """One reading in the scene. The ends of its colours are the lowest and the highest value so far."""
 
     total = "sum"  # how rows are summed up: the name of NumPy's function
     output: Output
-    channels: tuple[str, ...]
+    channels: tuple[str, ...]  # what it can be coloured by
     rows: Rows
 
     def __init__(self) -> None:
         self._ends: dict[str, tuple[float, float]] = {}
-        self._handles: dict[str, list[Any]] = {}  # what is drawn of each link
+        self.members: list[tuple[Any, str, Any]] = []  # what is drawn: viser's handle, its link, its row or rows
 
     def show(self, links: Collection[str]) -> None:
         """Show these links, and hide the others."""
-        for link, handles in self._handles.items():
-            for handle in handles:
-                handle.visible = link in links
+        for handle, link, _ in self.members:
+            handle.visible = link in links
 
     def remove(self) -> None:
         """Take the layer out of the scene."""
-        for handles in self._handles.values():
-            for handle in handles:
-                handle.remove()
+        for handle, _, _ in self.members:
+            handle.remove()
 
     @abstractmethod
     def read(self, readings: Tensor, env: int, channel: str) -> Shown:
@@ -122,7 +112,7 @@ def add_discs(
     normal: Float[Array, "row 3"],
     size: Float[Array, " row"],
     rank: int = 0,
-    colour: tuple[int, int, int] = REST,
+    colour: tuple[int, int, int] = LIVE_REST,
 ) -> Any:
     """Add a disc for each row to viser's scene; return their handle.
 
@@ -145,7 +135,7 @@ def add_discs(
         faces,
         np.array(turns),
         pos + (1 + rank) * LIFT * normal,
-        batched_scales=0.6**rank * np.clip(0.45 * size, *_DISC_RADIUS),
+        batched_scales=0.6**rank * np.clip(0.45 * size, *DISC_RADIUS),
         batched_colors=np.tile(np.array(colour, dtype=np.uint8), (len(pos), 1)),
         side="double",
         lod="off",
@@ -174,7 +164,6 @@ class DiscLayer(Layer):
             labels = [f"{link}, taxel {i}" for i, link in enumerate(links)]
         normal = taxels.normal / np.linalg.norm(taxels.normal, axis=1, keepdims=True)
         self.rows = Rows(body, np.array(links), taxels.pos, normal, taxels.size, labels)
-        self._members = []
         for link, owner in dict.fromkeys(zip(links, body.tolist(), strict=True)):
             rows = np.flatnonzero((body == owner) & (np.array(links) == link) & (taxels.size > 0))
             if not len(rows):
@@ -182,8 +171,7 @@ class DiscLayer(Layer):
             path = f"/body{owner}/{output.name}/{link}"
             handle = add_discs(scene, path, taxels.pos[rows], normal[rows], taxels.size[rows], rank)
             handle.on_click(lambda event, rows=rows: pick(int(rows[event.instance_index])))
-            self._members.append((handle, rows))
-            self._handles.setdefault(link, []).append(handle)
+            self.members.append((handle, link, rows))
 
     def read(self, readings: Tensor, env: int, channel: str) -> Shown:
         output = self.output
@@ -204,7 +192,7 @@ class DiscLayer(Layer):
         return Shown(value, _unit(output.units[0]), quantity, Normalize(1e-12, most, clip=False), _HEAT, along)
 
     def paint(self, colour: UInt8[Array, "row 3"]) -> None:
-        for handle, rows in self._members:
+        for handle, _, rows in self.members:
             handle.batched_colors = colour[rows]
 
 
@@ -226,65 +214,41 @@ class SurfaceLayer(Layer):
         labels = [f"{link.body}, cell {i}" for i, link in zip(boxes.chosen, links, strict=True)]
         self.rows = Rows(body, np.array([link.name for link in links]), layout.pos, normal, np.sqrt(layout.area), labels)
         self.bodies = frozenset(body.tolist())  # those whose surface this layer draws
-        self._members: list[tuple[Any, int]] = []
         for i, link in enumerate(layout.links):
             rows = np.flatnonzero(layout.link_id == i)
             owner = model.body(link.body).id
-            corners, _ = body_triangles(model, owner, [link])
-            if not len(rows) or not len(corners):
+            surfaces = body_surfaces(model, owner, [link])
+            if not len(rows) or not surfaces:
                 continue
             sides = boxes.size[rows[0]]
-            vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+            vertices = np.concatenate([each.corners for each in surfaces]).reshape(-1, 3)
+            faces = np.arange(len(vertices)).reshape(-1, 3)
             vertices, faces = subdivide_to_size(vertices, faces, float(np.median(sides)), max_iter=20)[:2]
             nearest = KDTree(layout.pos[rows] / sides).query(vertices[faces].mean(axis=1) / sides)[1]
             for cell in np.unique(nearest):
                 own = vertices[faces[nearest == cell]].reshape(-1, 3)
                 places, merged = np.unique(own.round(9), axis=0, return_inverse=True)
                 row = int(rows[cell])
-                handle = scene.add_mesh_simple(
-                    f"/body{owner}/{output.name}/{link.name}/{row}",
-                    places,
-                    merged.reshape(-1, 3),
-                    color=REST,
-                    flat_shading=True,
-                )
+                name = f"/body{owner}/{output.name}/{link.name}/{row}"
+                handle = scene.add_mesh_simple(name, places, merged.reshape(-1, 3), color=LIVE_REST, flat_shading=True)
                 handle.on_click(lambda _, row=row: pick(row))
-                self._members.append((handle, row))
-                self._handles.setdefault(link.name, []).append(handle)
-        self._painted = np.tile(np.array(REST, dtype=np.uint8), (len(self._members), 1))
+                self.members.append((handle, link.name, row))
 
     def read(self, readings: Tensor, env: int, channel: str) -> Shown:
         value = read_now(readings, env)[:, 0]
-        low, high = self._widened(channel, value)
-        if high - low < 1e-6 * max(1.0, abs(high)):
-            low, high = low - FLAT, high + FLAT
-        return Shown(value[self._chosen], self._unit, self._quantity, Normalize(low, high), WARMTH)
+        norm = norm_between(*self._widened(channel, value))
+        return Shown(value[self._chosen], self._unit, self._quantity, norm, WARMTH)
 
     def paint(self, colour: UInt8[Array, "row 3"]) -> None:
-        new = colour[[row for _, row in self._members]]
-        for i in np.flatnonzero((new != self._painted).any(axis=1)):
-            self._members[i][0].color = tuple(new[i].tolist())
-        self._painted = new
+        colours = [tuple(own) for own in colour.tolist()]
+        for handle, _, row in self.members:
+            handle.color = colours[row]
 
 
 def layer_of(
-    scene: Any,
-    model: mujoco.MjModel,
-    touch: TactileModule,
-    output: Output,
-    rank: int,
-    pick: Callable[[int], None],
+    scene: Any, model: mujoco.MjModel, touch: TactileModule, output: Output, rank: int, pick: Callable[[int], None]
 ) -> Layer:
-    """Draw a reading; `pick` is called with the row that a user clicks.
-
-    Args:
-        scene: Viser's scene.
-        model: The compiled scene, whose bodies are nodes `/body<id>`.
-        touch: The module.
-        output: Which reading.
-        rank: How many readings are drawn below this one.
-        pick: What to do with a click.
-    """
+    """Draw a reading over `rank` others in viser's scene; `pick` is called with the row that a user clicks."""
     if is_boxed(touch, output):
         return SurfaceLayer(scene, model, touch, output, pick)
     return DiscLayer(scene, model, touch, output, rank, pick)

@@ -16,11 +16,12 @@ from tgdsl.placement.propose.propose import FACTORS, Draft, LinkProposal
 from tgdsl.placement.propose.text import check_new, write_layout
 from tgdsl.placement.sample.sample import Samples
 from tgdsl.view.cameras import pose_of
-from tgdsl.view.layers import REST, add_discs
-from tgdsl.view.live_scene import CARRIER, ROBOT, add_body, aim_camera
+from tgdsl.view.layers import add_discs
+from tgdsl.view.live_scene import add_body, aim_camera
 from tgdsl.view.markers import Markers, in_world
 from tgdsl.view.page import FRAME, PORT, serve, stop, url_of
 from tgdsl.view.panel import EVERY
+from tgdsl.view.style import LIVE_OTHER, LIVE_REST, LIVE_SENSING
 
 CHOSEN = (234, 88, 12)  # colour of the taxels of the chosen links
 AXIS_LENGTH = 0.02  # of the axes at the origin of the chosen link [m]
@@ -201,7 +202,7 @@ class LayoutPage:
             self._frames[name] = scene.add_frame(
                 f"/body{body}", show_axes=False, axes_length=AXIS_LENGTH, axes_radius=0.03 * AXIS_LENGTH, **place
             )
-            for mesh, _ in add_body(scene, self._model, body, (), CARRIER if name in self._sampled else ROBOT, True):
+            for mesh, _ in add_body(scene, self._model, body, (), LIVE_SENSING if name in self._sampled else LIVE_OTHER, True):
                 if name in self._sampled:
                     mesh.on_click(lambda _, name=name: self._clicks.put(lambda: self._choose(name)))
         parts = [samples for _, samples in self._sampled.values()]
@@ -226,7 +227,7 @@ class LayoutPage:
                     if name in self._discs:
                         self._discs[name][1].remove()
                     path, size = f"/body{self._model.body(name).id}/taxels", np.sqrt(samples.area)
-                    colour = CHOSEN if name in names else REST
+                    colour = CHOSEN if name in names else LIVE_REST
                     handle = add_discs(self.server.scene, path, samples.pos, samples.normal, size, colour=colour)
                     handle.on_click(lambda _, name=name: self._clicks.put(lambda: self._choose(name)))
                     self._discs[name] = state, handle

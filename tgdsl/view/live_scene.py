@@ -13,16 +13,14 @@ from scipy.spatial.transform import Rotation
 from tgdsl.layout.layout import Link
 from tgdsl.module.outputs import Output
 from tgdsl.view.cameras import facing_camera
-from tgdsl.view.contacts import Contacts
 from tgdsl.view.layers import LIFT, Layer, Rows, Shown, SurfaceLayer, layer_of
 from tgdsl.view.markers import THRESHOLDS, Markers, Pose
 from tgdsl.view.meshes import body_surfaces, robot_bodies, shapes_of
-from tgdsl.view.stages import Poses, Stage
+from tgdsl.view.stages import Contacts, Poses, Stage
+from tgdsl.view.style import LIVE_OBJECT, LIVE_OTHER, LIVE_SENSING
 
 Array = np.ndarray
-CARRIER, ROBOT, OBJECT = (176, 181, 190), (128, 134, 145), (60, 112, 186)  # links with taxels, other links, objects
 ARROW = 0.03  # length of the arrow of the largest vector so far [m]
-STILL, STILL_TURN = 1e-5, 1e-4  # a body that moved less since it was drawn stays [m], [quaternion]
 _FORCE, _CONTACT = (30, 30, 30), (190, 24, 120)
 _CONTACT_SIZE = 0.0025  # width of a contact point [m]
 
@@ -40,13 +38,11 @@ class LiveScene:
         scene = server.scene
         scene.set_up_direction("+z")
         self.frames = {body: scene.add_frame(f"/body{body}", show_axes=False) for body in range(stage.model.nbody)}
-        self._pos, self._quat = np.full((stage.model.nbody, 3), np.inf), np.full((stage.model.nbody, 4), np.inf)  # as drawn
         self._meshes: dict[int, list[tuple[Any, Any]]] = {}
         for body in range(stage.model.nbody):
             self._add_body(stage.model, body)
         self._shapes = shapes_of(stage.model)
         self.layers: list[Layer] = []
-        self._switches: tuple[Any, ...] = ()
         self._arrows = scene.add_line_segments("/arrows", np.zeros((1, 2, 3)), _FORCE, thickness=2.0, thickness_units="screen")
         self._points = scene.add_point_cloud(
             "/contacts", np.zeros((1, 3)), _CONTACT, point_size=_CONTACT_SIZE, point_shape="circle", precision="float32"
@@ -54,18 +50,15 @@ class LiveScene:
         self._forces = scene.add_arrows(
             "/contact_forces", np.zeros((1, 2, 3)), _CONTACT, shaft_radius=0.0005, head_radius=0.0014, head_length=0.004
         )
-        for handle in (self._arrows, self._points, self._forces):
+        self._name = scene.add_label("/picked", "", font_screen_scale=0.9, anchor="bottom-left")
+        for handle in (self._arrows, self._points, self._forces, self._name):
             handle.visible = False
         self._largest_contact = THRESHOLDS["N"]  # smaller forces are rounding, and their arrows too short to draw
-        self._name: Any = None
 
     def move(self, poses: Poses, env: int) -> None:
         """Put the bodies where they are; redraw objects that have another shape in this environment."""
-        pos, quat = poses
-        apart = np.maximum(np.abs(pos - self._pos).max(axis=1) / STILL, np.abs(quat - self._quat).max(axis=1) / STILL_TURN)
-        for body in np.flatnonzero(apart > 1):
-            self._pos[body], self._quat[body] = pos[body], quat[body]
-            self.frames[int(body)].position, self.frames[int(body)].wxyz = pos[body], quat[body]
+        for frame, pos, quat in zip(self.frames.values(), *poses, strict=True):
+            frame.position, frame.wxyz = pos, quat  # viser sends what has changed
         model = self._stage.env_model(env)
         if model is not self._stage.model and (shapes := shapes_of(model)) != self._shapes:
             self._shapes = shapes
@@ -85,10 +78,6 @@ class LiveScene:
 
     def show(self, *, robot: bool, objects: bool, taxels: bool, plain: bool, links: set[str]) -> None:
         """Switch parts on and off; `plain`: the robot in grey in place of its own colours."""
-        switches = (robot, objects, taxels, plain, links, tuple(self.layers), self._shapes)
-        if switches == self._switches:
-            return
-        self._switches = switches
         surfaces = [layer for layer in self.layers if isinstance(layer, SurfaceLayer)]
         covered = frozenset[int]().union(*(layer.bodies for layer in surfaces)) if taxels else frozenset()
         for body, meshes in self._meshes.items():
@@ -130,18 +119,14 @@ class LiveScene:
             self._forces.points = np.stack([contacts.pos, contacts.pos + along], axis=1)[drawn].astype(np.float32)
             self._forces.visible = True
 
-    def name_row(self, rows: Rows, row: int | None, text: str = "") -> None:
+    def name_row(self, rows: Rows, row: int | None, poses: Poses, text: str = "") -> None:
         """Write text beside a row; None: beside nothing."""
-        path = None if row is None else f"/body{rows.body[row]}/picked"
-        if self._name is not None and self._name.name != path:
-            self._name.remove()
-            self._name = None
-        if row is None:
-            return
-        if self._name is None:
-            self._name = self._server.scene.add_label(path, text, font_screen_scale=0.9, anchor="bottom-left")
-        self._name.position = rows.pos[row] + 4 * LIFT * rows.normal[row]
-        self._name.text = text
+        self._name.visible = row is not None
+        if row is not None:
+            pos, quat = (part[rows.body[row]] for part in poses)
+            turn = Rotation.from_quat(quat, scalar_first=True)
+            self._name.position = pos + turn.apply(rows.pos[row] + 4 * LIFT * rows.normal[row])
+            self._name.text = text
 
     def place_camera(self, rows: Rows) -> None:
         """Look at the rows of a reading from where most of them face."""
@@ -155,7 +140,7 @@ class LiveScene:
         self._meshes[body] = add_body(self._server.scene, model, body, self._links, self._plain(body), is_plain)
 
     def _plain(self, body: int) -> tuple[int, int, int]:
-        return CARRIER if body in self._carriers else ROBOT if body in self.robot else OBJECT
+        return LIVE_SENSING if body in self._carriers else LIVE_OTHER if body in self.robot else LIVE_OBJECT
 
 
 def add_body(

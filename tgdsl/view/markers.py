@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -34,16 +34,6 @@ class Pose(NamedTuple):
 
     pos: Float[Array, "body 3"]
     quat: Float[Array, "body 4"]
-
-
-class Posed(Protocol):
-    """A model whose bodies are somewhere: a simulator's, or a recorded run's."""
-
-    model: mujoco.MjModel
-
-    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return origins [m] and quaternions w, x, y, z of all bodies in one environment, in the world."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,19 +147,11 @@ def read_now(values: Tensor, env: int) -> Float[Array, "row channel"]:
     return last_step(values)[env].detach().cpu().double().numpy()
 
 
-def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tensor, env: int) -> Markers:
-    """Return where the rows of a reading are in one environment, and what they read.
-
-    Args:
-        touch: The module.
-        scene: The scene, at the instant of the reading.
-        output: Which reading; its magnitude is the norm over the channels that share the first one's unit.
-        values: The reading of all environments; of stacked calls the last one is shown.
-        env: Which environment.
-    """
+def markers_of(touch: TactileModule, sim: Simulation, output: Output, values: Tensor, env: int) -> Markers:
+    """Return where the rows of a reading are in one environment, and their magnitudes; of stacked calls the last one's."""
     bodies, rows = rows_of(touch, output)
-    pose = Pose(*scene.body_poses(env))
-    pos, normal = in_world(scene.model, pose, bodies, rows.pos, rows.normal)
+    pose = Pose(*sim.body_poses(env))
+    pos, normal = in_world(sim.model, pose, bodies, rows.pos, rows.normal)
     same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
     read = read_now(values, env)
     value = magnitude(read, output.units)
@@ -184,7 +166,7 @@ def markers_of(touch: TactileModule, scene: Posed, output: Output, values: Tenso
         size=rows.size,
         value=scale * value,
         scale=scale,
-        vector=in_world(scene.model, pose, bodies, np.zeros_like(pos), read[:, same])[1] if is_vector else None,
+        vector=in_world(sim.model, pose, bodies, np.zeros_like(pos), read[:, same])[1] if is_vector else None,
         quantity=quantity,
         unit=unit,
         threshold=THRESHOLDS.get(output.units[0], 0.0),
@@ -225,14 +207,7 @@ def touched(
 
 
 def is_visible(taxels: Taxels, at: Float[Array, "taxel 3"], fragments: Fragments, camera: Camera) -> Bool[Array, " taxel"]:
-    """Return which taxels face the camera with nothing of the robot between.
-
-    Args:
-        taxels: The taxels in the world.
-        at: Where they are, as (column [pixel], row [pixel], nearness [m]).
-        fragments: The robot.
-        camera: The camera.
-    """
+    """Return which taxels, at (column [pixel], row [pixel], nearness [m]), face the camera, nothing of the robot between."""
     height, width = fragments.nearness.shape
     column = np.clip(np.rint(at[:, 0]), 0, width - 1).astype(int)
     row = np.clip(np.rint(at[:, 1]), 0, height - 1).astype(int)

@@ -43,27 +43,14 @@ def robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], s
 
 
 def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int], links: Iterable[Link] = ()) -> Mesh:
-    """Return the triangles of some bodies in the world: see `body_triangles`."""
+    """Return the triangles of some bodies in the world: see `body_surfaces`."""
     parts = [Mesh(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
     links = list(links)
     for body in sorted(bodies):
-        corners, normals = body_triangles(model, body, links)
         rotation = Rotation.from_quat(pose.quat[body], scalar_first=True).as_matrix().T
-        parts.append(Mesh(corners @ rotation + pose.pos[body], normals @ rotation, np.full(len(corners), body)))
+        for corners, normals, _ in body_surfaces(model, body, links):
+            parts.append(Mesh(corners @ rotation + pose.pos[body], normals @ rotation, np.full(len(corners), body)))
     return Mesh(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def body_triangles(
-    model: mujoco.MjModel, body: int, links: Iterable[Link] = ()
-) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
-    """Return corners and normals of a body's triangles in its own frame: of its geoms that collide, or else of all; no planes.
-
-    If one of `links` has its taxels on a geom or mesh that does not collide, those that do not collide are shown instead.
-    """
-    parts = [(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))]
-    parts += [_triangles(model, geom) for geom in _shown_geoms(model, body, links)]
-    corners, normals = zip(*parts, strict=True)
-    return np.concatenate(corners), np.concatenate(normals)
 
 
 class Surface(NamedTuple):
@@ -75,12 +62,17 @@ class Surface(NamedTuple):
 
 
 def body_surfaces(model: mujoco.MjModel, body: int, links: Iterable[Link] = ()) -> list[Surface]:
-    """Return the triangles of `body_triangles` by the colour of their geoms."""
+    """Return the triangles of a body by colour: of its geoms that collide, or else of all; no planes.
+
+    If one of `links` has its taxels on a geom or mesh that does not collide, those that do not collide are shown instead.
+    """
     by_colour: dict[tuple[float, float, float, float] | None, list[tuple[Array, Array]]] = {}
     for geom in _shown_geoms(model, body, links):
         corners, normals = _triangles(model, geom)
+        rotation = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).as_matrix().T
         if len(corners):
-            by_colour.setdefault(geom_colour(model, geom), []).append((corners, normals))
+            part = corners @ rotation + model.geom_pos[geom], normals @ rotation
+            by_colour.setdefault(geom_colour(model, geom), []).append(part)
     return [
         Surface(np.concatenate([corners for corners, _ in parts]), np.concatenate([normals for _, normals in parts]), colour)
         for colour, parts in by_colour.items()
@@ -117,13 +109,6 @@ def _names(model: mujoco.MjModel, geom: int) -> set[str]:
 
 
 def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
-    """Return corners and normals of a geom in its body's frame; none of one without a bounded surface."""
-    corners, normals = _local_triangles(model, geom)
-    rotation = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).as_matrix().T
-    return corners @ rotation + model.geom_pos[geom], normals @ rotation
-
-
-def _local_triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
     """Return corners and normals of a geom in its own frame; none of one without a bounded surface."""
     kind, mesh = GeomType(int(model.geom_type[geom])), int(model.geom_dataid[geom])
     if kind in (GeomType.mjGEOM_MESH, GeomType.mjGEOM_SDF) and mesh >= 0:

@@ -20,10 +20,11 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from queue import Empty, SimpleQueue
+from types import SimpleNamespace
 from typing import Any, BinaryIO, NamedTuple, cast
 
 import mujoco
@@ -32,19 +33,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.console.tables import TaxelTable
 from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
-from tgdsl.module.outputs import Output, outputs_of
-from tgdsl.plan.inputs import Inputs
-from tgdsl.plan.plan import Plan
+from tgdsl.module.outputs import outputs_of
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.view.meshes import shapes_of
 from tgdsl.view.page import FRAME, LOCAL, NETWORK_WARNING, PORT, Page, check_viser, drawn
 from tgdsl.view.stages import Poses, SimStage, Stage
 
 Array = np.ndarray
-ENV_WAIT = 1.0  # longest wait for the first frame of another environment [s]
 BROWSER_LOOK = 0.2  # time between looks for a browser [s]
 PRIORITY, LOWEST_PRIORITY = 10, 19  # of the page's process, as `nice` has it
 _CHILD = "from tgdsl.view.mirror import serve; serve()"
@@ -63,27 +60,10 @@ class Frame(NamedTuple):
     model: mujoco.MjModel | None  # of this environment, if its shapes are others than those of the frame before
 
 
-@dataclass(frozen=True)
-class _Tables:
-    """What a page wants of a module."""
-
-    plan: Plan
-    outputs: tuple[Output, ...]
-    taxels: Mapping[str, TaxelTable]
-    rows: Mapping[str, TaxelTable]
-
-    @property
-    def inputs(self) -> Inputs:
-        """What the module reads of a scene."""
-        return self.plan.inputs
-
-
-@dataclass(frozen=True)
-class _Opening:
+class _Opening(NamedTuple):
     """What the page's process begins with."""
 
-    tables: _Tables
-    outputs: Sequence[Output]  # those that are drawn
+    tables: SimpleNamespace  # see `_tables`
     model: mujoco.MjModel
     num_envs: int
     frame: Frame
@@ -114,7 +94,7 @@ class LoopPage:
         self._process = subprocess.Popen([sys.executable, "-c", _CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env)
         self._shapes = shapes_of(stage.model)  # of the model that the page has
         frame, tables = self._frame(0), _tables(stage.touch)
-        self._send(_Opening(tables, tuple(stage.outputs), stage.model, stage.num_envs, frame, host, port, priority))
+        self._send(_Opening(tables, stage.model, stage.num_envs, frame, host, port, priority))
         try:
             answer = pickle.load(cast(BinaryIO, self._process.stdout))
         except EOFError:
@@ -191,24 +171,16 @@ def frame_of(stage: Stage, env: int, shapes: bytes) -> Frame:
     model = stage.env_model(env)
     is_other = bool(stage.touch.inputs.objects) and shapes_of(model) != shapes
     readings = {o.name: stage.readings[o.name][env].detach().cpu().numpy().copy() for o in stage.outputs if stage.readings}
-    return Frame(
-        env,
-        stage.time,
-        pos.copy(),
-        quat.copy(),
-        readings,
-        dict(stage.notes(env)),
-        stage.state(env),
-        model if is_other else None,
-    )
+    notes, other = dict(stage.notes(env)), model if is_other else None
+    return Frame(env, stage.time, pos.copy(), quat.copy(), readings, notes, stage.state(env), other)
 
 
-def _tables(touch: TactileModule) -> _Tables:
-    """Return a module's tables, and its plan without what computes: constants may be large, or of classes of a script."""
+def _tables(touch: TactileModule) -> SimpleNamespace:
+    """Return what a page reads of a module; its plan without constants, which may be large, or of classes of a script."""
     bare: dict[str, Any] = {"constants": {}, "state": {}, "noise": None}
     sensors = tuple(replace(sensor, **bare) for sensor in touch.plan.sensors)
     plan = replace(touch.plan, quantities={}, observations=(), sensors=sensors)
-    return _Tables(plan, tuple(outputs_of(plan)), dict(touch.taxels), dict(touch.rows))
+    return SimpleNamespace(plan=plan, outputs=tuple(outputs_of(plan)), taxels=dict(touch.taxels), rows=dict(touch.rows))
 
 
 # In the page's process -----------------------------------------------------------------------------------------------------
@@ -218,25 +190,26 @@ class MirrorStage(Stage):
     """The stage of another process, frame by frame."""
 
     control_step = FRAME
+    is_gapless = False
 
     def __init__(self, opening: _Opening, source: BinaryIO, sink: BinaryIO):
         self.touch = cast(TactileModule, opening.tables)
-        self.model, self.num_envs, self._outputs = opening.model, opening.num_envs, opening.outputs
+        self.model, self.num_envs = opening.model, opening.num_envs
         self._source, self._sink, self._env_model = source, sink, opening.model
         self._arrived: SimpleQueue[Frame] = SimpleQueue()
         self._env, self._is_waiting, self.is_over = 0, False, False
         self._take(opening.frame)
         threading.Thread(target=self._listen, daemon=True).start()
 
-    @property
-    def outputs(self) -> Sequence[Output]:
-        """Readings that the other process can draw."""
-        return self._outputs
-
     def advance(self) -> None:
         """Take the frame that has come, if one has, and ask for the next one."""
-        self._receive(0.0)
-        self._ask()
+        with suppress(Empty):
+            self._take(self._arrived.get_nowait())
+            self._is_waiting = False
+        if not self._is_waiting:
+            self._is_waiting = True
+            pickle.dump(self._env, self._sink)
+            self._sink.flush()
 
     def restart(self) -> None:
         """Leave the loop as it is."""
@@ -246,12 +219,9 @@ class MirrorStage(Stage):
         return self._frame.notes
 
     def body_poses(self, env: int) -> Poses:
-        """Return the poses of the last frame; a frame of another environment is waited for."""
-        self._env, end = env, time.monotonic() + ENV_WAIT
-        while self._frame.env != env and not self.is_over and (left := end - time.monotonic()) > 0:
-            self._ask()
-            self._receive(left)
-        if self._frame.env != env:  # the loop stands still: nothing is drawn as this environment's readings
+        """Return the poses of the last frame; without readings if it is of another environment."""
+        self._env = env
+        if self._frame.env != env:
             self.readings = {}
         return self._frame.pos, self._frame.quat
 
@@ -262,18 +232,6 @@ class MirrorStage(Stage):
     def state(self, env: int) -> Mapping[str, Array] | None:
         """Return the state of the last frame."""
         return self._frame.state
-
-    def _ask(self) -> None:
-        if not self._is_waiting:
-            self._is_waiting = True
-            pickle.dump(self._env, self._sink)
-            self._sink.flush()
-
-    def _receive(self, timeout: float) -> None:
-        """Take the next frame if it comes in time [s]."""
-        with suppress(Empty):
-            self._take(self._arrived.get(timeout > 0, timeout))
-            self._is_waiting = False
 
     def _take(self, frame: Frame) -> None:
         self._frame, self.time = frame, frame.time

@@ -55,14 +55,8 @@ def drawing(
     Each panel has a scale of its own. An arrow is a vector as it is, in the plane of the picture; the longest is as long in
     every panel. Readings of bodies have one large marker per body; those of boxes, such as temperatures of cells, colour these.
 
-    Args:
-        touch: The module.
-        sim: The scene, at the instant of the readings.
-        readings: What the module read, by name.
-        env: Which environment.
-        title: What to write above it all.
-        view: From where, as in `view.picture`.
-        temperatures: Lowest and highest of the colours of temperatures [°C]; default: those that are read, in each panel.
+    `view` is as in `picture.drawing`; `temperatures` are the lowest and highest of the colours of temperatures [°C], by default
+    those that are read, in each panel.
 
     Raises:
         ViewError: If there is nothing to draw, or no such environment or view.

@@ -6,6 +6,7 @@ The page is served by viser, an optional package: `pip install tgdsl[view]`.
 from __future__ import annotations
 
 import math
+import threading
 import time
 import warnings
 from collections import deque
@@ -17,15 +18,15 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from PIL import Image
 
 from tgdsl.errors import TgdslError
 from tgdsl.module.outputs import Output
-from tgdsl.view.capture import Recording, png, view_of
-from tgdsl.view.heat_maps import HeatMaps
 from tgdsl.view.layers import DiscLayer, Layer, Shown
 from tgdsl.view.live_scene import LiveScene
-from tgdsl.view.panel import EVERY, Actions, Panel, legend
+from tgdsl.view.panel import EVERY, Panel, legend
+from tgdsl.view.picture import HeatMaps
 from tgdsl.view.sound import RANGE, RollingSound, sounding
 from tgdsl.view.stages import Poses, Stage
 
@@ -40,6 +41,10 @@ SOUND_SECONDS = 3.0  # how much of the past the spectrogram shows [s]
 SAVED_FRAMES = 1800  # number of frames that the page can save: the last minute at 30 per second
 NETWORK_WARNING = "the page is served at {}: whoever reaches this machine can see and control it"
 MAX_STEPS = 5  # most control steps per frame: a scene slower than that runs behind real time
+VIDEO_RATE = 10.0  # frames per second of a video at most
+VIDEO_SECONDS = 60.0  # how long a video is at most [s]
+_VIDEO_ROWS = 400  # rows of pixels of a video
+_PATIENCE = 20.0  # longest wait for one frame [s]
 _RECORD = ("record video", "stop and save video")  # label of the button before and during a recording
 
 
@@ -57,7 +62,7 @@ class Page:
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
         drawn(stage)
         self.server = serve(host, port)
-        self._recording: Recording | None = None
+        self._recording: threading.Event | None = None  # ends the video that is being recorded
         self.show(stage)
 
     @property
@@ -79,26 +84,23 @@ class Page:
         self._seen: dict[str, Any] = {"env": 0, "instant": 0, "group": EVERY, "plotted": EVERY, "keyframe": ""}
         self._history: deque[tuple[float, float]] = deque()
         self._frames_seen: deque[dict[str, Array]] = deque(maxlen=SAVED_FRAMES)
-        self._last_due: dict[str, float] = {}
+        self._images_due = 0.0  # when heat maps, spectrogram and observations are drawn again
         self._maps: dict[str, HeatMaps] = {}
-        units = {output.name: output.units[0] for output in stage.outputs}
-        heard = [sensor.name for sensor in sounding(stage.touch.plan) if sensor.name in units]
-        self._sounds = {name: RollingSound(name, units[name], SOUND_SECONDS) for name in heard}
+        heard = sounding(stage.touch.plan) if stage.is_gapless else ()
+        self._sounds = {own.name: RollingSound(own.name, own.readings[0].units[0], SOUND_SECONDS) for own in heard}
         self._clicks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         later = self._clicks.put
         with self.server.atomic():
             self.server.scene.reset()
             self.server.gui.reset()
             self.scene = LiveScene(self.server, stage, outputs, lambda row: later(lambda: self._pick(row)))
-            actions = Actions(
-                lambda: later(self._step_once),
-                lambda: later(self._restart),
-                lambda client: later(lambda: self._save(client)),
-                self._screenshot,
-                self._record_video,
-            )
-            self.panel = Panel(self.server.gui, stage, outputs, list(self._sounds), chosen, actions)
-            self.panel.record.label = _RECORD[self._recording is not None]
+            self.panel = panel = Panel(self.server.gui, stage, outputs, list(self._sounds), chosen)
+            acts = {"step once": self._step_once, "restart": self._restart}
+            panel.time.on_click(lambda event: later(acts[event.target.value]))
+            panel.screenshot.on_click(lambda event: send_picture(event.client))
+            panel.record.on_click(lambda event: self._record_video(event.client))
+            panel.save.on_click(lambda event: later(lambda: self._save(event.client)))
+            panel.record.label = _RECORD[self._recording is not None]
             self._react()
         self.draw()
         if is_first:
@@ -140,13 +142,16 @@ class Page:
 
     def draw(self) -> None:
         """Draw the stage as it is now."""
-        env = self.panel.env_index
+        env, now = self.panel.env_index, time.monotonic()
         poses = self.stage.body_poses(env)
+        with_images = now >= self._images_due
+        if with_images:
+            self._images_due = now + IMAGE
         with self.server.atomic():
             self.scene.move(poses, env)
             if self.stage.readings:
-                self._draw_touch(env, poses)
-            self._draw_text(self._draw_contacts(env))
+                self._draw_touch(env, poses, with_images)
+            self._draw_text(self._draw_contacts(env), with_images)
         self._record(env, *poses)
 
     def saved_frames(self) -> bytes:
@@ -171,7 +176,7 @@ class Page:
 
     # Touch -----------------------------------------------------------------------------------------------------------------
 
-    def _draw_touch(self, env: int, poses: Poses) -> None:
+    def _draw_touch(self, env: int, poses: Poses, with_images: bool) -> None:
         """Colour the readings; draw arrows, the legend, the picked row's name and the plot."""
         panel, links = self.panel, self.panel.shown_links
         for layer in self.scene.layers[1:]:
@@ -182,17 +187,17 @@ class Page:
         is_shown = np.isin(rows.link, list(links))
         self.scene.draw_arrows(rows, shown, poses, is_shown & panel.parts["arrows"].value)
         panel.legend.content = legend(shown)
-        if self._is_due("images", IMAGE):
+        if with_images:
             self._draw_images(layer, shown)
         if self._picked is not None:
             value, name = float(shown.value[self._picked]), f"**{rows.label[self._picked]}**"
-            self.scene.name_row(rows, self._picked, f"{rows.label[self._picked]}: {value:.4g} {shown.unit}")
+            self.scene.name_row(rows, self._picked, poses, f"{rows.label[self._picked]}: {value:.4g} {shown.unit}")
             name += f" at ({', '.join(f'{1e3 * part:.1f}' for part in rows.pos[self._picked])}) mm"
         else:
             is_meant = is_shown if panel.plotted.value == EVERY else rows.link == panel.plotted.value
             value = float(getattr(np, layer.total)(shown.value[is_meant])) if is_meant.any() else 0.0
             name = f"**{layer.total}**" if panel.plotted.value == EVERY else f"**{layer.total} of {panel.plotted.value}**"
-            self.scene.name_row(rows, None)
+            self.scene.name_row(rows, None, poses)
         panel.value.content = f"{name}: {shown.quantity} {value:.4g} {shown.unit}"
         self._history.append((self.stage.time, value))
         while not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
@@ -215,24 +220,12 @@ class Page:
             top = f"0 to {sound.sound.rate / 2000:.3g} kHz upward"
             panel.spectrogram.label = f"last {SOUND_SECONDS:g} s, {top}, {RANGE:g} dB below the loudest"
 
-    def _hear(self) -> None:
-        """Keep the sound of the step that the stage has made."""
-        env = self.panel.env_index
-        for name, sound in self._sounds.items():
-            block = self.stage.readings[name][env].detach().double().sum(dim=(1, 2)).cpu().numpy()
-            sound.add(block, self.stage.time, self.stage.control_step)
-
-    def _is_due(self, name: str, period: float) -> bool:
-        """Return whether a period has passed since this was last due [s]."""
-        now = time.monotonic()
-        if now - self._last_due.get(name, -math.inf) < period:
-            return False
-        self._last_due[name] = now
-        return True
-
     def _advance(self) -> None:
+        """Make one control step, and keep its sound."""
         self.stage.advance()
-        self._hear()
+        for name, sound in self._sounds.items():
+            block = self.stage.readings[name][self.panel.env_index].detach().double().sum(dim=(1, 2)).cpu().numpy()
+            sound.add(block, self.stage.time, self.stage.control_step)
 
     def _draw_contacts(self, env: int) -> str:
         """Draw the contacts if they are switched on; return what there is to say of them."""
@@ -245,23 +238,23 @@ class Page:
             return text
         return f"{text}, largest {np.linalg.norm(contacts.force, axis=1).max():.3g} N"
 
-    def _draw_text(self, contacts: str) -> None:
+    def _draw_text(self, contacts: str, with_observations: bool) -> None:
         """Write the time, and what the stage notes."""
         env = self.panel.env_index
         notes = self.stage.notes(env)
         rows = [f"\n| {name} | {f'{value:.4g}' if isinstance(value, float) else value} |" for name, value in notes.items()]
         self.panel.notes.content = f"| | |\n|---|---|{''.join(rows)}" if rows else ""
-        group = self.panel.observed
-        values_shown = self.panel.group_values
-        if group is not None and values_shown is not None and self._is_due("observations", IMAGE):
+        group, values_shown = self.panel.observed, self.panel.group_values
+        if group is not None and values_shown is not None and with_observations:
             rows = [f"\n| {name} | {_range(values)} | {unit} |" for name, unit, values in self.stage.observed(group.value, env)]
             values_shown.content = f"| | | |\n|---|---|---|{''.join(rows)}"
         layer = self.scene.layers[0]
         things = "taxels" if isinstance(layer, DiscLayer) else "cells"
         self.panel.status.content = f"t = {self.stage.time:.2f} s · {len(layer.rows.body)} {things}{contacts}"
-        instant = self.panel.instant
-        if instant is not None and self.stage.step_index != int(instant.value):
-            instant.value = self._seen["instant"] = self.stage.step_index
+        instant, step = self.panel.instant, self.stage.step_index
+        # where a browser has moved the slider since `_react`, its value stays for the next frame
+        if instant is not None and step != self._seen["instant"] == int(instant.value):
+            instant.value = self._seen["instant"] = step
 
     # Controls --------------------------------------------------------------------------------------------------------------
 
@@ -312,7 +305,9 @@ class Page:
         if layer.output.name != before:
             self._picked = None
             self._history.clear()
-            self.panel.offer(layer.channels, layer.rows.link.tolist())
+            self.panel.channel.options = layer.channels
+            self.panel.plotted.options = (EVERY, *dict.fromkeys(layer.rows.link.tolist()))
+            self.panel.channel.value, self.panel.plotted.value = layer.channels[0], EVERY
 
     def _step_once(self) -> None:
         self.panel.paused.value = True
@@ -323,16 +318,18 @@ class Page:
         if self._frames_seen:
             client.send_file_download("seen.npz", self.saved_frames(), save_immediately=True)
 
-    def _screenshot(self, client: Any) -> None:
-        """Send a picture of a browser's view to it."""
-        client.send_file_download("view.png", png(view_of(client)), save_immediately=True)
-
     def _record_video(self, client: Any) -> None:
-        """Begin a video of a browser's view, or end it and send it to that browser."""
-        recording, self._recording = self._recording, None if self._recording else Recording(client)
-        self.panel.record.label = _RECORD[self._recording is not None]
-        if recording is not None and (video := recording.stop()) is not None:
-            recording.client.send_file_download("view.gif", video, save_immediately=True)
+        """Record a browser's view until a second click, and send the video to that browser."""
+        if self._recording is not None:
+            self._recording.set()
+            return
+        self._recording = threading.Event()
+        self.panel.record.label = _RECORD[True]
+        video = record(client, self._recording)
+        self._recording = None
+        self.panel.record.label = _RECORD[False]
+        if video is not None:
+            client.send_file_download("view.gif", video, save_immediately=True)
 
     def _restart(self) -> None:
         self.stage.restart()
@@ -390,3 +387,45 @@ def drawn(stage: Stage) -> dict[str, Output]:
     if not outputs:
         raise TgdslError("no sensor of this document has taxels, bodies or cells to draw")
     return outputs
+
+
+def view_of(client: Any, rows: int | None = None) -> UInt8[Array, "h w 3"]:
+    """Return what a browser's camera sees, without the controls; default: as many pixels as the window has.
+
+    Raises:
+        TimeoutError: If the browser does not answer; viser raises another error where it is gone.
+    """
+    height, width = client.camera.image_height, client.camera.image_width
+    size = (height, width) if rows is None else (rows, round(rows * width / height))
+    return client.get_render(*size, transport_format="jpeg", timeout=_PATIENCE)[..., :3]
+
+
+def send_picture(client: Any) -> None:
+    """Send a picture of a browser's view to it, as a PNG file."""
+    file = BytesIO()
+    Image.fromarray(view_of(client)).save(file, "PNG", optimize=True)
+    client.send_file_download("view.png", file.getvalue(), save_immediately=True)
+
+
+def record(client: Any, is_over: threading.Event) -> bytes | None:
+    """Return a GIF file of a browser's view that plays in real time; None if no frame came.
+
+    Frames are asked for until `is_over` is set, for `VIDEO_SECONDS`, or until the browser is gone.
+    """
+    frames: list[tuple[float, Image.Image]] = []
+    begin = start = time.monotonic()
+    try:
+        while not is_over.is_set() and start - begin < VIDEO_SECONDS:
+            image = Image.fromarray(view_of(client, _VIDEO_ROWS))
+            frames.append((start, image.convert("P", palette=Image.Palette.ADAPTIVE)))
+            is_over.wait(max(0.0, 1 / VIDEO_RATE - (time.monotonic() - start)))
+            start = time.monotonic()
+    except (TimeoutError, RuntimeError):  # the browser is gone: the video ends here
+        pass
+    if not frames:
+        return None
+    times, images = zip(*frames, strict=True)
+    durations = np.diff([*times, times[-1] + 1 / VIDEO_RATE]) * 1e3
+    file = BytesIO()
+    images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=durations.round().tolist(), loop=0)
+    return file.getvalue()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,32 +19,10 @@ PARTS = ("robot", "objects", "taxels", "arrows", "contacts", "heat maps")
 _BLANK = np.full((8, 8, 3), 255, dtype=np.uint8)
 
 
-class Actions(NamedTuple):
-    """What the page does when a button is clicked; those that save something are called with viser's client."""
-
-    step_once: Callable[[], None]
-    restart: Callable[[], None]
-    save: Callable[[Any], None]
-    screenshot: Callable[[Any], None]
-    record: Callable[[Any], None]
-
-
-def _ends(stage: Stage) -> Float[Array, "2 actuator"]:
-    return np.array([(low, high) for _, low, high in stage.sliders]).T
-
-
 class Panel:
     """The handles of a page's controls."""
 
-    def __init__(
-        self,
-        gui: Any,
-        stage: Stage,
-        outputs: Mapping[str, Output],
-        sounds: Sequence[str],
-        reading: str | None,
-        actions: Actions,
-    ):
+    def __init__(self, gui: Any, stage: Stage, outputs: Mapping[str, Output], sounds: Sequence[str], reading: str | None):
         import viser.uplot as uplot
 
         names, groups = list(outputs), stage.touch.plan.layout.groups
@@ -54,8 +32,7 @@ class Panel:
         self.instant = gui.add_slider("step", 0, max(1, (stage.num_steps or 2) - 1), 1, 0) if stage.num_steps else None
         self.paused = gui.add_checkbox("pause", False)
         self.speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
-        acts = {"step once": actions.step_once, "restart": actions.restart}
-        gui.add_button_group("time", tuple(acts)).on_click(lambda event: acts[event.target.value]())
+        self.time = gui.add_button_group("time", ("step once", "restart"))
         with gui.add_folder("touch"):
             self.reading = gui.add_dropdown("reading", names, initial_value=reading)
             self.channel = gui.add_dropdown("channel", ("",))
@@ -86,10 +63,8 @@ class Panel:
             self.links = {name: gui.add_checkbox(name, True) for name in links}
         self.sliders: list[Any] = []
         with gui.add_folder("save"):
-            gui.add_button("screenshot").on_click(lambda event: actions.screenshot(event.client))
-            self.record = gui.add_button("video")
-            self.record.on_click(lambda event: actions.record(event.client))
-            gui.add_button("save last minute").on_click(lambda event: actions.save(event.client))
+            self.screenshot, self.record = gui.add_button("screenshot"), gui.add_button("video")
+            self.save = gui.add_button("save last minute")
         self.by_hand = self.keyframe = None
         if stage.control is None or not len(stage.control):
             return
@@ -99,8 +74,8 @@ class Panel:
                 self.keyframe = gui.add_dropdown("keyframe", ("", *filter(None, keys)))
             else:
                 self.by_hand = gui.add_checkbox("by hand", False)
-            for (name, low, high), value in zip(stage.sliders, np.clip(stage.control, *_ends(stage)), strict=True):
-                self.sliders.append(gui.add_slider(name, low, high, (high - low) / 200, float(value)))
+            self.sliders += (gui.add_slider(name, low, high, (high - low) / 200, low) for name, low, high in stage.sliders)
+        self.set_sliders(stage.control)
 
     @property
     def env_index(self) -> int:
@@ -116,12 +91,6 @@ class Panel:
     def shown_links(self) -> set[str]:
         """The links that are switched on."""
         return {name for name, box in self.links.items() if box.value}
-
-    def offer(self, channels: Sequence[str], links: Sequence[str]) -> None:
-        """Offer the channels and links of another reading."""
-        self.channel.options = tuple(channels)
-        self.plotted.options = (EVERY, *dict.fromkeys(links))
-        self.channel.value, self.plotted.value = channels[0], EVERY
 
     def set_sliders(self, control: Float[Array, " actuator"]) -> None:
         """Set the sliders to controls, or as near as their ranges allow."""

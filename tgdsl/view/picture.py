@@ -1,20 +1,26 @@
-"""Pictures of touch: the robot with its taxels coloured by reading, beside one heat map per link. No display is needed."""
+"""Pictures of touch: the robot with its taxels coloured by reading, beside one heat map per link. No display is needed.
+
+Shapes: `taxel` taxels of one sensor, `h` and `w` rows and columns of cells or pixels.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from scipy.spatial import KDTree
 from torch import Tensor
 
+from tgdsl.console.tables import TaxelTable
 from tgdsl.errors import did_you_mean
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
@@ -23,13 +29,15 @@ from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import Markers, markers_of, touched
 from tgdsl.view.raster import Viewport, unit
 from tgdsl.view.scene import draw_colour_bar, draw_markers, rendered, seen
-from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING, new_figure, save_figure
+from tgdsl.view.style import DPI, FAINT, HEAT, INK, SUPERSAMPLING, new_figure, pixels_of, save_figure, shortened
 
 Array = np.ndarray
 SIZE = (16.0, 9.0)  # width and height of the picture [inch]
 VIEW = (0.0125, 0.06, 0.55, 0.82)  # the 3-D view in the figure: left, bottom, width, height
 MAX_MAPS = 12
 _NAME_SPACING = 0.028  # least distance of the names of links, as a part of the 3-D view's height
+HEAT_MAP_WIDTH = 340  # columns of pixels of the live page's maps together
+_HEAD, _MARGIN = 16, 4  # rows of the title of a map there, and pixels around it
 _TITLE = {1: 11, 2: 11, 3: 9, 4: 7.8}  # size of the maps' titles, by how many stand side by side
 
 
@@ -50,14 +58,8 @@ def drawing(
 ) -> Figure:
     """Draw one reading of one environment: the robot with its taxels, then a map for each link, whose axes have its name.
 
-    Args:
-        touch: The module.
-        sim: The scene, at the instant of the readings.
-        readings: What the module read, by name.
-        env: Which environment.
-        reading: Which reading of taxels; default: a kinematic taxel's, if there is any, or else the first.
-        title: What to write above it all; default: the reading's name.
-        view: One of `cameras.VIEWS`, or azimuth and elevation in degrees, "30,20"; default: see `cameras.best_camera`.
+    The default reading is a kinematic taxel's, if there is any, or else the first; the default title is its name. A view is one
+    of `cameras.VIEWS`, or azimuth and elevation in degrees, "30,20"; default: see `cameras.best_camera`.
 
     Raises:
         ViewError: If there is no such reading, environment or view.
@@ -177,45 +179,58 @@ def distal(model: mujoco.MjModel, body: str, pos: Float[Array, "taxel 3"]) -> tu
     return (end - start) @ rotation, not ends
 
 
-def turned(table: Array, along: Float[Array, " 3"]) -> tuple[Float[Array, " 3"], int]:
-    """Return the direction to the right of a link's map, and by how many quarter turns, counter-clockwise, its grid is turned.
+class FlatMap(NamedTuple):
+    """Taxels of a link in the plane of their mean normal, seen from outside, with the distal end up."""
 
-    Unturned, columns run to the right and rows down, seen from outside; `along` shall be up, as nearly as it can be.
+    places: Float[Array, "taxel 2"]  # to the right and up [m]; of grids, before their quarter turns
+    cells: Int[Array, "h w"] | None  # which taxel each cell of a grid has, -1 for none; None: they are scattered
+    size: Float[Array, " 2"]  # height and width of the cells together [m]
+
+
+def flat_map(table: Array, along: Float[Array, " 3"]) -> FlatMap:
+    """Return the map of a link's taxels; `along` shall be up: a grid is turned by quarters until it nearly is.
+
+    Unturned, columns of a grid run to the right and rows down.
     """
     normal = unit(table["normal"].mean(axis=0), table["normal"][0])
     across = table["tangent"].mean(axis=0)
     across = unit(across - (across @ normal) * normal, table["tangent"][0])
-    if (table["row"] < 0).any():
-        up = along - (along @ normal) * normal
-        return (unit(np.cross(up, normal), across) if np.linalg.norm(up) > 0.1 * np.linalg.norm(along) else across), 0
+    is_grid = bool((table["row"] >= 0).all())
+    level = along - (along @ normal) * normal
+    if not is_grid and np.linalg.norm(level) > 0.1 * np.linalg.norm(along):
+        across = unit(np.cross(level, normal), across)
     up = np.cross(normal, across)
-    return across, int(np.argmax(np.array([up, across, -up, -across]) @ along))
+    places = table["pos"] @ np.stack([across, up], axis=1)
+    if not is_grid:
+        return FlatMap(places, None, np.ptp(places, axis=0)[::-1])
+    active = np.flatnonzero(table["radius"] > 0)
+    cells = np.full((table["row"].max() + 1, table["column"].max() + 1), -1)
+    cells[table["row"][active], table["column"][active]] = active
+    pitch = np.ptp(places, axis=0)[::-1] / np.maximum(np.array(cells.shape) - 1, 1)
+    pitch = np.where(pitch > 0, pitch, pitch.max() or 1.0)  # of a single row or column there is no pitch
+    quarters = int(np.argmax(np.array([up, across, -up, -across]) @ along))
+    size = pitch * cells.shape
+    return FlatMap(places, np.rot90(cells, quarters), size[::-1] if quarters % 2 else size)
 
 
 def _draw_map(axes: Axes, value: Array, table: Array, along: Float[Array, " 3"], norm: Normalize) -> None:
-    """Draw one link with its distal end up: a grid in quarter turns, or scattered taxels in the plane of their mean normal."""
+    """Draw one link with its distal end up: a grid as cells, scattered taxels as dots."""
     shown = np.where(value > 0, value, -1.0)
-    active = table["radius"] > 0
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
-    across, quarters = turned(table, along)
-    normal = unit(table["normal"].mean(axis=0), table["normal"][0])
-    x, y = 1e3 * table["pos"] @ across, 1e3 * table["pos"] @ np.cross(normal, across)
-    if (table["row"] >= 0).all():
-        cells = np.full((table["row"].max() + 1, table["column"].max() + 1), np.nan)
-        cells[table["row"][active], table["column"][active]] = shown[active]
-        pitch = np.array([np.ptp(y), np.ptp(x)]) / np.maximum(np.array(cells.shape) - 1, 1)
-        pitch = np.where(pitch > 0, pitch, pitch.max() or 1.0)  # of a single row or column there is no pitch
-        high, wide = pitch[::-1] if quarters % 2 else pitch
-        cells = np.rot90(cells, quarters)
-        axes.patch.set(facecolor="#f6f7f8", hatch="////", edgecolor="#d9dce0", linewidth=0)
+    places, cells, size = flat_map(table, along)
+    axes.patch.set_facecolor("#f6f7f8")
+    if cells is not None:
+        axes.patch.set(hatch="////", edgecolor="#d9dce0", linewidth=0)
         edge = 9.0 / max(9, *cells.shape)
-        axes.pcolormesh(np.ma.masked_invalid(cells), cmap=HEAT, norm=norm, edgecolors="white", linewidth=edge)
+        image = np.ma.masked_array(shown[cells], cells < 0)
+        axes.pcolormesh(image, cmap=HEAT, norm=norm, edgecolors="white", linewidth=edge)
+        high, wide = size / cells.shape
         axes.set(aspect=np.clip(high / wide, 0.4, 2.5), ylim=(len(cells), 0))
         return
-    size = 0.03 * axes.get_window_extent().height * 72 / DPI
-    axes.scatter(x[active], y[active], c=shown[active], cmap=HEAT, norm=norm, s=size**2, linewidths=0)
-    axes.patch.set_facecolor("#f6f7f8")
+    x, y = 1e3 * places[table["radius"] > 0].T
+    width = 0.03 * axes.get_window_extent().height * 72 / DPI
+    axes.scatter(x, y, c=shown[table["radius"] > 0], cmap=HEAT, norm=norm, s=width**2, linewidths=0)
     axes.margins(0.12)
     axes.set_aspect("equal", "datalim")
 
@@ -227,3 +242,53 @@ def short_names(links: list[str]) -> dict[str, str]:
     while len(links) > 1 and len({tuple(own[: shared + 1]) for own in words.values()}) == 1:
         shared += 1
     return {link: "_".join(own[max(min(shared, len(own) - 2), 0) :]) for link, own in words.items()}
+
+
+class HeatMaps:
+    """Maps of all links that carry taxels, as one image."""
+
+    def __init__(self, model: mujoco.MjModel, table: TaxelTable):
+        links = list(dict.fromkeys(table["link"].tolist()))
+        columns = math.ceil(math.sqrt(len(links)))
+        side = HEAT_MAP_WIDTH // columns
+        room = side - 2 * _MARGIN
+        rows = -(-len(links) // columns)
+        self._taxel: Int[Array, "h w"] = np.full((rows * (side + _HEAD), columns * side), -1)
+        figure = new_figure(self._taxel.shape[1] / DPI, self._taxel.shape[0] / DPI)
+        for i, (link, name) in enumerate(short_names(links).items()):
+            row, column = divmod(i, columns)
+            top, left = row * (side + _HEAD), column * side
+            chosen = np.flatnonzero(table["link"] == link)
+            along, _ = distal(model, str(table["body"][chosen[0]]), table["pos"][chosen])
+            map_ = _map_of(table[chosen], along, room)
+            first = top + _HEAD + _MARGIN + (room - len(map_)) // 2, left + _MARGIN + (room - map_.shape[1]) // 2
+            pixels = self._taxel[first[0] : first[0] + len(map_), first[1] : first[1] + map_.shape[1]]
+            pixels[:] = np.where(map_ >= 0, chosen[map_], -1)
+            height, width = self._taxel.shape
+            x, y = (left + side / 2) / width, 1 - (top + _HEAD / 2) / height
+            figure.text(x, y, shortened(name, side // 6), size=6.5, color=INK, ha="center", va="center")
+        self._blank, self._drawn = pixels_of(figure), self._taxel >= 0
+
+    def image(self, colour: UInt8[Array, "taxel 3"]) -> UInt8[Array, "h w 3"]:
+        """Return the maps with taxels in these colours."""
+        result = self._blank.copy()
+        result[self._drawn] = colour[self._taxel[self._drawn]]
+        return result
+
+
+def _map_of(table: TaxelTable, along: Float[Array, " 3"], room: int) -> Int[Array, "h w"]:
+    """Return which taxel of a link each pixel of its map shows, -1 for none; the map has at most `room` pixels a side."""
+    places, cells, size = flat_map(table, along)
+    if cells is not None:
+        height, width = np.maximum(1, np.floor(room * size / size.max())).astype(int)
+        row, column = np.arange(height) * len(cells) // height, np.arange(width) * cells.shape[1] // width
+        return cells[row[:, None], column]
+    apart = KDTree(places).query(places, k=min(2, len(places)))[0].reshape(len(places), -1)[:, -1]
+    reach = 0.5 * float(np.median(apart)) or 1e-3
+    pixel = float((size + 2 * reach).max()) / room
+    height, width = np.maximum(1, np.floor((size + 2 * reach) / pixel)).astype(int)
+    left, top = places[:, 0].min() - reach, places[:, 1].max() + reach
+    x, y = np.meshgrid(left + pixel * (np.arange(width) + 0.5), top - pixel * (np.arange(height) + 0.5))
+    active = np.flatnonzero(table["radius"] > 0)
+    distance, taxel = KDTree(places[active]).query(np.stack([x, y], axis=-1))
+    return np.where(distance < reach, active[taxel], -1)

@@ -32,7 +32,7 @@ from tgdsl.view.markers import Taxels, is_visible, taxels_of
 from tgdsl.view.meshes import mesh_of, robot_bodies
 from tgdsl.view.raster import Fragments, Mesh, Viewport, downsample, light_direction, rasterise, shade, viewport_for
 from tgdsl.view.scene import draw_image, draw_scale_bar
-from tgdsl.view.style import FAINT, INK, new_figure, save_figure
+from tgdsl.view.style import DISC_RADIUS, FAINT, INK, new_figure, save_figure
 
 Array = np.ndarray
 COLOURS = ("#0f7fb8", "#e8871e", "#c2315b", "#3a9d5d", "#7a55b0", "#8c6d46", "#d4b106", "#4f5d75")
@@ -45,7 +45,6 @@ _SURFACE = np.array([0.91, 0.92, 0.94])
 _CROSS = "#d40000"
 _DIAGONALS = np.array([[3, 15], [9, 21]])  # corners of a disc of 24 that lie opposite each other
 _AMBIENT_OCCLUSION = ((0.004, 12.0), (0.012, 6.0))  # width [m] of hollows, and how much darker per metre of depth
-_RADIUS = (0.0006, 0.0022)  # least and largest radius of a disc [m]
 
 
 def render(model: mujoco.MjModel, layouts: Mapping[str, Layout], out: Path, **options: Any) -> Path:
@@ -183,12 +182,12 @@ def _draw_captions(axes: Axes, name: str, layout: Layout, num_crossed: int) -> N
 
 def radii(layout: Layout, pos: Float[Array, "taxel 3"]) -> Float[Array, " taxel"]:
     """Return the radius of each disc [m]: the same on a link, and small enough to leave room between neighbours."""
-    radius = np.full(len(pos), _RADIUS[1])
+    radius = np.full(len(pos), DISC_RADIUS[1])
     for link in range(len(layout.links)):
         own = np.flatnonzero(layout.link_id == link)
         if len(own) > 1:
             apart = KDTree(pos[own]).query(pos[own], k=2)[0][:, 1]
-            radius[own] = np.clip(0.44 * np.median(apart), *_RADIUS)
+            radius[own] = np.clip(0.44 * np.median(apart), *DISC_RADIUS)
     return radius
 
 

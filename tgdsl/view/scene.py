@@ -22,10 +22,9 @@ from tgdsl.view.cameras import best_camera, camera_of
 from tgdsl.view.markers import Markers, Pose, is_visible
 from tgdsl.view.meshes import mesh_of, robot_bodies
 from tgdsl.view.raster import Fragments, Mesh, Viewport, downsample, rasterise, shade, viewport_for
-from tgdsl.view.style import DPI, HEAT, INK, SUPERSAMPLING
+from tgdsl.view.style import DPI, HEAT, INK, OBJECT, OTHER, SENSING, SUPERSAMPLING
 
 Array = np.ndarray
-_SENSING, _OTHER, _OBJECT = np.array([0.83, 0.84, 0.86]), np.array([0.60, 0.62, 0.66]), np.array([0.33, 0.55, 0.83])
 _DEPTH = 0.5  # how much of the shading painted surfaces keep
 # returns the colours of points of the robot's surface [m] on some bodies, NaN where these stay grey
 Paint = Callable[[Array, Array], Array]
@@ -58,17 +57,10 @@ def seen(
     view: str | None = None,
     layouts: Sequence[Layout] = (),
 ) -> Seen:
-    """Return robot and felt objects, seen from where some taxels are in view.
+    """Return robot and felt objects, seen from where some taxels are in view; default view: see `cameras.best_camera`.
 
-    Args:
-        touch: The module.
-        sim: The scene.
-        markers: The taxels.
-        env: Which environment.
-        width: Columns, before `SUPERSAMPLING` of them become one pixel.
-        height: Rows, in the same way.
-        view: From where; default: see `cameras.best_camera`.
-        layouts: What else carries sensors; the first gives views their names where the module has no taxels.
+    Width and height count before `SUPERSAMPLING` pixels become one. `layouts` are what else carries sensors; the first gives
+    views their names where the module has no taxels.
     """
     model, pose = sim.model, Pose(*sim.body_poses(env))
     layouts = (touch.plan.layout, *layouts)
@@ -91,7 +83,7 @@ def rendered(seen: Seen, paint: Paint | None = None) -> RenderedScene:
     """Draw what is in view; objects are fainter over a robot that is painted."""
     hand, carriers, objects, viewport = seen
     fragments = rasterise(viewport.project(hand.corners), viewport.width, viewport.height)
-    colour = np.where(np.isin(hand.body, list(carriers))[:, None], _SENSING, _OTHER)
+    colour = np.where(np.isin(hand.body, list(carriers))[:, None], SENSING, OTHER)
     image = shade(np.ones((viewport.height, viewport.width, 3)), fragments, hand, colour, viewport)
     if paint is not None:
         drawn = fragments.face >= 0
@@ -101,7 +93,7 @@ def rendered(seen: Seen, paint: Paint | None = None) -> RenderedScene:
         image[drawn] = np.where(np.isnan(painted), image[drawn], painted * light)
     over = rasterise(viewport.project(objects.corners), viewport.width, viewport.height)
     over.face[over.nearness < fragments.nearness] = -1
-    blue = np.broadcast_to(_OBJECT, (len(objects.body), 3))
+    blue = np.broadcast_to(OBJECT, (len(objects.body), 3))
     image = shade(image, over, objects, blue, viewport, opacity=0.4 if paint is None else 0.25)
     return RenderedScene(downsample(image, SUPERSAMPLING), fragments, viewport)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,8 +28,7 @@ _SOUND = matplotlib.colormaps["magma"]
 RANGE = 80.0  # levels that a spectrogram tells apart [dB]
 
 
-@dataclass(frozen=True, eq=False)
-class Sound:
+class Sound(NamedTuple):
     """The samples of a sensor over a run."""
 
     name: str  # the sensor's name

@@ -1,6 +1,6 @@
 """Stages that a page shows: a scene at one instant, how it goes on, and what its taxels read.
 
-Shapes: `env` environments, `step` control steps, `actuator` actuators.
+Shapes: `env` environments, `step` control steps, `actuator` actuators, `contact` contacts.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
@@ -24,8 +24,8 @@ from tgdsl.observations.observations import HAND_ONLY
 from tgdsl.runtime.connect import simulate
 from tgdsl.runtime.rollout import substeps_of
 from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.simulators.state_values import INTEGRATED
 from tgdsl.scene.scene import scene_model
-from tgdsl.view.contacts import Contacts, contacts_of, simulated_contacts, state_of
 from tgdsl.view.overview import drawn_outputs
 
 Array = np.ndarray
@@ -48,6 +48,20 @@ class Observed(NamedTuple):
     values: Float[Array, " feature"]
 
 
+class Contacts(NamedTuple):
+    """Contacts of one environment in the world."""
+
+    pos: Float[Array, "contact 3"]  # [m]
+    bodies: Int[Array, "contact 2"]  # the two bodies of each; -1 for a flex
+    force: Float[Array, "contact 3"] | None  # on the second body [N]; None where it is unknown
+
+    def forces_on(self, bodies: frozenset[int]) -> Float[Array, "contact 3"]:
+        """Return the forces [N], each on that one of its two bodies that is among `bodies`, or else on the second."""
+        assert self.force is not None
+        is_in = np.isin(self.bodies, list(bodies))
+        return np.where((is_in[:, 0] & ~is_in[:, 1])[:, None], -self.force, self.force)
+
+
 class Stage(ABC):
     """A scene at one instant."""
 
@@ -61,6 +75,7 @@ class Stage(ABC):
     control: Float[Array, " actuator"] | None = None
     by_hand: bool | None = None  # whether `control` acts in place of a policy; None: there is no policy
     groups: Sequence[str] = ()  # names of the groups of observations
+    is_gapless = True  # whether `advance` makes each control step, so that sounds are joined
     num_steps: int | None = None  # number of instants of a recorded run; None: the scene goes on without end
     step_index = 0  # which instant of a recorded run this is
 
@@ -160,7 +175,7 @@ class SimStage(Stage):
         return self.sim.env_model(env) if self.touch.inputs.objects else self.model
 
     def state(self, env: int) -> Mapping[str, Array]:
-        return state_of(self.sim, env)
+        return {name: self.sim.arrays[name][env].detach().cpu().numpy().copy() for name in INTEGRATED}
 
 
 class SceneStage(SimStage):
@@ -229,6 +244,30 @@ class RunStage(RecordedStage):
         self.body_poses(env)
         mujoco.mj_collision(self.model, self._data)
         return contacts_of(self.model, self._data, with_force=False)
+
+
+def simulated_contacts(model: mujoco.MjModel, state: Mapping[str, Array]) -> Contacts:
+    """Return the contacts of a state, by MuJoCo's forward dynamics on the CPU."""
+    data = mujoco.MjData(model)
+    for name, value in state.items():
+        if name == "time":
+            data.time = float(value)
+        else:
+            getattr(data, name)[...] = value
+    mujoco.mj_forward(model, data)
+    return contacts_of(model, data)
+
+
+def contacts_of(model: mujoco.MjModel, data: mujoco.MjData, with_force: bool = True) -> Contacts:
+    """Return the contacts of a state for which MuJoCo makes constraints."""
+    active = [i for i in range(data.ncon) if not data.contact[i].exclude]
+    geoms = data.contact.geom[active].reshape(-1, 2)
+    bodies = np.where(geoms < 0, -1, model.geom_bodyid[geoms])
+    force, local = np.zeros((len(active), 3)), np.zeros(6)
+    for row, i in enumerate(active if with_force else ()):
+        mujoco.mj_contactForce(model, data, i, local)
+        force[row] = local[:3] @ data.contact.frame[i].reshape(3, 3)
+    return Contacts(data.contact.pos[active].reshape(-1, 3), bodies, force if with_force else None)
 
 
 def kinematic_poses(model: mujoco.MjModel, data: mujoco.MjData) -> Poses:

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from torch import Tensor
 
@@ -18,7 +17,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.view.markers import Pose, in_world, magnitude, read_now
 from tgdsl.view.picture import MAX_MAPS, short_names
-from tgdsl.view.style import DPI, HEAT, INK, REST, new_figure
+from tgdsl.view.style import DPI, HEAT, INK, REST, new_figure, pixels_of, shortened
 
 Array = np.ndarray
 RADIUS = (0.16, 0.36)  # of the sphere of a taxel that reads nothing, or something, as a part of its patch's width
@@ -73,13 +72,9 @@ class LinkBars:
         figure = new_figure(_WIDTH / DPI, height / DPI)
         figure.text(6 / _WIDTH, 1 - 9 / height, title, size=7.5, color=INK, va="center")
         for i, name in enumerate(names):
-            name = name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}"
             y = 1 - (_ROW * (i + 1) + 9) / height
-            figure.text((_LABELS - 6) / _WIDTH, y, name, size=7.5, color=INK, ha="right", va="center")
-        canvas = figure.canvas
-        assert isinstance(canvas, FigureCanvasAgg)
-        canvas.draw()
-        self._labels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            figure.text((_LABELS - 6) / _WIDTH, y, shortened(name, _LETTERS), size=7.5, color=INK, ha="right", va="center")
+        self._labels = pixels_of(figure)
 
     def draw(self, frame: UInt8[Array, "row column 3"], step: int) -> UInt8[Array, "row column 3"]:
         """Return a frame with the bars of a step over it."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -12,8 +11,7 @@ from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
-from tgdsl.view.contacts import state_of
-from tgdsl.view.stages import Observed, Slider, Stage
+from tgdsl.view.stages import Observed, SimStage, Slider, Stage
 
 Array = np.ndarray
 
@@ -32,17 +30,16 @@ class _ByHand(Actor):
         self._actor.begin(ended)
 
 
-class TaskStage(Stage):
+class TaskStage(SimStage):
     """Environments of a task in which an actor acts, episode after episode; `control` is an action, from -1 to 1."""
 
     by_hand: bool | None = False
 
     def __init__(self, env: TouchEnv, actor: Actor, seed: int = 0):
+        super().__init__(env.touch, env.sim)
         self.env, self._seed, self.groups = env, seed, tuple(env.groups)
         self._actor, self._features = _ByHand(actor, self), env.describe()
-        self.control = np.zeros(env.num_actions)
-        self.touch, self.model = env.touch, env.sim.model
-        self.num_envs, self.control_step = env.num_envs, env.control_step
+        self.control, self.control_step = np.zeros(env.num_actions), env.control_step
         self.restart()
 
     def restart(self) -> None:
@@ -84,18 +81,6 @@ class TaskStage(Stage):
         terms = {name: float(value[env]) / self.control_step for name, value in info.terms.items()}
         return {f"score [{self.env.task.score_unit}]": float(info.score[env]), **terms}
 
-    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
-        """Return where the simulator has the bodies."""
-        return self.env.sim.body_poses(env)
-
-    def env_model(self, env: int) -> mujoco.MjModel:
-        """Return the simulator's model of one environment."""
-        return self.env.sim.env_model(env) if self.touch.inputs.objects else self.model
-
-    def state(self, env: int) -> Mapping[str, Array]:
-        """Return the simulator's state of one environment."""
-        return state_of(self.env.sim, env)
-
     def close(self) -> None:
         """Release the simulator."""
         self.env.close()
@@ -105,9 +90,8 @@ class LearnerStage(TaskStage):
     """Environments that a learner steps; `keep` takes each control step."""
 
     def __init__(self, env: TouchEnv):
-        self.env, self.touch, self.model = env, env.touch, env.sim.model
-        self.num_envs, self.control_step = env.num_envs, env.control_step
-        self.time, self.readings = 0.0, env.now.readings
+        SimStage.__init__(self, env.touch, env.sim)
+        self.env, self.control_step, self.readings = env, env.control_step, env.now.readings
         self._moment = None
 
     def keep(self, moment: Moment) -> None:
