@@ -33,7 +33,8 @@ test: $(READY)
 
 # The rest: each kind compiled by itself, learning, the physics of tasks, the wheel; and calls with their types and shapes checked.
 test-full: $(READY)
-	@$(PYTEST) -m slow
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m browser
+	@$(PYTEST) -m "slow and not browser"
 	@$(PYTEST) -m "not slow" --check-types -k "not sensors or float32_equals_reference" tests/geometry tests/observations tests/quantities tests/surfaces tests/tensors tests/sensors
 
 # Adapters against the simulators as they are installed, each in an environment of its own beside torch and the rest of $(VENV). mjlab

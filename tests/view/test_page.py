@@ -14,6 +14,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from box_hands import BOX_HAND
 from faulty_lines import FaultyEmulator
 from first_order_hands import first_order_hand
 from hand_logs import write_log
@@ -25,13 +26,17 @@ from xhand1_hands import PATIENT
 import tgdsl
 from tgdsl.commands.view import View
 from tgdsl.errors import SimulationError, TgdslError
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.propose.text import new_draft
 from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import TipForces
 from tgdsl.runtime.xhand1.log.log import Fault
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
 from tgdsl.runtime.xhand1.wire.protocol import JOINTS, STATE_SIZE, decode_state
 from tgdsl.scene.scene import scene_model
+from tgdsl.schema.load import load_layout
 from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
+from tgdsl.view.layout_page import LayoutPage
 from tgdsl.view.meshes import body_surfaces
 from tgdsl.view.page import Page
 from tgdsl.view.picture import HeatMaps
@@ -652,22 +657,25 @@ def at_rest(page: Page) -> Iterator[None]:
     page.panel.paused.value = was_paused
 
 
-def is_drawn(view, page: Page) -> bool:
+def is_drawn(view) -> bool:
     """Return whether more than 2 % of the picture's left half is not background."""
     from matplotlib.image import imread
 
-    with at_rest(page):
-        pixels = imread(io.BytesIO(view.screenshot()))[:, :600, :3]
+    pixels = imread(io.BytesIO(view.screenshot()))[:, :600, :3]
     return bool((np.abs(pixels - pixels[5, 400]) > 0.05).any(axis=2).mean() > 0.02)
 
 
-def open_page(browser, page: Page):
+def open_tab(browser, url: str):
     view = browser.new_page(viewport={"width": 960, "height": 640})
     view.set_default_timeout(120_000)  # WebGL in software
-    with at_rest(page):
-        view.goto(page.url)
-        view.get_by_text("taxels").first.wait_for()
+    view.goto(url)
+    view.get_by_text("taxels").first.wait_for()
     return view
+
+
+def open_page(browser, page: Page):
+    with at_rest(page):
+        return open_tab(browser, page.url)
 
 
 def field_of(view, label: str):
@@ -695,6 +703,12 @@ def total(view) -> float:
     return float(re.search(r"(-?[\d.]+(?:e-?\d+)?) N", text)[1])
 
 
+def seconds(view) -> float:
+    """Return the scene's time as the page writes it [s]."""
+    return float(re.search(r"t = ([\d.]+) s", view.get_by_text("t = ").first.inner_text())[1])
+
+
+@pytest.mark.browser
 @pytest.mark.slow
 def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
     own = document.with_name("two_balls.yaml")
@@ -702,7 +716,8 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
     own.write_text(text)
     with serving(View(own, envs=2)) as page:
         view = open_page(browser, page)
-        assert soon(lambda: is_drawn(view, page))
+        with at_rest(page):
+            assert soon(lambda: is_drawn(view))
         assert soon(lambda: total(view) > 0)
         before = total(view)
         write(view, "lift", "-0.02")
@@ -716,6 +731,26 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
         ball = page.stage.model.body("ball").id
         assert soon(lambda: page.panel.env_index == 1 and np.ptp(page.scene._meshes[ball][0][0].vertices) < 0.035)
         assert soon(lambda: total(view) == pytest.approx(float(page.stage.readings["touch"][1, :, 2].sum()), rel=0.01))
+
+        # Opened twice: both show the same, and what one sets the other has.
+        with at_rest(page):
+            other = open_page(browser, page)
+            assert soon(lambda: total(other) == total(view) != 0)
+            write(other, "lift", "0.02")
+            assert soon(lambda: field_of(view, "lift").input_value() == "0.02")
+            other.close()
+        assert soon(lambda: total(view) == 0)
+
+        # Lost and regained: the scene goes on, and the browser shows it again by itself.
+        assert soon(lambda: len(page.server.get_clients()) == 1)
+        lost, clients = page.stage.time, set(page.server.get_clients())
+        page.server._websock_server.disconnect_all_clients()  # a browser that is set offline keeps its local connections
+        assert soon(lambda: page.stage.time > lost + 0.2)
+        assert soon(lambda: page.server.get_clients().keys() - clients)
+        assert soon(lambda: seconds(view) > page.stage.time - 1.0 > lost)
+        write(view, "lift", "-0.02")
+        assert soon(lambda: total(view) != 0)
+
         view.reload()
         view.get_by_text("16 taxels").wait_for()
         own.write_text(text.replace("rows: 4", "rows: 3"))
@@ -727,11 +762,13 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
         view.close()
 
 
+@pytest.mark.browser
 @pytest.mark.slow
 def test_a_browser_shows_a_run_and_scrubs_it(browser, document, tmp_path):
     with serving(View(recorded(document, tmp_path))) as page:
         view = open_page(browser, page)
-        assert soon(lambda: is_drawn(view, page))
+        with at_rest(page):
+            assert soon(lambda: is_drawn(view))
         field_of(view, "pause").dispatch_event("click")
         assert soon(lambda: page.panel.paused.value)
         write(view, "step", "2")
@@ -741,23 +778,27 @@ def test_a_browser_shows_a_run_and_scrubs_it(browser, document, tmp_path):
         view.close()
 
 
+@pytest.mark.browser
 @pytest.mark.slow
 def test_a_browser_shows_a_task_with_its_policy_and_reward_terms(browser):
     task, policy = ROOT / "examples/tasks/in_palm_rotate_cube.yaml", ROOT / "policies/in_palm_rotate_cube.pt"
     with serving(View(task, policy=policy, envs=2)) as page:
         view = open_page(browser, page)
-        assert soon(lambda: is_drawn(view, page))
+        with at_rest(page):
+            assert soon(lambda: is_drawn(view))
         assert view.get_by_text("object_distance").count() > 0
         assert view.get_by_text("199 taxels").count() > 0
         view.close()
 
 
+@pytest.mark.browser
 @pytest.mark.slow
 def test_a_browser_shows_the_log_of_a_hand_and_scrubs_it(browser, tmp_path):
     path, _, _ = hand_log(tmp_path / "log.npz")
     with serving(View(path)) as page:
         view = open_page(browser, page)
-        assert soon(lambda: is_drawn(view, page))
+        with at_rest(page):
+            assert soon(lambda: is_drawn(view))
         field_of(view, "pause").dispatch_event("click")
         assert soon(lambda: page.panel.paused.value)
         write(view, "step", "2")
@@ -765,11 +806,13 @@ def test_a_browser_shows_the_log_of_a_hand_and_scrubs_it(browser, tmp_path):
         view.close()
 
 
+@pytest.mark.browser
 @pytest.mark.slow
 def test_a_browser_shows_an_emulated_hand_and_saves_what_was_seen(browser, tmp_path):
     with serving(View(Path("emulator"))) as page:
         view = open_page(browser, page)
-        assert soon(lambda: is_drawn(view, page))
+        with at_rest(page):
+            assert soon(lambda: is_drawn(view))
         assert view.get_by_text("joints with errors").count() > 0
         with view.expect_download() as download:
             view.get_by_role("button", name="save last minute").dispatch_event("click")
@@ -778,3 +821,39 @@ def test_a_browser_shows_an_emulated_hand_and_saves_what_was_seen(browser, tmp_p
             assert arrays["tips"].shape[1:] == (5, 3)
             assert (np.diff(arrays["time"]) > 0).all()
         view.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_a_browser_changes_a_layout_and_writes_it(browser, tmp_path):
+    (tmp_path / "hand.xml").write_text(BOX_HAND)
+    out = tmp_path / "layout.yaml"
+    page = LayoutPage(new_draft(load_model(tmp_path / "hand.xml"), "4/cm2", True, out, False), out, port=8340)
+    is_over = threading.Event()
+
+    def loop() -> None:
+        while not is_over.is_set():
+            page.run(seconds=0.2)
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        view = open_tab(browser, page.url)
+        assert soon(lambda: is_drawn(view))
+        before, after = (page.draft.proposal.links[0].counts["med"] * num for num in (1, 2))
+        option = view.get_by_role("option", name="palm", exact=True, include_hidden=True)
+        assert soon(lambda: view.locator("input[value='(all)']").first.dispatch_event("click") or option.count() > 0)
+        option.first.dispatch_event("click")
+        view.get_by_text(f"{before} of them").wait_for()
+        write(view, "taxels per cm²", "8")
+        view.get_by_text(f"{after} of them").wait_for()
+        view.reload()
+        view.get_by_text(f"{after} of them").wait_for()
+        view.get_by_role("button", name="write layout.yaml").dispatch_event("click")
+        assert soon(out.exists)
+        assert load_layout(out).spec.resolutions["med"]["palm"].count == after
+        view.close()
+    finally:
+        is_over.set()
+        thread.join()
+        page.close()
