@@ -786,7 +786,7 @@ def test_a_browser_shows_a_task_with_its_policy_and_reward_terms(browser):
         view = open_page(browser, page)
         with at_rest(page):
             assert soon(lambda: is_drawn(view))
-        assert view.get_by_text("object_distance").count() > 0
+        view.get_by_text("object_distance").first.wait_for()
         assert view.get_by_text("199 taxels").count() > 0
         view.close()
 
