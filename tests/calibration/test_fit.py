@@ -33,6 +33,18 @@ def test_parameters_and_clock_are_found(fitted):
     assert any("correlation 0.99" in text for text in fitted.warnings)
 
 
+def test_a_load_cell_under_all_taxels_is_enough(path):
+    """The sum of all rows, with noise of its own, finds the same parameters."""
+    arrays = recording(path)
+    arrays["target:touch"] = arrays["target:touch"].sum(axis=1, keepdims=True)
+    fit = tgdsl.calibrate(path, arrays | {"rows:touch": np.array("sum")}, FIT, hold_out="time", starts=2)
+    stiffness, exponent = (fit.parameters[name] for name in FIT)
+    assert stiffness.low < 900 < stiffness.high and exponent.low < 1.3 < exponent.high
+    assert fit.errors[0].error == pytest.approx(3**0.5 * fit.errors[0].floor, rel=0.2)  # of three rows' noise
+    with pytest.raises(TgdslError, match=r"hold_out: taxel: each target has one row; expected time or recording"):
+        tgdsl.calibrate(path, arrays | {"rows:touch": np.array("sum")}, FIT, hold_out="taxel")
+
+
 def test_a_linear_parameter_is_solved_for(fitted):
     """Force is linear in the stiffness, and not in the exponent; the solution is the minimum of the search without that."""
     problem, solution = fitted.problem, fitted.solution

@@ -54,6 +54,12 @@ BAD = {
         lambda a: a.update({"target:touch": a["target:touch"][:, :2]}),
         r"target:touch: found shape \(60, 2, 3\), expected \(60, 3, 3\): samples, taxels, channels",
     ),
+    "one row of several": (
+        lambda a: a.update({"target:touch": a["target:touch"][:, :1]}),
+        r"found shape \(60, 1, 3\), .*; if they are sums of all rows, set rows:touch to \"sum\"",
+    ),
+    "several rows of a sum": (lambda a: a.update({"rows:touch": np.array("sum")}), r"found shape \(60, 3, 3\), expected \(60, 1, 3\)"),
+    "neither each nor sum": (lambda a: a.update({"rows:touch": np.array("all")}), 'rows:touch: found "all"; expected "each" or "sum"'),
     "no field": (lambda a: a.pop("body_quat"), "body_quat: this field is missing"),
     "no target": (lambda a: a.pop("target:touch"), "there is no target; expected target:<reading>, of touch"),
     "other times": (lambda a: a.update({"clock:touch": a["clock:touch"] + 100}), "found times from 100.52 to 102.72 s"),
@@ -92,7 +98,13 @@ def test_what_is_no_recording_is_refused(pressed, tmp_path):
     _, touch, _ = pressed
     (tmp_path / "text.npz").write_text("no archive")
     (tmp_path / "empty.npz").touch()
-    for name, message in (("text.npz", "no .npz file"), ("empty.npz", "no .npz file"), ("none.npz", "there is no such file")):
+    (tmp_path / "press.csv").write_text("0,1")
+    for name, message in (
+        ("text.npz", "no .npz file"),
+        ("empty.npz", "no .npz file"),
+        ("none.npz", "there is no such file"),
+        ("press.csv", "a CSV file needs a YAML document"),
+    ):
         with pytest.raises(SpecError, match=message):
             read(touch, tmp_path / name)
 

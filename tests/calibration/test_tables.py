@@ -134,3 +134,11 @@ def test_a_position_may_be_fixed(folder):
     text = (folder / "press.yaml").read_text()
     (folder / "press.yaml").write_text(text.replace("[px, py, pz]", "[0 m, -2 mm, px]"))
     assert read_tables(folder / "press.yaml")["body_pos"][:, 1].tolist() == [[0.0, -0.002, 0.0]] * 1200
+
+
+def test_one_column_is_the_sum_of_all_rows(folder):
+    text = TABLES.replace("channels: {force_z: [1, 2, 3]}", "channels: {force_z: 1}\n    rows: sum")
+    (folder / "press.yaml").write_text(text)
+    touch = tgdsl.compile(folder / "touch.yaml", dtype="float64")
+    (target,) = load_recording(folder / "press.yaml", touch.inputs, {output.name: output for output in touch.outputs}).targets
+    assert target.is_sum and target.value.shape == (60, 1, 1)

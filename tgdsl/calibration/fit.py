@@ -150,6 +150,8 @@ def calibrate(
     names = ["<arrays>"] if len(sources) == 1 else [f"<arrays {i}>" for i in range(1, len(sources) + 1)]
     loaded = [load_recording(source, model.module.inputs, outputs, name) for source, name in zip(sources, names, strict=True)]
     problem = Problem(model, loaded, reading, gain)
+    if hold_out in ("taxel", "blocks") and all(part.target.value.shape[1] == 1 for part in problem.parts):
+        raise TgdslError(f"hold_out: {hold_out}: each target has one row; expected time or recording")
     solution = _best(problem, starts, seed, robust)
     out = None if hold_out == "none" else checks.held_out(problem, solution, hold_out, folds, seed)
     known = checks.uncertainty(problem, solution)

@@ -119,7 +119,7 @@ class Model:
         values = self._read(target.reading, states, time)[:, :, list(target.channels)]
         if target.zero is not None:
             values = (values - values[np.searchsorted(time, target.zero)])[np.searchsorted(time, target.time)]
-        return values
+        return values.sum(axis=1, keepdims=True) if target.is_sum else values
 
     def _read(self, reading: str, states: Mapping[str, np.ndarray], time: np.ndarray) -> np.ndarray:
         wanted = self.module.inputs.fields

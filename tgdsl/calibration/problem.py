@@ -81,7 +81,7 @@ class Problem:
         Each recording's reading may have a map of its own, of all readings or by their names, and a gain of its own.
         """
         self.model, self.recordings, self.gain = model, tuple(recordings), gain
-        self.places = {t.reading: _places(model, t.reading) for r in recordings for t in r.targets}
+        self.places = {t.reading: None if t.is_sum else _places(model, t.reading) for r in recordings for t in r.targets}
         maps: Mapping[str, ReadingMap] = reading if isinstance(reading, Mapping) else dict.fromkeys(self.places, reading)
         self.parts = tuple(
             _part(i, target, maps.get(target.reading, "none"), self.places[target.reading], model)

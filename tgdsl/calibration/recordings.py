@@ -7,6 +7,7 @@
 | `bodies`, `pairs`, `joints`, … | names | what stands along the axis of such a field; default: the order of `touch.inputs` |
 | `width:<field>` | as one step, or as all | standard deviation of the field's offset, at all steps or at each; 0: none |
 | `target:<reading>` | (sample, row, channel) | what the sensor read |
+| `rows:<reading>` | text | "sum": the target is the sum of all rows, (sample, 1, channel), as of a load cell; default: "each" |
 | `unit:<reading>` | text | unit of the target |
 | `clock:<reading>` | (sample,) | clock of the target [s], ascending |
 | `clock_width:<reading>` | () | standard deviation of its unknown offset from the states' clock [s]; default: 0, none |
@@ -43,7 +44,7 @@ from tgdsl.plan.inputs import Inputs
 
 NAMES_OF = {axis: f"{axis}s" for axis in ("pair", "object", "joint", "actuator")} | {"body": "bodies", "heated": "heated"}
 """Key of the names along each axis of the state."""
-OF_TARGET = ("target", "unit", "clock", "clock_width", "channels", "weight", "floor", "zero")
+OF_TARGET = ("target", "rows", "unit", "clock", "clock_width", "channels", "weight", "floor", "zero")
 ROUNDING = 0.01  # largest error of a quaternion's length: recordings are rounded
 DERIVED = {"body_linvel": "body_pos", "body_angvel": "body_quat"}  # velocities that follow from other fields
 Arrays = Mapping[str, np.ndarray]
@@ -62,6 +63,7 @@ class Target:
     floor: float  # RMS noise, in the unit of the reading; 0: unknown
     unit: str  # unit of the reading
     zero: float | None  # time at which the reading was set to zero [s]; None: never
+    is_sum: bool = False  # whether its one row is the sum of the reading's
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +135,8 @@ def _arrays(source: str | Path | Arrays, name: str) -> dict[str, np.ndarray]:
             return dict(file)
     except (OSError, EOFError, ValueError, BadZipFile, TypeError, AttributeError) as error:
         why = "there is no such file" if isinstance(error, FileNotFoundError) else "this is no .npz file of plain arrays"
-        raise SpecError([Problem(name, 0, 0, "", why)]) from error
+        hint = "a CSV file needs a YAML document that says what its columns are" if Path(name).suffix == ".csv" else ""
+        raise SpecError([Problem(name, 0, 0, "", why, hint)]) from error
 
 
 @dataclass
@@ -170,7 +173,8 @@ class _Reader:
         fields = {name: self._field(name, len(time)) for name in wanted if name in self.arrays}
         for name in wanted:
             if name not in fields and DERIVED.get(name) not in self.arrays:
-                self.note(name, "this field is missing", f"the module reads {', '.join(self.inputs.fields)}")
+                hint = "gate: geometric needs no contacts; " if name.startswith("contact_") else ""
+                self.note(name, "this field is missing", f"{hint}the module reads {', '.join(self.inputs.fields)}")
         widths = {name: self._width(name, value) for name, value in fields.items() if f"width:{name}" in self.arrays}
         readings = [key.removeprefix("target:") for key in self.arrays if key.startswith("target:")]
         if not readings:
@@ -248,10 +252,14 @@ class _Reader:
         channels, (factor, unit) = self._channels(name, output), self._unit(name, output)
         if not len(time):
             return None
-        shape = (len(time), *output.shape[:-1], len(channels))
+        is_sum = self._is_sum(name, output)
+        shape = (len(time), *((1,) if is_sum else output.shape[:-1]), len(channels))
         if value.shape != shape:
-            axes = (*(["instants"] if len(shape) > 3 else []), f"{output.rows}s")
-            self.note(key, f"found shape {value.shape}, expected {shape}: samples, {', '.join(axes)}, channels")
+            axes = (*(["instants"] if len(shape) > 3 else []), "the sum" if is_sum else f"{output.rows}s")
+            hint = (
+                f'if they are sums of all rows, set rows:{name} to "sum"' if value.shape == (*shape[:1], 1, *shape[2:]) else ""
+            )
+            self.note(key, f"found shape {value.shape}, expected {shape}: samples, {', '.join(axes)}, channels", hint)
             return None
         try:
             weight = np.broadcast_to(self.arrays.get(weight_key, np.ones(())), shape).astype(np.float64)
@@ -269,7 +277,17 @@ class _Reader:
         floor, zero = self._scalar(f"floor:{name}") or 0.0, self._scalar(f"zero:{name}")
         value = np.where((weight > 0) & np.isfinite(value), value, 0.0) * factor
         value, weight = (each.reshape(len(time), -1, len(channels)) for each in (value, weight))
-        return Target(name, value, weight, channels, time, width, floor * factor, unit, zero)
+        return Target(name, value, weight, channels, time, width, floor * factor, unit, zero, is_sum)
+
+    def _is_sum(self, name: str, output: Output) -> bool:
+        """Return whether the target is the sum of all rows."""
+        key = f"rows:{name}"
+        written = str(self.arrays.get(key, "each"))
+        if written not in ("each", "sum"):
+            self.note(key, f'found "{written}"', 'expected "each" or "sum"')
+        elif written == "sum" and len(output.shape) > 2:
+            self.note(key, "a reading of several instants per call has no sum", 'expected "each"')
+        return written == "sum" and len(output.shape) == 2
 
     def _channels(self, name: str, output: Output) -> tuple[int, ...]:
         key = f"channels:{name}"

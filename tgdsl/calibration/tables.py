@@ -13,6 +13,7 @@
         time: 0
         unit: N
         channels: {force_z: 4}             # one column, or a list of one for each row of the reading
+        rows: sum                          # the column is the sum of all rows, as of a load cell
         scale: -0.00981                    # from the column to the unit
         invalid: [-1]                      # numbers that stand for a missing reading
         clock_width: 0.5 s
@@ -70,6 +71,8 @@ class TargetSpec(SpecModel):
     """Unit of the numbers, once scaled."""
     channels: Annotated[dict[str, Column | Annotated[tuple[Column, ...], Field(min_length=1)]], Field(min_length=1)]
     """Columns of each channel, one for each row of the reading."""
+    rows: Literal["each", "sum"] = "each"
+    """Whether columns are rows of the reading, or one column the sum of all rows, as of a load cell."""
     scale: float = 1.0
     """Factor from the columns' numbers to the unit."""
     invalid: tuple[float, ...] = ()
@@ -179,6 +182,7 @@ def read_tables(path: str | Path) -> dict[str, Any]:
             f"target:{name}": value, f"weight:{name}": np.isfinite(value).astype(np.float64),
             f"clock:{name}": table.column(target.time), f"clock_width:{name}": target.clock_width,
             f"channels:{name}": list(target.channels), f"unit:{name}": target.unit, f"floor:{name}": target.floor,
+            f"rows:{name}": target.rows,
         }  # fmt: skip
     if problems := [problem for table in tables.values() for problem in table.problems]:
         raise SpecError(problems)

@@ -35,7 +35,7 @@ _ABOUT = {
     "hand": "the fingers, the palm and what is fixed to it",
 }
 _OPTIONS = {
-    "surface": "on the hull that the simulator collides: hollows of the mesh are deeper in it than taxels feel",
+    "surface": "on what the simulator collides: the surface itself lies deeper in it than taxels feel",
     "exposed": "without what is inside other colliding geoms in the initial state",
 }
 _NOT_COLLIDED = "the simulator collides none of these links, so taxels feel with `gate: geometric` alone"
