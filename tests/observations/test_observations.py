@@ -146,7 +146,7 @@ def test_a_reading_with_the_wrong_rows_is_a_mistake(tmp_path):
         tgdsl.compile(observing(tmp_path, {"policy": [{"type": "elastomer", "of": "touch"}]}))
 
 
-def test_all_types_are_one_graph(tmp_path, readings):
+def test_types_of_forces_links_and_joints_are_one_graph(tmp_path, readings):
     touch = tgdsl.compile(observing(tmp_path, {**TERMS, "cop": [{"type": "cop", "of": "touch"}]}), dtype=torch.float64)
     traced = torch.compile(touch.observe, backend="eager", fullgraph=True)(readings)
     torch.testing.assert_close(traced, touch.observe(readings), rtol=0, atol=0)

@@ -14,6 +14,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import yaml
 from box_hands import BOX_HAND
 from faulty_lines import FaultyEmulator
 from first_order_hands import first_order_hand
@@ -236,6 +237,26 @@ def test_what_is_saved_is_shown_and_mistakes_have_their_line(document):
     assert "press.yaml:12" in problem
     assert "proximity" in problem
     document.write_text(DOCUMENT)
+
+
+def test_a_layout_that_is_saved_is_shown(document):
+    whole = yaml.safe_load(DOCUMENT)
+    layout = document.with_name("layout.yaml")
+    layout.write_text(yaml.safe_dump({"tgdsl": 1, **whole["robot"]["layout"]}))
+    whole["robot"]["layout"] = layout.name
+    own = document.with_name("own.yaml")
+    own.write_text(yaml.safe_dump(whole))
+    watch = View(own)._watch()
+    assert watch() is None
+    layout.write_text(layout.read_text().replace("rows: 4", "rows: 5"))
+    stage = watch()
+    assert isinstance(stage, Stage) and len(stage.touch.taxels["touch"]["pos"]) == 20
+    stage.close()
+    layout.write_text(layout.read_text().replace("rows: 5", "rows: five"))
+    problem = watch()
+    assert isinstance(problem, str) and "layout.yaml" in problem
+    own.unlink()  # an editor replaces it
+    assert watch() is None
 
 
 def test_the_plot_begins_again_when_another_environment_is_chosen(document):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +12,7 @@ import tyro
 
 from tgdsl.commands import arguments as args
 from tgdsl.console.progress import StatusLine
-from tgdsl.errors import TgdslError
+from tgdsl.errors import SpecError, TgdslError
 
 if TYPE_CHECKING:
     from tgdsl.view.stages import Stage
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 class View:
     """Open a live page in the browser: robot and objects, taxels coloured by their readings, a slider per actuator.
 
-    The page of a document follows the file: what is saved is shown within seconds, mistakes with their lines.
+    The page of a document follows the files: a document, layout or robot that is saved is shown within seconds, mistakes with
+    their lines.
     """
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
@@ -94,14 +96,14 @@ class View:
         return TaskStage(env, args.actor_for(env, saved, seed=self.seed), self.seed)
 
     def _watch(self) -> Callable[[], Stage | str | None]:
-        """Return a function that compiles the source's file again if it has been saved since."""
-        seen = self._saved()
+        """Return a function that compiles the source again if it, or a file that it names, has been saved since."""
+        seen = _named(self.source)
 
         def watch() -> Stage | str | None:
             nonlocal seen
-            if (saved := self._saved()) == seen or saved is None:
+            if all(_saved(file) == when for file, when in seen.items()) or _saved(self.source) is None:
                 return None
-            seen = saved
+            seen = _named(self.source)
             try:
                 return self._stage()
             except TgdslError as error:  # a document's mistakes, each with its line
@@ -109,9 +111,35 @@ class View:
 
         return watch
 
-    def _saved(self) -> int | None:
-        """Return when the file was saved; None while an editor replaces it."""
-        try:
-            return self.source.stat().st_mtime_ns
-        except FileNotFoundError:
-            return None
+
+def _saved(file: Path) -> int | None:
+    """Return when a file was saved; None while an editor replaces it."""
+    try:
+        return file.stat().st_mtime_ns
+    except OSError:
+        return None
+
+
+def _named(document: Path) -> dict[Path, int | None]:
+    """Return when a document, and the files that it and the YAML files among them name, were saved."""
+    result, left = dict[Path, int | None](), [document]
+    while left:
+        if (file := left.pop()) not in result:
+            result[file] = _saved(file)
+            if file.suffix in (".yaml", ".yml"):
+                left += [path for text in _texts(file) if (path := file.parent / text).is_file()]
+    return result
+
+
+def _texts(file: Path) -> list[str]:
+    """Return all texts of a YAML file, which may be names of files; none if it cannot be read."""
+    from tgdsl.schema.load import read_source
+
+    left, result = list[object](), list[str]()
+    with suppress(SpecError):
+        left.append(read_source(file).value)
+    while left:
+        value = left.pop()
+        left += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+        result += [value] if isinstance(value, str) else []
+    return result
