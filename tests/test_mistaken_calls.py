@@ -64,7 +64,7 @@ def test_environments_counts_and_memory(touch):
     state = touch.example_state(2)
     with pytest.raises(StateError, match="memory: found NoneType, expected `initial_memory`, or what the step before returned"):
         touch.step(state, None)
-    with pytest.raises(StateError, match=r"env_ids: found 'all', expected indices of environments, or a mask of them"):
+    with pytest.raises(StateError, match=r"env_ids: found 'all', expected indices"):
         touch.reset("all")
     touch.reset([0])  # before the first call every environment begins an episode
     with pytest.raises(SimulationError, match=r"^num_envs is '2', expected a whole number of at least 1$"):

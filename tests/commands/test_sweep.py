@@ -178,14 +178,14 @@ def test_a_run_that_goes_on_learns_the_minutes_that_are_left(tmp_path, place):
 def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base, monkeypatch):
     for name in ("argv", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))
-    trial = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml"))
+    trial = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml", "--device", "cpu"))
     assert run_trial(trial, str(base / "x")) == "failed: exit code 2"
     assert "nowhere.yaml" in (base / "x" / "log.txt").read_text()
     assert not (base / "x" / "ended.json").exists()
     (base / "x" / "ended.json").write_text("{}")
     assert run_trial(trial, str(base / "x")) == "was made before"
     other = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml", "--envs", "4"))
-    what = "its folder holds a run of other settings, `tgdsl train nowhere.yaml`; give another --out"
+    what = "its folder holds a run of other settings, `tgdsl train nowhere.yaml --device cpu`; give another --out"
     assert run_trial(other, str(base / "x")) == f"failed: {what}"
 
 
