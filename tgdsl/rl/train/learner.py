@@ -13,7 +13,7 @@ import io
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -230,7 +230,7 @@ def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[st
     """Return the groups of observations of actor, critic and, if there is one, random network distillation."""
     train, problems = loaded.spec.train, list[Problem]()
     privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
-    named: dict[tuple[str, ...], list[str] | None] = {("actor",): train.actor, ("critic",): train.critic}
+    named: dict[tuple[str, ...], Sequence[str] | None] = {("actor",): train.actor, ("critic",): train.critic}
     if train.rnd != "off":
         named["rnd", "groups"] = train.rnd.groups
     for place, names in named.items():
