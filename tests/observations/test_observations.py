@@ -146,6 +146,7 @@ def test_a_reading_with_the_wrong_rows_is_a_mistake(tmp_path):
         tgdsl.compile(observing(tmp_path, {"policy": [{"type": "elastomer", "of": "touch"}]}))
 
 
+@pytest.mark.slow  # compiled, which types that are checked at each call cannot be
 def test_types_of_forces_links_and_joints_are_one_graph(tmp_path, readings):
     touch = tgdsl.compile(observing(tmp_path, {**TERMS, "cop": [{"type": "cop", "of": "touch"}]}), dtype=torch.float64)
     traced = torch.compile(touch.observe, backend="eager", fullgraph=True)(readings)
@@ -174,6 +175,7 @@ def deepest(monkeypatch):
     register(DeepestObservation)
 
 
+@pytest.mark.slow  # compiled, which types that are checked at each call cannot be
 def test_documents_modules_and_artefacts_have_it(tmp_path, deepest, monkeypatch):
     touch = tgdsl.compile(observing(tmp_path, {"policy": [{"type": "deepest", "of": "depth"}]}), dtype=torch.float64)
     readings = touch(touch.example_state(3))
