@@ -147,8 +147,9 @@ def test_a_reading_with_the_wrong_rows_is_a_mistake(tmp_path):
 
 
 @pytest.mark.slow  # compiled, which types that are checked at each call cannot be
-def test_types_of_forces_links_and_joints_are_one_graph(tmp_path, readings):
-    touch = tgdsl.compile(observing(tmp_path, {**TERMS, "cop": [{"type": "cop", "of": "touch"}]}), dtype=torch.float64)
+def test_types_of_forces_links_and_joints_are_one_graph(tmp_path, readings, deepest):
+    more = {"cop": [{"type": "cop", "of": "touch"}], "own": [{"type": "deepest", "of": "depth"}]}
+    touch = tgdsl.compile(observing(tmp_path, {**TERMS, **more}), dtype=torch.float64)
     traced = torch.compile(touch.observe, backend="eager", fullgraph=True)(readings)
     torch.testing.assert_close(traced, touch.observe(readings), rtol=0, atol=0)
 
@@ -175,14 +176,11 @@ def deepest(monkeypatch):
     register(DeepestObservation)
 
 
-@pytest.mark.slow  # compiled, which types that are checked at each call cannot be
 def test_documents_modules_and_artefacts_have_it(tmp_path, deepest, monkeypatch):
     touch = tgdsl.compile(observing(tmp_path, {"policy": [{"type": "deepest", "of": "depth"}]}), dtype=torch.float64)
     readings = touch(touch.example_state(3))
     depth = readings["depth"][:, :, 0]
     assert torch.equal(touch.observe(readings)["policy"], torch.stack([depth[:, :4].amax(1), depth[:, 4:].amax(1)], dim=1))
-    traced = torch.compile(touch.observe, backend="eager", fullgraph=True)
-    assert torch.equal(traced(readings)["policy"], touch.observe(readings)["policy"])
     tgdsl.save(touch, tmp_path / "touch.safetensors")
     loaded = tgdsl.load(tmp_path / "touch.safetensors", dtype="float64")
     assert torch.equal(loaded.observe(readings)["policy"], touch.observe(readings)["policy"])

@@ -255,6 +255,8 @@ def test_a_layout_that_is_saved_is_shown(document):
     layout.write_text(layout.read_text().replace("rows: 5", "rows: five"))
     problem = watch()
     assert isinstance(problem, str) and "layout.yaml" in problem
+    own.write_text(f"{own.read_text()}\nnotes: {'a text that is no name of a file ' * 20}\n")
+    assert "notes" in str(watch())
     own.unlink()  # an editor replaces it
     assert watch() is None
 

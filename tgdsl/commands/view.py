@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from os.path import isfile  # of a text that can be no file's name, it is False
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -127,7 +128,7 @@ def _named(document: Path) -> dict[Path, int | None]:
         if (file := left.pop()) not in result:
             result[file] = _saved(file)
             if file.suffix in (".yaml", ".yml"):
-                left += [path for text in _texts(file) if (path := file.parent / text).is_file()]
+                left += [path for text in _texts(file) if isfile(path := file.parent / text)]
     return result
 
 

@@ -25,12 +25,10 @@ from tgdsl.module.state import SHAPES
 from tgdsl.observations import observations
 from tgdsl.observations.observations import (
     PROPRIOCEPTION,
-    JointObservation,
     JointSpec,
-    ObservationSpec,
+    Observation,
     OfReading,
     ReadingObservation,
-    ReadingSpec,
 )
 from tgdsl.placement.reach import unfelt
 from tgdsl.plan import tree
@@ -130,7 +128,7 @@ class JointsRead(NamedTuple):
     actuators: tuple[str, ...]
 
 
-def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
+def _terms(loaded: Loaded) -> list[tuple[str, int, Observation]]:
     return [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
 
 
@@ -138,7 +136,7 @@ def _joints_read(loaded: Loaded, resolved: Resolved) -> JointsRead:
     robot, selected = resolved.joints, {}
     read: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
     for group, i, spec in _terms(loaded):
-        if isinstance(spec, JointObservation):
+        if isinstance(spec, JointSpec):
             selected[group, i] = _rows(loaded, ("observations", group, i), spec, robot)
             read[PROPRIOCEPTION[spec.type].rows].update(selected[group, i])
     actuators = tuple(actuator.name for actuator in robot.actuators if actuator.name in read["actuator"])
@@ -178,18 +176,18 @@ def _observations(
     for group, i, spec in _terms(loaded):
         if isinstance(spec, OfReading):
             terms += _of_reading(loaded, group, i, spec, reading_of)
-        elif isinstance(spec, JointObservation):
+        elif isinstance(spec, JointSpec):
             chosen, every = read.terms[group, i], read.joints if PROPRIOCEPTION[spec.type].rows == "joint" else read.actuators
             constants = {} if chosen == every else {"rows": np.array([every.index(n) for n in chosen], dtype=np.int64)}
             terms.append(PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants))
         else:
-            count = observations.HAND_ONLY.get(spec.type, 0)
-            terms.append(PlannedObservation(group, i, spec.type, None, (), count, {}))
+            count = observations.HAND_ONLY.get(spec.type_name, 0)
+            terms.append(PlannedObservation(group, i, spec.type_name, None, (), count, {}))
     return tuple(terms)
 
 
 def _of_reading(
-    loaded: Loaded, group: str, i: int, spec: ReadingSpec, readings: Mapping[str, tuple[PlannedReading, Layout]]
+    loaded: Loaded, group: str, i: int, spec: OfReading, readings: Mapping[str, tuple[PlannedReading, Layout]]
 ) -> list[PlannedObservation]:
     """Return the observation of a sensor's reading, or nothing if it is wrong."""
     path: Path = ("observations", group, i)
@@ -202,14 +200,15 @@ def _of_reading(
     else:
         channel_names = spec.needs
         if reading.rows != spec.rows or not set(channel_names) <= set(reading.channels):
-            problem = f'"{spec.type}" needs {", ".join(channel_names)} of each {spec.rows}, which "{spec.of}" does not read'
+            needs = f"{', '.join(channel_names)} of each {spec.rows}"
+            problem = f'"{spec.type_name}" needs {needs}, which "{spec.of}" does not read'
             loaded.note(path, problem, f"it reads {', '.join(reading.channels)} of each {reading.rows}")
             return []
     constants = dict(sorted(spec.lower(layout).items()))
     channels = tuple(reading.channels.index(channel) for channel in channel_names)
     per_call = spec.num_features(len(channels), reading.num_rows, len(layout.links))
     axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
-    return [PlannedObservation(group, i, spec.type, spec.of, channels, max(reading.steps, 1) * per_call, constants, axes)]
+    return [PlannedObservation(group, i, spec.type_name, spec.of, channels, max(reading.steps, 1) * per_call, constants, axes)]
 
 
 def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: PlannedReading) -> tuple[str, ...]:

@@ -52,6 +52,11 @@ PROPRIOCEPTION = {
 class Observation(SpecModel):
     """Base of all types."""
 
+    @property
+    def type_name(self) -> str:
+        """The type's word in documents."""
+        return self.type  # type: ignore[attr-defined]
+
     @staticmethod
     def observe(
         reading: Float[Tensor, "env row channel"], channels: tuple[int, ...], constants: Mapping[str, Tensor]

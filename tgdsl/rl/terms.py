@@ -481,7 +481,7 @@ class Linear(CurriculumTerm):
 
 
 class HandTask(Task[S]):
-    """A task whose reward has the terms of all tasks of tgdsl; a task that repeats one sets its own weight and place."""
+    """Base of tgdsl's tasks, with their common reward terms; a task repeats one for another weight or place in the sum."""
 
     action_rate = ActionRate.of_task(-5e-4)
     work = Work.of_task(-5e-3)

@@ -35,11 +35,11 @@ class LayoutPage:
     Args:
         draft: The layout.
         out: The file that the button writes.
-        is_forced: Whether that may replace a file that the page has not written.
+        is_forced: Whether that may replace a file that the page did not write.
         port: Port; where it is taken, the next free one.
 
     Attributes:
-        written: What there is to say of the file that was written last; empty before the first.
+        written: Lines that sum up the last file that was written; empty before the first.
     """
 
     def __init__(self, draft: Draft, out: Path, is_forced: bool = False, port: int = PORT):
@@ -47,8 +47,8 @@ class LayoutPage:
         self.written: list[str] = []
         self.server, self._clicks = serve(port=port), SimpleQueue[Callable[[], None]]()
         self._model, self._discs = draft.robot.compiled, dict[str, Any]()
-        self._sampled: dict[str, tuple[Any, Samples]] = {}  # by link: what its taxels follow from, and they
-        self._bytes: bytes | None = None  # of the file, as the page has written it
+        self._sampled: dict[str, tuple[Any, Samples]] = {}  # by link: its placement, and the taxels
+        self._bytes: bytes | None = None  # of the file that the page wrote
         self._add_controls()
         self._offer()
         self._sample()
@@ -113,7 +113,7 @@ class LayoutPage:
         return [link for link in proposal.links if chosen == EVERY or link.name in names]
 
     def _offer(self) -> None:
-        """Offer what can be set of the chosen links, as it is of the first one."""
+        """Offer controls for the chosen links, set to the values of the first one."""
         gui, links = self.server.gui, self._links()
         self._shown = self.chosen.value, self.resolution.value
         for handle in self._offered:
@@ -143,7 +143,7 @@ class LayoutPage:
         self._applied = self._tried = self._values()
 
     def _values(self) -> dict[str, Any]:
-        """Return what the controls are set to, as `Draft.change` takes it."""
+        """Return the values of the controls, as arguments of `Draft.change`."""
         if not self._offered:
             return {}
         values = {"density": self.density.value * 1e4, "facing": self._sides[self.side.value], "within": self.within.value}
@@ -155,7 +155,7 @@ class LayoutPage:
         return {**values, "box": None if is_whole else box}
 
     def _try(self, change: Callable[[], None]) -> bool:
-        """Change the draft and draw what follows; return whether this can be done, else say why and leave all as it was."""
+        """Change the draft and draw it; where that fails, show the error, restore the draft and return False."""
         before = self.draft.proposal
         try:
             change()
@@ -169,7 +169,7 @@ class LayoutPage:
         return True
 
     def _write(self) -> None:
-        """Write the layout, if the controls are set to what it can be."""
+        """Write the layout, unless the controls have a value that failed."""
         if self._tried != self._applied:
             self.problem.content += "\n\nnothing is written"
             return
@@ -217,7 +217,7 @@ class LayoutPage:
         self.chosen.value = EVERY if self.chosen.value == name else name
 
     def _draw(self) -> None:
-        """Draw the taxels that have changed, those of the chosen links in another colour, and say how many there are."""
+        """Draw the taxels that have changed, with those of the chosen links in another colour, and count them."""
         chosen, resolution, links = self._links(), self.resolution.value, self.draft.proposal.links
         names = {link.name for link in chosen} if self.chosen.value != EVERY else set()
         with self.server.atomic():

@@ -62,7 +62,7 @@ class LinkProposal:
 
     @property
     def region(self) -> tuple[Any, ...]:
-        """What says which part of the link has taxels."""
+        """Side, angle and box: the part of the link with taxels."""
         return self.facing, self.within, self.box
 
 
@@ -128,7 +128,7 @@ class Draft:
 
     Attributes:
         robot: The robot.
-        proposal: The layout as it is now; setting one that it was before takes changes back.
+        proposal: The current layout; assign an earlier one to undo changes.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class Draft:
                 include matches no link that can have taxels.
         """
         self.robot, self._sampler = robot, Sampler(robot)
-        self._pools: dict[str, tuple[Any, dict[Hashable, Pool | None]]] = {}  # by link: the surface they are drawn on, and they
+        self._pools: dict[str, tuple[Any, dict[Hashable, Pool | None]]] = {}  # by link: the surface, and the pools on it
         flexions, surfaces = _sampled_hands(self._sampler, include, progress, density)
         left_out = tuple(self._sampler.left_out)
         if not surfaces:
