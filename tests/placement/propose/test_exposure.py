@@ -41,7 +41,7 @@ def test_every_taxel_can_feel(tmp_path, here, side):
             "finger": ("mesh", True),
             "thumb": ("collision", False),
         }
-    hull = "on the hull that the simulator collides: hollows of the mesh are deeper in it than taxels feel"
+    hull = "on what the simulator collides: the surface itself lies deeper in it than taxels feel"
     exposed = "without what is inside other colliding geoms in the initial state"
     assert f"    # {hull}\n    # {exposed}\n    palm: {{method: poisson, count: " in text
     assert "surface: collision, exposed: true" in text
