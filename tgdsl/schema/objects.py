@@ -29,7 +29,7 @@ class _PlacedGeom(SpecModel):
     quat: Quat = (1.0, 0.0, 0.0, 0.0)
     """Orientation of its frame in the body's frame, w, x, y, z."""
     density: Annotated[Positive, Usual("number", low=5.0, high=25000.0)] = 1000.0
-    """Its density [kg/m³]; counts unless the body's inertia is given in the scene."""
+    """Density [kg/m³]; ignored if the scene gives the body's inertia."""
 
 
 class _Primitive(SpecModel):
@@ -57,20 +57,20 @@ class ColliderSpec(_Primitive):
     quat: Quat = (1.0, 0.0, 0.0, 0.0)
     """Orientation of its frame in the body's frame, w, x, y, z."""
     core: StrictBool = False
-    """Whether links that have primitive colliders meet it too; the others meet what is no such link alone."""
+    """Whether it also collides with links that have primitive colliders; by default it does not."""
 
 
 class CollidersSpec(SpecModel):
-    """The primitive colliders of a robot, in a file of their own beside its model."""
+    """The primitive colliders of a robot, in a file next to its model."""
 
     tgdsl: Literal[1]
     """Version of the grammar."""
     bodies: Annotated[dict[str, Annotated[tuple[ColliderSpec, ...], Field(min_length=1)]], Field(min_length=1)]
-    """Colliders by the name of the body whose colliding geoms they stand in for."""
+    """Colliders by body; they replace the colliding geoms of that body."""
 
 
 class MeshGeom(_PlacedGeom):
-    """A mesh of a file."""
+    """A mesh from a file."""
 
     mesh: str
     """Mesh file (.stl, .obj), relative to this document."""
@@ -108,10 +108,10 @@ CompoundGeoms.model_rebuild()
 
 
 class TemperaturePerEnv(SpecModel):
-    """A temperature at which each environment begins its episodes: see `SceneState.object_temperature`."""
+    """Temperature per environment at the start of an episode: see `SceneState.object_temperature`."""
 
     per_env: Annotated[Temperature, Usual("temperature", high=250.0)]
-    """The temperature that all environments have to begin with [°C]."""
+    """Initial value in all environments [°C]."""
 
 
 def _is_per_env(value: Any) -> str:
@@ -140,51 +140,51 @@ Bits = Annotated[StrictInt, Field(ge=0, lt=2**31)]
 
 
 class ObjectSpec(SpecModel):
-    """Something that taxels can feel: a body of the scene as it is, with other geoms, or a body of its own."""
+    """An object that taxels can sense: a body of the scene, with its geoms or other ones, or an added body."""
 
     body: str | None = None
-    """Name of its body in the scene (or in the robot's file, if there is no scene); default: a body of its own, of the object's
-    name, is added to the scene. Bodies below it that have no joint are part of it, unless they are objects themselves; what is
-    fixed to the world is no part of `world`."""
+    """Name of its body in the scene (or in the robot's file, if there is no scene); default: a body with the object's name is
+    added to the scene. Child bodies without joints belong to it, unless they are objects themselves; bodies fixed to the world
+    do not belong to `world`."""
     geom: Variant | None = None
-    """Geom that the body has instead of its own, and of those of bodies that are part of it. What else the scene says of the
-    body's first geom, such as friction, stays."""
+    """Geom that replaces the geoms of the body and of the bodies that belong to it. Other attributes of the body's first geom,
+    such as friction, stay."""
     variants: Annotated[tuple[Variant, ...], Field(min_length=1)] | None = None
-    """The same, of which each environment takes one: see `SceneState.variant`."""
+    """Alternatives to `geom`, one per environment: see `SceneState.variant`."""
     size: Literal["fixed", "per_env"] = "fixed"
-    """`per_env` if its size is part of the state: see `SceneState.object_size`. It (and each variant) is then one primitive."""
+    """`per_env`: its size is part of the state, see `SceneState.object_size`; it and each variant must be one primitive."""
     pos: Annotated[Position | None, Usual("length", high=10.0)] = None
-    """Where a body of its own starts, in the world [m]; default: the origin."""
+    """Initial position of an added body in the world [m]; default: the origin."""
     quat: Quat | None = None
-    """How it is turned there, w, x, y, z; default: not at all."""
+    """Initial orientation of an added body, w, x, y, z; default: that of the world."""
     joint: Literal["free", "fixed"] | None = None
-    """Whether a body of its own moves freely (the default) or is fixed to the world."""
+    """Joint of an added body: it moves freely (default), or is fixed to the world."""
     contype: Bits | None = None
-    """MuJoCo's bits of the geoms of a body of its own; default: 1, and what makes it collide with all geoms of the scene that
-    collide."""
+    """MuJoCo's `contype` of an added body's geoms; default: 1, plus the bits for contact with all colliding geoms of the
+    scene."""
     conaffinity: Bits | None = None
-    """The same."""
+    """MuJoCo's `conaffinity` of an added body's geoms; default: as for `contype`."""
     surface: str = "collision"
-    """What is felt of it: `collision`, the geoms that collide, meshes by their convex hulls as MuJoCo collides them; `visual`,
-    the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is. The
-    solver's contacts with it are those on its geoms that collide, and on all that do of its body where it has none itself."""
+    """The surface that taxels sense: `collision`, the geoms that collide, meshes as convex hulls, as in MuJoCo; `visual`, the
+    other geoms, meshes in their exact shape; or names of geoms or meshes of its body, with shell wildcards. Contacts are those
+    of its colliding geoms, or, if it has none, of all colliding geoms of its body."""
     query: Literal["sdf", "raycast"] = "sdf"
-    """How distances to its meshes are found: on a grid baked at compile time, or to the nearest triangle at run time (needs
-    warp-lang). Primitives are exact either way."""
+    """Distances to its meshes: from a grid that is baked at compile time, or to the nearest triangle at run time (needs
+    warp-lang). Primitives are exact in both."""
     tolerance: Annotated[PositiveLength, Usual("length", high=0.005)] = 5e-5
-    """Distance error that a grid may have, 99th percentile away from sharp edges [m]."""
+    """Largest distance error of a grid, 99th percentile away from sharp edges [m]."""
     max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
     """Largest size of a grid [bytes]."""
 
     temperature: Annotated[ObjectTemperature | None, Usual("temperature", high=250.0)] = None
-    """Its temperature when an episode begins, `45 degC`; `{per_env: 45 degC}` if that is part of the state, beginning with it:
-    see `SceneState.object_temperature`. Default: that of the surroundings [°C]."""
+    """Temperature at the start of an episode, `45 degC`; `{per_env: 45 degC}` makes it part of the state, with this initial
+    value: see `SceneState.object_temperature`. Default: ambient temperature [°C]."""
     material: ObjectMaterials | None = None
-    """What it is made of, for the flow of heat: a name such as `steel`, `{like: steel, emissivity: 0.8}`, or all numbers. Of a
-    list each environment takes one: see `SceneState.object_material`."""
+    """Material for heat flow: a name such as `steel`, `{like: steel, emissivity: 0.8}`, or all numbers. A list has one entry
+    per environment: see `SceneState.object_material`."""
     cells: tuple[Cells, Cells, Cells] | None = None
-    """Numbers of cells along x, y, z in which its temperature is resolved, a grid over the box of its geoms in its body's
-    frame; default: it has one temperature."""
+    """Numbers of cells of its temperature along x, y, z, over the bounding box of its geoms in its body's frame; default: one
+    temperature."""
 
     @model_validator(mode="after")
     def _check_heat(self) -> ObjectSpec:
