@@ -79,7 +79,7 @@ class TactileModule(HookedModule):
 
     @property
     def inputs(self) -> Inputs:
-        """What the module reads of a scene, and in which order."""
+        """The fields of a scene that the module reads, and their order."""
         return self.plan.inputs
 
     @property
@@ -89,27 +89,27 @@ class TactileModule(HookedModule):
 
     @property
     def observations(self) -> dict[str, tuple[ObservationTerm, ...]]:
-        """The terms of each observation group: name, type, size, and where its features stand in what `observe` returns."""
+        """The terms of each observation group: name, type, size, and the slice of its features in the result of `observe`."""
         return observation_terms(self.plan)
 
     @property
     def taxels(self) -> dict[str, TaxelTable]:
-        """The taxels that lie on each sensor's links, as tables: see `taxels.taxel_table`.
+        """Tables of the taxels on each sensor's links: see `taxels.taxel_table`.
 
-        They are the rows of a reading if its `rows` in `outputs` is "taxel". A `link_contact` has a row per body instead,
-        whatever taxels the layout gives its links: `rows` has the `body` of each row and its `links`, joined by commas.
+        They are the rows of a reading if its `rows` in `outputs` is "taxel". A `link_contact` has one row per body instead:
+        `rows` has the `body` of each row and its `links`, joined by commas.
         """
         with_taxels = [sensor for sensor in self.plan.sensors if len(sensor.taxels)]
         return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in with_taxels})
 
     @property
     def taxels_id(self) -> str:
-        """A hash of all taxels, to the last bit; `tgdsl.check_taxels` compares those of modules, artefacts and rollouts."""
+        """Hash of all taxels, exact to the last bit: see `tgdsl.check_taxels`."""
         return self.plan.taxels_id
 
     @property
     def rows(self) -> dict[str, TaxelTable]:
-        """What the rows of each reading are, as tables: a taxel as in `taxels`, a `body`, or what the kind says."""
+        """Tables of the rows of each reading: taxels as in `taxels`, bodies, or other rows that the kind defines."""
         return row_tables(self.plan)
 
     @property
@@ -124,35 +124,35 @@ class TactileModule(HookedModule):
 
     @property
     def has_state(self) -> bool:
-        """Whether any sensor carries something from one call to the next."""
+        """Whether any sensor has state, which is carried from call to call."""
         return self.memory.is_wanted
 
     @property
     def num_envs(self) -> int | None:
-        """Number of environments whose state is held; None before the first call, or if there is no state."""
+        """Number of environments of the state; None before the first call, or if there is no state."""
         return self.memory.num_envs
 
     def forward(
         self, state: SceneState, mask: Tensor | None = None, env_ids: EnvIds | None = None
     ) -> dict[str, Float[Tensor, "env *step row channel"]]:
-        """Read all sensors, and advance what they remember.
+        """Read all sensors, and advance their state.
 
-        With `mask` or `env_ids` it reads and advances those environments alone, as after a reset in the middle of a control
-        step: delay, noise and history of the others stay where they are, and their rows are as they were handed out before. A
-        mask on the module's device can be captured in a CUDA graph.
+        With `mask` or `env_ids` only these environments are read and advanced, such as after a reset in the middle of a control
+        step. The others keep delay, noise and history, and their rows repeat the last readings. A mask on the module's device
+        can be captured in a CUDA graph.
 
         Args:
             state: The scene, at one instant.
             mask: Which environments to read, boolean (env,); default: all.
-            env_ids: The same by indices.
+            env_ids: Indices of environments, instead of a mask.
 
         Returns:
-            Readings of all environments by name, as `outputs` lists them, in the module's dtype. They are tensors of their own,
-            but for a module that replays a CUDA graph (see `compile`), and histories that are declared as views.
+            Readings of all environments by name, in the order of `outputs` and the module's dtype. They are new tensors, except
+            if the module replays a CUDA graph (see `compile`), and for histories that are declared as views.
 
         Raises:
-            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device; if there are no
-                such environments, or some are to be left out before anything was handed out.
+            StateError: If a required field is missing, or has the wrong shape, dtype or device; if there are no such
+                environments, or the first call leaves some out.
         """
         tensors, num_envs = self._tensors(state)
         step = "advance"
@@ -167,11 +167,11 @@ class TactileModule(HookedModule):
         return self.memory.with_views(readings)
 
     def record_outputs(self, readings: Mapping[str, Tensor]) -> None:
-        """Note what a call has handed out; for who replays a captured graph of calls in their place."""
+        """Keep the readings of a call, for callers that replay a captured graph of calls."""
         self.memory.cache_readings(readings)
 
     def peek(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
-        """Return what a call would read, with its errors, and advance nothing: the next call draws the same random numbers."""
+        """Return the readings of a call, and raise its errors, without advancing state: the next call draws the same noise."""
         tensors, num_envs = self._tensors(state)
         is_first = self.has_state and self.num_envs is None
         memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
@@ -182,9 +182,9 @@ class TactileModule(HookedModule):
                 self.free()
 
     def initial_memory(self, num_envs: int, dt: float | None = None) -> dict[str, Tensor]:
-        """Return what sensors remember before their first call, for `step`, (env, …) but for `memory.SHARED`.
+        """Return the initial state for `step`: tensors (env, …), except those in `memory.SHARED`.
 
-        `dt` is the shortest time between steps [s], needed if `inputs.fields` has it: delays keep so many calls.
+        `dt` is the shortest time between steps [s], required if `inputs.fields` has it: the length of delays follows from it.
 
         Raises:
             StateError: If the time is missing.
@@ -198,13 +198,13 @@ class TactileModule(HookedModule):
     def step(
         self, state: SceneState, memory: Mapping[str, Tensor], reset: Bool[Tensor, " env"] | None = None
     ) -> tuple[dict[str, Float[Tensor, "env *step row channel"]], dict[str, Tensor]]:
-        """Read all sensors as a call does, as a function: nothing is held, and nothing changes in place.
+        """Read all sensors as a pure function: the module's own state is neither used nor changed.
 
-        Derivatives go through the memory from step to step. `memory` is `initial_memory`, or that of the step before; `reset`
-        has the environments that begin an episode at this step. Returns readings by name, and the memory after the step.
+        Derivatives pass through the memory from step to step. `memory` is `initial_memory`, or the result of the last step;
+        `reset` marks environments that begin an episode at this step. Returns readings by name, and the memory after the step.
 
         Raises:
-            StateError: As a call does, or if the memory is another module's or of another number of environments.
+            StateError: As for a call, or if the memory is from another module or has another number of environments.
         """
         self.constants.refresh()
         tensors = self.incoming.tensors(state, self.dtype, self.device)
@@ -236,16 +236,16 @@ class TactileModule(HookedModule):
         Args:
             path: The file.
             to: "pt2" (torch.export), "aoti" (AOTInductor, for C++) or "onnx"; default: by the ending .pt2, .aoti.pt2 or .onnx.
-            dt: Time between steps [s]; default: what the document says. The file is made for it.
+            dt: Time between steps [s], fixed in the file; default: the document's.
             state_dtype: Dtype of the state's floats; default: the module's.
-            source: What it is exported from, for `tgdsl verify`.
-            overrides: What was overridden of it.
+            source: The document, for `tgdsl verify`.
+            overrides: Overrides of the document.
 
         Returns:
             Names, shapes and dtypes of all inputs and outputs, in order.
 
         Raises:
-            TgdslError: If a sensor cannot be exported, the format is none, or what writes it is not installed.
+            TgdslError: If a sensor cannot be exported, the format is unknown, or its package is not installed.
             FileError: If the file cannot be written.
         """
         file = Path(path)
@@ -263,14 +263,14 @@ class TactileModule(HookedModule):
         return export_step(step, file, file_format, touch.inductor_options(), source, overrides)
 
     def free(self) -> None:
-        """Let go of all that sensors remember, and of the number of environments; the seed is kept.
+        """Discard all state and the number of environments; the seed stays.
 
         The next call may have any number of environments, and begins an episode in each.
         """
         self.memory.free()
 
     def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
-        """Return the fields of a state that are wanted, and the number of environments."""
+        """Return the required fields of a state, and the number of environments."""
         self.constants.refresh()
         tensors = self.incoming.tensors(state, self.dtype, self.device)
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
@@ -280,18 +280,18 @@ class TactileModule(HookedModule):
         return tensors, num_envs
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
+        """Return the readings of `advance`, `advance_some` or `look`, eager, compiled or replayed: see `compile`."""
         result = self.calls.of(getattr(self, name))(tensors, memory)
         return {name: result[name] for name in self.plan.readings()}
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the readings of `core`, and put the new state in the place of the old one."""
+        """Return the readings of `core`, and replace the old state with the new one."""
         readings, updated = self._read(tensors, memory)
         store(memory, updated | kept(readings, memory))
         return readings
 
     def advance_some(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Do what `advance` does for the environments of `tensors["mask"]`; of the others return what was handed out before."""
+        """Advance the environments of `tensors["mask"]`; return their readings, and the last readings of the others."""
         readings, updated = chosen_rows(tensors["mask"], *self.core(tensors, memory), memory)
         store(memory, updated | kept(readings, memory))
         return readings
@@ -308,8 +308,8 @@ class TactileModule(HookedModule):
             memory: State by `sensor:name`, each (env, …), and the clock's.
 
         Returns:
-            Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
-            what is new: (env, …).
+            Readings by name, and signals before their noise as `<sensor>/signal`; and the new state. For a ring (env, call, …)
+            that is the new entry alone, (env, …).
         """
         copies = {name: memory[name].clone() for name in self._overwritten}
         readings, updated = self._read(tensors, memory | copies)
@@ -323,7 +323,7 @@ class TactileModule(HookedModule):
         """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
 
         Raises:
-            ObservationError: If a reading that is observed is missing or of another shape, or only the real hand has it.
+            ObservationError: If an observed reading is missing or has another shape, or only the real hand has it.
         """
         self.constants.refresh()
         return observe(self.plan, self.constants, readings)
@@ -331,60 +331,59 @@ class TactileModule(HookedModule):
     def images(
         self, name: str, readings: Mapping[str, Tensor]
     ) -> tuple[dict[str, Float[Tensor, "env channel row column"]], dict[str, Bool[Tensor, "row column"]]]:
-        """Return the reading `name` of taxels as one image per link, and where its pixels are taxels, for convolutions.
+        """Return the reading `name` as one image per link, for convolutions, and masks of the pixels that are taxels.
 
-        Cells of a link's grid that missed its surface, and inactive probes, are 0 in the image and False in the mask. Links
-        without a grid are left out. Of stacked calls it is the last one.
+        Grid cells that miss the surface, and inactive probes, are 0 in the image and False in the mask. Links without a grid
+        are left out. If calls are stacked, the image is of the last one.
 
         Raises:
-            TgdslError: If there is no such reading, if it is not one of taxels, or none of its links has a grid.
+            TgdslError: If there is no such reading, its rows are no taxels, or none of its links has a grid.
         """
         return images_of(self.plan, name, readings)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Begin a new episode in some environments (default: all), by indices or a mask; the others are left untouched.
+        """Begin a new episode in some environments (default: all), given as indices or a mask.
 
-        State is at rest again, filters start from the next reading's true value, and gains, dead taxels and what else is drawn
-        per episode are redrawn. Indices that lie on a GPU are checked by the kernel, which asserts.
+        State returns to rest, filters start from the next reading's true value, and gains, dead taxels and other noise per
+        episode are drawn again. Indices on a GPU are checked by an assertion in the kernel.
 
         Raises:
             StateError: If there are no such environments.
         """
         if self.num_envs is None:
             check_env_ids(env_ids, StateError)
-            return  # nothing is held yet, and the first call begins an episode
+            return  # there is no state yet, and the first call begins an episode
         with torch.no_grad():
             self.memory.reset(env_mask(env_ids, self.num_envs, self.device, StateError, waits=False))
 
     def seed(self, seed: int, first_env: int | None = None) -> TactileModule:
-        """Choose the random numbers of noise; steps and episodes are counted from 0 again.
+        """Set the seed of noise; steps and episodes count from 0 again.
 
-        They depend on the seed, the sensor's name, the environment's number and the step, and on nothing else: not on other
-        sensors or environments, the batch size, the device or the process. A reset begins the next episode, whose numbers are
-        others: reset first, then seed.
+        Random numbers depend only on seed, sensor name, number of the environment, episode and step: not on other sensors or
+        environments, batch size, device or process. A reset begins the next episode, so reset first, then seed.
 
         Args:
-            seed: Any integer; those that differ by a multiple of 2⁶⁴ are the same.
-            first_env: Number of this module's first environment among those of all processes; default: where torch runs
-                distributed, the process's rank times the number of its environments, else 0.
+            seed: Any integer, modulo 2⁶⁴.
+            first_env: Number of this module's first environment across all processes; default: rank times number of
+                environments if torch runs distributed, else 0.
 
         Raises:
-            TgdslError: If they are no integers, or `first_env` is none that an environment can have.
+            TgdslError: If an argument is no integer, or `first_env` is out of range.
         """
         self.memory.clock.seed_with(seed, first_env)
         return self
 
     def compile(self, graph: bool = False, **options: Any) -> TactileModule:
-        """Have calls and `peek` compiled by `torch.compile` into fused kernels, in place; their first one then takes longer.
+        """Compile calls and `peek` with `torch.compile` into fused kernels, in place, at the first call.
 
         Args:
-            graph: Whether calls without derivatives (under `torch.no_grad` or `inference_mode`) replay a CUDA graph: the host
-                then has little to do, and readings lie in the same memory at each call, so copy what is to be kept.
-            **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`, one graph for every batch ≥ 2, and
+            graph: Whether calls without derivatives (under `torch.no_grad` or `inference_mode`) replay a CUDA graph. Each call
+                then overwrites the readings of the last one: copy them to keep them.
+            **options: Options of `torch.compile`; default `fullgraph=True, dynamic=True`, one graph for all batches ≥ 2, and
                 `options=inductor_options()`.
 
         Raises:
-            TgdslError: If graphs are wanted of a module that is not on a GPU.
+            TgdslError: If `graph` is set and the module is not on a GPU.
         """
         if graph and self.device.type != "cuda":
             raise TgdslError(f"`graph` needs a module on a GPU, this one is on {self.device}")
@@ -398,24 +397,24 @@ class TactileModule(HookedModule):
         return self
 
     def inductor_options(self) -> dict[str, Any]:
-        """Return what `compile` asks of Inductor: see `calls.inductor_options`."""
+        """Return the default Inductor options of `compile`: see `calls.inductor_options`."""
         return inductor_options(self.plan, self._quantities, self.device)
 
     def example_state(
         self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03
     ) -> SceneState:
-        """Return a valid random state of all fields in `inputs`, with bodies close enough to touch.
+        """Return a random valid state with all fields of `inputs`, and bodies close enough to touch.
 
         `spread` is the standard deviation of the bodies' positions, and of contacts from their links [m].
         """
         return example_state(self.inputs, num_envs, seed, dtype, spread).to(self.device)
 
     def explain(self) -> str:
-        """Return an account of what is computed, what was dropped and why, and what it costs."""
+        """Return a text that lists computed and omitted quantities, with reasons and cost."""
         return explain(Explained(self.plan, self._quantities, self.constants, self.memory, self.core))
 
     def operations_per_env(self) -> int:
-        """Return how many elementary operations one environment takes, counted in an eager run."""
+        """Return the number of elementary operations per environment, counted in an eager run."""
         return operations_per_env(Explained(self.plan, self._quantities, self.constants, self.memory, self.core))
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
@@ -425,6 +424,6 @@ class TactileModule(HookedModule):
         self.calls.forget_graphs()
 
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
-        """Have state that is loaded before the first call where the module is."""
+        """Load state on the module's device, also before the first call."""
         self.memory.home = self.memory.clock.home = torch.empty(0, dtype=self.dtype, device=self.device)
         load()

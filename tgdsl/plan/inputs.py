@@ -1,4 +1,4 @@
-"""What a module wants of a scene, and in which order."""
+"""The fields of a scene that a module reads, and their order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tgdsl.quantities.pairs import Pair
 
 @dataclass(frozen=True)
 class ContactPart:
-    """Geoms whose contacts count: those of a body, those of a body and of all bodies below it, or a single one."""
+    """Geoms whose contacts count: all geoms of a body, of a body and all bodies below it, or one geom."""
 
     kind: Literal["body", "subtree", "geom"]
     name: str
@@ -31,7 +31,7 @@ class Touching(NamedTuple):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a module wants of a scene, and in which order.
+    """The fields of a scene that a module reads, and their order.
 
     Attributes:
         fields: Fields of `SceneState` that are read.
@@ -39,17 +39,17 @@ class Inputs:
         pairs: Pairs whose contacts are read.
         bodies_of: Body of each object named in `pairs`.
         slots: Contacts per pair of the slotted contact fields; 0 if none is read.
-        objects: Objects that differ between environments: those of the fields `variant` and `object_size`.
-        num_variants: How many variants each of these objects has; 1 if only its size differs.
-        heated: Objects that hold heat: those of the fields `object_temperature` and `object_material`, if either is read.
-        num_materials: Of how many materials each of these may be.
-        start_temperatures: What the temperature of each is to begin with [°C], where it is part of the state; else None.
+        objects: Objects that differ between environments, in the order of the fields `variant` and `object_size`.
+        num_variants: Number of variants of each of these objects; 1 if only its size differs.
+        heated: Objects with a temperature, in the order of the fields `object_temperature` and `object_material`.
+        num_materials: Number of possible materials of each of these.
+        start_temperatures: Initial temperature of each [°C] if it is part of the state; else None.
         joints: Joints of the fields `joint_pos`, `joint_vel` and `joint_effort`: hinges and slides.
         actuators: Actuators of the field `last_action`.
-        contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
-        link_parts: Whose contacts are a link's, where they are not just those of its body: see `parts_of_link`.
-        substeps: Physics steps of a call at each of which some sensor is advanced: see `SceneState.substeps`.
-        dt: Time between calls that some sensor's constants are made for [s]; 0: none are.
+        contacts_of: Geoms of objects, where they are not just their body's: see `parts_of`.
+        link_parts: Geoms of links, where they are not just their body's: see `parts_of_link`.
+        substeps: Physics steps per call, if a sensor advances at each of them: see `SceneState.substeps`.
+        dt: Time between calls for which a sensor's constants are computed [s]; 0: for none.
     """
 
     fields: tuple[str, ...]
@@ -71,7 +71,7 @@ class Inputs:
 
     @cached_property
     def names(self) -> Mapping[str, tuple[str, ...]]:
-        """What stands at each place of each axis of the fields whose entries have names."""
+        """Names of the entries along each named axis of the fields."""
         return {
             "body": self.bodies,
             "pair": tuple(f"{pair.link} – {pair.object}" for pair in self.pairs),
@@ -83,7 +83,7 @@ class Inputs:
 
     @cached_property
     def sizes(self) -> Mapping[str, int]:
-        """How many there are along each named axis of the fields."""
+        """Number of entries along each named axis of the fields."""
         return {**{axis: len(names) for axis, names in self.names.items()}, "slot": self.slots}
 
     def parts_of(self, name: str) -> tuple[ContactPart, ...]:
@@ -91,11 +91,11 @@ class Inputs:
         return self.contacts_of.get(name) or (ContactPart("body", self.bodies_of[name]),)
 
     def parts_of_link(self, link: str) -> tuple[ContactPart, ...]:
-        """Return the geoms whose contacts are a link's; no geom is in two parts, nor in those of two links.
+        """Return the geoms whose contacts are a link's; no geom is in two parts, nor in two links.
 
         A link is rigid: its body, and the child bodies that have no joint, carry no taxels of the layout, are no sensor's link
-        and are not objects. This is so for all sensors of a module: a child body with taxels is a link of its own for a sensor
-        that is on its parent alone, too.
+        and are not objects. This holds for all sensors of a module: a child body with taxels is a separate link even for a
+        sensor on its parent alone.
         """
         return self.link_parts.get(link) or (ContactPart("body", link),)
 
@@ -104,11 +104,11 @@ class Inputs:
         return tuple(Touching(*parts) for parts in itertools.product(self.parts_of(pair.object), self.parts_of_link(pair.link)))
 
     def renamed(self, names: Mapping[str, str] | None = None, *, prefix: str = "") -> Inputs:
-        """Return the same inputs by the names that another scene has for bodies, geoms, joints and actuators.
+        """Return these inputs with another scene's names of bodies, geoms, joints and actuators.
 
         Args:
-            names: Names in the other scene by the names here.
-            prefix: Stands before all other names there, such as "robot/"; the body "world" has none.
+            names: The other scene's names, by the names here.
+            prefix: Prefix of all other names there, such as "robot/"; the body "world" has none.
 
         Raises:
             StateError: If `names` has a name that is not among these.
